@@ -1,0 +1,44 @@
+# make demo   set up .venv and run the main job: replay an attack and watch it being blocked
+# make test   set up .venv and run the tests
+# make venv   set up .venv alone
+# make check  ruff, mypy, import rules
+# make p4     compile p4/sdnator.p4 again (needs p4c)
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.set-up
+
+.PHONY: venv demo test check p4 clean
+.DEFAULT_GOAL := test
+
+venv: $(STAMP)
+
+# The stamp holds what the environment was made from: a second run does nothing.
+$(STAMP): pyproject.toml $(wildcard setup.py apps/*/*.c)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "SDNator needs Python 3.11 or later; $(PYTHON) is `$(PYTHON) -V 2>&1`. Try: make PYTHON=python3.11" >&2; exit 2; }
+	@echo "==> setting up $(VENV) (once; takes a minute or two)"
+	@$(PYTHON) -m venv $(VENV) \
+	  || { echo "Python cannot make virtual environments here; on Debian: apt install python3-venv" >&2; exit 2; }
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: venv
+	@$(BIN)/sdnator demo
+
+test: venv
+	@echo "==> tests"
+	@$(BIN)/python -m pytest
+
+check: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy .
+
+p4: venv
+	$(BIN)/python -m sdnator.p4_program compile
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info demo

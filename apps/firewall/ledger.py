@@ -1,0 +1,146 @@
+"""The life of decisions: in force, extended while the attack goes on, probation, lifted.
+
+Pure: every call carries the capture time it happens at.  A block that ends while its drop counter
+still runs at more than three times the sender's training rate is extended; otherwise it is lifted and
+the sender is on probation, where one hot second blocks it again, a step higher.
+"""
+
+import hashlib
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from apps.firewall.policy import Rules
+from apps.messages import Alert, Confirmation, Decision, Evidence, Sender, Target
+
+SECOND = 1_000_000_000
+PROBATION_S = 600
+STILL_GOING_RATIO = 3.0
+"""A block is extended while its drops exceed the training rate this many times."""
+STILL_GOING_FLOOR = 1.0
+"""... and this many packets a second, for senders whose training rate is next to nothing."""
+
+
+@dataclass
+class Block:
+    """One block in force."""
+
+    decision: Decision
+    training_rate: float
+    drops: int = 0
+    drops_at: int = 0
+    drop_rate: float = 0.0
+    state: str = "decided"
+
+
+@dataclass
+class Ledger:
+    """All blocks in force and all senders on probation."""
+
+    rules: Rules
+    blocks: dict[str, Block] = field(default_factory=dict)
+    probation: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    refused: int = 0
+    """Blocks that a cap prevented."""
+    _recent: deque[int] = field(default_factory=deque)
+
+    def covering(self, sender: Sender) -> Block | None:
+        """The block in force that already stops this sender."""
+        for block in self.blocks.values():
+            target = block.decision.target
+            if block.decision.switch != sender.switch:
+                continue
+            if target.kind == "mac" and (target.address, target.port) == (sender.mac, sender.port):
+                return block
+            if target.kind == "ip" and target.address == sender.ip:
+                return block
+        return None
+
+    def on_probation(self, sender: Sender, now: int) -> bool:
+        """True if a block of this sender was lifted less than ten minutes ago."""
+        return any(
+            self.probation.get((sender.switch, kind, address), 0) > now
+            for kind, address in (("mac", sender.mac), ("ip", sender.ip))
+        )
+
+    def cap_reached(self, now: int) -> str | None:
+        """Why no further block may be made at this moment, or None."""
+        while self._recent and self._recent[0] <= now - 60 * SECOND:
+            self._recent.popleft()
+        if len(self.blocks) >= self.rules.max_blocks:
+            return f"{len(self.blocks)} blocks are in force (max_blocks)"
+        if len(self._recent) >= self.rules.max_decisions_per_minute:
+            return f"{len(self._recent)} blocks were decided within a minute (max_decisions_per_minute)"
+        return None
+
+    def block(
+        self, alert: Alert, target: Target, reason: str, evidence: Iterable[Evidence], offences: int
+    ) -> Decision:
+        """Open a block; `offences` is the number of earlier ones in the archive."""
+        level = min(offences, len(self.rules.durations_s) - 1)
+        now = alert.event_time
+        decision = Decision(
+            id=decision_id(alert.sender.switch, target, now),
+            action="block",
+            switch=alert.sender.switch,
+            target=target,
+            reason=reason,
+            evidence=tuple(evidence),
+            event_time=now,
+            expires=now + self.rules.durations_s[level] * SECOND,
+            level=level,
+            dry_run=self.rules.dry_run,
+            first_packet=alert.first_packet,
+        )
+        self.blocks[decision.id] = Block(decision, alert.training_rate, drops_at=now)
+        self._recent.append(now)
+        return decision
+
+    def confirm(self, confirmation: Confirmation) -> None:
+        """Note what the switch said; a block that failed is not in force."""
+        block = self.blocks.get(confirmation.id)
+        if block is None:
+            return
+        block.state = confirmation.state
+        if confirmation.state in {"failed", "removed", "expired"}:
+            del self.blocks[confirmation.id]
+
+    def count_drops(self, decision_id: str, packets: int, now: int) -> None:
+        """Take a reading of a block's drop counter."""
+        block = self.blocks.get(decision_id)
+        if block is None or now <= block.drops_at:
+            return
+        block.drop_rate = (packets - block.drops) * SECOND / (now - block.drops_at)
+        block.drops, block.drops_at = packets, now
+
+    def due(self, now: int) -> list[Decision]:
+        """Decisions that time alone brings: extended blocks and lifted ones."""
+        return [self._end(block, now) for block in list(self.blocks.values()) if 0 < block.decision.expires <= now]
+
+    def _end(self, block: Block, now: int) -> Decision:
+        old = block.decision
+        floor = max(block.training_rate * STILL_GOING_RATIO, STILL_GOING_FLOOR)
+        if block.drop_rate > floor and not old.dry_run:
+            extended = _changed(
+                old,
+                now,
+                expires=now + self.rules.durations_s[old.level] * SECOND,
+                reason=f"still going on ({block.drop_rate:.0f} dropped packets a second): {old.reason}",
+            )
+            block.decision = extended
+            return extended
+        del self.blocks[old.id]
+        key = (old.switch, old.target.kind, old.target.address)
+        self.probation[key] = now + PROBATION_S * SECOND
+        return _changed(old, now, action="unblock", reason="the block ran out; on probation for ten minutes")
+
+
+def _changed(old: Decision, now: int, **changes: object) -> Decision:
+    fields = {name: getattr(old, name) for name in old.__struct_fields__}
+    return Decision(**(fields | {"event_time": now} | changes))
+
+
+def decision_id(switch: str, target: Target, now: int) -> str:
+    """A short id, the same for the same decision in every replay."""
+    text = f"{switch} {target.kind} {target.address} {target.port} {now}"
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,0 +1,123 @@
+"""When a sender may be blocked: pure rules over alerts, no clock and no I/O.
+
+The rule (DESIGN of Kitsune's alerts): a sender is blocked at five hot seconds of ten, or at two when
+its rate is also twenty times the most it sent in any second of training.  A MAC is blocked only if one
+address stands behind it, otherwise the address is; routers and servers alert but are never blocked
+unless the operator says so; the allow-list always wins.
+"""
+
+import ipaddress
+from dataclasses import dataclass, field
+
+import msgspec
+
+from apps.messages import Alert, Role, Sender, Target
+
+
+class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the operator can set about blocking."""
+
+    hot_seconds: int = 5
+    """Hot seconds among the last ten that lead to a block."""
+    hot_seconds_fast: int = 2
+    """The same for senders far beyond their training rate."""
+    fast_rate_ratio: float = 20.0
+    """'Far beyond': this many times the highest rate of any second of training."""
+    protected_roles: tuple[Role, ...] = ("gateway", "dns", "dhcp", "multicast")
+    """Senders in these roles alert but are not blocked."""
+    allow: tuple[str, ...] = ()
+    """Addresses, prefixes and MAC addresses that are never blocked."""
+    durations_s: tuple[int, ...] = (600, 3600, 86_400, 604_800)
+    """Length of a block by offence: first, second, third, fourth and later."""
+    max_blocks: int = 4096
+    """Blocks in force at a time; past that the firewall stops blocking and says so."""
+    max_decisions_per_minute: int = 120
+    """Blocks decided in a minute of capture time; past that the firewall stops blocking and says so."""
+    dry_run: bool = False
+    """Decide and archive, but change nothing in the switch."""
+
+
+@dataclass(frozen=True)
+class AllowList:
+    """Addresses, prefixes and MACs that no block may touch."""
+
+    networks: tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...] = ()
+    macs: frozenset[str] = field(default_factory=frozenset)
+
+    @classmethod
+    def parse(cls, entries: tuple[str, ...]) -> "AllowList":
+        """Read entries of the operator; raises ValueError that names the wrong one."""
+        networks, macs = [], set()
+        for entry in entries:
+            if _is_mac(entry):
+                macs.add(entry.lower())
+                continue
+            try:
+                networks.append(ipaddress.ip_network(entry, strict=False))
+            except ValueError as error:
+                raise ValueError(
+                    f"allow-list entry {entry!r} is no IP address, prefix or MAC address: {error}"
+                ) from error
+        return cls(tuple(networks), frozenset(macs))
+
+    def covers(self, sender: Sender) -> bool:
+        """True if a block of this sender would touch an allowed one."""
+        if sender.mac in self.macs:
+            return True
+        if not sender.ip:
+            return False
+        address = ipaddress.ip_address(sender.ip)
+        return any(address in network for network in self.networks)
+
+
+def _is_mac(text: str) -> bool:
+    octets = text.split(":")
+    return len(octets) == 6 and all(
+        len(octet) == 2 and set(octet.lower()) <= set("0123456789abcdef") for octet in octets
+    )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the rules say of an alert: a target to block, or why not."""
+
+    target: Target | None
+    reason: str
+
+
+def judge(alert: Alert, rules: Rules, allow_list: AllowList, *, on_probation: bool = False) -> Verdict:
+    """Apply the rules to one alert.  On probation one hot second is enough."""
+    needed, why = _seconds_needed(alert, rules, on_probation=on_probation)
+    if alert.hot_seconds < needed:
+        return Verdict(None, f"{alert.hot_seconds} hot seconds of ten, {needed} needed")
+    if allow_list.covers(alert.sender):
+        return Verdict(None, "the sender is on the allow-list")
+    if alert.role in rules.protected_roles:
+        return Verdict(None, f"the sender is a {alert.role}: it alerts but is not blocked")
+    target = target_of(alert)
+    if target is None:
+        return Verdict(
+            None, f"{alert.mac_addresses} addresses stand behind {alert.sender.mac}, and the frames carry none"
+        )
+    return Verdict(target, f"{why}: {alert.reason}")
+
+
+def _seconds_needed(alert: Alert, rules: Rules, *, on_probation: bool) -> tuple[int, str]:
+    if on_probation:
+        return 1, "anomalous again during probation"
+    ratio = alert.rate / alert.training_rate if alert.training_rate > 0 else 0.0
+    if ratio >= rules.fast_rate_ratio:
+        return rules.hot_seconds_fast, (
+            f"anomalous in {alert.hot_seconds} seconds of the last ten at {ratio:.0f} times its training rate"
+        )
+    return rules.hot_seconds, f"anomalous in {alert.hot_seconds} seconds of the last ten"
+
+
+def target_of(alert: Alert) -> Target | None:
+    """The narrowest thing that stops this sender and nobody else; None if there is none."""
+    sender = alert.sender
+    if alert.mac_addresses <= 1:
+        return Target(kind="mac", address=sender.mac, port=sender.port)
+    if sender.ip:
+        return Target(kind="ip", address=sender.ip)
+    return None

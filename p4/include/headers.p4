@@ -1,0 +1,129 @@
+// Headers, metadata and the constants that the control plane shares with the program.
+
+const bit<9> CPU_PORT = 510;
+const bit<32> COPY_SESSION = 1;           // clone session towards the controller
+const bit<32> COPY_BYTES = 256;           // of a copied frame: all headers, those quoted by ICMP errors too
+const bit<32> PACKET_IN_HEADER_BYTES = 52;
+#define COPY_FIELDS 1
+
+const bit<32> INSTANCE_INGRESS_CLONE = 1; // BMv2's numbers for standard_metadata.instance_type
+const bit<32> INSTANCE_REPLICATION = 5;
+
+const bit<16> ETHERTYPE_IPV4 = 0x0800;
+const bit<16> ETHERTYPE_ARP = 0x0806;
+const bit<16> ETHERTYPE_VLAN = 0x8100;
+const bit<16> ETHERTYPE_QINQ = 0x88a8;
+const bit<16> ETHERTYPE_IPV6 = 0x86dd;
+
+const bit<8> PROTO_HOP_BY_HOP = 0;
+const bit<8> PROTO_ICMP = 1;
+const bit<8> PROTO_TCP = 6;
+const bit<8> PROTO_UDP = 17;
+const bit<8> PROTO_ROUTING = 43;
+const bit<8> PROTO_FRAGMENT = 44;
+const bit<8> PROTO_ICMPV6 = 58;
+const bit<8> PROTO_DESTINATION_OPTIONS = 60;
+
+typedef bit<48> mac_t;
+typedef bit<128> address_t;               // IPv6, or IPv4 in the low 32 bits
+typedef bit<256> query_map_t;             // one bit for each telemetry query
+
+@controller_header("packet_in")
+header packet_in_t {
+    bit<9> ingress_port;
+    bit<7> reason;
+    bit<48> timestamp;                    // us on the switch's clock
+    bit<32> length;                       // bytes on the wire
+    bit<32> sequence;                     // of this packet-in, from 1: a gap is a loss
+    bit<32> arrival;                      // of the frame at the switch, from 0
+    query_map_t query_map;                // queries that the frame matched
+}
+
+@controller_header("packet_out")
+header packet_out_t {
+    bit<9> egress_port;
+    bit<7> operation;                     // 0: send the frame out of egress_port
+    bit<32> query;
+    address_t key_source;
+    address_t key_destination;
+}
+
+header ethernet_t { mac_t destination; mac_t source; bit<16> ethertype; }
+header vlan_t { bit<3> priority; bit<1> drop_eligible; bit<12> vid; bit<16> ethertype; }
+header arp_t {
+    bit<16> hardware_type; bit<16> protocol_type; bit<8> hardware_length; bit<8> protocol_length;
+    bit<16> operation;
+    mac_t sender_mac; bit<32> sender_ip; mac_t target_mac; bit<32> target_ip;
+}
+header ipv4_t {
+    bit<4> version; bit<4> ihl; bit<8> tos; bit<16> total_length;
+    bit<16> identification; bit<3> flags; bit<13> fragment_offset;
+    bit<8> ttl; bit<8> protocol; bit<16> checksum; bit<32> source; bit<32> destination;
+}
+header ipv4_options_t { varbit<320> options; }
+header ipv6_t {
+    bit<4> version; bit<8> traffic_class; bit<20> flow_label;
+    bit<16> payload_length; bit<8> next_header; bit<8> hop_limit;
+    address_t source; address_t destination;
+}
+header extension_t { bit<8> next_header; bit<8> length; bit<48> first; } // RFC 8200, 4.2: 8 bytes, then
+header extension_rest_t { varbit<16320> rest; }                          // `length` times 8 more
+header fragment_t { bit<8> next_header; bit<8> reserved; bit<13> offset; bit<2> zero; bit<1> more; bit<32> identification; }
+header tcp_t {
+    bit<16> source_port; bit<16> destination_port; bit<32> sequence; bit<32> acknowledgement;
+    bit<4> data_offset; bit<4> reserved; bit<8> flags; bit<16> window; bit<16> checksum; bit<16> urgent;
+}
+header udp_t { bit<16> source_port; bit<16> destination_port; bit<16> length; bit<16> checksum; }
+header icmp_t { bit<8> type; bit<8> code; bit<16> checksum; bit<32> rest; }
+header ports_t { bit<16> source_port; bit<16> destination_port; }        // quoted by an ICMP error
+
+struct headers_t {
+    packet_in_t packet_in;
+    packet_out_t packet_out;
+    ethernet_t ethernet;
+    vlan_t[2] vlan;
+    arp_t arp;
+    ipv4_t ipv4;
+    ipv4_options_t ipv4_options;
+    ipv6_t ipv6;
+    extension_t extension0;
+    extension_rest_t extension0_rest;
+    extension_t extension1;
+    extension_rest_t extension1_rest;
+    extension_t extension2;
+    extension_rest_t extension2_rest;
+    fragment_t fragment;
+    tcp_t tcp;
+    udp_t udp;
+    icmp_t icmp;
+    ipv4_t quoted_ipv4;
+    ipv4_options_t quoted_ipv4_options;
+    ipv6_t quoted_ipv6;
+    ports_t quoted_ports;
+}
+
+struct metadata_t {
+    // what a copy for the controller keeps (a plain clone would lose it)
+    @field_list(COPY_FIELDS) bit<9> ingress_port;
+    @field_list(COPY_FIELDS) bit<7> reason;
+    @field_list(COPY_FIELDS) bit<48> timestamp;
+    @field_list(COPY_FIELDS) bit<32> length;
+    @field_list(COPY_FIELDS) bit<32> sequence;
+    @field_list(COPY_FIELDS) bit<32> arrival;
+    @field_list(COPY_FIELDS) query_map_t query_map;
+    // what tables match on
+    bit<12> vid;                          // outer VLAN, 0 = untagged
+    bit<16> ethertype;                    // behind the VLAN tags
+    bit<1> is_ipv4;                       // ARP counts as IPv4
+    address_t source;
+    address_t destination;
+    bit<8> protocol;
+    bit<2> fragment;                      // 0 whole, 1 first fragment, 2 later fragment
+    bit<1> l4_valid;                      // ports (or ICMP type) below are those of the frame
+    bit<16> source_port;
+    bit<16> destination_port;
+    bit<8> tcp_flags;
+    // verdicts
+    bit<1> blocked;
+    query_map_t copies;                   // queries that want a packet-in
+}

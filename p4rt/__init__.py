@@ -1,0 +1,26 @@
+"""P4Runtime's messages and service on current protobuf: the wire that switch and controller share.
+
+The generated modules of the `p4runtime` wheel were made by an old protoc and are refused by every
+protobuf since 4 (only its slow pure-Python back end takes them).  The same files carry their
+serialized file descriptors, though, and those are all that protobuf needs.  This package reads the
+descriptors out of the wheel's source text, without running it, and registers them.
+
+    dataplane (server) ──┐
+                         ├── p4rt ── descriptors of the p4runtime wheel ── protobuf (upb)
+    p4runtime_ctrl ──────┘
+
+Nothing here is ours but the registering; both ends import it, as both would import generated code.
+"""
+
+from p4rt.messages import p4data, p4info, p4runtime, p4types, status
+from p4rt.service import P4RuntimeStub, add_p4runtime_servicer
+
+__all__ = [
+    "P4RuntimeStub",
+    "add_p4runtime_servicer",
+    "p4data",
+    "p4info",
+    "p4runtime",
+    "p4types",
+    "status",
+]

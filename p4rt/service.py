@@ -1,0 +1,74 @@
+"""The gRPC face of P4Runtime: a client stub and the registration of a server."""
+
+from typing import Any, Protocol
+
+import grpc
+
+from p4rt.messages import p4runtime
+
+_SERVICE = "p4.v1.P4Runtime"
+_UNARY = ("Write", "SetForwardingPipelineConfig", "GetForwardingPipelineConfig", "Capabilities")
+
+
+class P4RuntimeStub:
+    """Client side of the P4Runtime service (P4Runtime specification, section 8).
+
+    Every attribute is a gRPC multi-callable of that name: `stub.Write(request, timeout=5)`.
+    """
+
+    def __init__(self, channel: grpc.Channel) -> None:
+        def unary(name: str) -> Any:
+            return channel.unary_unary(
+                f"/{_SERVICE}/{name}",
+                request_serializer=getattr(p4runtime, f"{name}Request").SerializeToString,
+                response_deserializer=getattr(p4runtime, f"{name}Response").FromString,
+            )
+
+        self.Write = unary("Write")
+        self.SetForwardingPipelineConfig = unary("SetForwardingPipelineConfig")
+        self.GetForwardingPipelineConfig = unary("GetForwardingPipelineConfig")
+        self.Capabilities = unary("Capabilities")
+        self.Read: Any = channel.unary_stream(
+            f"/{_SERVICE}/Read",
+            request_serializer=p4runtime.ReadRequest.SerializeToString,
+            response_deserializer=p4runtime.ReadResponse.FromString,
+        )
+        self.StreamChannel: Any = channel.stream_stream(
+            f"/{_SERVICE}/StreamChannel",
+            request_serializer=p4runtime.StreamMessageRequest.SerializeToString,
+            response_deserializer=p4runtime.StreamMessageResponse.FromString,
+        )
+
+
+class P4RuntimeServicer(Protocol):
+    """What a server must offer: the six calls of the service, by their names on the wire."""
+
+    def Write(self, request: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
+    def Read(self, request: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
+    def SetForwardingPipelineConfig(self, request: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
+    def GetForwardingPipelineConfig(self, request: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
+    def Capabilities(self, request: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
+    def StreamChannel(self, request_iterator: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
+
+
+def add_p4runtime_servicer(servicer: P4RuntimeServicer, server: grpc.Server) -> None:
+    """Register `servicer` for the P4Runtime service of `server`."""
+    handlers = {
+        name: grpc.unary_unary_rpc_method_handler(
+            getattr(servicer, name),
+            request_deserializer=getattr(p4runtime, f"{name}Request").FromString,
+            response_serializer=getattr(p4runtime, f"{name}Response").SerializeToString,
+        )
+        for name in _UNARY
+    }
+    handlers["Read"] = grpc.unary_stream_rpc_method_handler(
+        servicer.Read,
+        request_deserializer=p4runtime.ReadRequest.FromString,
+        response_serializer=p4runtime.ReadResponse.SerializeToString,
+    )
+    handlers["StreamChannel"] = grpc.stream_stream_rpc_method_handler(
+        servicer.StreamChannel,
+        request_deserializer=p4runtime.StreamMessageRequest.FromString,
+        response_serializer=p4runtime.StreamMessageResponse.SerializeToString,
+    )
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, handlers),))
