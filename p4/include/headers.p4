@@ -4,10 +4,17 @@ const bit<9> CPU_PORT = 510;
 const bit<32> COPY_SESSION = 1;           // clone session towards the controller
 const bit<32> COPY_BYTES = 256;           // of a copied frame: all headers, those quoted by ICMP errors too
 const bit<32> PACKET_IN_HEADER_BYTES = 52;
+const bit<32> ETHERNET_BYTES = 14;
 #define COPY_FIELDS 1
 
 const bit<32> INSTANCE_INGRESS_CLONE = 1; // BMv2's numbers for standard_metadata.instance_type
 const bit<32> INSTANCE_REPLICATION = 5;
+
+const bit<7> OPERATION_SEND = 0;
+const bit<7> OPERATION_READ_CELL = 1;
+
+// packet_in.reason: 0 = a telemetry query wants the frame
+const bit<7> REASON_CELL = 1;             // answer to OPERATION_READ_CELL: sequence = count, arrival = window
 
 const bit<16> ETHERTYPE_IPV4 = 0x0800;
 const bit<16> ETHERTYPE_ARP = 0x0806;
@@ -42,10 +49,13 @@ header packet_in_t {
 @controller_header("packet_out")
 header packet_out_t {
     bit<9> egress_port;
-    bit<7> operation;                     // 0: send the frame out of egress_port
-    bit<32> query;
+    bit<7> operation;                     // 0: send the frame out of egress_port; 1: read a counting cell
+    bit<32> query;                        // number of the query, and its key, masked as the query masks it
     address_t key_source;
     address_t key_destination;
+    bit<16> key_port;
+    bit<16> key_length;
+    bit<48> timestamp;                    // any time in the window that is asked for, us
 }
 
 header ethernet_t { mac_t destination; mac_t source; bit<16> ethertype; }
@@ -123,7 +133,56 @@ struct metadata_t {
     bit<16> source_port;
     bit<16> destination_port;
     bit<8> tcp_flags;
+    bit<32> tcp_sequence;
+    bit<32> tcp_acknowledgement;
+    bit<1> quoted;                        // the ports are those that an ICMP error quotes
+    bit<8> quoted_protocol;
+    bit<8> icmp_type;
+    bit<8> icmp_code;
+    bit<16> arp_operation;
+    mac_t arp_sender_mac;
+    mac_t arp_target_mac;
     // verdicts
     bit<1> blocked;
+    bit<1> answered;                      // the switch itself answers (SYN cookie)
     query_map_t copies;                   // queries that want a packet-in
+    query_map_t digests;                  // queries that want a digest of every frame
+    query_map_t crossed;                  // counting queries whose threshold this frame reached
+    query_map_t overflow;                 // counting queries that had no cell for this frame's key
+    bit<1> reading;                       // the frame asks for a cell and must not change it
+    bit<32> cell_epoch;
+    bit<32> cell_count;
+}
+
+struct frame_digest_t {
+    query_map_t queries;                  // that the frame matched and that want digests
+    query_map_t crossed;
+    query_map_t overflow;
+    bit<48> timestamp;
+    bit<32> arrival;                      // also makes each digest unique: equal ones could be suppressed
+    bit<32> sequence;
+    bit<9> ingress_port;
+    bit<12> vid;
+    bit<16> ethertype;
+    bit<32> length;
+    mac_t eth_src;
+    mac_t eth_dst;
+    bit<1> is_ipv4;
+    address_t src;
+    address_t dst;
+    bit<8> protocol;
+    bit<2> fragment;
+    bit<1> l4_valid;
+    bit<1> quoted;                        // the ports below are those that an ICMP error quotes
+    bit<8> quoted_protocol;
+    bit<16> sport;
+    bit<16> dport;
+    bit<8> tcp_flags;
+    bit<32> tcp_sequence;
+    bit<32> tcp_acknowledgement;
+    bit<8> icmp_type;
+    bit<8> icmp_code;
+    bit<16> arp_operation;
+    mac_t arp_sender_mac;
+    mac_t arp_target_mac;
 }

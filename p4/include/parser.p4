@@ -16,7 +16,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
     state packet_out_header {
         packet.extract(hdr.packet_out);
         transition select(hdr.packet_out.operation) {
-            0: ethernet;
+            OPERATION_SEND: ethernet;
             default: accept;
         }
     }
@@ -60,6 +60,9 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
         meta.is_ipv4 = 1;
         meta.source = (address_t)hdr.arp.sender_ip;
         meta.destination = (address_t)hdr.arp.target_ip;
+        meta.arp_operation = hdr.arp.operation;
+        meta.arp_sender_mac = hdr.arp.sender_mac;
+        meta.arp_target_mac = hdr.arp.target_mac;
         transition accept;
     }
 
@@ -184,6 +187,8 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
         meta.source_port = hdr.tcp.source_port;
         meta.destination_port = hdr.tcp.destination_port;
         meta.tcp_flags = hdr.tcp.flags;
+        meta.tcp_sequence = hdr.tcp.sequence;
+        meta.tcp_acknowledgement = hdr.tcp.acknowledgement;
         transition accept;
     }
     state udp {
@@ -195,6 +200,8 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
     }
     state icmp {
         packet.extract(hdr.icmp);
+        meta.icmp_type = hdr.icmp.type;
+        meta.icmp_code = hdr.icmp.code;
         meta.l4_valid = 1;
         transition select(hdr.icmp.type) {
             3: quoted_ipv4;
@@ -207,6 +214,8 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
     }
     state icmpv6 {
         packet.extract(hdr.icmp);
+        meta.icmp_type = hdr.icmp.type;
+        meta.icmp_code = hdr.icmp.code;
         meta.l4_valid = 1;
         transition select(hdr.icmp.type) {
             1..4: quoted_ipv6;
@@ -226,6 +235,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
         transition quoted_ipv4_payload;
     }
     state quoted_ipv4_payload {
+        meta.quoted_protocol = hdr.quoted_ipv4.protocol;
         transition select(hdr.quoted_ipv4.fragment_offset, hdr.quoted_ipv4.protocol) {
             (0, PROTO_TCP): quoted_ports;
             (0, PROTO_UDP): quoted_ports;
@@ -234,6 +244,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
     }
     state quoted_ipv6 {
         packet.extract(hdr.quoted_ipv6);
+        meta.quoted_protocol = hdr.quoted_ipv6.next_header;
         transition select(hdr.quoted_ipv6.next_header) {
             PROTO_TCP: quoted_ports;
             PROTO_UDP: quoted_ports;
@@ -242,6 +253,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
     }
     state quoted_ports {
         packet.extract(hdr.quoted_ports);
+        meta.quoted = 1;
         meta.source_port = hdr.quoted_ports.source_port;
         meta.destination_port = hdr.quoted_ports.destination_port;
         transition accept;

@@ -13,9 +13,10 @@ control Telemetry(inout headers_t hdr, inout metadata_t meta) {
     @name(".ingress.match_l4") action match_l4(query_map_t queries) { meta.query_map = meta.query_map & queries; }
     @name(".ingress.match_sport") action match_sport(query_map_t queries) { meta.query_map = meta.query_map & queries; }
     @name(".ingress.match_dport") action match_dport(query_map_t queries) { meta.query_map = meta.query_map & queries; }
-    @name(".ingress.set_active") action set_active(query_map_t active, query_map_t copy) {
+    @name(".ingress.set_active") action set_active(query_map_t active, query_map_t copies, query_map_t digests) {
         meta.query_map = meta.query_map & active;
-        meta.copies = meta.query_map & copy;
+        meta.copies = meta.query_map & copies;
+        meta.digests = meta.query_map & digests;
         active_counter.count();
     }
 
@@ -83,11 +84,11 @@ control Telemetry(inout headers_t hdr, inout metadata_t meta) {
         size = 512;
     }
     @name(".ingress.telemetry_active")
-    @brief("Queries that are in force, and which of them want packet-ins")
+    @brief("Queries that are in force, and which of them want packet-ins or digests")
     table telemetry_active {
         key = { }
         actions = { set_active; }
-        default_action = set_active(0, 0);
+        default_action = set_active(0, 0, 0);
         counters = active_counter;
     }
 

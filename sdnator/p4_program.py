@@ -1,0 +1,109 @@
+"""The compiled switch program: where it is, and whether it still belongs to its source.
+
+`python -m sdnator.p4_program compile` runs p4c (where it is installed) and writes the record that
+`check` compares: the hashes of all sources and artefacts and the compiler's version.
+
+    P4ProgramError (RuntimeError)   artefacts missing, or no longer those of the source
+"""
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+PROGRAM = "sdnator"
+RECORD = "sdnator.build.json"
+
+
+class P4ProgramError(RuntimeError):
+    """The compiled program is missing or out of date; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class P4Program:
+    """Paths of the artefacts that p4c made."""
+
+    bmv2_json: Path
+    p4info: Path
+
+
+def folder() -> Path:
+    """The folder of the artefacts: inside the installed package, or `p4/` of the checkout."""
+    here = Path(__file__).resolve().parent
+    installed = here / "program"
+    return installed if installed.is_dir() else here.parent / "p4"
+
+
+def find() -> P4Program:
+    """The compiled program; raises P4ProgramError where it is missing."""
+    base = folder()
+    program = P4Program(base / f"{PROGRAM}.json", base / f"{PROGRAM}.p4info.txtpb")
+    for path in (program.bmv2_json, program.p4info):
+        if not path.is_file():
+            raise P4ProgramError(f"{path} is missing: reinstall, or run `make p4` in a checkout with p4c")
+    return program
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def hashes(base: Path) -> dict[str, dict[str, str]]:
+    """SHA-256 of every source and artefact in a program folder."""
+    sources = sorted(base.rglob("*.p4"))
+    artefacts = (base / f"{PROGRAM}.json", base / f"{PROGRAM}.p4info.txtpb")
+    return {
+        "sources": {str(path.relative_to(base)): _hash(path) for path in sources},
+        "artefacts": {path.name: _hash(path) for path in artefacts},
+    }
+
+
+def check(base: Path) -> None:
+    """Raise P4ProgramError where source and artefacts no longer belong together."""
+    record: dict[str, Any] = json.loads((base / RECORD).read_text(encoding="utf-8"))
+    now = hashes(base)
+    for part in ("sources", "artefacts"):
+        changed = sorted(name for name, _ in set(record[part].items()) ^ set(now[part].items()))
+        if changed:
+            raise P4ProgramError(f"{', '.join(changed)} changed since p4c ran: run `make p4` and commit all of {base}")
+
+
+def compile_program(base: Path) -> None:
+    """Run p4c on the source and write the artefacts and their record."""
+    p4c = shutil.which("p4c-bm2-ss")
+    if p4c is None:
+        raise P4ProgramError("p4c-bm2-ss is not installed: build p4c (github: p4lang/p4c) with its BMv2 back end")
+    command = [
+        p4c, "--arch", "v1model", "--Werror",
+        "--p4runtime-files", f"{PROGRAM}.p4info.txtpb", "-o", f"{PROGRAM}.json", f"{PROGRAM}.p4",
+    ]  # fmt: skip
+    subprocess.run(command, cwd=base, check=True)
+    answer = subprocess.run([p4c, "--version"], capture_output=True, text=True, check=True)
+    words = (answer.stdout + answer.stderr).split()
+    number = next(word for word in words if word[0].isdigit())
+    record = {"p4c": number, "options": command[1:4], **hashes(base)}
+    (base / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def main() -> int:
+    """`compile` or `check` the program of this checkout."""
+    try:
+        if sys.argv[1:] == ["compile"]:
+            compile_program(folder())
+        elif sys.argv[1:] == ["check"]:
+            check(folder())
+        else:
+            print("usage: python -m sdnator.p4_program compile|check", file=sys.stderr)
+            return 2
+    except (P4ProgramError, subprocess.CalledProcessError) as error:
+        print(f"sdnator: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

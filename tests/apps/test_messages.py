@@ -1,0 +1,30 @@
+"""Messages survive the wire and refuse what is not theirs."""
+
+import msgspec
+import pytest
+
+from apps.messages import Alert, Decision, Target
+from tests.apps.firewall.alerts import alert
+
+
+def test_message_survives_the_wire():
+    """to_value and from_value are inverse."""
+    message = alert()
+    assert Alert.from_value(message.to_value()) == message
+
+
+def test_wrong_field_is_named():
+    """A value of another shape is refused, and the text names the field."""
+    value = alert().to_value() | {"hot_seconds": "many"}
+    with pytest.raises(msgspec.ValidationError, match="hot_seconds"):
+        Alert.from_value(value)
+
+
+def test_unknown_action_is_refused():
+    """A decision can only be one of the four verbs."""
+    decision = Decision(
+        id="x", action="block", switch="s1", target=Target(kind="ip", address="10.0.0.1"),
+        reason="r", event_time=1, expires=2,
+    )  # fmt: skip
+    with pytest.raises(msgspec.ValidationError, match="action"):
+        Decision.from_value(decision.to_value() | {"action": "explode"})
