@@ -1,0 +1,88 @@
+"""Which of several Coordinators leads.  Pure: time is an argument (s, monotonic).
+
+    listening ──no leader for 3 intervals──► leading ──a better claim, or I was stopped──► listening
+
+All announce themselves every interval.  One that starts or was stopped listens before it leads, so it
+never contradicts a leader that is there; of two leaders the one with the higher term stays, at equal
+terms the one that started first.
+"""
+
+import msgspec
+
+_PATIENCE = 3.0
+
+
+class Claim(msgspec.Struct, frozen=True, kw_only=True):
+    """What a Coordinator says of itself."""
+
+    instance_id: str
+    started: int
+    """UTC, ns."""
+    term: int = 0
+    """Grows with each change of the leader."""
+    leading: bool = False
+
+    @property
+    def rank(self) -> tuple[int, int, str]:
+        """The smaller one has precedence."""
+        return -self.term, self.started, self.instance_id
+
+
+class Leadership:
+    """One Coordinator's view of who leads."""
+
+    def __init__(self, instance_id: str, started: int, now: float, *, interval: float = 0.2) -> None:
+        self.claim = Claim(instance_id=instance_id, started=started)
+        self.leader = ""
+        """Instance id of the leader; "" while unknown."""
+        self._interval = interval
+        self._quiet_since = now
+        self._ticked = now
+        self._announce_at = now
+
+    @property
+    def leading(self) -> bool:
+        return self.claim.leading
+
+    def heard(self, other: Claim, now: float) -> None:
+        """Another's claim arrived."""
+        mine = self.claim
+        if other.instance_id == mine.instance_id:
+            return
+        if other.leading and (not mine.leading or other.rank < mine.rank):
+            self._listen(now, leader=other.instance_id)
+        elif other.instance_id == self.leader and not mine.leading:
+            # it steps down: no need to wait in full
+            self.leader = ""
+            self._quiet_since = now - (_PATIENCE - 1) * self._interval
+        elif not other.leading and not mine.leading and other.rank < mine.rank and not self.leader:
+            # it started earlier and will lead
+            self._quiet_since = now
+        self.claim = msgspec.structs.replace(
+            self.claim, term=max(self.claim.term, other.term * other.leading)
+        )
+
+    def tick(self, now: float) -> Claim | None:
+        """What to announce now, if anything.  Call several times per interval."""
+        patience = _PATIENCE * self._interval
+        if now - self._ticked > patience:
+            self._listen(now, leader="")
+        self._ticked = now
+        if not self.leading and now - self._quiet_since > patience:
+            self.claim = msgspec.structs.replace(self.claim, leading=True, term=self.claim.term + 1)
+            self.leader = self.claim.instance_id
+            self._announce_at = now
+        if now < self._announce_at:
+            return None
+        self._announce_at = now + self._interval
+        return self.claim
+
+    def resigned(self) -> Claim:
+        """The last word of one that stops."""
+        return msgspec.structs.replace(self.claim, leading=False)
+
+    def _listen(self, now: float, *, leader: str) -> None:
+        self.leader = leader
+        self._quiet_since = now
+        if self.claim.leading:
+            self.claim = msgspec.structs.replace(self.claim, leading=False)

@@ -1,0 +1,362 @@
+"""Who is here, which instance works, and what each app is told.  Pure: time is an argument (s, monotonic).
+
+    Registration, Heartbeat, expire(now) ──► Registry ──► outgoing(): Assignments to send
+                                                     └──► events(): what changed, for the archive
+
+All of it is soft: an unknown instance that shows a sign of life is told so and registers again, and an
+instance that already works is kept (its heartbeats say so), so a Coordinator that starts or takes over
+changes nothing that is well.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import msgspec
+
+from coordinator.matching import Declarations, Matched, match
+from coordinator.selection import Strategy, at_random
+from due.membership import Assignments, Heartbeat, Registration
+
+_SILENCE = 3.0
+
+
+class State(Enum):
+    """Of an instance."""
+
+    ACTIVE = "active"
+    """Works."""
+    IDLE = "idle"
+    """Lives and waits: another instance of its app works."""
+    UNRESPONSIVE = "unresponsive"
+    """No sign of life for longer than its heartbeat allows."""
+    OFFLINE = "offline"
+    """It said good-bye."""
+
+
+@dataclass(slots=True)
+class Instance:
+    """What is known of one instance."""
+
+    registration: Registration
+    seen: float
+    beat: Heartbeat | None = None
+    gone: State | None = None
+
+    @property
+    def alive(self) -> bool:
+        return self.gone is None
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One change; `instance_id` is empty where it concerns the app."""
+
+    kind: str
+    app_id: str
+    instance_id: str = ""
+    detail: str = ""
+
+    def to_value(self) -> dict[str, str]:
+        return {
+            "event": self.kind,
+            "app_id": self.app_id,
+            "instance_id": self.instance_id,
+            "detail": self.detail,
+        }
+
+
+class _App:
+    """The instances of one app and what they were last told."""
+
+    def __init__(self, epoch: int) -> None:
+        self.instances: dict[str, Instance] = {}
+        self.active = ""
+        self.epoch = epoch
+        self.sent: Assignments | None = None
+
+    @property
+    def alive(self) -> list[Instance]:
+        return [self.instances[name] for name in sorted(self.instances) if self.instances[name].alive]
+
+    @property
+    def standby(self) -> bool:
+        return any(one.registration.instances == "standby" for one in self.alive)
+
+    def declarations(self) -> Declarations:
+        """The union of what live instances declare, each once."""
+        registrations = [one.registration for one in self.alive]
+        return Declarations(
+            tuple(dict.fromkeys(c for r in registrations for c in r.capabilities)),
+            tuple(dict.fromkeys(i for r in registrations for i in r.interests)),
+        )
+
+    def claim(self) -> str:
+        """The live instance that already works by an earlier Coordinator's word, or ""."""
+        claims = [
+            one.beat for one in self.alive if one.beat is not None and one.beat.active and one.beat.version
+        ]
+        return max(claims, key=lambda beat: beat.epoch).instance_id if claims else ""
+
+
+class Registry:
+    """The Coordinator's knowledge.  Not thread-safe.
+
+    `missed`: heartbeats an instance may miss before it counts as unresponsive.
+    `forget_s`: seconds after which an instance that is gone is no longer listed.
+    `first_epoch`, `version`: the least to begin with; higher than those of any earlier Coordinator.
+    """
+
+    def __init__(
+        self,
+        coordinator: str,
+        *,
+        select: Strategy = at_random,
+        missed: float = 4.0,
+        shortest_timeout_s: float = 0.3,
+        forget_s: float = 300.0,
+        first_epoch: int = 1,
+        version: int = 1,
+    ) -> None:
+        self.coordinator = coordinator
+        self.leading = False
+        self.matched = Matched()
+        self.failovers = 0
+        self._select = select
+        self._missed = missed
+        self._shortest_timeout_s = shortest_timeout_s
+        self._forget_s = forget_s
+        self._apps: dict[str, _App] = {}
+        self._epochs: dict[str, int] = {}
+        self._first_epoch = first_epoch
+        self._version = version
+        self._heard: float | None = None
+        self._looked: float | None = None
+        self._dirty = False
+        self._answers: dict[str, None] = {}
+        self._events: list[Event] = []
+
+    # --- what comes in -------------------------------------------------------------------------
+
+    def registered(self, message: Registration, now: float) -> None:
+        """An instance declares itself, for the first time or again."""
+        app = self._app(message.app_id)
+        known = app.instances.get(message.instance_id)
+        self._hear(known, now)
+        if known is None:
+            app.instances[message.instance_id] = Instance(message, now)
+            self._note("joined", message.app_id, message.instance_id)
+        else:
+            if not known.alive:
+                self._note("returned", message.app_id, message.instance_id)
+            known.registration, known.seen, known.gone = message, now, None
+        self._dirty = True
+        if self.leading:
+            self._answer(message.app_id)
+
+    def beat(self, message: Heartbeat, now: float) -> None:
+        """A sign of life, or the good-bye."""
+        app = self._app(message.app_id)
+        app.epoch = max(app.epoch, message.epoch)
+        known = app.instances.get(message.instance_id)
+        self._hear(known, now)
+        if message.state == "offline":
+            if known is not None and known.gone is not State.OFFLINE:
+                self._lost(message.app_id, known, State.OFFLINE)
+                known.seen = now
+            return
+        if known is None or known.registration.revision != message.revision:
+            self._answer(message.app_id)
+        if known is None:
+            return
+        if not known.alive:
+            self._note("returned", message.app_id, message.instance_id)
+            self._dirty = True
+        known.seen, known.beat, known.gone = now, message, None
+        if self.leading and (app.sent is None or app.sent.version != message.version):
+            self._answer(message.app_id)
+
+    def expire(self, now: float) -> None:
+        """Find who has been silent too long, and drop who has been gone for long.  Call often."""
+        paused = now - self._looked if self._looked is not None else 0.0
+        self._looked = now
+        for name, app in list(self._apps.items()):
+            for instance in list(app.instances.values()):
+                if paused > self._shortest_timeout_s:
+                    instance.seen += paused
+                silent = now - instance.seen
+                if instance.alive and silent > self._patience(instance, now):
+                    self._lost(name, instance, State.UNRESPONSIVE)
+                elif not instance.alive and silent > self._forget_s:
+                    del app.instances[instance.registration.instance_id]
+            if not app.instances and name not in self._answers:
+                self._epochs[name] = max(app.epoch, self._epochs.get(name, 0))
+                del self._apps[name]
+
+    def lead(self) -> None:
+        """From now on this Coordinator decides; working instances keep working."""
+        self.leading = True
+        for app in self._apps.values():
+            app.active = ""
+        self._dirty = True
+
+    def follow(self) -> None:
+        """Another Coordinator decides: listen only."""
+        self.leading = False
+
+    # --- what goes out -------------------------------------------------------------------------
+
+    def outgoing(self) -> list[Assignments]:
+        """What to send now: answers, and what changed since the last call."""
+        if self._dirty and self.leading:
+            self._dirty = False
+            self._elect()
+            self._match()
+        messages = []
+        for name in self._answers:
+            app = self._app(name)
+            messages.append(
+                app.sent if self.leading and app.sent is not None else self._question(name, app.epoch)
+            )
+        self._answers.clear()
+        return messages
+
+    def events(self) -> list[Event]:
+        """What changed since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    # --- what is known -------------------------------------------------------------------------
+
+    def instances(self) -> Iterator[tuple[Instance, State]]:
+        """Every instance that is listed, and its state."""
+        for name in sorted(self._apps):
+            app = self._apps[name]
+            for instance in app.instances.values():
+                yield instance, self._state(app, instance)
+
+    def declarations(self) -> dict[str, Declarations]:
+        """What the live instances of each app declare together."""
+        return {name: self._apps[name].declarations() for name in sorted(self._apps)}
+
+    def assignments(self) -> dict[str, Assignments]:
+        """What each app was last told."""
+        return {name: app.sent for name, app in sorted(self._apps.items()) if app.sent is not None}
+
+    def epochs(self) -> dict[str, int]:
+        """The highest epoch of every app ever seen."""
+        return self._epochs | {name: app.epoch for name, app in self._apps.items()}
+
+    # --- inside --------------------------------------------------------------------------------
+
+    def _app(self, name: str) -> _App:
+        if name not in self._apps:
+            self._apps[name] = _App(self._epochs.get(name, 0))
+        return self._apps[name]
+
+    def _timeout(self, instance: Instance) -> float:
+        return max(self._missed * instance.registration.heartbeat, self._shortest_timeout_s)
+
+    def _patience(self, instance: Instance, now: float) -> float:
+        """Longer while nobody at all is heard: then the connection is the likelier culprit."""
+        timeout = self._timeout(instance)
+        return timeout if self._heard is None or now - self._heard <= timeout else _SILENCE * timeout
+
+    def _hear(self, sender: Instance | None, now: float) -> None:
+        """When known ones speak again after a silence of all, nobody is blamed for the silence."""
+        heard, self._heard = self._heard, now
+        if heard is None or sender is None:
+            return
+        known = [one for app in self._apps.values() for one in app.instances.values()]
+        blamed = [
+            one
+            for one in known
+            if one.gone is not State.OFFLINE and heard - one.seen <= _SILENCE * self._timeout(one)
+        ]
+        timeouts = [self._timeout(one) for one in blamed if one.registration.heartbeat < self._forget_s]
+        if not timeouts or now - heard <= max(timeouts):
+            return
+        for one in blamed:
+            one.seen = now
+            if not one.alive:
+                one.gone = None
+                self._dirty = True
+
+    def _lost(self, name: str, instance: Instance, state: State) -> None:
+        instance.gone = state
+        self._dirty = True
+        self._note(state.value, name, instance.registration.instance_id)
+
+    def _state(self, app: _App, instance: Instance) -> State:
+        if instance.gone is not None:
+            return instance.gone
+        waits = (
+            instance.registration.instances == "standby" and app.active != instance.registration.instance_id
+        )
+        return State.IDLE if waits else State.ACTIVE
+
+    def _elect(self) -> None:
+        for name, app in self._apps.items():
+            if not app.standby:
+                app.active = "" if app.alive else app.active
+                continue
+            known = app.instances.get(app.active)
+            if known is not None and known.alive:
+                continue
+            before, claim = app.active, app.claim()
+            candidates = [(one.registration, one.beat) for one in app.alive]
+            app.active = claim or self._select(candidates)[0].instance_id
+            app.epoch = max(app.epoch + 1, self._first_epoch)
+            if before and before != app.active:
+                self.failovers += 1
+            self._note("activated", name, app.active, f"epoch {app.epoch}")
+
+    def _match(self) -> None:
+        self.matched = match(self.declarations())
+        for name, app in self._apps.items():
+            if not app.alive:
+                continue
+            message = self._message(name, app)
+            if app.sent is None or _content(app.sent) != _content(message):
+                self._version += 1
+                self._note_incompatible(name, app.sent, message)
+                app.sent = msgspec.structs.replace(message, version=self._version)
+                self._answer(name)
+
+    def _message(self, name: str, app: _App) -> Assignments:
+        return Assignments(
+            app_id=name,
+            coordinator=self.coordinator,
+            version=self._version,
+            epoch=app.epoch,
+            active=app.active,
+            revisions={one.registration.instance_id: one.registration.revision for one in app.alive},
+            assignments=tuple(
+                msgspec.structs.replace(assignment, epoch=app.epoch)
+                for assignment in self.matched.assignments.get(name, ())
+            ),
+            incompatible=self.matched.incompatible.get(name, ()),
+        )
+
+    def _question(self, name: str, epoch: int) -> Assignments:
+        """Not an order: an instance that does not find itself in it registers again."""
+        return Assignments(
+            app_id=name, coordinator=self.coordinator, version=self._version, epoch=epoch, revisions={}
+        )
+
+    def _answer(self, name: str) -> None:
+        self._answers[name] = None
+
+    def _note(self, kind: str, app: str, instance: str = "", detail: str = "") -> None:
+        self._events.append(Event(kind, app, instance, detail))
+
+    def _note_incompatible(self, name: str, before: Assignments | None, after: Assignments) -> None:
+        known = set(before.incompatible) if before is not None else set()
+        for one in after.incompatible:
+            if one not in known:
+                self._note("incompatible", name, detail=f"{one.key}: {one.reason}")
+
+
+def _content(message: Assignments) -> tuple[Any, ...]:
+    return message.epoch, message.active, message.revisions, message.assignments, message.incompatible

@@ -1,0 +1,236 @@
+"""The Coordinator: who is here, who wants what, who makes what, at what rate.
+
+    due.registration.*, due.heartbeat.* ──► Registry ──► due.assignment.<app>
+    due.leader.coordinator ◄──────────────► Leadership
+    HTTP on loopback ──► api.py ──► views of the registry, the archive, live data
+
+Run it with `python -m coordinator.service`; it is an app like any other and registers with itself.
+"""
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from coordinator.api import Api, Northbound
+from coordinator.leadership import Claim, Leadership
+from coordinator.registry import Registry
+from coordinator.selection import STRATEGIES
+from due import NO_WAIT, PUB_ONLY, Capability, DueError, Engine, Interest, Item
+from due import service as due_service
+from due.errors import InvalidOption
+from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
+
+INTERESTS = (
+    Interest(f"{REGISTRATION}.*"),
+    Interest(f"{HEARTBEAT}.*"),
+    Interest("due.leader.coordinator"),
+    Interest("due.health.*"),
+)
+# due.assignment.<app> and due.leader.coordinator are written as well, undeclared: nobody has to ask for them
+CAPABILITIES = (Capability("due.event.coordinator", archive="always", index=True),)
+
+EVENTS = "due.event.coordinator"
+_LEADER = "due.leader.coordinator"
+
+log = logging.getLogger("coordinator")
+
+M = TypeVar("M", Registration, Heartbeat, Claim)
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the Coordinator."""
+
+    http: bool = True
+    """Serve the HTTP API."""
+    http_host: str = "127.0.0.1"
+    """Address to listen on; the API has no log-in, so keep it on loopback."""
+    http_port: int = 0
+    """0 takes a free port; `health` and the log name it."""
+    address_file: str = ""
+    """Where to write the API's URL once it listens; empty: nowhere."""
+    selection: str = "random"
+    """How the working instance of a standby app is chosen: random, oldest or least_busy."""
+    missed_heartbeats: float = 4.0
+    """So many heartbeats late, an instance is unresponsive."""
+    forget_s: float = 300.0
+    """Seconds after which an instance that is gone is no longer listed."""
+    leader_interval_s: float = 0.2
+    """Seconds between announcements; a leader silent for three of them is replaced."""
+
+    def __post_init__(self) -> None:
+        if self.selection not in STRATEGIES:
+            raise ValueError(f"selection {self.selection!r}: one of {', '.join(sorted(STRATEGIES))}")
+        if not 0 <= self.http_port < 65536:
+            raise ValueError(f"http_port {self.http_port}: 0 to 65535")
+
+
+class CoordinatorService:
+    """Callbacks run in the engine's thread, `tick` in the main thread, the API in its own: one lock."""
+
+    def __init__(self, engine: Engine, settings: Settings) -> None:
+        self._engine = engine
+        self._settings = settings
+        self._lock = threading.Lock()
+        started = time.time_ns()
+        self._registry = Registry(
+            engine.instance_id,
+            select=STRATEGIES[settings.selection],
+            missed=settings.missed_heartbeats,
+            forget_s=settings.forget_s,
+            # both grow from one Coordinator to the next, so neither has to be remembered
+            first_epoch=started // 1_000_000_000,
+            version=started // 1_000_000,
+        )
+        self._leadership = Leadership(
+            engine.instance_id, started, time.monotonic(), interval=settings.leader_interval_s
+        )
+        self._counts = {"registrations": 0, "heartbeats": 0, "misunderstood": 0, "assignments_sent": 0}
+        self._apps_health: dict[str, Any] = {}
+        self._api: Api | None = None
+
+    def start(self) -> None:
+        """Listen; raises InvalidOption if the HTTP address cannot be had."""
+        for key, handler in (
+            (f"{REGISTRATION}.*", self._registered),
+            (f"{HEARTBEAT}.*", self._beat),
+            (_LEADER, self._claimed),
+            ("due.health.*", self._healthy),
+        ):
+            self._engine.observe(key).subscribe(handler)
+        if self._settings.http:
+            self._serve()
+
+    def tick(self) -> None:
+        """Announce, look for the silent, send what changed."""
+        now = time.monotonic()
+        with self._lock:
+            led = self._leadership.leading
+            claim = self._leadership.tick(now)
+            self._registry.expire(now)
+            self._obey(led)
+            messages, events = self._registry.outgoing(), self._registry.events()
+            leading = self._leadership.leading
+        if claim is not None:
+            self._write(_LEADER, msgspec.to_builtins(claim))
+        for message in messages:
+            self._write(f"{ASSIGNMENT}.{message.app_id}", message.to_value())
+        self._counts["assignments_sent"] += len(messages)
+        for event in events if leading else ():
+            log.info("%s %s %s %s", event.app_id, event.instance_id, event.kind, event.detail)
+            self._engine.write(EVENTS, event.to_value())
+
+    def stop(self) -> None:
+        """Stop serving; a last word lets another Coordinator lead at once."""
+        if self._leadership.leading:
+            self._write(_LEADER, msgspec.to_builtins(self._leadership.resigned()))
+        if self._api is not None:
+            self._api.stop()
+
+    def health(self) -> dict[str, Any]:
+        """State of this Coordinator and its counters."""
+        with self._lock:
+            states: dict[str, int] = {}
+            for _, state in self._registry.instances():
+                states[state.value] = states.get(state.value, 0) + 1
+            return {
+                "leading": self._leadership.leading,
+                "leader": self._leadership.leader,
+                "instances": states,
+                "failovers": self._registry.failovers,
+                "http": self._api.url if self._api is not None else "",
+                **self._counts,
+            }
+
+    def _serve(self) -> None:
+        northbound = Northbound(
+            engine=self._engine,
+            registry=self._registry,
+            lock=self._lock,
+            health=self.health,
+            apps_health=lambda: dict(self._apps_health),
+            events_key=EVENTS,
+        )
+        try:
+            self._api = Api(northbound, self._settings.http_host, self._settings.http_port)
+        except OSError as error:
+            where = f"{self._settings.http_host}:{self._settings.http_port}"
+            raise InvalidOption(
+                f"HTTP API cannot listen on {where}: {error.strerror}; set http_port"
+            ) from error
+        self._api.start()
+        log.info("HTTP API at %s", self._api.url)
+        if self._settings.address_file:
+            Path(self._settings.address_file).write_text(self._api.url)
+
+    def _obey(self, led: bool) -> None:
+        """Carry a change of leadership over to the registry."""
+        leading = self._leadership.leading
+        if leading and not self._registry.leading:
+            log.info("this Coordinator leads")
+            self._registry.lead()
+        elif not leading and self._registry.leading:
+            self._registry.follow()
+        if led and not leading:
+            log.warning("another Coordinator (%s) leads: waiting", self._leadership.leader or "not yet known")
+
+    def _registered(self, item: Item) -> None:
+        message = self._understood(item, Registration)
+        if message is not None:
+            self._counts["registrations"] += 1
+            with self._lock:
+                self._registry.registered(message, time.monotonic())
+
+    def _beat(self, item: Item) -> None:
+        message = self._understood(item, Heartbeat)
+        if message is not None:
+            self._counts["heartbeats"] += 1
+            with self._lock:
+                self._registry.beat(message, time.monotonic())
+
+    def _claimed(self, item: Item) -> None:
+        claim = self._understood(item, Claim)
+        if claim is None:
+            return
+        with self._lock:
+            leader, led = self._leadership.leader, self._leadership.leading
+            self._leadership.heard(claim, time.monotonic())
+            self._obey(led)
+            if self._leadership.leader != leader and not led:
+                log.warning("another Coordinator (%s) leads: waiting", self._leadership.leader)
+
+    def _healthy(self, item: Item) -> None:
+        self._apps_health[item.app_id] = {"instance_id": item.instance_id, "health": item.value}
+
+    def _understood(self, item: Item, kind: type[M]) -> M | None:
+        try:
+            return msgspec.convert(item.value, kind)
+        except msgspec.ValidationError as error:
+            self._counts["misunderstood"] += 1
+            if self._counts["misunderstood"] == 1:
+                log.warning(
+                    "%s from %s was not understood: %s; more are counted only", item.key, item.app_id, error
+                )
+            return None
+
+    def _write(self, key: str, value: dict[str, Any]) -> None:
+        try:
+            self._engine.write(key, value, [PUB_ONLY, NO_WAIT])
+        except DueError as error:
+            log.warning("%s could not be sent: %s", key, error)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run until a signal; returns the exit code."""
+    return due_service.run(
+        "coordinator", CoordinatorService, Settings, INTERESTS, CAPABILITIES, argv, instances="shared"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
