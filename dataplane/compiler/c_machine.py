@@ -1,0 +1,299 @@
+"""The generated-C back end: c_code's unit behind the interface of machine.Machine."""
+
+import struct
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from typing import Any
+
+from dataplane.compiler import layout as layouts
+from dataplane.compiler import machine as m
+from dataplane.compiler.c_build import library
+from dataplane.compiler.c_code import generate, key_places, table_words, words
+from dataplane.compiler.machine import Batch, KeyPlace, RangePart, Replicas
+from dataplane.tree import ArraySpec, Program, TableSpec
+
+_DECLARATIONS = """
+void *dp_new(uint32_t cpu_port);
+void dp_free(void *h);
+uint64_t dp_run(void *h, uint32_t port, uint32_t count, const char *data, const uint32_t *lengths,
+                const uint64_t *times, uint8_t *verdicts);
+const uint8_t *dp_output(void *h);
+void dp_statistics(void *h, uint64_t *to);
+void dp_ports(void *h, const char *exists);
+void dp_session(void *h, uint32_t number, uint32_t count, const uint32_t *pairs, uint32_t length);
+void dp_group(void *h, uint32_t number, uint32_t count, const uint32_t *pairs);
+void dp_insert(void *h, uint32_t t, uint32_t slot, const uint64_t *value, const uint64_t *mask,
+               uint32_t ranges, const uint64_t *range, uint32_t rank, int64_t action,
+               const uint64_t *params, uint64_t now);
+void dp_replace(void *h, uint32_t t, uint32_t slot, int64_t action, const uint64_t *params);
+void dp_remove(void *h, uint32_t t, uint32_t slot);
+void dp_default(void *h, uint32_t t, int64_t action, const uint64_t *params);
+void dp_entry(void *h, uint32_t t, uint32_t slot, uint64_t *to);
+void dp_set_entry(void *h, uint32_t t, uint32_t slot, uint32_t which, uint64_t a, uint64_t b);
+void dp_entry_meter(void *h, uint32_t t, uint32_t slot, const uint64_t *rates);
+uint64_t *dp_counter(void *h, uint32_t array, uint32_t index);
+void dp_meter(void *h, uint32_t array, uint32_t index, const uint64_t *rates);
+uint64_t *dp_register(void *h, uint32_t array, uint64_t limb);
+"""
+_NONE = 0xFFFFFFFF
+_OUT_PORT, _OUT_CPU, _OUT_DIGEST = 1, 2, 3
+_RECORD = struct.Struct("<III4x")
+_WORD = (1 << 64) - 1
+_Rates = tuple[int, int, int, int]
+
+
+class _Native:
+    """The library's handle, shared by the parts of one machine."""
+
+    def __init__(self, text: str, cpu_port: int) -> None:
+        self.ffi, self.lib = library(text, _DECLARATIONS)
+        self.handle = self.lib.dp_new(cpu_port)
+        if self.handle == self.ffi.NULL:
+            raise MemoryError("no memory for the switch's state")
+
+    def rates(self, rates: _Rates | None) -> Any:
+        return self.ffi.NULL if rates is None else self.ffi.new("uint64_t[4]", rates)
+
+
+class CTable:
+    """See machine.TableStore."""
+
+    def __init__(self, native: _Native, number: int, spec: TableSpec, stride: int) -> None:
+        self._ffi, self._lib, self._handle = native.ffi, native.lib, native.handle
+        self._native = native
+        self._number = number
+        self._words, places = key_places(spec) if spec.keys else (0, ())
+        self.place = KeyPlace(places)
+        self._stride = stride
+        self._param_words = {}
+        widths = {a.name: tuple(words(p.width) for p in a.params) for a in spec.actions}
+        self._narrow = all(w == 1 for counts in widths.values() for w in counts)
+        self._counts: dict[int, tuple[int, ...]] = {}
+
+    def know_action(self, number: int, counts: tuple[int, ...]) -> None:
+        """Words of each parameter of an action."""
+        self._counts[number] = counts
+
+    def _params(self, action: int, params: Sequence[int]) -> Any:
+        if not self._narrow and action >= 0:
+            params = list(_split(params, self._counts[action]))
+        return self._ffi.new("uint64_t[]", [*params, *[0] * (self._stride - len(params) + 1)])
+
+    def _key(self, value: int) -> Any:
+        return self._ffi.new("uint64_t[]", [(value >> 64 * i) & _WORD for i in range(self._words)] or [0])
+
+    def insert(
+        self,
+        slot: int,
+        value: int,
+        mask: int,
+        ranges: tuple[RangePart, ...],
+        rank: int,
+        action: int,
+        params: Sequence[int],
+        now_us: int,
+    ) -> None:
+        parts = self._ffi.NULL
+        if ranges:
+            flat = chain.from_iterable(
+                (r.shift // 64, r.shift % 64, (1 << r.width) - 1, r.low, r.high) for r in ranges
+            )
+            parts = self._ffi.new("uint64_t[]", list(flat))
+        self._lib.dp_insert(
+            self._handle,
+            self._number,
+            slot,
+            self._key(value),
+            self._key(mask),
+            len(ranges),
+            parts,
+            rank,
+            action,
+            self._params(action, params),
+            now_us,
+        )
+
+    def replace(self, slot: int, action: int, params: Sequence[int]) -> None:
+        self._lib.dp_replace(self._handle, self._number, slot, action, self._params(action, params))
+
+    def remove(self, slot: int) -> None:
+        self._lib.dp_remove(self._handle, self._number, slot)
+
+    def set_default(self, action: int, params: Sequence[int]) -> None:
+        self._lib.dp_default(self._handle, self._number, action, self._params(action, params))
+
+    def _entry(self, slot: int) -> tuple[int, int, int]:
+        state = self._ffi.new("uint64_t[3]")
+        self._lib.dp_entry(self._handle, self._number, slot, state)
+        return state[0], state[1], state[2]
+
+    def counter(self, slot: int) -> tuple[int, int]:
+        return self._entry(slot)[:2]
+
+    def set_counter(self, slot: int, packets: int, octets: int) -> None:
+        self._lib.dp_set_entry(self._handle, self._number, slot, 0, packets & _WORD, octets & _WORD)
+
+    def set_meter(self, slot: int, rates: _Rates | None) -> None:
+        self._lib.dp_entry_meter(self._handle, self._number, slot, self._native.rates(rates))
+
+    def hit_us(self, slot: int) -> int:
+        return self._entry(slot)[2]
+
+    def touch(self, slot: int, now_us: int) -> None:
+        self._lib.dp_set_entry(self._handle, self._number, slot, 1, now_us, 0)
+
+
+def _split(values: Sequence[int], counts: Sequence[int]) -> Iterable[int]:
+    for value, count in zip(values, counts, strict=True):
+        for i in range(count):
+            yield (value >> 64 * i) & _WORD
+
+
+class CCounters:
+    """See machine.CounterStore."""
+
+    def __init__(self, native: _Native, number: int) -> None:
+        self._native, self._number = native, number
+
+    def _cell(self, index: int) -> Any:
+        return self._native.lib.dp_counter(self._native.handle, self._number, index)
+
+    def read(self, index: int) -> tuple[int, int]:
+        cell = self._cell(index)
+        return cell[0], cell[1]
+
+    def write(self, index: int, packets: int, octets: int) -> None:
+        cell = self._cell(index)
+        cell[0], cell[1] = packets & _WORD, octets & _WORD
+
+
+class CMeters:
+    """See machine.MeterStore."""
+
+    def __init__(self, native: _Native, number: int) -> None:
+        self._native, self._number = native, number
+
+    def configure(self, index: int, rates: _Rates | None) -> None:
+        native = self._native
+        native.lib.dp_meter(native.handle, self._number, index, native.rates(rates))
+
+
+class CRegisters:
+    """See machine.RegisterStore."""
+
+    def __init__(self, native: _Native, number: int, spec: ArraySpec) -> None:
+        self._native, self._number = native, number
+        self._words = words(spec.width)
+
+    def _cell(self, index: int) -> Any:
+        return self._native.lib.dp_register(self._native.handle, self._number, index * self._words)
+
+    def read(self, index: int) -> int:
+        cell = self._cell(index)
+        return sum(cell[i] << 64 * i for i in range(self._words))
+
+    def write(self, index: int, value: int) -> None:
+        cell = self._cell(index)
+        for i in range(self._words):
+            cell[i] = (value >> 64 * i) & _WORD
+
+
+class CMachine:
+    """See machine.Machine."""
+
+    backend = "c"
+
+    def __init__(self, program: Program, cpu_port: int) -> None:
+        """Raises CompilerError, Unsupported."""
+        self.text = generate(program, layouts.make(program))
+        native = self._native = _Native(self.text, cpu_port)
+        self.tables = {
+            name: CTable(native, i, spec, table_words(program, spec))
+            for i, (name, spec) in enumerate(program.tables.items())
+        }
+        for pipeline in (program.ingress, program.egress):
+            for node in pipeline.nodes.values():
+                self._know_actions(program, node)
+        self.counters = {name: CCounters(native, i) for i, name in enumerate(program.counters)}
+        self.meters = {name: CMeters(native, i) for i, name in enumerate(program.meters)}
+        self.registers = {
+            name: CRegisters(native, i, spec) for i, (name, spec) in enumerate(program.registers.items())
+        }
+        self._digests = {
+            number: (spec.name, tuple(words(w) for w in spec.widths))
+            for number, spec in program.digests.items()
+        }
+
+    def _know_actions(self, program: Program, node: object) -> None:
+        table = self.tables.get(getattr(node, "name", ""))
+        if table is not None:
+            for number in getattr(node, "actions", ()):
+                params = program.actions[number].spec.params
+                table.know_action(number, tuple(words(p.width) for p in params))
+
+    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> Batch:
+        ffi, lib = self._native.ffi, self._native.lib
+        count = len(frames)
+        lengths = ffi.new("uint32_t[]", [len(f) for f in frames])
+        times = ffi.new("uint64_t[]", [t & _WORD for t in times_us])
+        verdicts = ffi.new("uint8_t[]", count)
+        data = frames[0] if count == 1 else b"".join(frames)
+        used = lib.dp_run(self._native.handle, port, count, data, lengths, times, verdicts)
+        batch = Batch(verdicts=bytes(ffi.buffer(verdicts, count)))
+        if used:
+            self._collect(batch, bytes(ffi.buffer(lib.dp_output(self._native.handle), used)))
+        return batch
+
+    def _collect(self, batch: Batch, records: bytes) -> None:
+        at, end = 0, len(records)
+        unpack = _RECORD.unpack_from
+        while at < end:
+            kind, number, length = unpack(records, at)
+            at += 16
+            if kind == _OUT_PORT:
+                batch.outputs.append((number, records[at : at + length]))
+            elif kind == _OUT_CPU:
+                batch.packet_ins.append(records[at : at + length])
+            else:
+                batch.digests.append(self._digest(number, records, at))
+            at += (length + 7) & ~7
+
+    def _digest(self, number: int, records: bytes, at: int) -> tuple[str, tuple[int, ...]]:
+        name, counts = self._digests[number]
+        values = struct.unpack_from(f"<{sum(counts)}Q", records, at)
+        if all(c == 1 for c in counts):
+            return name, values
+        joined: list[int] = []
+        i = 0
+        for count in counts:
+            joined.append(sum(values[i + j] << 64 * j for j in range(count)))
+            i += count
+        return name, tuple(joined)
+
+    def set_clone_session(self, session: int, replicas: Replicas | None, packet_length: int) -> None:
+        count, pairs = self._pairs(replicas)
+        self._native.lib.dp_session(self._native.handle, session, count, pairs, packet_length)
+
+    def set_multicast_group(self, group: int, replicas: Replicas | None) -> None:
+        count, pairs = self._pairs(replicas)
+        self._native.lib.dp_group(self._native.handle, group, count, pairs)
+
+    def _pairs(self, replicas: Replicas | None) -> tuple[int, Any]:
+        if replicas is None:
+            return _NONE, self._native.ffi.NULL
+        flat = list(chain.from_iterable(replicas))
+        return len(replicas), self._native.ffi.new("uint32_t[]", flat or [0])
+
+    def set_ports(self, ports: frozenset[int] | None) -> None:
+        exists = bytes(ports is None or port in ports for port in range(512))
+        self._native.lib.dp_ports(self._native.handle, exists)
+
+    def statistics(self) -> dict[str, int]:
+        counts = self._native.ffi.new("uint64_t[]", len(m.STATISTICS))
+        self._native.lib.dp_statistics(self._native.handle, counts)
+        return dict(zip(m.STATISTICS, counts, strict=True))
+
+    def close(self) -> None:
+        if self._native.handle != self._native.ffi.NULL:
+            self._native.lib.dp_free(self._native.handle)
+            self._native.handle = self._native.ffi.NULL

@@ -1,0 +1,130 @@
+"""What a back end offers the switch: the loaded program with its state, without names or checks.
+
+Two make it: `python_machine.PythonMachine` and `c_machine.CMachine`.  Callers hold the switch's lock and
+have checked every number; tables are addressed by slots that `tables.Table` hands out.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+Replicas = tuple[tuple[int, int], ...]
+"""(port, instance) of each copy."""
+
+
+@dataclass(slots=True)
+class Batch:
+    """What a batch of frames led to; `verdicts` has a byte per frame."""
+
+    outputs: list[tuple[int, bytes]] = field(default_factory=list)
+    packet_ins: list[bytes] = field(default_factory=list)
+    digests: list[tuple[str, tuple[int, ...]]] = field(default_factory=list)
+    verdicts: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class KeyPlace:
+    """Where a table's key fields stand in one long integer: shift in bits, by field."""
+
+    shifts: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RangePart:
+    """One bounded field of an entry: position in the key, width in bits, bounds."""
+
+    shift: int
+    width: int
+    low: int
+    high: int
+
+
+class TableStore(Protocol):
+    """Entries of one table, by slot."""
+
+    place: KeyPlace
+
+    def insert(
+        self,
+        slot: int,
+        value: int,
+        mask: int,
+        ranges: tuple[RangePart, ...],
+        rank: int,
+        action: int,
+        params: Sequence[int],
+        now_us: int,
+    ) -> None:
+        """Largest rank wins, then the lowest slot."""
+
+    def replace(self, slot: int, action: int, params: Sequence[int]) -> None: ...
+
+    def remove(self, slot: int) -> None: ...
+
+    def set_default(self, action: int, params: Sequence[int]) -> None:
+        """Action -1: none."""
+
+    def counter(self, slot: int) -> tuple[int, int]:
+        """(packets, bytes)"""
+        ...
+
+    def set_counter(self, slot: int, packets: int, octets: int) -> None: ...
+
+    def set_meter(self, slot: int, rates: tuple[int, int, int, int] | None) -> None:
+        """(cir, cburst, pir, pburst); None = always green."""
+
+    def hit_us(self, slot: int) -> int:
+        """Packet time of the last hit, or of the insertion."""
+        ...
+
+    def touch(self, slot: int, now_us: int) -> None: ...
+
+
+class CounterStore(Protocol):
+    def read(self, index: int) -> tuple[int, int]: ...
+
+    def write(self, index: int, packets: int, octets: int) -> None: ...
+
+
+class MeterStore(Protocol):
+    def configure(self, index: int, rates: tuple[int, int, int, int] | None) -> None: ...
+
+
+class RegisterStore(Protocol):
+    def read(self, index: int) -> int: ...
+
+    def write(self, index: int, value: int) -> None: ...
+
+
+class Machine(Protocol):
+    """A program with its state, ready to run."""
+
+    backend: str
+    tables: Mapping[str, TableStore]
+    counters: Mapping[str, CounterStore]
+    meters: Mapping[str, MeterStore]
+    registers: Mapping[str, RegisterStore]
+
+    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> Batch: ...
+
+    def set_clone_session(self, session: int, replicas: Replicas | None, packet_length: int) -> None:
+        """None removes it."""
+
+    def set_multicast_group(self, group: int, replicas: Replicas | None) -> None: ...
+
+    def set_ports(self, ports: frozenset[int] | None) -> None:
+        """Frames to other ports are dropped; None = every port exists."""
+
+    def statistics(self) -> dict[str, int]: ...
+
+    def close(self) -> None: ...
+
+
+INSTANCE_INGRESS_CLONE, INSTANCE_EGRESS_CLONE = 1, 2
+INSTANCE_RECIRCULATED, INSTANCE_REPLICATED, INSTANCE_RESUBMITTED = 4, 5, 6
+DROP_PORT = 511
+MAX_PASSES = 1024
+"""Passes through ingress or egress that one frame may cause; BMv2 would loop for ever."""
+MAX_FRAME = 65_535
+STATISTICS = ("frames", "parser_errors", "dropped", "no_such_port", "loop_drops", "oversized")
+COPIED, FORWARDED = 1, 2

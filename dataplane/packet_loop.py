@@ -1,0 +1,174 @@
+"""The one thread that moves packets: ports in, switch, ports and controllers out.
+
+A lossless port (a replay's) is read only as far as the controllers' queues have room; when they have
+none, or no controller is primary, its frames wait where they are.  Other ports are always read, and the
+packet-ins that nobody can take are counted.
+"""
+
+import select
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Mapping
+
+from dataplane.device import Device
+from dataplane.pipeline import Pipeline
+from dataplane.ports import Port, Wakeup
+from dataplane.switch import Result
+
+_CHUNK = 256
+_IDLE_MS = 100
+_PACKET_OUTS = 4096
+
+
+class PacketClock:
+    """µs for packets: of the capture where one drives the switch, else since the start."""
+
+    def __init__(self, *, driven: bool) -> None:
+        self._driven = driven
+        self._start_ns = time.monotonic_ns()
+        self._last_us = 0
+
+    def now(self) -> int:
+        """The packets' time, µs."""
+        return self._last_us if self._driven else (time.monotonic_ns() - self._start_ns) // 1000
+
+    def advance(self, time_us: int) -> None:
+        """A frame of a capture was stamped so."""
+        self._last_us = time_us
+
+
+class PacketLoop:
+    """Runs a device's ports.
+
+    ports: by port number
+    clock: the same as the device's
+    """
+
+    def __init__(self, device: Device, ports: Mapping[int, Port], clock: PacketClock) -> None:
+        self.counts: Counter[str] = Counter()
+        self._device = device
+        self._ports = dict(ports)
+        self._clock = clock
+        self._wakeup = Wakeup()
+        self._packet_outs: deque[bytes] = deque()
+        self._space = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="packets", daemon=True)
+        device.on_room = self._wakeup.set
+        device.on_packet_out = self._put_packet_out
+
+    def start(self) -> None:
+        """Begin to process packets."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Finish the frames in hand, then close the ports."""
+        self._stopping = True
+        self._wakeup.set()
+        with self._space:
+            self._space.notify_all()
+        self._thread.join()
+        for port in self._ports.values():
+            port.close()
+        self._wakeup.close()
+
+    def _put_packet_out(self, payload: bytes) -> None:
+        with self._space:
+            # the controller's stream is not read on while too many wait
+            self._space.wait_for(lambda: len(self._packet_outs) < _PACKET_OUTS or self._stopping)
+            self._packet_outs.append(payload)
+        self._wakeup.set()
+
+    def _run(self) -> None:
+        while not self._stopping:
+            ready = self._wait()
+            with self._device.running:
+                pipeline = self._device.pipeline
+                if pipeline is None:
+                    self._discard(ready)
+                    continue
+                self._send_packet_outs(pipeline)
+                for number in ready:
+                    self._receive(pipeline, number, self._ports[number])
+                self._device.tick(pipeline, self._clock.now())
+
+    def _wait(self) -> list[int]:
+        """Port numbers that have frames and may be read."""
+        poll = select.poll()
+        poll.register(self._wakeup.fileno(), select.POLLIN)
+        waiting, descriptors = [], {}
+        room = self._device.room()
+        for number, port in self._ports.items():
+            readable = not port.lossless or room > 0
+            if readable and port.waiting():
+                waiting.append(number)
+            events = (select.POLLIN if readable else 0) | (select.POLLOUT if port.unsent() else 0)
+            descriptor = port.fileno()
+            if events and descriptor >= 0:
+                poll.register(descriptor, events)
+                descriptors[descriptor] = number
+        happened = dict(poll.poll(0 if waiting else self._timeout_ms()))
+        if self._wakeup.fileno() in happened:
+            self._wakeup.clear()
+        return self._sort_out(happened, descriptors, waiting)
+
+    def _sort_out(
+        self, happened: dict[int, int], descriptors: dict[int, int], waiting: list[int]
+    ) -> list[int]:
+        for descriptor, number in descriptors.items():
+            events = happened.get(descriptor, 0)
+            if events & ~select.POLLIN:
+                self._ports[number].flush()
+            if events & ~select.POLLOUT and number not in waiting:
+                waiting.append(number)
+        return waiting
+
+    def _timeout_ms(self) -> int:
+        pipeline = self._device.pipeline
+        due = None if pipeline is None else pipeline.digests.next_due_ns()
+        if due is None:
+            return _IDLE_MS
+        return max(0, min(_IDLE_MS, (due - time.monotonic_ns() + 999_999) // 1_000_000))
+
+    def _discard(self, ready: list[int]) -> None:
+        for number in ready:
+            port = self._ports[number]
+            if not port.lossless:
+                frames = port.receive(_CHUNK).frames
+                self.counts["without_pipeline"] += len(frames)
+                port.done(bytes(len(frames)))
+
+    def _send_packet_outs(self, pipeline: Pipeline) -> None:
+        while self._packet_outs:
+            payload = self._packet_outs.popleft()
+            result = pipeline.switch.packet_out(payload, self._clock.now())
+            self._hand_out(pipeline, result, lossless=True)
+            with self._space:
+                self._space.notify_all()
+
+    def _receive(self, pipeline: Pipeline, number: int, port: Port) -> None:
+        limit = _CHUNK
+        if port.lossless:
+            limit = min(limit, self._device.room())
+            if not limit:
+                return
+        arrived = port.receive(limit)
+        frames = arrived.frames
+        if not frames:
+            return
+        times = arrived.times_us or [self._clock.now()] * len(frames)
+        if arrived.times_us:
+            self._clock.advance(times[-1])
+        result = pipeline.switch.process_many(number, frames, times)
+        self._hand_out(pipeline, result, lossless=port.lossless)
+        port.done(result.verdicts)
+
+    def _hand_out(self, pipeline: Pipeline, result: Result, *, lossless: bool) -> None:
+        for number, frame in result.outputs:
+            port = self._ports.get(number)
+            if port is None:
+                self.counts["no_such_port"] += 1
+            else:
+                port.send(frame)
+        self._device.deliver(pipeline, result, lossless=lossless)

@@ -1,0 +1,146 @@
+"""What waits to be sent to controllers: one Stream per StreamChannel, one PacketQueue per role.
+
+    packet loop ── put ──► PacketQueue of the role ─┐
+                                                    ├─ Stream.messages() ──► gRPC
+    arbitration, errors ── post ──► Stream ─────────┘
+
+A queue belongs to its role, not to a stream: what a primary had not been sent when it left goes to the
+next one.  Messages are protobuf bytes, ready to send.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+
+from dataplane.status import Refused
+
+_TAKE = 64
+_MAX_CONTROL = 4096
+
+
+class PacketQueue:
+    """Packet-ins and digest lists of one role, bounded by what `room` says.
+
+    capacity: messages
+    on_room: called (from a stream's thread) when a queue that was full has room again
+    """
+
+    def __init__(self, capacity: int, on_room: Callable[[], None]) -> None:
+        self._capacity = capacity
+        self._on_room = on_room
+        self._items: deque[bytes] = deque()
+        self._stalled = False
+        self.reader: Stream | None = None
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def room(self) -> int:
+        """Messages that can be put; 0 asks for `on_room` later."""
+        room = self._capacity - len(self._items)
+        if room > 0:
+            return room
+        self._stalled = True
+        # the reader may have emptied it before it could see the flag
+        return max(0, self._capacity - len(self._items))
+
+    def put(self, messages: Iterable[bytes]) -> None:
+        """Append; the caller has looked at `room`."""
+        self._items.extend(messages)
+        reader = self.reader
+        if reader is not None:
+            reader.wake()
+
+    def take(self) -> list[bytes]:
+        """Some messages from the front."""
+        items = self._items
+        taken = [items.popleft() for _ in range(min(_TAKE, len(items)))]
+        if self._stalled and len(items) <= self._capacity // 2:
+            self._stalled = False
+            self._on_room()
+        return taken
+
+    def give_back(self, messages: list[bytes]) -> None:
+        """Messages that were taken and not sent go to the front again."""
+        self._items.extendleft(reversed(messages))
+
+    def clear(self) -> int:
+        """Drop everything; the number of messages dropped."""
+        dropped = len(self._items)
+        self._items.clear()
+        self._stalled = False
+        self._on_room()
+        return dropped
+
+
+class Stream:
+    """One StreamChannel: its own messages, and the queue of its role while it is primary."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.queue: PacketQueue | None = None
+        self.error: Refused | None = None
+        self.dropped = 0
+        self._control: deque[bytes] = deque()
+        self._changed = threading.Condition()
+        self._sleeping = False
+        self._ended = False
+
+    def post(self, message: bytes) -> None:
+        """Send a message of this stream's own, ahead of what is queued."""
+        if len(self._control) >= _MAX_CONTROL:
+            self.dropped += 1
+            return
+        self._control.append(message)
+        self.wake()
+
+    def end(self, error: Refused | None = None) -> None:
+        """End the stream, with an error status or without."""
+        if not self._ended:
+            self.error = error
+            self._ended = True
+        self.wake()
+
+    def wake(self) -> None:
+        """Something may be there to send."""
+        if self._sleeping:
+            with self._changed:
+                self._changed.notify()
+
+    def messages(self) -> Iterator[bytes]:
+        """Everything to be sent, until the stream ends; runs in the stream's own thread."""
+        while True:
+            queue, batch = self._next()
+            if not batch:
+                return
+            position = 0
+            try:
+                for message in batch:
+                    position += 1
+                    yield message
+            finally:
+                if queue is not None and position < len(batch):
+                    queue.give_back(batch[position:])
+
+    def _next(self) -> tuple[PacketQueue | None, list[bytes]]:
+        with self._changed:
+            while True:
+                # set before looking: whoever adds something later sees it and wakes us
+                self._sleeping = True
+                found = self._look()
+                if found is not None:
+                    self._sleeping = False
+                    return found
+                self._changed.wait()
+
+    def _look(self) -> tuple[PacketQueue | None, list[bytes]] | None:
+        if self._control:
+            return None, [self._control.popleft() for _ in range(len(self._control))]
+        if self._ended:
+            return None, []
+        queue = self.queue
+        if queue is not None and len(queue):
+            taken = queue.take()
+            if taken:
+                return queue, taken
+        return None

@@ -1,0 +1,127 @@
+"""The switches that the contract suite runs against: one set of calls, whatever is behind it."""
+
+import queue
+import threading
+import time
+from collections import defaultdict
+from typing import Any, Protocol
+
+import grpc
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from dataplane.bmv2 import Bmv2
+from dataplane.switch import Backend
+from tests.dataplane.embedded import Embedded
+
+_WAIT_S = 10.0
+_QUIET_S = 0.15
+
+
+class Target(Protocol):
+    """A P4Runtime switch with ports 1, 2 and 3."""
+
+    name: str
+    address: str
+
+    def inject(self, port: int, *frames: bytes) -> None: ...
+    def sent(self, port: int, count: int) -> list[bytes]: ...
+    def quiet(self, port: int) -> bool: ...
+    def close(self) -> None: ...
+
+
+class EmbeddedTarget:
+    """The product's own switch, in this process."""
+
+    def __init__(self, backend: Backend) -> None:
+        self.name = f"embedded-{backend}"
+        self._switch = Embedded(backend=backend)
+        self.address = self._switch.address
+
+    def inject(self, port: int, *frames: bytes) -> None:
+        self._switch.memory[port].inject(*frames)
+
+    def sent(self, port: int, count: int) -> list[bytes]:
+        outgoing, deadline = self._switch.memory[port].outgoing, time.monotonic() + _WAIT_S
+        while len(outgoing) < count and time.monotonic() < deadline:
+            time.sleep(0.002)
+        return [outgoing.popleft() for _ in range(min(count, len(outgoing)))]
+
+    def quiet(self, port: int) -> bool:
+        time.sleep(_QUIET_S)
+        return not self._switch.memory[port].outgoing
+
+    def close(self) -> None:
+        self._switch.close()
+
+
+def _packet_messages() -> tuple[type, type]:
+    """PacketStreamRequest and PacketStreamResponse of p4.bm: id, device_id, port, packet."""
+    described = descriptor_pb2.FileDescriptorProto(
+        name="p4/bm/contract.proto", package="p4.bm", syntax="proto3"
+    )
+    kinds = descriptor_pb2.FieldDescriptorProto
+    fields = (("id", kinds.TYPE_UINT64), ("device_id", kinds.TYPE_UINT64), ("port", kinds.TYPE_UINT32))
+    for name in ("PacketStreamRequest", "PacketStreamResponse"):
+        message = described.message_type.add(name=name)
+        for number, (field, kind) in enumerate((*fields, ("packet", kinds.TYPE_BYTES)), 1):
+            message.field.add(name=field, number=number, type=kind, label=kinds.LABEL_OPTIONAL)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(described)
+    request, response = (
+        message_factory.GetMessageClass(pool.FindMessageTypeByName(f"p4.bm.{name}"))
+        for name in ("PacketStreamRequest", "PacketStreamResponse")
+    )
+    return request, response
+
+
+class Bmv2Target:
+    """simple_switch_grpc with frames by gRPC; needs no root."""
+
+    name = "bmv2"
+
+    def __init__(self) -> None:
+        self._request, response = _packet_messages()
+        self._switch = Bmv2({}, device_id=1, packet_stream=True)
+        self.address = self._switch.address
+        self._frames: defaultdict[int, queue.SimpleQueue[bytes]] = defaultdict(queue.SimpleQueue)
+        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._channel = grpc.insecure_channel(self._switch.packet_address)
+        call = self._channel.stream_stream(
+            "/p4.bm.DataplaneInterface/PacketStream",
+            request_serializer=self._request.SerializeToString,
+            response_deserializer=response.FromString,
+        )
+        self._call = call(iter(self._requests.get, None), wait_for_ready=True)
+        self._thread = threading.Thread(target=self._receive, daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        try:
+            for response in self._call:
+                self._frames[response.port].put(response.packet)
+        except grpc.RpcError:
+            return
+
+    def inject(self, port: int, *frames: bytes) -> None:
+        for frame in frames:
+            self._requests.put(self._request(device_id=1, port=port, packet=frame))
+
+    def sent(self, port: int, count: int) -> list[bytes]:
+        frames = []
+        try:
+            while len(frames) < count:
+                frames.append(self._frames[port].get(timeout=_WAIT_S))
+        except queue.Empty:
+            pass
+        return frames
+
+    def quiet(self, port: int) -> bool:
+        time.sleep(_QUIET_S)
+        return self._frames[port].empty()
+
+    def close(self) -> None:
+        self._requests.put(None)
+        self._call.cancel()
+        self._thread.join(5)
+        self._channel.close()
+        self._switch.close()

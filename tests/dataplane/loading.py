@@ -1,0 +1,47 @@
+"""Programs and frames that several tests of the data plane use."""
+
+from functools import cache
+from pathlib import Path
+
+from dataplane.program import load
+from dataplane.tree import Program
+from tests.requirements import shared_data
+
+_HERE = Path(__file__).resolve().parent
+BACKENDS = ("python", "c")
+
+
+@cache
+def features() -> Program:
+    """programs/features.p4: one byte of the frame chooses what happens."""
+    return load((_HERE / "programs" / "features.json").read_text())
+
+
+@cache
+def sdnator() -> Program:
+    return load((_HERE.parent.parent / "p4" / "sdnator.json").read_text())
+
+
+@cache
+def shared(name: str) -> Program:
+    """One of the shared programs: small, sketch."""
+    return load(shared_data(f"p4/{name}.json").read_text())
+
+
+def ethernet(etype: int, payload: bytes) -> bytes:
+    return bytes.fromhex("020000000002 020000000001") + etype.to_bytes(2, "big") + payload
+
+
+def frame(
+    what: int, a: int = 0, b: int = 0, c: int = 0, d: int = 0, e: int = 0, *, rest: bytes = b""
+) -> bytes:
+    """A frame of features.p4's own type; the header is 20 bytes behind Ethernet."""
+    parts = [(what, 1), (a, 1), (b, 1), (c, 2), (d, 4), (e, 8), (0, 2)]
+    return ethernet(0x88B5, b"".join(v.to_bytes(n, "big") for v, n in parts) + rest)
+
+
+def fields(data: bytes) -> dict[str, int]:
+    """The header of `frame`, read back."""
+    places = {"what": (14, 1), "a": (15, 1), "b": (16, 1), "c": (17, 2), "d": (19, 4), "e": (23, 8)}
+    places["result"] = (31, 2)
+    return {name: int.from_bytes(data[at : at + n], "big") for name, (at, n) in places.items()}
