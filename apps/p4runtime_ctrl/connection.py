@@ -1,0 +1,212 @@
+"""The stream to one switch: arbitration, packet-ins, notifications; opened again whenever it ends.  I/O.
+
+A lost stream is opened again, with growing pauses.  A chief claims to be primary with its rank, a
+deputy with the lowest id there is; when the switch says that there is no primary, the deputy waits a
+moment for the chief, then asks for its place.
+"""
+
+import queue
+import threading
+import time
+from typing import Any, Final, Protocol
+
+import grpc
+
+from apps.p4runtime_ctrl.session import Address, Pipeline, Session, translated
+from p4rt import P4RuntimeStub, p4runtime
+
+_FIRST_PAUSE: Final = 0.05
+_DEPUTY_WAITS_S: Final = 0.5
+_PRIMARY, _NO_PRIMARY = 0, 5
+
+
+class Listener(Protocol):
+    """Told about one switch, from the connection's threads."""
+
+    def became_primary(self, session: "Session") -> None: ...
+    def became_backup(self) -> None: ...
+    def lost(self, cause: str) -> None: ...
+    def packets(self, messages: list[Any]) -> None: ...
+    def other(self, message: Any) -> None: ...
+
+
+class Connection:
+    """Keeps the stream to one switch open and its listener informed.
+
+    Packet-ins are handed over in order, in lists: as soon as the listener is free again and at most
+    `linger_s` after the first of them, never more than `batch` at once.  While the listener is busy
+    at most four batches wait; then reading stops and gRPC's flow control holds the switch.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        pipeline: Pipeline,
+        listener: Listener,
+        *,
+        batch: int = 1024,
+        linger_s: float = 0.002,
+        longest_pause_s: float = 1.0,
+        chief: bool = True,
+    ) -> None:
+        self._address = address
+        self._pipeline = pipeline
+        self._listener = listener
+        self._batch = batch
+        self._linger_s = linger_s
+        self._longest_pause_s = longest_pause_s
+        self._closing = threading.Event()
+        self._gathered: list[Any] = []
+        self._changed = threading.Condition()
+        self._call: Any = None
+        self._stub: Any = None
+        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._election_id: Any = None
+        self._primary: bool | None = None
+        self._chief = chief
+        self._patience: threading.Timer | None = None
+        name = address.target
+        self._threads = [
+            threading.Thread(target=self._keep_open, name=f"stream {name}", daemon=True),
+            threading.Thread(target=self._hand_over, name=f"packets {name}", daemon=True),
+        ]
+
+    def open(self) -> None:
+        """Start; the listener hears of success and failure."""
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End the stream (a backup takes over at once) and wait for the threads."""
+        self._closing.set()
+        self._stop_waiting()
+        self.break_off()
+        with self._changed:
+            self._changed.notify_all()
+        for thread in self._threads:
+            if thread.is_alive() and thread is not threading.current_thread():
+                thread.join(timeout=5)
+
+    def stand(self, *, chief: bool) -> None:
+        """Become chief or deputy of the controllers of this switch."""
+        if chief != self._chief:
+            self._chief = chief
+            self._claim(self._usual_id())
+
+    def break_off(self) -> None:
+        """Give this stream up; a new one is opened unless `close` was called."""
+        call = self._call
+        if call is not None:
+            call.cancel()
+
+    def _keep_open(self) -> None:
+        pause = _FIRST_PAUSE
+        while not self._closing.is_set():
+            opened = time.monotonic()
+            cause = self._one_stream()
+            if self._closing.is_set():
+                return
+            self._listener.lost(cause)
+            if time.monotonic() - opened > self._longest_pause_s * 2:
+                pause = _FIRST_PAUSE
+            self._closing.wait(pause)
+            pause = min(pause * 2, self._longest_pause_s)
+
+    def _one_stream(self) -> str:
+        """Open the stream, read it to its end, say why it ended."""
+        self._requests = queue.SimpleQueue()
+        self._primary = None
+        with self._address.channel() as stream, self._address.channel() as calls:
+            self._stub = P4RuntimeStub(calls)
+            self._claim(self._usual_id())
+            self._call = P4RuntimeStub(stream).StreamChannel(iter(self._requests.get, None))
+            try:
+                for message in self._call:
+                    self._take(message)
+            except grpc.RpcError as error:
+                return str(translated(error, self._address.target))
+            else:
+                return f"switch at {self._address.target} closed the stream"
+            finally:
+                self._stop_waiting()
+                self._requests.put(None)
+                self._call = None
+
+    def _usual_id(self) -> int:
+        rank = self._address.rank if self._chief else 0
+        return rank << 64 | time.time_ns() // 1_000_000
+
+    def _claim(self, election_id: int) -> None:
+        """Ask to be primary under this id."""
+        self._election_id = p4runtime.Uint128(high=election_id >> 64, low=election_id & (1 << 64) - 1)
+        request = p4runtime.StreamMessageRequest()
+        request.arbitration.device_id = self._address.device_id
+        request.arbitration.election_id.CopyFrom(self._election_id)
+        self._requests.put(request)
+
+    def _take(self, message: Any) -> None:
+        kind = message.WhichOneof("update")
+        if kind == "packet":
+            self._gather(message.packet)
+        elif kind == "arbitration":
+            self._arbitrated(message.arbitration)
+        else:
+            self._listener.other(message)
+
+    def _arbitrated(self, arbitration: Any) -> None:
+        """The switch repeats itself whenever another controller comes or goes; only changes are told."""
+        self._stop_waiting()
+        if arbitration.status.code == _NO_PRIMARY:
+            highest = arbitration.election_id.high << 64 | arbitration.election_id.low
+            self._fill_the_place(max(highest + 1, self._usual_id()))
+            return
+        primary = arbitration.status.code == _PRIMARY
+        if primary == self._primary:
+            return
+        self._primary = primary
+        if primary:
+            session = Session(self._stub, self._address, self._pipeline, self._election_id)
+            self._listener.became_primary(session)
+        else:
+            self._listener.became_backup()
+
+    def _fill_the_place(self, election_id: int) -> None:
+        if self._chief:
+            self._claim(election_id)
+            return
+        self._patience = threading.Timer(_DEPUTY_WAITS_S, self._claim, (election_id,))
+        self._patience.daemon = True
+        self._patience.start()
+
+    def _stop_waiting(self) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+            self._patience = None
+
+    def _gather(self, packet: Any) -> None:
+        gathered = self._gathered
+        gathered.append(packet)
+        count = len(gathered)
+        if count != 1 and count % self._batch:
+            return
+        with self._changed:
+            self._changed.notify_all()
+            while len(self._gathered) >= 4 * self._batch and not self._closing.is_set():
+                self._changed.wait(timeout=1)
+
+    def _hand_over(self) -> None:
+        while not self._closing.is_set():
+            with self._changed:
+                while not self._gathered and not self._closing.is_set():
+                    self._changed.wait(timeout=1)
+                if len(self._gathered) < self._batch:
+                    self._changed.wait(timeout=self._linger_s)
+            while self._gathered and not self._closing.is_set():
+                # appends go to the same list from the other thread; both slices are atomic
+                messages = self._gathered[: self._batch]
+                del self._gathered[: len(messages)]
+                with self._changed:
+                    self._changed.notify_all()
+                self._listener.packets(messages)
+                if len(self._gathered) < self._batch:
+                    break

@@ -1,0 +1,38 @@
+"""What can go wrong between controller and switch.
+
+ControllerError
+├── ProgramError      the P4 program lacks something that the controller needs
+├── EntryError        an entry that does not fit the program; never sent to the switch
+├── TelemetryError    a packet request that the classifier cannot hold
+└── SwitchError       the switch: unreachable, refused, silent
+    ├── NotPrimary    another controller is in charge of it
+    └── Unreachable   no connection, or it broke
+"""
+
+
+class ControllerError(Exception):
+    """Base of this app's errors; the text says what, where and what to do."""
+
+
+class ProgramError(ControllerError):
+    """The P4 program lacks a table, action or header that the controller needs."""
+
+
+class EntryError(ControllerError):
+    """An entry names something unknown, or a value does not fit its field."""
+
+
+class TelemetryError(ControllerError):
+    """The classifier cannot hold the requests."""
+
+
+class SwitchError(ControllerError):
+    """The switch answered with an error."""
+
+
+class NotPrimary(SwitchError):  # noqa: N818 - a state rather than an accident
+    """Another controller is primary; this one may not write."""
+
+
+class Unreachable(SwitchError):  # noqa: N818 - reads better where it is caught
+    """There is no connection to the switch."""

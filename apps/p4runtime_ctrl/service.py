@@ -1,0 +1,486 @@
+"""The P4Runtime controller: one agent per switch between gRPC and DUE.
+
+packets thread of a connection   packet-ins → record batch → DUE (blocks while consumers are behind)
+worker thread of a switch        decisions, commands, requests, counters: one after the other
+DUE's dispatcher                 puts work into the workers' bounded queues
+"""
+
+import logging
+import queue
+import secrets
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import due.service
+from apps.messages import Confirmation, Decision, TableCommand
+from apps.p4runtime_ctrl.connection import Connection
+from apps.p4runtime_ctrl.demand import ALL, PREFIX, Offer, requests_for
+from apps.p4runtime_ctrl.errors import ControllerError, ProgramError, SwitchError
+from apps.p4runtime_ctrl.history import DECISIONS, commands_of, decisions_for, is_for, read
+from apps.p4runtime_ctrl.p4info import Program
+from apps.p4runtime_ctrl.packet_in import PacketReader
+from apps.p4runtime_ctrl.session import Address, Pipeline, Session
+from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.switch import Switch
+from apps.p4runtime_ctrl.telemetry import Request
+from apps.packets import read_frames
+from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item
+
+INTERESTS = (
+    Interest("network.block.firewall.*"),
+    Interest("network.protect.firewall.*"),
+    Interest("network.p4_command.*.*"),
+    Interest("network.telemetry.*.*"),
+)
+CAPABILITIES = (
+    Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
+    Capability("network.confirmation.p4runtime_ctrl.*", delivery="reliable", archive="always"),
+    Capability("network.switch.p4runtime_ctrl.*", archive="always"),
+)
+
+_LOG = logging.getLogger(__name__)
+_JOBS: Final = 10_000
+_ALIVE_S: Final = 1.0
+_SECOND_US: Final = 1_000_000
+_STARTING: Final = "starting"
+_START_S: Final = 10.0
+_LOOK_EVERY_S: Final = 0.25
+
+
+@dataclass(frozen=True)
+class _Decide:
+    decision: Decision
+
+
+_Job = _Decide | Callable[[], None]
+
+
+class Agent:
+    """Keeps one switch as desired, and publishes what it sends."""
+
+    def __init__(self, engine: Engine, settings: Settings, mine: SwitchSettings, pipeline: Pipeline) -> None:
+        self.name = mine.name
+        self._engine = engine
+        self._mine = mine
+        self._settings = settings
+        self._program = Program(pipeline.p4info)
+        self._reader = PacketReader(self._program, mine.base_us)
+        self._program_name = Path(settings.program).name
+        forward = {int(port): egress for port, egress in mine.forward.items()}
+        self._switch = Switch(
+            mine.name, self._program, self._now, forward=forward, fail=mine.fail, guard=settings.guard
+        )
+        address = Address(
+            mine.address,
+            mine.device_id,
+            settings.rank,
+            copies_session=settings.copy_session,
+            cpu_port=settings.cpu_port,
+            timeout_s=settings.timeout_s,
+        )
+        self._connection = Connection(
+            address, pipeline, self, batch=settings.batch, linger_s=settings.linger_ms / 1000
+        )
+        self._jobs: queue.Queue[_Job] = queue.Queue(_JOBS)
+        self._closing = threading.Event()
+        self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
+        self._session: Session | None = None
+        self._connected = False
+        self._was_backup = False
+        self._recent: deque[Decision] = deque(maxlen=_JOBS)
+        self._published: dict[str, int] = {}
+        self._blocks: list[dict[str, Any]] = []
+        self._counting = threading.Event()
+        self._counted_second = 0
+        self._counted_at = 0.0
+        self._alive_at = 0.0
+        self._secret_at = float("-inf")
+        self._stated = (0, 0, 0.0)
+        self._change = _STARTING
+
+    # -- from the service ---------------------------------------------------------------------
+
+    def start(self, *, chief: bool) -> None:
+        self._restore()
+        self._worker.start()
+        self._connection.stand(chief=chief)
+        self._connection.open()
+
+    def stand(self, *, chief: bool) -> None:
+        self._connection.stand(chief=chief)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the first attempt to reach the switch has ended, well or badly."""
+        return self._change != _STARTING
+
+    def stop(self) -> None:
+        self._put(self._leave)
+        self._closing.set()
+        self._worker.join(timeout=self._settings.timeout_s * 2)
+        self._connection.close()
+
+    def decide(self, decision: Decision) -> None:
+        self._recent.append(decision)
+        self._put(_Decide(decision))
+
+    def command(self, command: TableCommand) -> None:
+        self._put(partial(self._command, command))
+
+    def want(self, requests: dict[str, Request]) -> None:
+        self._put(partial(self._want, requests))
+
+    def say_again(self) -> None:
+        """Somebody new may be listening: the state is best effort and said on change only."""
+        self._put(self._write_state)
+
+    def tick(self) -> None:
+        """Wall-clock duties: is the switch alive, are counters due, has the state changed."""
+        if not self._worker.is_alive():
+            raise ControllerError(f"{self.name}: the worker has ended; the log has the reason")
+        now = time.monotonic()
+        if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
+            self._alive_at = now
+            self._put(self._check_alive)
+        if now - self._counted_at > 1:
+            self._count_soon()
+        if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
+            self._secret_at = now
+            self._put(self._change_secret)
+        received, lost, stated_at = self._stated
+        if now - stated_at > 1 and (received, lost) != (self._reader.received, self._reader.lost):
+            self._put(self._write_state)
+
+    def health(self) -> dict[str, Any]:
+        return self._state()
+
+    # -- from the connection ------------------------------------------------------------------
+
+    def became_primary(self, session: Session) -> None:
+        self._put(partial(self._take_over, session))
+
+    def became_backup(self) -> None:
+        self._put(self._stand_back)
+
+    def lost(self, cause: str) -> None:
+        self._session = None
+        self._put(partial(self._lose, cause))
+
+    def packets(self, messages: list[Any]) -> None:
+        """The hot path: one record batch for each key that somebody wants."""
+        packets = self._reader.read(messages)
+        for segment, bit in list(self._published.items()):
+            chosen = packets.matching(bit)
+            if len(chosen):
+                key = f"{PREFIX}.{self.name}.{segment}"
+                at = int(chosen.time_us[-1]) * 1000
+                self._engine.write(key, chosen.batch(read_frames), [NO_WAIT], event_time=at)
+        if self._reader.time_us // _SECOND_US != self._counted_second:
+            self._count_soon()
+
+    def other(self, message: Any) -> None:
+        if message.WhichOneof("update") == "idle_timeout_notification":
+            self._put(partial(self._expire, list(message.idle_timeout_notification.table_entry)))
+
+    # -- the worker ---------------------------------------------------------------------------
+
+    def _put(self, job: _Job) -> None:
+        while not self._closing.is_set():
+            try:
+                self._jobs.put(job, timeout=1)
+            except queue.Full:
+                continue
+            return
+
+    def _work(self) -> None:
+        while not (self._closing.is_set() and self._jobs.empty()):
+            try:
+                jobs = [self._jobs.get(timeout=0.2)]
+            except queue.Empty:
+                continue
+            while len(jobs) < _JOBS and not self._jobs.empty():
+                jobs.append(self._jobs.get())
+            self._run(jobs)
+
+    def _run(self, jobs: Sequence[_Job]) -> None:
+        decisions: list[Decision] = []
+        for job in jobs:
+            if isinstance(job, _Decide):
+                decisions.append(job.decision)
+                continue
+            self._decide(decisions)
+            decisions = []
+            try:
+                job()
+            except ControllerError as error:
+                _LOG.error("%s: %s", self.name, error)
+                self._say(str(error))
+        self._decide(decisions)
+        if self._session is not None and self._session.broken:
+            self._session = None
+            self._connection.break_off()
+
+    def _take_over(self, session: Session) -> None:
+        self._connected = True
+        if self._was_backup:
+            self._was_backup = False
+            self._restore()
+        try:
+            report = self._switch.bring_up(session)
+        except SwitchError:
+            self._connection.break_off()
+            raise
+        if report.program_loaded:
+            self._reader.expect_first()
+        self._session = session
+        self._confirm(report.confirmations)
+        _LOG.info("%s: primary; %s", self.name, report)
+        self._say(f"primary: {report}")
+
+    def _stand_back(self) -> None:
+        self._connected = True
+        self._was_backup = True
+        self._session = None
+        self._say("backup: another controller is primary")
+
+    def _lose(self, cause: str) -> None:
+        if self._connected:
+            _LOG.warning("%s: lost: %s", self.name, cause)
+        self._connected = False
+        self._say(f"lost: {cause}")
+
+    def _leave(self) -> None:
+        if self._session is not None:
+            self._switch.withdraw(self._session)
+
+    def _decide(self, decisions: Sequence[Decision]) -> None:
+        if not decisions:
+            return
+        self._confirm(self._switch.decide(decisions, self._session))
+        self._counted_second = 0
+        self._count_soon()
+
+    def _command(self, command: TableCommand) -> None:
+        self._confirm(self._switch.command(command, self._session))
+
+    def _want(self, requests: dict[str, Request]) -> None:
+        """What is not wanted any more stops being published first, what is new is published at once."""
+        wanted = {segment: request.bit for segment, request in requests.items() if request.copy}
+        self._published = wanted
+        refused = self._switch.want(tuple(requests.values()), self._session)
+        for text in refused:
+            _LOG.error("%s: %s", self.name, text)
+        names = ", ".join(request.name for request in requests.values()) or "nothing"
+        self._say(f"telemetry: {names}")
+
+    def _expire(self, entries: Iterable[Any]) -> None:
+        if self._session is not None:
+            self._confirm(self._switch.expire(entries, self._session))
+
+    def _check_alive(self) -> None:
+        if self._session is not None:
+            self._session.alive()
+
+    def _change_secret(self) -> None:
+        self._switch.change_secret(secrets.randbits(32), secrets.randbits(32), self._session)
+
+    def _count_soon(self) -> None:
+        """Have block counters read, unless that is under way, not due, or there is nothing to count."""
+        if self._counting.is_set() or self._session is None or not self._switch.blocks:
+            return
+        if time.monotonic() - self._counted_at < self._settings.counters_ms / 1000:
+            return
+        self._counting.set()
+        self._put(self._count)
+
+    def _count(self) -> None:
+        try:
+            if self._session is not None:
+                self._blocks = self._switch.count_blocks(self._session)
+                self._write_state()
+        finally:
+            self._counted_second = self._reader.time_us // _SECOND_US
+            self._counted_at = time.monotonic()
+            self._counting.clear()
+
+    def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
+        key = f"network.confirmation.p4runtime_ctrl.{self.name}"
+        for confirmation in confirmations:
+            self._engine.write(key, confirmation.to_value(), [NO_WAIT], event_time=confirmation.event_time)
+
+    def _say(self, change: str) -> None:
+        self._change = change
+        self._write_state()
+
+    def _write_state(self) -> None:
+        self._stated = (self._reader.received, self._reader.lost, time.monotonic())
+        if not self._switch.blocks:
+            self._blocks = []
+        key = f"network.switch.p4runtime_ctrl.{self.name}"
+        self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
+
+    def _state(self) -> dict[str, Any]:
+        event_time, arrival = self._now()
+        return {
+            "switch": self.name,
+            "connected": self._connected,
+            "primary": self._session is not None,
+            "target": self._mine.target or self._mine.address,
+            "program": self._program_name,
+            "fail": self._mine.fail,
+            "telemetry": [request.name for request in self._switch.requests],
+            "packet_in": self._reader.received,
+            "lost": self._reader.lost,
+            "restarts": self._reader.restarts,
+            "arrival": arrival,
+            "event_time": event_time,
+            "blocks": self._blocks,
+            "change": self._change,
+        }
+
+    def _now(self) -> tuple[int, int]:
+        return self._reader.time_us * 1000, self._reader.arrival
+
+    def _restore(self) -> None:
+        """Desired state from Data Archives, and what was heard since."""
+        if not self._settings.restore:
+            return
+        since = self._settings.restore_since
+        items = [item for key in DECISIONS for item in self._engine.get(key)]
+        decisions = decisions_for(self.name, items, list(self._recent), since)
+        commands = commands_of(self._engine.get(f"network.p4_command.*.{self.name}"), since)
+        for problem in self._switch.restore(decisions, commands):
+            _LOG.warning("%s: not restored: %s", self.name, problem)
+
+
+class P4RuntimeCtrlService:
+    """All switches of the settings.  Raises `ProgramError` for a program that cannot be read."""
+
+    def __init__(self, engine: Engine, settings: Settings) -> None:
+        self._engine = engine
+        pipeline = load_pipeline(settings)
+        names = [each.name for each in settings.switches]
+        if len(set(names)) != len(names):
+            raise ProgramError(f"two switches have one name: {', '.join(sorted(names))}")
+        self._agents = {each.name: Agent(engine, settings, each, pipeline) for each in settings.switches}
+        self._offers: dict[str, Offer] = {}
+        self._wanted: tuple[str, ...] = ()
+        self._demand = threading.Lock()
+        self._asked: dict[str, dict[str, Request]] = {name: {} for name in self._agents}
+        self._chief = True
+        self._looked_at = 0.0
+
+    def start(self) -> None:
+        """Returns when every switch is under control, or could not be reached at the first attempt."""
+        while self._engine.health()["phase"] == "waiting":
+            time.sleep(0.01)
+        self._chief = bool(self._engine.health()["active"])
+        for agent in self._agents.values():
+            agent.start(chief=self._chief)
+        for key in DECISIONS:
+            self._engine.observe(key).subscribe(self._on_decision)
+        self._engine.observe("network.p4_command.*.*").subscribe(self._on_command)
+        self._engine.observe("network.telemetry.*.*").subscribe(self._on_offer)
+        self._engine.on_assignments(self._on_assignments)
+        deadline = time.monotonic() + _START_S
+        while time.monotonic() < deadline and not all(agent.settled for agent in self._agents.values()):
+            time.sleep(0.01)
+
+    def tick(self) -> None:
+        for agent in self._agents.values():
+            agent.tick()
+        if time.monotonic() - self._looked_at > _LOOK_EVERY_S:
+            self._looked_at = time.monotonic()
+            self._look_at_duty()
+            self._demand_changed()
+
+    def _look_at_duty(self) -> None:
+        """DUE says which instance of this app works; that one is the chief of its switches, too."""
+        chief = bool(self._engine.health()["active"])
+        if chief != self._chief:
+            _LOG.info("%s", "active: claiming the switches" if chief else "standby: leaving the switches")
+            self._chief = chief
+            for agent in self._agents.values():
+                agent.stand(chief=chief)
+
+    def stop(self) -> None:
+        for agent in self._agents.values():
+            agent.stop()
+
+    def health(self) -> dict[str, Any]:
+        return {"switches": [agent.health() for agent in self._agents.values()]}
+
+    def _on_decision(self, item: Item) -> None:
+        decision = read(Decision, item)
+        if decision is None:
+            return
+        for agent in self._agents.values():
+            if is_for(decision, agent.name):
+                agent.decide(decision)
+
+    def _on_command(self, item: Item) -> None:
+        agent = self._agents.get(item.key.rpartition(".")[2])
+        command = read(TableCommand, item) if agent is not None else None
+        if agent is not None and command is not None:
+            agent.command(command)
+
+    def _on_offer(self, item: Item) -> None:
+        offer = read(Offer, item)
+        if offer is None:
+            return
+        with self._demand:
+            self._offers[offer.name] = offer
+        self._demand_changed()
+
+    def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
+        with self._demand:
+            self._wanted = tuple(
+                assignment.key for assignment in assignments if assignment.capability.startswith(PREFIX)
+            )
+        self._demand_changed()
+        for agent in self._agents.values():
+            agent.say_again()
+
+    def _demand_changed(self) -> None:
+        """Tell agents what is wanted of them; everything while no Coordinator is there to ask."""
+        with self._demand:
+            for name, agent in self._agents.items():
+                everything = f"{PREFIX}.{name}.{ALL}"
+                wanted = (*self._wanted, everything) if self._engine.wanted(everything) else self._wanted
+                requests = requests_for(name, wanted, self._offers)
+                if requests != self._asked[name]:
+                    self._asked[name] = requests
+                    agent.want(requests)
+
+
+def load_pipeline(settings: Settings) -> Pipeline:
+    """The compiled program; raises `ProgramError` naming the file that cannot be read."""
+    try:
+        config = Path(settings.program).read_bytes()
+        text = Path(settings.p4info).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ProgramError(
+            f"{error.filename}: {error.strerror}; compile the P4 program or give its path"
+        ) from error
+    return Pipeline(config, Program.from_text(text).message)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    try:
+        return due.service.run(
+            "p4runtime_ctrl", P4RuntimeCtrlService, Settings, INTERESTS, CAPABILITIES, argv
+        )
+    except ProgramError as error:
+        _LOG.error("%s", error)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,249 @@
+"""Calls to one switch over gRPC: program, writes and reads.  I/O.
+
+The calls have a channel of their own, so that a held-up stream never delays a write.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import grpc
+
+from apps.p4runtime_ctrl.desired_state import Change
+from apps.p4runtime_ctrl.errors import NotPrimary, SwitchError, Unreachable
+from apps.p4runtime_ctrl.switch import Outcome
+from p4rt import P4RuntimeStub, p4runtime, status
+
+_METADATA_BYTES: Final = 16 << 20  # a failed batch explains each of its updates in trailing metadata
+_BATCH: Final = 5_000
+_CHANNEL_OPTIONS: Final = (
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.max_send_message_length", -1),
+    ("grpc.max_metadata_size", _METADATA_BYTES),
+    ("grpc.absolute_max_metadata_size", _METADATA_BYTES),
+    # no connection shared with, or remembered from, another channel
+    ("grpc.use_local_subchannel_pool", 1),
+    # an attempt to connect that gets no answer is given up after this long, and made again
+    ("grpc.min_reconnect_backoff_ms", 1000),
+)
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A compiled program: BMv2 JSON and p4info."""
+
+    config: bytes
+    p4info: Any
+
+    @property
+    def cookie(self) -> int:
+        """Tells programs apart: 63 bits of the digest of both parts."""
+        data = self.config + self.p4info.SerializeToString(deterministic=True)
+        return int.from_bytes(hashlib.sha256(data).digest()[:8], "big") >> 1
+
+
+@dataclass(frozen=True)
+class Address:
+    """Which switch, and as whom.
+
+    `rank` is the high half of the election id: the controller of the highest rank is primary.  The
+    low half is the time a stream was opened, so that a new stream wins over a dead one of the same
+    rank that the switch still holds open.
+    """
+
+    target: str
+    device_id: int
+    rank: int
+    copies_session: int = 1
+    cpu_port: int = 510
+    timeout_s: float = 5.0
+    credentials: grpc.ChannelCredentials | None = None
+
+    def channel(self) -> grpc.Channel:
+        if self.credentials is not None:
+            return grpc.secure_channel(self.target, self.credentials, options=_CHANNEL_OPTIONS)
+        return grpc.insecure_channel(self.target, options=_CHANNEL_OPTIONS)
+
+
+class Session:
+    """Calls to a switch while this controller is primary (a `switch.Transport`)."""
+
+    def __init__(self, stub: P4RuntimeStub, address: Address, pipeline: Pipeline, election_id: Any) -> None:
+        self._stub = stub
+        self._election_id = election_id
+        self.broken = False
+        """A call found no switch: the stream is to be opened anew."""
+        self._address = address
+        self._pipeline = pipeline
+
+    def ensure_program(self) -> bool:
+        if self._loaded_cookie() == self._pipeline.cookie:
+            return False
+        # BMv2 keeps replicas of clone sessions over a new program
+        self._write_copies(p4runtime.Update.DELETE)
+        request = p4runtime.SetForwardingPipelineConfigRequest(
+            device_id=self._address.device_id,
+            election_id=self._election_id,
+            action=p4runtime.SetForwardingPipelineConfigRequest.VERIFY_AND_COMMIT,
+        )
+        request.config.p4info.CopyFrom(self._pipeline.p4info)
+        request.config.p4_device_config = self._pipeline.config
+        request.config.cookie.cookie = self._pipeline.cookie
+        self._call(self._stub.SetForwardingPipelineConfig, request, patience=6)
+        return True
+
+    def ensure_copies(self) -> None:
+        outcome = self._write_copies(p4runtime.Update.INSERT)
+        if outcome.code:  # BMv2 says UNKNOWN or ALREADY_EXISTS where there is one
+            outcome = self._write_copies(p4runtime.Update.MODIFY)
+        if outcome.code:
+            raise SwitchError(
+                f"{self._address.target}: clone session {self._address.copies_session}"
+                f" to port {self._address.cpu_port} refused: {outcome.message}"
+            )
+
+    def write(self, changes: Sequence[Change]) -> list[Outcome]:
+        updates = [change.update for change in changes]
+        outcomes: list[Outcome] = []
+        for start in range(0, len(updates), _BATCH):
+            outcomes += self._write_updates(updates[start : start + _BATCH])
+        return outcomes
+
+    def read_entries(self) -> Iterator[Any]:
+        # direct meters are told only to who asks for them
+        return self._read(p4runtime.TableEntry(meter_config=p4runtime.MeterConfig()))
+
+    def read_standing(self, entries: Iterable[Any]) -> Iterator[Any]:
+        wanted = [_standing_key(entry) for entry in entries]
+        return self._read(*wanted) if wanted else iter(())
+
+    def read_counters(self, table_id: int) -> Iterator[Any]:
+        return self._read(p4runtime.TableEntry(table_id=table_id, counter_data=p4runtime.CounterData()))
+
+    def alive(self) -> str:
+        """The switch's P4Runtime version; raises `Unreachable` when it does not answer."""
+        reply = self._call(self._stub.Capabilities, p4runtime.CapabilitiesRequest())
+        return str(reply.p4runtime_api_version)
+
+    def _loaded_cookie(self) -> int | None:
+        request = p4runtime.GetForwardingPipelineConfigRequest(
+            device_id=self._address.device_id,
+            response_type=p4runtime.GetForwardingPipelineConfigRequest.COOKIE_ONLY,
+        )
+        try:
+            reply = self._invoke(self._stub.GetForwardingPipelineConfig, request)
+        except grpc.RpcError as error:
+            if error.code() in (grpc.StatusCode.FAILED_PRECONDITION, grpc.StatusCode.NOT_FOUND):
+                return None
+            raise self._translated(error) from error
+        return int(reply.config.cookie.cookie) if reply.config.HasField("cookie") else None
+
+    def _write_copies(self, kind: int) -> Outcome:
+        update = p4runtime.Update(type=kind)
+        session = update.entity.packet_replication_engine_entry.clone_session_entry
+        session.session_id = self._address.copies_session
+        if kind != p4runtime.Update.DELETE:
+            session.replicas.add(egress_port=self._address.cpu_port, instance=1)
+        return self._write_updates([update])[0]
+
+    def _write_updates(self, updates: list[Any]) -> list[Outcome]:
+        request = p4runtime.WriteRequest(
+            device_id=self._address.device_id, election_id=self._election_id, updates=updates
+        )
+        try:
+            self._invoke(self._stub.Write, request, patience=4)
+        except grpc.RpcError as error:
+            return self._failures(error, updates)
+        return [Outcome()] * len(updates)
+
+    def _failures(self, error: Any, updates: list[Any]) -> list[Outcome]:
+        details = _details(error)
+        if len(details) == len(updates):
+            return details
+        if error.code() in _BROKEN or error.code() == grpc.StatusCode.PERMISSION_DENIED:
+            raise self._translated(error) from error
+        if len(updates) == 1:
+            return [Outcome(error.code().value[0], error.details() or error.code().name)]
+        # the switch did not say which: ask again in halves; what went in before now 'exists'
+        half = len(updates) // 2
+        again = self._write_updates(updates[:half]) + self._write_updates(updates[half:])
+        return [_forgiven(update, outcome) for update, outcome in zip(updates, again, strict=True)]
+
+    def _read(self, *entries: Any) -> Iterator[Any]:
+        request = p4runtime.ReadRequest(device_id=self._address.device_id)
+        for entry in entries:
+            entity = request.entities.add()
+            meter = isinstance(entry, p4runtime.MeterEntry)
+            (entity.meter_entry if meter else entity.table_entry).CopyFrom(entry)
+        try:
+            for reply in self._invoke(self._stub.Read, request, patience=6):
+                for entity in reply.entities:
+                    yield getattr(entity, entity.WhichOneof("entity"))
+        except grpc.RpcError as error:
+            raise self._translated(error) from error
+
+    def _call(self, method: Callable[..., Any], request: Any, *, patience: int = 1) -> Any:
+        try:
+            return self._invoke(method, request, patience=patience)
+        except grpc.RpcError as error:
+            raise self._translated(error) from error
+
+    def _translated(self, error: Any) -> SwitchError:
+        found = translated(error, self._address.target)
+        self.broken |= isinstance(found, Unreachable)
+        return found
+
+    def _invoke(self, method: Callable[..., Any], request: Any, *, patience: int = 1) -> Any:
+        try:
+            return method(request, timeout=self._address.timeout_s * patience)
+        except ValueError as error:  # gRPC's way to say that the channel was closed meanwhile
+            raise Unreachable(f"switch at {self._address.target}: the connection was given up") from error
+
+
+_BROKEN: Final = (
+    grpc.StatusCode.UNAVAILABLE,
+    grpc.StatusCode.DEADLINE_EXCEEDED,
+    grpc.StatusCode.CANCELLED,
+)
+
+
+def _standing_key(entry: Any) -> Any:
+    if isinstance(entry, p4runtime.MeterEntry):
+        return p4runtime.MeterEntry(meter_id=entry.meter_id, index=entry.index)
+    return p4runtime.TableEntry(table_id=entry.table_id, is_default_action=True)
+
+
+def translated(error: Any, target: str) -> SwitchError:
+    code = error.code()
+    text = f"switch at {target}: {code.name}: {error.details()}"
+    if code in _BROKEN:
+        return Unreachable(text)
+    if code == grpc.StatusCode.PERMISSION_DENIED:
+        return NotPrimary(text)
+    return SwitchError(text)
+
+
+def _details(error: Any) -> list[Outcome]:
+    """The outcomes of single updates out of the trailing metadata, empty where it has none."""
+    for key, value in error.trailing_metadata() or ():
+        if key == "grpc-status-details-bin":
+            found = status.Status.FromString(value)
+            return [_outcome(packed) for packed in found.details]
+    return []
+
+
+def _outcome(packed: Any) -> Outcome:
+    detail = p4runtime.Error()
+    packed.Unpack(detail)
+    names = {code.value[0]: code.name for code in grpc.StatusCode}
+    text = detail.message or names.get(detail.canonical_code, "")
+    return Outcome(detail.canonical_code, text if detail.canonical_code else "")
+
+
+def _forgiven(update: Any, outcome: Outcome) -> Outcome:
+    inserted = (
+        update.type == p4runtime.Update.INSERT and outcome.code == grpc.StatusCode.ALREADY_EXISTS.value[0]
+    )
+    deleted = update.type == p4runtime.Update.DELETE and outcome.code == grpc.StatusCode.NOT_FOUND.value[0]
+    return Outcome() if inserted or deleted else outcome

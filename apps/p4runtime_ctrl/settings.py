@@ -1,0 +1,53 @@
+"""Options of the controller, each with its default and its text."""
+
+from typing import Literal
+
+import msgspec
+
+from apps.p4runtime_ctrl.guard import GuardSettings
+
+
+class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One switch."""
+
+    name: str
+    """As it stands in keys."""
+    address: str
+    """Of its P4Runtime server, HOST:PORT."""
+    device_id: int = 1
+    base_us: int = 0
+    """Absolute time of the switch's clock zero: integer microseconds since the epoch."""
+    forward: dict[str, int] = {}
+    """Wires: ingress port to egress port."""
+    fail: Literal["open", "closed"] = "open"
+    """While it is not under control: open keeps the wires, closed takes them out, and puts them in last."""
+    target: str = ""
+    """What kind of switch it is, for people."""
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the controller."""
+
+    switches: tuple[SwitchSettings, ...]
+    program: str
+    """The compiled program, BMv2 JSON."""
+    p4info: str
+    """Its p4info in protobuf text format."""
+    batch: int = 1024
+    """Most packets in one record batch."""
+    linger_ms: float = 2.0
+    """How long the first packet of a batch waits for others."""
+    rank: int = 1
+    """The controller of the highest rank is primary, the others are backups."""
+    copy_session: int = 1
+    """Clone session that the program copies frames to."""
+    cpu_port: int = 510
+    timeout_s: float = 5.0
+    """A switch that does not answer a call for this long is given up and connected again."""
+    counters_ms: int = 20
+    """Least wall time between two readings of block counters."""
+    restore: bool = True
+    """Take up the decisions and commands in Data Archives at start."""
+    restore_since: int = 0
+    """... those written after this time only (ns since the epoch)."""
+    guard: GuardSettings = GuardSettings()

@@ -1,0 +1,381 @@
+"""One switch as it should be: its desired entries, who asked for them, and how it is brought there.
+
+Everything that the controller wants of a switch is kept here, connected or not.  While there is a
+`Transport` changes go to the switch at once; after any break `bring_up` reads what is there and writes
+the difference.  No thread, clock or socket of its own: the service calls it from one thread.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, Protocol
+
+from apps.messages import Confirmation, Decision, State, TableCommand, TableUpdate
+from apps.p4runtime_ctrl.blocks import BLOCK_TABLES
+from apps.p4runtime_ctrl.desired_state import (
+    DELETE,
+    INSERT,
+    MODIFY,
+    Change,
+    EntrySet,
+    deletion,
+    difference,
+    entry_key,
+    is_standing,
+    table_id,
+)
+from apps.p4runtime_ctrl.errors import EntryError, ProgramError, SwitchError
+from apps.p4runtime_ctrl.guard import SECRET_WORDS, GuardSettings, secrets_entry
+from apps.p4runtime_ctrl.orders import Order, OrderBook, Owner
+from apps.p4runtime_ctrl.p4info import Program
+from apps.p4runtime_ctrl.telemetry import Classifier, Request
+
+_FORWARD: Final = "ingress.forward_port"
+_OK, _NOT_FOUND, _EXISTS = 0, 5, 6
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the switch said to one update: a gRPC status code and its text."""
+
+    code: int = _OK
+    message: str = ""
+
+
+class Transport(Protocol):
+    """A switch within reach.  Every method raises `SwitchError`."""
+
+    def ensure_program(self) -> bool:
+        """Load the program unless the switch has it; True if it was loaded (its tables are empty then)."""
+
+    def ensure_copies(self) -> None:
+        """Clone session towards the controller."""
+
+    def write(self, changes: Sequence[Change]) -> list[Outcome]:
+        """One outcome for each change, in order; each succeeds or fails by itself."""
+
+    def read_entries(self) -> Iterable[Any]:
+        """All entries of all tables, without default actions."""
+
+    def read_standing(self, entries: Iterable[Any]) -> Iterable[Any]:
+        """What the switch holds for these default actions and meter cells."""
+
+    def read_counters(self, table_id: int) -> Iterable[Any]:
+        """Entries of one table with their direct counters."""
+
+
+@dataclass
+class BringUp:
+    """What had to be changed for the switch to be as desired."""
+
+    program_loaded: bool = False
+    inserted: int = 0
+    modified: int = 0
+    removed: int = 0
+    failed: dict[bytes, str] = field(default_factory=dict)
+    confirmations: list[Confirmation] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        parts = ["program loaded"] if self.program_loaded else []
+        counts = {"inserted": self.inserted, "modified": self.modified, "removed": self.removed}
+        parts += [f"{count} {what}" for what, count in counts.items() if count]
+        parts += [f"{len(self.failed)} failed ({next(iter(self.failed.values()))})"] if self.failed else []
+        return ", ".join(parts) or "nothing to change"
+
+
+Clock = Callable[[], tuple[int, int]]
+"""Capture time in ns and arrival number of the newest packet seen."""
+
+
+class Switch:
+    """Desired state of the switch `name`.
+
+    `forward` maps ingress to egress ports; `fail` says what matters more while the switch is brought
+    up: that traffic flows (open: wires first) or that nothing passes unchecked (closed: wires last).
+    Raises `ProgramError` where the program lacks what the controller needs.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        program: Program,
+        clock: Clock,
+        *,
+        forward: Mapping[int, int] | None = None,
+        fail: Literal["open", "closed"] = "open",
+        guard: GuardSettings | None = None,
+    ) -> None:
+        self.name = name
+        self.program = program
+        self.requests: tuple[Request, ...] = ()
+        self.fail = fail
+        self._clock = clock
+        self._classifier = Classifier(program)
+        self._book = OrderBook(program, guard or GuardSettings(), self._classifier.table_ids)
+        self._block_tables = {program.table(each).id for each in BLOCK_TABLES}
+        self._forward = [self._wire(*ports) for ports in (forward or {}).items()]
+        self._desired = EntrySet(self._forward)
+        self._owners: dict[bytes, Owner] = {}
+        self._unconfirmed: dict[bytes, Order] = {}
+        self._telemetry = EntrySet()
+        self._secrets = (0, (0,) * len(SECRET_WORDS))
+        self.blocks = 0
+        """Entries that drop traffic."""
+
+    @property
+    def guards(self) -> bool:
+        """Whether any service is protected."""
+        return self._book.guards
+
+    def restore(self, decisions: Iterable[Decision], commands: Iterable[TableCommand]) -> list[str]:
+        """Build the desired state from history, oldest first; returns what did not fit the program."""
+        problems: list[str] = []
+        for decision in decisions:
+            if decision.dry_run:
+                continue
+            try:
+                self._remember(self._book.of_decision(decision))
+            except (EntryError, ProgramError) as error:
+                problems.append(f"decision {decision.id}: {error}")
+        for command in commands:
+            orders, refused = self._book.of_command(command)
+            problems += [f"command {command.id}: {reason}" for _, reason in refused]
+            for order in [] if refused else orders:
+                self._remember(order)
+        return problems
+
+    def bring_up(self, transport: Transport) -> BringUp:
+        """Read, compare, write the difference in one batch."""
+        report = BringUp(program_loaded=transport.ensure_program())
+        transport.ensure_copies()
+        standing = [entry for entry in self._desired if is_standing(entry)]
+        standing += [entry for entry in self._classifier.entries(()) if is_standing(entry)]
+        read = [entry for entry in transport.read_entries() if not entry.is_const]
+        read += transport.read_standing(standing)
+        ids = self._classifier.table_ids
+        present = EntrySet(entry for entry in read if table_id(entry) not in ids)
+        telemetry = EntrySet(entry for entry in read if table_id(entry) in ids)
+        changes = self._plan(present, telemetry)
+        for change, outcome in zip(changes, transport.write(changes) if changes else [], strict=True):
+            self._note(report, change, outcome)
+        self._telemetry = self._classifier.entries(self.requests)
+        report.confirmations = self._confirm_pending(report)
+        return report
+
+    def decide(self, decisions: Sequence[Decision], transport: Transport | None) -> list[Confirmation]:
+        """Carry decisions out; dry runs are left alone and not confirmed."""
+        orders: list[Order] = []
+        answers: list[Confirmation] = []
+        for decision in decisions:
+            if decision.dry_run:
+                continue
+            try:
+                orders.append(self._book.of_decision(decision))
+            except (EntryError, ProgramError) as error:
+                owner = Owner(decision.id, decision.action, decision.target)
+                answers.append(self._confirmation(owner, "failed", cause=str(error)))
+        return answers + self._carry_out(orders, transport)
+
+    def command(self, command: TableCommand, transport: Transport | None) -> list[Confirmation]:
+        """Carry a command out: one confirmation for each of its updates, in order.
+
+        A command with an update that does not fit the program is refused as a whole.
+        """
+        orders, refused = self._book.of_command(command)
+        if refused:
+            return [self._confirmation(owner, "failed", cause=reason) for owner, reason in refused]
+        return self._carry_out(orders, transport)
+
+    def want(self, requests: Sequence[Request], transport: Transport | None) -> list[str]:
+        """Change what the switch is to send; returns what the switch refused.
+
+        Raises `TelemetryError` or `EntryError` for requests that cannot be held: then nothing changes.
+        """
+        wanted = tuple(requests)
+        kept = [request for request in wanted if request in self.requests]
+        desired = self._classifier.entries(wanted)
+        self.requests = wanted
+        if transport is None:
+            return []
+        changes = self._classifier.transition(self._telemetry, wanted, kept)
+        outcomes = transport.write(changes) if changes else []
+        self._telemetry = desired
+        return [
+            f"{self.program.describe(change.entry)}: {outcome.message}"
+            for change, outcome in zip(changes, outcomes, strict=True)
+            if outcome.code != _OK
+        ]
+
+    def change_secret(self, first: int, second: int, transport: Transport | None) -> None:
+        """Replace the older of the two cookie secrets, and use it from now on."""
+        current, words = self._secrets
+        current = 1 - current
+        words = (*words[:2], first, second) if current else (first, second, *words[2:])
+        self._secrets = (current, words)
+        entry = secrets_entry(self.program, current, words)
+        self._desired.put(entry)
+        if transport is not None:
+            transport.write([Change(MODIFY, entry)])
+
+    def expire(self, entries: Iterable[Any], transport: Transport) -> list[Confirmation]:
+        """Delete entries that the switch reports as idle; those already gone are not confirmed twice."""
+        idle = [entry for entry in entries if entry in self._desired]
+        outcomes = transport.write([deletion(entry) for entry in idle]) if idle else []
+        answers = []
+        for entry, outcome in zip(idle, outcomes, strict=True):
+            owner = self._owners.get(entry_key(entry), Owner("", "expire"))
+            self._forget(entry)
+            state: State = "expired" if outcome.code in (_OK, _NOT_FOUND) else "failed"
+            answers.append(self._confirmation(owner, state, entry, cause=outcome.message or "idle"))
+        return answers
+
+    def count_blocks(self, transport: Transport) -> list[dict[str, Any]]:
+        """Direct counters of the entries that drop traffic, with the decisions they come from."""
+        found = []
+        for table in sorted({table_id(entry) for entry in self._desired} & self._block_tables):
+            for entry in transport.read_counters(table):
+                owner = self._owners.get(entry_key(entry))
+                found.append(
+                    {
+                        "id": owner.id if owner else "",
+                        "handle": self.program.describe(entry),
+                        "packets": entry.counter_data.packet_count,
+                        "bytes": entry.counter_data.byte_count,
+                    }
+                )
+        return found
+
+    def withdraw(self, transport: Transport) -> None:
+        """Fail closed: take the wires out before the controller goes."""
+        if self.fail == "closed" and self._forward:
+            transport.write([deletion(entry) for entry in self._forward])
+
+    def _wire(self, ingress: int, egress: int) -> Any:
+        return self.program.entry(
+            TableUpdate(
+                kind="insert",
+                table=_FORWARD,
+                match={"ingress_port": ingress},
+                action="to_port",
+                params={"port": egress},
+            )
+        )
+
+    def _plan(self, present: EntrySet, telemetry: EntrySet) -> list[Change]:
+        wires = {entry_key(entry) for entry in self._forward}
+        plain = difference(self._desired, present)
+        forward = [change for change in plain if entry_key(change.entry) in wires]
+        others = [change for change in plain if entry_key(change.entry) not in wires]
+        packets = self._classifier.transition(telemetry, self.requests, kept=())
+        return forward + others + packets if self.fail == "open" else others + packets + forward
+
+    def _note(self, report: BringUp, change: Change, outcome: Outcome) -> None:
+        if outcome.code != _OK:
+            name = self.program.describe(change.entry)
+            report.failed[entry_key(change.entry)] = f"{name}: {outcome.message}"
+        elif change.kind == INSERT:
+            report.inserted += 1
+        elif change.kind == MODIFY:
+            report.modified += 1
+        else:
+            report.removed += 1
+
+    def _confirm_pending(self, report: BringUp) -> list[Confirmation]:
+        """What was postponed is done now, or never will be."""
+        pending, self._unconfirmed = self._unconfirmed, {}
+        answers = []
+        for key, order in pending.items():
+            done: State = "removed" if order.main.kind == DELETE else "installed"
+            cause = report.failed.get(key)
+            state: State = "failed" if cause else done
+            text = cause or "done when the switch was back"
+            answers.append(self._confirmation(order.owner, state, order.main.entry, cause=text))
+        return answers
+
+    def _remember(self, order: Order) -> None:
+        for change in order.changes:
+            if change.kind == DELETE:
+                self._forget(change.entry)
+                continue
+            if table_id(change.entry) in self._block_tables and change.entry not in self._desired:
+                self.blocks += 1
+            self._desired.put(change.entry)
+            self._owners[entry_key(change.entry)] = order.owner
+
+    def _forget(self, entry: Any) -> None:
+        if self._desired.discard(entry) and table_id(entry) in self._block_tables:
+            self.blocks -= 1
+        self._owners.pop(entry_key(entry), None)
+
+    def _carry_out(self, orders: Sequence[Order], transport: Transport | None) -> list[Confirmation]:
+        """In batches without repeated keys: P4Runtime leaves the order within a batch open."""
+        answers: list[Confirmation] = []
+        batch: list[Order] = []
+        taken: set[bytes] = set()
+        for order in orders:
+            if taken & order.keys:
+                answers += self._write(batch, transport)
+                batch, taken = [], set()
+            batch.append(order)
+            taken |= order.keys
+        return answers + self._write(batch, transport)
+
+    def _write(self, orders: list[Order], transport: Transport | None) -> list[Confirmation]:
+        if not orders:
+            return []
+        if transport is None:
+            return [self._postpone(order, "the switch is not connected") for order in orders]
+        try:
+            outcomes = iter(transport.write([change for order in orders for change in order.changes]))
+        except SwitchError as error:
+            return [self._postpone(order, str(error)) for order in orders]
+        return [self._conclude(order, [next(outcomes) for _ in order.changes]) for order in orders]
+
+    def _postpone(self, order: Order, cause: str) -> Confirmation:
+        """Kept as desired; done and confirmed again when the switch is back."""
+        self._remember(order)
+        self._unconfirmed[entry_key(order.main.entry)] = order
+        text = f"{cause}; it is kept and done when the switch is back"
+        return self._confirmation(order.owner, "failed", order.main.entry, cause=text)
+
+    def _conclude(self, order: Order, outcomes: list[Outcome]) -> Confirmation:
+        main = order.main
+        results = list(zip(order.changes, outcomes, strict=True))
+        bad = [(change, outcome) for change, outcome in results if not _achieved(change, outcome)]
+        if bad:
+            self._book.give_up(order)
+            return self._confirmation(order.owner, "failed", bad[0][0].entry, cause=bad[0][1].message)
+        said = next(outcome for change, outcome in results if change is main)
+        if main.kind == DELETE:
+            self._remember(order)
+            return self._confirmation(order.owner, "removed", main.entry, cause=said.message)
+        if said.code == _EXISTS:
+            if main.entry not in self._desired:
+                self._remember(order)
+            return self._confirmation(order.owner, "exists", main.entry, cause=said.message)
+        self._remember(order)
+        return self._confirmation(order.owner, "installed", main.entry)
+
+    def _confirmation(
+        self, owner: Owner, state: State, entry: Any | None = None, *, cause: str = ""
+    ) -> Confirmation:
+        event_time, arrival = self._clock()
+        handle = self.program.describe(entry) if entry is not None else ""
+        if state == "failed" and handle and handle not in cause:
+            cause = f"{handle}: {cause}"
+        return Confirmation(
+            id=owner.id,
+            switch=self.name,
+            state=state,
+            action=owner.action,
+            target=owner.target,
+            handle=handle,
+            cause=cause,
+            event_time=event_time,
+            arrival=arrival,
+        )
+
+
+def _achieved(change: Change, outcome: Outcome) -> bool:
+    """Whether the switch is now as the change wants it, be it by this change or before."""
+    also = {INSERT: _EXISTS, DELETE: _NOT_FOUND}.get(change.kind)
+    return outcome.code in (_OK, also)

@@ -1,0 +1,184 @@
+"""What the switch is to send: a set of requests → entries of its bit-vector classifier.
+
+One table per field gives the map of requests whose condition on that field holds; the switch ANDs
+the maps and masks them with `active`.  A table gives one match only, so an entry carries the bits of
+every wider entry that covers it, and where two conditions overlap their intersection gets an entry
+of its own (`boxes` has the geometry).
+
+A request comes in by its field entries first and its `active` bit last, and leaves in the reverse
+order: no packet sees half a request.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from apps.messages import TableUpdate
+from apps.p4runtime_ctrl.boxes import Box, Shape, closure
+from apps.p4runtime_ctrl.desired_state import DELETE, INSERT, MODIFY, Change, EntrySet, difference, entry_body
+from apps.p4runtime_ctrl.errors import EntryError, ProgramError, TelemetryError
+from apps.p4runtime_ctrl.p4info import Program, Table
+
+EVERY_PACKET: Final = 255
+"""The classifier's bit of the request for all packets; per-port requests count down from it."""
+QUERIES: Final = 256
+_ACTIVE: Final = "ingress.telemetry_active"
+_PREFIX: Final = "ingress.telemetry_"
+_MAPS: Final = ("active", "copies", "digests")
+
+
+class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Packets that somebody wants: those that meet all conditions.
+
+    Conditions go by match field of the classifier, in the notation of `apps.messages.TableUpdate`
+    (`{"src": "10.0.0.0/8", "dport": [80, 90], "tcp_flags": [2, 23]}`); none means every packet.
+    """
+
+    name: str
+    """Last segment of the key that the packets are published under."""
+    bit: int
+    """0 to 255, unlike that of any other request."""
+    conditions: dict[str, Any] = {}
+    copy: bool = True
+    """Packet-ins of the matching packets; else they are only counted."""
+    digest: bool = False
+
+
+class Classifier:
+    """The telemetry tables of a program.  Raises `ProgramError` where it has none."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._active = _find(program, _ACTIVE)
+        self._tables = [
+            table
+            for table in program.tables.values()
+            if table.name.startswith(_PREFIX) and table.name != _ACTIVE
+        ]
+        for table in self._tables:
+            if len(table.actions) != 1 or len(table.actions[0].params) != 1:
+                raise ProgramError(f"{table.name}: one action with the map of queries is expected")
+        taken = [param.name for param in self._active.default_actions[0].params]
+        if sorted(taken) != sorted(_MAPS):
+            raise ProgramError(f"{_ACTIVE}: its action takes {', '.join(taken)}, not {', '.join(_MAPS)}")
+        self.table_ids = frozenset(table.id for table in (*self._tables, self._active))
+
+    def entries(self, requests: Sequence[Request]) -> EntrySet:
+        """All entries and default actions that the requests need.
+
+        Raises `TelemetryError` where two requests share a bit or a table is too small, `EntryError`
+        for a condition that the classifier cannot express.
+        """
+        _check_bits(requests)
+        conditions = [self._assign(request) for request in requests]
+        found = EntrySet([self._active_entry(requests)])
+        for table in self._tables:
+            boxes = [given.get(table.id) for given in conditions]
+            self._fill(found, table, list(zip(requests, boxes, strict=True)))
+        return found
+
+    def transition(
+        self, present: EntrySet, requests: Sequence[Request], kept: Sequence[Request]
+    ) -> list[Change]:
+        """Steps from what the switch holds to `requests`, to be written in this order.
+
+        `kept` are the requests that go on unchanged and must not miss a packet.
+        """
+        desired = self.entries(requests)
+        fields = difference(self._without_active(desired), self._without_active(present), rank=_outside_in)
+        goal = self._active_entry(requests)
+        pause = self._active_entry(kept) if fields else goal
+        changes = list(fields)
+        held = present.get(goal)
+        if held is None or entry_body(held) != entry_body(pause):
+            changes.insert(0, Change(MODIFY, pause))
+        if entry_body(pause) != entry_body(goal):
+            changes.append(Change(MODIFY, goal))
+        return changes
+
+    def _without_active(self, entries: EntrySet) -> EntrySet:
+        return EntrySet(entry for entry in entries if entry.table_id != self._active.id)
+
+    def _active_entry(self, requests: Iterable[Request]) -> Any:
+        chosen = list(requests)
+        maps = {
+            "active": _map(chosen),
+            "copies": _map(request for request in chosen if request.copy),
+            "digests": _map(request for request in chosen if request.digest),
+        }
+        action = self._active.default_actions[0]
+        update = TableUpdate(kind="modify", table=self._active.name, action=action.name, params=maps)
+        return self._program.entry(update)
+
+    def _assign(self, request: Request) -> dict[int, Box]:
+        """Conditions of a request by table; one that fits several tables goes to the first."""
+        given: dict[int, dict[str, Any]] = {}
+        for name, value in request.conditions.items():
+            table = next((table for table in self._tables if name in (f.name for f in table.fields)), None)
+            if table is None:
+                known = sorted({field.name for table in self._tables for field in table.fields})
+                raise EntryError(
+                    f"request {request.name}: no condition {name!r}; there are {', '.join(known)}"
+                )
+            given.setdefault(table.id, {})[name] = value
+        shapes = {table.id: Shape(table) for table in self._tables}
+        return {table_id: shapes[table_id].box(match) for table_id, match in given.items()}
+
+    def _fill(self, found: EntrySet, table: Table, wanted: list[tuple[Request, Box | None]]) -> None:
+        action = table.actions[0]
+        name = action.params[0].name
+        everywhere = [request for request, box in wanted if box is None]
+
+        def update(
+            match: Mapping[str, Any], bits: int, priority: int = 0, *, default: bool = False
+        ) -> TableUpdate:
+            kind: Any = "modify" if default else "insert"
+            return TableUpdate(
+                kind=kind,
+                table=table.name,
+                match=dict(match),
+                action=action.name,
+                params={name: bits},
+                priority=priority,
+            )
+
+        found.put(self._program.entry(update({}, _map(everywhere), default=True)))
+        shape = Shape(table)
+        boxes = closure((box for _, box in wanted if box is not None), limit=table.size, where=table.name)
+        for box in boxes:
+            covering = [request for request, other in wanted if other is None or other.covers(box)]
+            priority = shape.priority(box) if table.has_priority else 0
+            found.put(self._program.entry(update(shape.match(box), _map(covering), priority)))
+
+
+def _find(program: Program, name: str) -> Table:
+    try:
+        return program.table(name)
+    except EntryError as error:
+        raise ProgramError(f"the program has no telemetry: {error}") from error
+
+
+def _map(requests: Iterable[Request]) -> int:
+    bits = 0
+    for request in requests:
+        bits |= 1 << request.bit
+    return bits
+
+
+def _check_bits(requests: Sequence[Request]) -> None:
+    taken: dict[int, str] = {}
+    for request in requests:
+        if not 0 <= request.bit < QUERIES:
+            raise TelemetryError(f"request {request.name}: bit {request.bit} is not within 0..{QUERIES - 1}")
+        if request.bit in taken:
+            raise TelemetryError(f"requests {taken[request.bit]} and {request.name} share bit {request.bit}")
+        taken[request.bit] = request.name
+
+
+def _outside_in(change: Change) -> tuple[int, int]:
+    """Narrow entries come first and go last, so that no packet falls to a wider one meanwhile."""
+    narrow = sum(match.lpm.prefix_len for match in change.entry.match) + change.entry.priority
+    if change.kind == INSERT:
+        return 0, -narrow
+    return (1, 0) if change.kind != DELETE else (2, narrow)

@@ -1,0 +1,102 @@
+"""Real switches for tests: the embedded one always, BMv2 where it is installed; both without ports."""
+
+import ctypes
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+from tests.requirements import optional_program
+
+KINDS = ("embedded", "bmv2")
+
+
+class Target:
+    """A switch process that can be killed and started again on the same address."""
+
+    def __init__(self, kind: str, folder: Path, *, ports: tuple[str, ...] = ()) -> None:
+        self.kind = kind
+        self.folder = folder
+        self._ports = ports
+        self._program = sys.executable if kind == "embedded" else optional_program("simple_switch_grpc")
+        self._port = free_port()
+        self._process: subprocess.Popen[str] | None = None
+
+    @property
+    def address(self) -> str:
+        return f"127.0.0.1:{self._port}"
+
+    @property
+    def command(self) -> list[str]:
+        if self.kind == "embedded":
+            ports = [part for port in self._ports for part in ("--port", port)]
+            return [self._program, "-m", "dataplane", "--grpc", self.address, "--device-id", "1",
+                    "--cpu-port", "510", *ports]  # fmt: skip
+        return [self._program, "--no-p4", "--device-id", "1", "--thrift-port", str(free_port()), "-L", "off",
+                "--", "--grpc-server-addr", self.address, "--cpu-port", "510"]  # fmt: skip
+
+    def start(self) -> None:
+        self._process = subprocess.Popen(
+            self.command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - one call of prctl, nothing else
+        )
+        if self.kind == "embedded":
+            assert self._process.stdout is not None
+            assert json.loads(self._process.stdout.readline())["ready"]
+        else:
+            _wait_for_port(self._port)
+
+    def kill(self) -> None:
+        """As kill -9 does."""
+        if self._process is not None:
+            self._process.kill()
+            self._end()
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._end()
+
+    def pause(self) -> None:
+        """Silent, with all its connections open."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        assert self._process is not None
+        self._process.send_signal(signal.SIGCONT)
+
+    def _end(self) -> None:
+        assert self._process is not None
+        self._process.send_signal(signal.SIGCONT)
+        self._process.wait(10)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._process = None
+
+
+def free_port() -> int:
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _wait_for_port(port: int) -> None:
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        with closing(socket.socket()) as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.05)
+    raise AssertionError(f"nothing listens on port {port}")
+
+
+def _die_with_parent() -> None:
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)

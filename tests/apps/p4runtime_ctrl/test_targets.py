@@ -1,0 +1,181 @@
+"""The controller's switch logic does the same on the embedded switch and on BMv2."""
+
+import threading
+
+import pytest
+
+from apps.messages import Decision, TableCommand, TableUpdate
+from apps.messages import Target as Sender
+from apps.p4runtime_ctrl.connection import Connection
+from apps.p4runtime_ctrl.desired_state import INSERT, Change
+from apps.p4runtime_ctrl.session import Address, Pipeline
+from apps.p4runtime_ctrl.switch import Switch
+from apps.p4runtime_ctrl.telemetry import Request
+from tests.apps.p4runtime_ctrl.programs import PROGRAM, program
+from tests.apps.p4runtime_ctrl.targets import KINDS, Target
+
+
+class Attached:
+    """A connection that brings its switch up whenever it becomes primary, in the stream's thread."""
+
+    def __init__(self, address, switch, rank=1):
+        self.switch = switch
+        self.changed = threading.Condition()
+        self.reports, self.session, self.error = [], None, None
+        pipeline = Pipeline(PROGRAM.read_bytes(), program().message)
+        self.connection = Connection(Address(address, 1, rank), pipeline, self)
+        self.connection.open()
+
+    def became_primary(self, session):
+        try:
+            report = self.switch.bring_up(session)
+        except Exception as error:  # noqa: BLE001 - shown by the waiting test
+            self.error = error
+        with self.changed:
+            self.session = session
+            self.reports.append(None if self.error else report)
+            self.changed.notify_all()
+
+    def became_backup(self):
+        pass
+
+    def lost(self, cause):
+        pass
+
+    def packets(self, messages):
+        pass
+
+    def other(self, message):
+        pass
+
+    def until_up(self, times=1):
+        with self.changed:
+            assert self.changed.wait_for(lambda: len(self.reports) >= times, 60)
+        if self.error:
+            raise self.error
+        return self.reports[-1]
+
+
+@pytest.fixture(params=KINDS)
+def target(request, tmp_path):
+    made = Target(request.param, tmp_path)
+    made.start()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def attach(target):
+    attached = []
+
+    def make(switch, **options):
+        attached.append(Attached(target.address, switch, **options))
+        return attached[-1]
+
+    yield make
+    for each in attached:
+        each.connection.close()
+
+
+def make(**options):
+    return Switch("s1", program(), lambda: (0, 0), **options)
+
+
+def decision(number, action, sender):
+    return Decision(
+        id=f"d{number}", action=action, switch="s1", target=sender, reason="", event_time=1, expires=0
+    )
+
+
+SENDERS = (
+    Sender(kind="ip", address="10.0.0.1"),
+    Sender(kind="ip", address="2001:db8::1"),
+    Sender(kind="mac", address="02:00:00:00:00:01", port=1),
+    Sender(kind="mac", address="02:00:00:00:00:02"),
+)
+REQUESTS = (
+    Request(name="packets", bit=255),
+    Request(name="web", bit=0, conditions={"dst": "10.0.0.0/8", "dport": [80, 90], "protocol": 6}),
+    Request(name="scan", bit=1, conditions={"tcp_flags": [2, 0x17], "dport": [85, 1023], "vid": 7}),
+    Request(name="six", bit=2, conditions={"src": "2001:db8::/32", "ingress_port": 1}, copy=False),
+)
+
+
+def test_everything_survives_a_reconnection_and_a_restart(target, attach):
+    switch = make(forward={1: 2, 2: 1})
+    switch.want(REQUESTS, None)
+    attached = attach(switch)
+    assert attached.until_up().program_loaded
+    answers = switch.decide([decision(n, "block", s) for n, s in enumerate(SENDERS)], attached.session)
+    answers += switch.decide(
+        [decision(9, "protect", Sender(kind="ip", address="10.0.0.80", port=80))], attached.session
+    )
+    answers += switch.command(
+        TableCommand(
+            id="c1",
+            updates=(
+                TableUpdate(kind="insert", table="allow", match={"src": "10.0.0.7"}, action="allow_frame", priority=3),
+                TableUpdate(
+                    kind="insert", table="known_sources", match={"is_ipv4": 1, "src": "10.0.0.5"}, action="known"
+                ),
+            ),
+        ),
+        attached.session,
+    )  # fmt: skip
+    switch.change_secret(11, 12, attached.session)
+    assert {answer.state for answer in answers} == {"installed"}, answers
+    attached.connection.break_off()
+    assert str(attached.until_up(2)) == "nothing to change"
+    target.kill()
+    target.start()
+    report = attached.until_up(3)
+    assert report.program_loaded
+    assert not report.failed
+    assert report.inserted >= 4 + 2 + 2 + 2
+    attached.connection.break_off()
+    assert str(attached.until_up(4)) == "nothing to change"
+
+
+def test_exists_removed_and_failed_are_told_apart(target, attach):
+    switch = make()
+    attached = attach(switch)
+    attached.until_up()
+    for action, states in (("block", ["installed", "exists"]), ("unblock", ["removed", "removed"])):
+        for state in states:
+            answers = switch.decide([decision(1, action, sender) for sender in SENDERS], attached.session)
+            assert [answer.state for answer in answers] == [state] * len(SENDERS)
+    assert switch.count_blocks(attached.session) == []
+
+
+def test_a_large_batch_says_which_of_its_updates_failed(target, attach):
+    attached = attach(make())
+    attached.until_up()
+
+    def block(number):
+        match = {"is_ipv4": 1, "src": number}
+        update = TableUpdate(kind="insert", table="block_src", match=match, action="drop_src")
+        return Change(INSERT, program().entry(update))
+
+    assert {o.code for o in attached.session.write([block(n) for n in range(1, 300)])} == {0}
+    outcomes = attached.session.write([block(n) for n in range(1, 2000)])
+    assert [o.code == 0 for o in outcomes] == [n >= 300 for n in range(1, 2000)]
+    assert len(list(attached.session.read_counters(program().table("block_src").id))) == 1999
+    assert str(attached.switch.bring_up(attached.session)) == "1999 removed"
+
+
+def test_telemetry_comes_and_goes(target, attach):
+    switch = make()
+    attached = attach(switch)
+    attached.until_up()
+    for wanted in (REQUESTS[:1], REQUESTS[:3], REQUESTS[1:], (), REQUESTS):
+        assert switch.want(wanted, attached.session) == []
+        assert str(switch.bring_up(attached.session)) == "nothing to change"
+
+
+def test_a_backup_takes_over(target, attach):
+    chief = attach(make(forward={1: 2}), rank=2)
+    chief.until_up()
+    deputy = attach(make(forward={1: 2}), rank=1)
+    assert not deputy.reports
+    chief.connection.close()
+    assert str(deputy.until_up()) == "nothing to change"
