@@ -1,0 +1,183 @@
+"""Bounded mode of AfterImage's Python twin: ceilings, forgetting, and catching up in one step.
+
+A stream with many links (a hub) logs its packets instead of telling all its peers.  A peer replays
+what it has missed when it is next needed: packet by packet while the log still has it, else in closed
+form from the hub's damped sums.
+"""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.afterimage_python import LOG_KEPT, SCALES, Link, Stream, Table, damp, factors_of, pair_of
+from apps.kitsune.kernel import Columns
+from apps.kitsune.text_keys import TextKeys, text_keys
+
+HUB_DEGREE: Final = 8
+_FORGET_AT_ONCE: Final = 3
+
+
+class BoundedTable(Table):
+    """At most `max_streams` streams and `max_links` links; idle and oldest ones are forgotten."""
+
+    def __init__(self, max_streams: int, max_links: int, horizon: float) -> None:
+        super().__init__()
+        self._max_streams, self._max_links, self._horizon = max_streams, max_links, horizon
+        self._order = 0
+
+    def begin(self, time: float) -> None:
+        self._order += 1
+        for _ in range(_FORGET_AT_ONCE):
+            oldest = next(iter(self.streams.values()), None)
+            if oldest is None or not time - oldest.touched > self._horizon:
+                break
+            self._forget_stream(oldest)
+            self.forgotten_idle += 1
+        while len(self.streams) > self._max_streams - 2:
+            self._forget_stream(next(iter(self.streams.values())))
+            self.forgotten_full += 1
+        while len(self.links) > self._max_links - 1:
+            self._forget_link(next(iter(self.links.values())))
+            self.forgotten_full += 1
+
+    def enter(self, key: str, time: float) -> Stream:
+        if key in self.streams:
+            self.streams.move_to_end(key)
+        stream = super().enter(key, time)
+        stream.touched = time
+        return stream
+
+    def renew(self, pair: tuple[str, str]) -> None:
+        self.links.move_to_end(pair)
+
+    def prepare(self, stream: Stream) -> None:
+        if len(stream.hub_links) > HUB_DEGREE:
+            return  # too many to ask each: its links wait until they are addressed
+        pending = []
+        for link in reversed(stream.hub_links):
+            far = 1 - link.side(stream)
+            hub = link.ends[far]
+            missed = hub.logged - link.seen[far]
+            if missed > LOG_KEPT:
+                stream.decay(hub.spoken)
+                _account(link, far)
+            elif missed:
+                events = list(hub.log)[len(hub.log) - missed :]
+                pending += [(order, link, far, time, residual) for order, time, residual in events]
+        pending.sort(key=lambda event: event[0])
+        for _, link, far, time, residual in pending:
+            stream.decay(time)
+            link.update(far, residual, time)
+        for link, far in dict.fromkeys((link, far) for _, link, far, _, _ in pending):
+            _note(link, far)
+
+    def prepare_link(self, link: Link, stream: Stream, far: Stream) -> None:
+        self.prepare(far)
+        if far is not stream:
+            near = link.side(stream)
+            for side in (1 - near, near):
+                if link.ends[side].is_hub and link.seen[side] != link.ends[side].logged:
+                    _account(link, side)
+
+    def tell_peers(self, stream: Stream, residual: list[float], time: float) -> None:
+        if not stream.is_hub:
+            super().tell_peers(stream, residual, time)
+            return
+        stream.logged += 1
+        stream.log.append((self._order, time, residual))
+        if time > stream.spoken:
+            factors = factors_of(time - stream.spoken)
+            damp(stream.count, factors)
+            damp(stream.residuals, factors)
+            stream.spoken = time
+        for k in SCALES:
+            stream.count[k] += 1
+            stream.residuals[k] += residual[k]
+
+    def connect(self, link: Link) -> None:
+        super().connect(link)
+        if link.ends[0] is link.ends[1]:
+            return
+        for side, end in enumerate(link.ends):
+            if end.is_hub:
+                link.ends[1 - side].hub_links[link] = None
+                _note(link, side)
+            elif len(end.links) > HUB_DEGREE:
+                end.is_hub = True
+                end.spoken = end.last
+                _become_hub(end)
+
+    def _forget_stream(self, stream: Stream) -> None:
+        for link in list(stream.links):
+            self._forget_link(link)
+        del self.streams[stream.key]
+
+    def _forget_link(self, link: Link) -> None:
+        del self.links[pair_of(*link.ends)]
+        for side, end in enumerate(link.ends):
+            end.links.pop(link, None)
+            link.ends[1 - side].hub_links.pop(link, None)
+
+
+def _become_hub(hub: Stream) -> None:
+    for link in hub.links:
+        near = link.side(hub)
+        if link.ends[1 - near] is not hub:
+            link.ends[1 - near].hub_links[link] = None
+            _note(link, near)
+
+
+def _note(link: Link, side: int) -> None:
+    hub = link.ends[side]
+    link.seen[side], link.then[side] = hub.logged, hub.spoken
+    link.count_then[side], link.residuals_then[side] = hub.count.copy(), hub.residuals.copy()
+
+
+def _account(link: Link, side: int) -> None:
+    """All packets of one end that the link has missed, in one step."""
+    hub = link.ends[side]
+    since = factors_of(hub.spoken - link.then[side])
+    link.decay(hub.spoken)
+    until = factors_of(link.last - hub.spoken)
+    other = link.residual[1 - side]
+    for k in SCALES:
+        total = hub.residuals[k] - link.residuals_then[side][k] * since[k]
+        link.cf3[k] += total * until[k] * other[k]
+        link.w3[k] += (hub.count[k] - link.count_then[side][k] * since[k]) * until[k]
+    link.residual[side] = hub.log[-1][2]
+    _note(link, side)
+
+
+class PythonEngine:
+    """The four tables of AfterImage."""
+
+    def __init__(self, bounded: bool, max_streams: int, max_links: int, horizon: float) -> None:
+        self._mac_ip, self._hosts, self._jitter, self._sockets = self._tables = [
+            BoundedTable(max_streams, max_links, horizon) if bounded else Table() for _ in range(4)
+        ]
+
+    def update(self, columns: Columns, out: npt.NDArray[np.float64]) -> None:
+        """Writes the features of each row of the columns."""
+        for row, keys in zip(out, text_keys(columns), strict=True):
+            row[:] = self._features(keys)
+
+    def _features(self, keys: TextKeys) -> list[float]:
+        size, time = keys.length, keys.time
+        groups = (
+            self._mac_ip.packet(keys.sender, size, time),
+            self._hosts.packet_to(keys.source, keys.destination, size, time),
+            self._jitter.packet(keys.source + keys.destination, 0.0, time, jitter=True),
+            self._sockets.packet_to(keys.source_socket, keys.destination_socket, size, time),
+        )
+        return [value for group in groups for scale in group for value in scale]
+
+    def counts(self) -> tuple[int, int, int, int]:
+        """Streams, links, streams forgotten for age, cells forgotten for lack of room."""
+        streams, links = sum(len(t.streams) for t in self._tables), sum(len(t.links) for t in self._tables)
+        return (
+            streams,
+            links,
+            sum(table.forgotten_idle for table in self._tables),
+            sum(table.forgotten_full for table in self._tables),
+        )

@@ -1,0 +1,203 @@
+"""The whole of Kitsune without I/O: a record batch goes in, scores and alerts come out."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
+from apps.kitsune.kernel import Columns, Kernel
+from apps.kitsune.kitnet import KitNet
+from apps.kitsune.model_file import Model, save_model
+from apps.kitsune.names import ip_text, mac_text
+from apps.kitsune.reasons import Explanation, reason
+from apps.kitsune.senders import HotSecond, Senders
+from apps.kitsune.threshold import Benign, Calibration
+from apps.kitsune.training_check import TrainingCheck
+from apps.messages import Alert, Sender
+
+TRAIN: Final = 0
+SCORED: Final = 1
+
+
+class DetectorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the detector."""
+
+    fm_grace: int = 5_000
+    """Packets from which the feature map is learnt."""
+    ad_grace: int = 50_000
+    """Packets from which the autoencoders learn, after the feature map."""
+    max_ae: int = 10
+    """Most features of one autoencoder."""
+    mode: Mode = "bounded"
+    """`reference`: exact as published, state and cost grow; `bounded`: both have a ceiling."""
+    threshold: float = 1.0
+    """Packets that score this much or more are over the line (1.0 is the paper's)."""
+    false_alarms_per_hour: float = 0.0
+    """Greater than 0: once enough packets are scored, the line moves to where so many benign packets an
+    hour would cross it; until then `threshold` holds."""
+    calibration_packets: int = 10_000
+    """Scored packets after training, taken for benign, from which benign scores are learnt."""
+    max_streams: int = MAX_STREAMS
+    """Bounded mode: most streams in each of four tables."""
+    max_links: int = MAX_LINKS
+    """Bounded mode: most links in each of two tables."""
+    horizon: float = HORIZON_S
+    """Bounded mode: seconds after which an idle stream is forgotten."""
+    clip: float = 1e6
+    """Bounded mode: limit of scaled features, so that one that was constant in training keeps the score finite."""
+
+    @property
+    def scale_limit(self) -> float:
+        """`clip` where it applies."""
+        return self.clip if self.mode == "bounded" else 0.0
+
+
+_DEFAULTS: Final = DetectorSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """What became of a batch, row by row."""
+
+    scores: npt.NDArray[np.float64]
+    """RMSE of the output layer; 0.0 for training packets."""
+    state: npt.NDArray[np.uint8]
+    """`TRAIN` or `SCORED`."""
+    features: npt.NDArray[np.float64]
+    """The 100 features of each packet."""
+    over: int
+    """Packets over the line."""
+    line: float
+    """The line that was in force."""
+
+
+class Detector:
+    """Scores every packet in the order given and raises alerts per sender and second.
+
+    Args:
+        settings: all options.
+        model: a saved model; then nothing is trained.
+        kernel: None uses the Python twins.
+    """
+
+    def __init__(
+        self,
+        settings: DetectorSettings = _DEFAULTS,
+        *,
+        model: Model | None = None,
+        kernel: Kernel | None = None,
+    ) -> None:
+        self.settings = settings
+        self.afterimage = AfterImage(
+            settings.mode,
+            max_streams=settings.max_streams,
+            max_links=settings.max_links,
+            horizon=settings.horizon,
+            kernel=kernel,
+        )
+        self.training_warnings: list[str] = []
+        self._check = TrainingCheck()
+        self._trained_at_us = 0
+        if model is None:
+            self.model = KitNet(
+                fm_grace=settings.fm_grace,
+                ad_grace=settings.ad_grace,
+                max_ae=settings.max_ae,
+                clip=settings.scale_limit,
+                kernel=kernel,
+            )
+            self.senders = Senders()
+            self.calibration = Calibration(settings.calibration_packets)
+        else:
+            self._take(model)
+        self.line = self._line()
+
+    @property
+    def trained(self) -> int:
+        """Packets used for training so far."""
+        return self.model.trained
+
+    def process(self, batch: Columns, switch: str = "") -> tuple[Scored, list[Alert]]:
+        """Trains on or scores a batch; alerts are for the seconds that this batch has completed."""
+        features = self.afterimage.update(batch)
+        before = self.model.trained
+        scores, errors = self.model.process(features)
+        trained = self.model.trained - before
+        if trained:
+            self._check.see(batch, trained)
+            self._trained_at_us = int(batch["time_us"][trained - 1])
+        state = np.full(len(scores), SCORED, dtype=np.uint8)
+        state[:trained] = TRAIN
+        line = self.line
+
+        def explain(row: int) -> Explanation:
+            return Explanation(features[row].copy(), errors[row - trained].copy())
+
+        hot = self.senders.add(batch, switch, scores=scores, trained=trained, line=line, evidence=explain)
+        over = int(np.count_nonzero(~(scores[trained:] < line)))
+        if trained and self.model.is_trained:
+            self.training_warnings = self._check.warnings(self.senders.known())
+        if self.calibration.add(scores[trained:], seconds(batch)[trained:]):
+            self.line = self._line()
+        return Scored(scores, state, features, over, line), [self._alert(second) for second in hot]
+
+    def notes(self) -> dict[str, Any]:
+        """What a model file keeps beside the network."""
+        benign = self.calibration.benign
+        return {
+            "senders": self.senders.to_state(),
+            "benign": None if benign is None else benign.to_state(),
+            "trained_at_us": self._trained_at_us,
+            "training_warnings": self.training_warnings,
+        }
+
+    def save(self, path: Path) -> None:
+        """Writes the trained model; raises `ModelFileError`."""
+        save_model(path, self.model, self.notes())
+
+    @property
+    def trained_at_us(self) -> int:
+        """Capture time of the last training packet."""
+        return self._trained_at_us
+
+    def _take(self, model: Model) -> None:
+        self.model = model.network
+        notes = model.notes
+        self.senders = Senders.from_state(notes["senders"])
+        benign = None if notes["benign"] is None else Benign(**notes["benign"])
+        self.calibration = Calibration(self.settings.calibration_packets, benign)
+        self._trained_at_us = int(notes["trained_at_us"])
+        self.training_warnings = list(notes["training_warnings"])
+
+    def _line(self) -> float:
+        benign = self.calibration.benign
+        if self.settings.false_alarms_per_hour and benign is not None:
+            return benign.line(self.settings.false_alarms_per_hour)
+        return self.settings.threshold
+
+    def finish(self) -> list[Alert]:
+        """No more packets: alerts of the second that was still open."""
+        return [self._alert(second) for second in self.senders.finish()]
+
+    def _alert(self, hot: HotSecond) -> Alert:
+        switch, port, mac, address = hot.record.identity
+        sender = Sender(switch=switch, port=port, mac=mac_text(mac), ip=ip_text(*address))
+        return Alert(
+            id=f"kitsune-{switch}-{port}-{sender.mac}-{sender.ip}-{hot.second}",
+            sender=sender,
+            event_time=(hot.second + 1) * 1_000_000_000,
+            first_packet=hot.tally.first_over,
+            packets=hot.tally.packets,
+            over=hot.tally.over,
+            peak_score=hot.tally.peak,
+            hot_seconds=hot.hot_seconds,
+            rate=float(hot.tally.packets),
+            training_rate=float(hot.record.training_rate),
+            mac_addresses=self.senders.roles.addresses(mac),
+            role=self.senders.roles.role(mac, address),
+            reason=reason(hot, self.model, self.line),
+        )

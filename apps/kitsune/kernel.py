@@ -1,0 +1,94 @@
+"""Finds the C kernel, if it was built; without it the Python twins do the same work slowly."""
+
+import functools
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import cffi
+import numpy as np
+import numpy.typing as npt
+
+LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
+"""Damping factors of the five time scales, per second."""
+
+Columns = Mapping[str, npt.NDArray[Any]]
+"""A record batch, or the columns of one."""
+
+_LIBRARY: Final = Path(__file__).with_name("_kernel.so")
+
+PACKET_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
+    ("length", "uint32_t", "u4"),
+    ("time", "double", "f8"),
+    ("eth_src", "uint64_t", "u8"),
+    ("eth_dst", "uint64_t", "u8"),
+    ("arp_op", "int32_t", "i4"),
+    ("arp_src_ip", "uint32_t", "u4"),
+    ("arp_dst_ip", "uint32_t", "u4"),
+    ("ip_version", "uint8_t", "u1"),
+    ("ip_src_hi", "uint64_t", "u8"),
+    ("ip_src_lo", "uint64_t", "u8"),
+    ("ip_dst_hi", "uint64_t", "u8"),
+    ("ip_dst_lo", "uint64_t", "u8"),
+    ("tcp_sport", "int32_t", "i4"),
+    ("tcp_dport", "int32_t", "i4"),
+    ("udp_sport", "int32_t", "i4"),
+    ("udp_dport", "int32_t", "i4"),
+    ("icmp_type", "int32_t", "i4"),
+)
+"""Columns that features are made of: name, C type, numpy type. `time` is in seconds."""
+
+_DECLARATIONS: Final = (
+    "typedef struct {"
+    + "".join(f"const {c_type} *{name};" for name, c_type, _ in PACKET_FIELDS)
+    + """} Columns;
+    typedef struct AfterImage AfterImage;
+    AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon);
+    void afterimage_free(AfterImage *);
+    int afterimage_update(AfterImage *, const Columns *, long n, double *out);
+    void afterimage_counts(const AfterImage *, uint64_t *out);
+    typedef struct {
+        int32_t count, visible, hidden;
+        const int32_t *visible_of, *hidden_of, *input;
+        double *weights, *hidden_bias, *visible_bias, *low, *high;
+    } Layer;
+    void kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width,
+                      double rate, double *scratch);
+    void kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width,
+                      double clip, double *scratch, double *errors, double *scores);
+    """
+)
+
+
+class Kernel(NamedTuple):
+    """The loaded library and the cffi instance that speaks to it."""
+
+    ffi: Any
+    lib: Any
+
+    def pointer(self, kind: str, array: npt.NDArray[Any]) -> Any:
+        """A C pointer to the array's data; the array must be contiguous and outlive the call."""
+        return self.ffi.cast(f"{kind} *", array.ctypes.data)
+
+
+@functools.cache
+def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
+    """The kernel, or None with one warning when it was not built (no C compiler at installation)."""
+    ffi = cffi.FFI()
+    ffi.cdef(_DECLARATIONS)
+    try:
+        return Kernel(ffi, ffi.dlopen(str(path)))
+    except OSError as error:
+        warnings.warn(
+            f"Kitsune runs on its Python twin, about 200 times slower: {error}. "
+            "Install a C compiler and reinstall SDNator to get the kernel.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return None
+
+
+def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:
+    """The array as the kernel reads it; copied only when type or layout differ."""
+    return np.ascontiguousarray(array, dtype=kind)

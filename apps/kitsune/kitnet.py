@@ -1,0 +1,245 @@
+"""KitNET: an ensemble of autoencoders learns what is normal; their errors are the anomaly score.
+
+Training sees every packet once: first a map of features is learnt (`fm_grace` + 1 packets), then the
+autoencoders (`ad_grace` packets), then packets are scored.  Source: Mirsky et al., NDSS 2018, and
+its published implementation, whose numbers are met within 1e-12 given equal features.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.feature_map import FeatureMapper
+from apps.kitsune.kernel import Kernel, contiguous
+
+_Array = npt.NDArray[np.float64]
+_SEED = 1234
+_BLOCK = 1024
+
+
+@dataclass
+class Layer:
+    """Autoencoders of one layer, padded to a common size; `mask_*` are 1 where a unit exists."""
+
+    inputs: tuple[tuple[int, ...], ...]
+    """For each autoencoder the numbers of its inputs."""
+    weights: _Array
+    hidden_bias: _Array
+    visible_bias: _Array
+    low: _Array
+    high: _Array
+    index: npt.NDArray[np.int32] = field(init=False)
+    visible_of: npt.NDArray[np.int32] = field(init=False)
+    hidden_of: npt.NDArray[np.int32] = field(init=False)
+    visible_mask: _Array = field(init=False)
+    hidden_mask: _Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        count, visible, hidden = self.weights.shape
+        self.visible_of = np.array([len(group) for group in self.inputs], dtype=np.int32)
+        self.hidden_of = hidden_units(self.visible_of)
+        self.index = np.zeros((count, visible), dtype=np.int32)
+        for row, group in zip(self.index, self.inputs, strict=True):
+            row[: len(group)] = group
+        self.visible_mask = (np.arange(visible) < self.visible_of[:, None]).astype(float)
+        self.hidden_mask = (np.arange(hidden) < self.hidden_of[:, None]).astype(float)
+
+    @classmethod
+    def fresh(cls, inputs: Sequence[Sequence[int]]) -> "Layer":
+        """Untrained: every autoencoder draws its weights from the same seed, as published."""
+        groups = tuple(tuple(group) for group in inputs)
+        sizes = np.array([len(group) for group in groups])
+        count, visible, hidden = len(groups), int(sizes.max()), int(hidden_units(sizes).max())
+        weights = np.zeros((count, visible, hidden))
+        for autoencoder, size in enumerate(sizes.tolist()):
+            units = int(hidden_units(np.array([size]))[0])
+            bound = 1 / size
+            draw = np.random.RandomState(_SEED).uniform(low=-bound, high=bound, size=(size, units))
+            weights[autoencoder, :size, :units] = draw
+        low, high = np.full((count, visible), np.inf), np.full((count, visible), -np.inf)
+        return cls(groups, weights, np.zeros((count, hidden)), np.zeros((count, visible)), low, high)
+
+    def train_one(self, row: _Array, rate: float) -> _Array:
+        """One step of gradient descent for all autoencoders; returns their RMSE before the step."""
+        values = row[self.index]
+        self.low = np.where(values < self.low, values, self.low)
+        self.high = np.where(values > self.high, values, self.high)
+        x = (values - self.low) / (self.high - self.low + 1e-16) * self.visible_mask
+        y = _sigmoid(np.matmul(x[:, None], self.weights)[:, 0] + self.hidden_bias) * self.hidden_mask
+        z = _sigmoid(np.matmul(self.weights, y[..., None])[..., 0] + self.visible_bias)
+        e = (x - z) * self.visible_mask
+        gradient = np.matmul(e[:, None], self.weights)[:, 0] * y * (1 - y)
+        self.weights += rate * (x[..., None] * gradient[:, None] + e[..., None] * y[:, None])
+        self.hidden_bias += rate * gradient
+        self.visible_bias += rate * e
+        return np.asarray(np.sqrt((e**2).sum(axis=1) / self.visible_of))
+
+    def errors(self, rows: _Array, clip: float) -> _Array:
+        """RMSE of each autoencoder for rows of inputs, shape (rows, autoencoders)."""
+        values = rows[:, self.index].transpose(1, 0, 2)
+        x = (values - self.low[:, None]) / (self.high - self.low + 1e-16)[:, None]
+        if clip:
+            x = np.clip(x, -clip, clip)
+        x = np.where(self.visible_mask[:, None] > 0, x, 0.0)
+        y = _sigmoid(np.matmul(x, self.weights) + self.hidden_bias[:, None])
+        z = _sigmoid(np.matmul(y, self.weights.transpose(0, 2, 1)) + self.visible_bias[:, None])
+        e = (x - z) * self.visible_mask[:, None]
+        return np.asarray(np.sqrt((e**2).sum(axis=2) / self.visible_of[:, None]).T)
+
+
+def hidden_units(visible: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    """Three quarters of the inputs, rounded up."""
+    return np.array([math.ceil(0.75 * size) for size in visible.tolist()], dtype=np.int32)
+
+
+def _sigmoid(x: _Array) -> _Array:
+    with np.errstate(over="ignore"):
+        return np.asarray(1.0 / (1.0 + np.exp(-x)))
+
+
+class KitNet:
+    """The detector on feature rows: trains itself on the first packets, then scores.
+
+    Args:
+        width: number of features per packet.
+        fm_grace, ad_grace: packets for the feature map and for the autoencoders; `fm_grace` + 1 +
+            `ad_grace` packets get no score, as published.
+        max_ae: most inputs of one autoencoder, at least 1.
+        feature_map: groups of feature numbers; leaves out learning the map.  The autoencoders then
+            train on all `fm_grace` + 1 + `ad_grace` packets, as published.
+        clip: limit of scaled inputs when scoring; 0 = none, as published (a feature that was constant
+            in training then scores near 1e16 when it first moves).
+        kernel: None uses the Python twin.
+    """
+
+    learning_rate = 0.1
+
+    def __init__(
+        self,
+        width: int = 100,
+        *,
+        fm_grace: int = 5_000,
+        ad_grace: int = 50_000,
+        max_ae: int = 10,
+        feature_map: Sequence[Sequence[int]] | None = None,
+        clip: float = 0.0,
+        kernel: Kernel | None = None,
+    ) -> None:
+        if fm_grace < 1 or ad_grace < 1:
+            raise ValueError(f"fm_grace={fm_grace} and ad_grace={ad_grace}: both must be at least 1")
+        self.width = width
+        self.fm_grace, self.ad_grace, self.max_ae = fm_grace, ad_grace, max(1, max_ae)
+        self.clip = clip
+        self.trained = 0
+        self._kernel = kernel
+        self._mapper = FeatureMapper(width)
+        self.feature_map: list[list[int]] = []
+        self.ensemble: Layer | None = None
+        self.output: Layer | None = None
+        if feature_map is not None:
+            self._build(feature_map)
+
+    @property
+    def training_packets(self) -> int:
+        """How many packets get no score."""
+        return self.fm_grace + self.ad_grace + 1
+
+    @property
+    def is_trained(self) -> bool:
+        return self.trained >= self.training_packets
+
+    def process(self, features: _Array) -> tuple[_Array, _Array]:
+        """Trains on or scores rows of features, in order.
+
+        Returns the scores (RMSE; 0.0 for training packets) and the RMSE of each autoencoder (an
+        array without rows until the first packet is scored).
+        """
+        taught = min(len(features), self.training_packets - self.trained)
+        self.learn(features[:taught])
+        scores, errors = self.score(features[taught:])
+        return np.concatenate([np.zeros(taught), scores]), errors
+
+    def learn(self, features: _Array) -> None:
+        """Trains on rows of features, in order."""
+        if not self.feature_map:
+            share = features[: self.fm_grace + 1 - self._mapper.packets]
+            self._mapper.learn(share)
+            self.trained += len(share)
+            features = features[len(share) :]
+            if self._mapper.packets == self.fm_grace + 1:
+                self._build(self._mapper.cluster(self.max_ae))
+        if len(features):
+            self._train(contiguous(features, "f8"))
+            self.trained += len(features)
+
+    def score(self, features: _Array) -> tuple[_Array, _Array]:
+        """Scores rows of features without learning; needs a finished feature map."""
+        if not len(features):
+            return np.zeros(0), np.zeros((0, len(self.feature_map)))
+        ensemble, output = self._layers()
+        if self._kernel is not None:
+            return self._score_in_kernel(self._kernel, contiguous(features, "f8"))
+        blocks = [
+            ensemble.errors(features[start : start + _BLOCK], self.clip)
+            for start in range(0, len(features), _BLOCK)
+        ]
+        errors = np.concatenate(blocks)
+        return output.errors(errors, self.clip)[:, 0], errors
+
+    def _layers(self) -> tuple[Layer, Layer]:
+        if self.ensemble is None or self.output is None:
+            raise ValueError(
+                f"KitNET has seen {self.trained} packets and needs {self.training_packets} before it can score: "
+                "train it on more packets or lower fm_grace and ad_grace"
+            )
+        return self.ensemble, self.output
+
+    def _build(self, feature_map: Sequence[Sequence[int]]) -> None:
+        self.feature_map = [list(group) for group in feature_map]
+        self.ensemble = Layer.fresh(self.feature_map)
+        self.output = Layer.fresh([range(len(self.feature_map))])
+
+    def _train(self, features: _Array) -> None:
+        ensemble, output = self._layers()
+        if self._kernel is None:
+            for row in features:
+                output.train_one(ensemble.train_one(row, self.learning_rate), self.learning_rate)
+            return
+        kernel = self._kernel
+        scratch = self._scratch()
+        layers = [_c_layer(kernel, layer) for layer in (ensemble, output)]
+        rows = kernel.pointer("double", features)
+        kernel.lib.kitnet_train(
+            *layers, rows, len(features), self.width, self.learning_rate, kernel.pointer("double", scratch)
+        )
+
+    def _score_in_kernel(self, kernel: Kernel, features: _Array) -> tuple[_Array, _Array]:
+        layers = [_c_layer(kernel, layer) for layer in self._layers()]
+        errors = np.empty((len(features), len(self.feature_map)))
+        scores = np.empty(len(features))
+        scratch = self._scratch()
+        rows, work, rmse, out = (
+            kernel.pointer("double", array) for array in (features, scratch, errors, scores)
+        )
+        kernel.lib.kitnet_score(*layers, rows, len(features), self.width, self.clip, work, rmse, out)
+        return scores, errors
+
+    def _scratch(self) -> _Array:
+        units = sum(sum(layer.weights.shape) for layer in self._layers())
+        return np.empty(4 * units)
+
+
+def _c_layer(kernel: Kernel, layer: Layer) -> Any:
+    count, visible, hidden = layer.weights.shape
+    struct = kernel.ffi.new("Layer *")
+    struct.count, struct.visible, struct.hidden = count, visible, hidden
+    struct.visible_of = kernel.pointer("int32_t", layer.visible_of)
+    struct.hidden_of = kernel.pointer("int32_t", layer.hidden_of)
+    struct.input = kernel.pointer("int32_t", layer.index)
+    for name in ("weights", "hidden_bias", "visible_bias", "low", "high"):
+        setattr(struct, name, kernel.pointer("double", getattr(layer, name)))
+    return struct

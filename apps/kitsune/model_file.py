@@ -1,0 +1,156 @@
+"""A trained model in a file: one .npz with arrays and a JSON header, versioned, without pickle.
+
+    ModelFileError
+    ├── NotAModelError      foreign, damaged or truncated
+    └── WrongVersionError   written by a version whose files this one does not read
+
+AfterImage's state is not part of it: the statistics of a capture begin anew, as they did in training.
+"""
+
+import io
+import json
+import os
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.afterimage import WIDTH
+from apps.kitsune.kernel import LAMBDAS
+from apps.kitsune.kitnet import KitNet, Layer
+
+FORMAT: Final = "sdnator-kitsune-model"
+VERSION: Final = 1
+_ARRAYS: Final = ("weights", "hidden_bias", "visible_bias", "low", "high")
+
+
+class ModelFileError(ValueError):
+    """A model cannot be saved or loaded; the text says which file, what and what to do."""
+
+
+class NotAModelError(ModelFileError):
+    """The file is foreign, damaged or truncated."""
+
+
+class WrongVersionError(ModelFileError):
+    """The file's version is not read by this program."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What a file holds."""
+
+    network: KitNet
+    notes: dict[str, Any]
+    """Beside the network: senders, roles, benign scores, time of training (`trained_at_us`)."""
+
+
+def save_model(path: Path, network: KitNet, notes: dict[str, Any]) -> None:
+    """Writes a trained network and plain `notes`; the file appears whole or not at all.
+
+    Raises `ModelFileError` when the network is untrained or the file cannot be written.
+    """
+    if network.ensemble is None or network.output is None or not network.is_trained:
+        raise ModelFileError(
+            f"{path}: the model has seen {network.trained} of {network.training_packets} training packets; "
+            "nothing was saved. Train on a longer capture or lower fm_grace and ad_grace"
+        )
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "width": network.width,
+        "lambdas": list(LAMBDAS),
+        "fm_grace": network.fm_grace,
+        "ad_grace": network.ad_grace,
+        "max_ae": network.max_ae,
+        "feature_map": network.feature_map,
+        "notes": notes,
+    }
+    arrays = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    for layer_name, layer in (("ensemble", network.ensemble), ("output", network.output)):
+        arrays |= {f"{layer_name}_{name}": getattr(layer, name) for name in _ARRAYS}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        partial.write_bytes(buffer.getvalue())
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ModelFileError(
+            f"{path}: the model cannot be written ({error.strerror}); name another file"
+        ) from error
+
+
+def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:
+    """Reads a model; raises `ModelFileError` that names the file and what is wrong with it."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise ModelFileError(f"{path}: no such model; write one with --save-model") from None
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        raise NotAModelError(
+            f"{path}: not a whole Kitsune model ({error}); train again and save it anew"
+        ) from error
+    header = _header(path, arrays)
+    try:
+        network = _network(header, arrays, clip, kernel)
+        return Model(network, dict(header["notes"]))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise NotAModelError(
+            f"{path}: damaged Kitsune model ({error}); train again and save it anew"
+        ) from error
+
+
+def _header(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    try:
+        header = json.loads(bytes(arrays["header"]))
+        found, version = header["format"], header["version"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise NotAModelError(
+            f"{path}: not a Kitsune model (no header); use a file from --save-model"
+        ) from error
+    if found != FORMAT:
+        raise NotAModelError(f"{path}: not a Kitsune model (format {found!r}); use a file from --save-model")
+    if version != VERSION:
+        raise WrongVersionError(
+            f"{path}: model version {version}, this program reads version {VERSION}; train again"
+        )
+    return dict(header)
+
+
+def _network(header: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], clip: float, kernel: Any) -> KitNet:
+    if header["lambdas"] != list(LAMBDAS) or header["width"] != WIDTH:
+        raise ValueError(f"features: {header['width']} with scales {header['lambdas']}")
+    feature_map = header["feature_map"]
+    if sorted(feature for group in feature_map for feature in group) != list(range(WIDTH)):
+        raise ValueError("the feature map does not hold every feature once")
+    network = KitNet(
+        WIDTH,
+        fm_grace=header["fm_grace"],
+        ad_grace=header["ad_grace"],
+        max_ae=header["max_ae"],
+        feature_map=feature_map,
+        clip=clip,
+        kernel=kernel,
+    )
+    network.ensemble = _layer(arrays, "ensemble", feature_map)
+    network.output = _layer(arrays, "output", [list(range(len(feature_map)))])
+    network.trained = network.training_packets
+    return network
+
+
+def _layer(arrays: dict[str, npt.NDArray[Any]], name: str, groups: list[list[int]]) -> Layer:
+    expected = Layer.fresh(groups)
+    values = {}
+    for part in _ARRAYS:
+        array = np.array(arrays[f"{name}_{part}"], dtype=np.float64)
+        if array.shape != getattr(expected, part).shape:
+            raise ValueError(f"{name}_{part} has shape {array.shape}")
+        values[part] = array
+    return Layer(expected.inputs, **values)

@@ -1,0 +1,92 @@
+"""Why a second was hot, in words."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.kernel import LAMBDAS
+from apps.kitsune.kitnet import KitNet
+from apps.kitsune.names import ip_text, mac_text
+from apps.kitsune.senders import HotSecond
+
+_GROUPS: Final = (
+    (0, 3, "packets from this MAC and address"),
+    (15, 7, "packets from this host to that host"),
+    (50, 3, "gaps between packets of the two hosts"),
+    (65, 7, "packets from this socket to that socket"),
+)
+_STATISTICS: Final = (
+    "rate",
+    "mean size",
+    "spread of sizes",
+    "joint spread",
+    "joint size",
+    "covariance",
+    "correlation",
+)
+_GAP_STATISTICS: Final = ("number", "mean", "spread")
+_NOTABLE: Final = 2.0
+"""A rate or fan-out this many times its training maximum is worth a word."""
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """The packet with the highest score of a second, as the autoencoders saw it."""
+
+    features: npt.NDArray[np.float64]
+    errors: npt.NDArray[np.float64]
+
+
+def feature_words(feature: int) -> str:
+    """What a feature number measures, for people."""
+    start, per_scale, group = max(entry for entry in _GROUPS if entry[0] <= feature)
+    scale, statistic = divmod(feature - start, per_scale)
+    names = _GAP_STATISTICS if start == 50 else _STATISTICS
+    return f"{names[statistic]} of {group} over {1 / LAMBDAS[scale]:.2g} s"
+
+
+def reason(hot: HotSecond, model: KitNet, line: float) -> str:
+    """One sentence or more: what the sender did, and which autoencoders noticed by which features."""
+    tally, record = hot.tally, hot.record
+    _, _, mac, address = record.identity
+    who = ip_text(*address) or mac_text(mac)
+    parts = _comparisons(
+        who, tally.packets, record.training_rate, len(tally.destinations), record.training_destinations
+    )
+    parts.append(
+        f"{tally.over} of {tally.packets} packets scored over {line:.3g}, the highest {tally.peak:.3g}"
+    )
+    if isinstance(tally.evidence, Explanation):
+        parts.append(_autoencoders(tally.evidence, model))
+    return "; ".join(parts)
+
+
+def _comparisons(who: str, packets: int, trained_packets: int, hosts: int, trained_hosts: int) -> list[str]:
+    if not trained_packets:
+        return [f"{who} was never seen in training and sends {packets} packets/s to {hosts} hosts"]
+    parts = []
+    if trained_hosts and hosts >= _NOTABLE * trained_hosts:
+        parts.append(f"{who} sends to {hosts / trained_hosts:.0f} times more hosts than in training")
+    if packets >= _NOTABLE * trained_packets:
+        parts.append(f"{who} sends {packets / trained_packets:.0f} times more packets than in training")
+    return parts or [f"{who} sends no more than in training, but differently"]
+
+
+def _autoencoders(evidence: Explanation, model: KitNet) -> str:
+    ensemble, output = model.ensemble, model.output
+    if ensemble is None or output is None:
+        return "no model"
+    excess = (evidence.errors - output.low[0]) / (output.high[0] - output.low[0] + 1e-16)
+    worst = np.argsort(-excess)[:2].tolist()
+    words = [feature_words(_most_moved(evidence.features, model, autoencoder)) for autoencoder in worst]
+    return f"autoencoders {' and '.join(map(str, worst))} moved most: " + ", ".join(dict.fromkeys(words))
+
+
+def _most_moved(features: npt.NDArray[np.float64], model: KitNet, autoencoder: int) -> int:
+    ensemble: Any = model.ensemble
+    group = np.array(model.feature_map[autoencoder])
+    low, high = ensemble.low[autoencoder, : len(group)], ensemble.high[autoencoder, : len(group)]
+    scaled = (features[group] - low) / (high - low + 1e-16)
+    return int(group[np.argmax(np.abs(scaled - 0.5))])

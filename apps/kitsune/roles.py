@@ -1,0 +1,126 @@
+"""Which senders serve the house: gateways, DNS, DHCP and multicast speakers alert but are not blocked.
+
+Roles are learnt from the training traffic only, so that an attacker cannot earn one later.
+"""
+
+import ipaddress
+from typing import Any, Final
+
+from apps.messages import Role
+
+MOST_ADDRESSES: Final = 1_024
+"""Addresses remembered behind one MAC; counting stops there."""
+MOST_MACS: Final = 65_536
+_ROUTED: Final = 3
+"""A MAC from or to which this many addresses outside the house were seen is a gateway."""
+_DNS, _DHCP = 53, 67
+_FEW: Final = 4
+
+Address = tuple[int, int, int]
+
+
+class Roles:
+    """Learns roles and which addresses stand behind which MAC."""
+
+    def __init__(self) -> None:
+        self._behind: dict[int, set[Address]] = {}
+        self._towards: dict[int, set[Address]] = {}
+        self._serves: dict[Address, Role] = {}
+        self._multicast: dict[Address, list[int]] = {}
+        self._gateways: set[int] = set()
+        self._gateway_addresses: set[Address] = set()
+
+    def see(self, mac: int, address: Address) -> None:
+        """A frame came from this MAC and address (once per sender is enough)."""
+        if address[0] and not is_link_local(address):
+            _remember(self._behind, mac, address)
+
+    def learn(
+        self, address: Address, udp_sport: int, to_mac: int, destination: Address, to_multicast: bool
+    ) -> None:
+        """A training packet: what does its sender do, and who carries it further?"""
+        if destination[0] and not to_multicast:
+            _remember(self._towards, to_mac, destination)
+        if udp_sport == _DNS and self._serves.get(address) != "dhcp":
+            self._serves[address] = "dns"
+        elif udp_sport == _DHCP:
+            self._serves[address] = "dhcp"
+        tally = self._multicast.setdefault(address, [0, 0])
+        tally[0] += 1
+        tally[1] += to_multicast
+
+    def close_training(self) -> None:
+        """Training is over: roles are settled."""
+        for mac in self._behind.keys() | self._towards.keys():
+            behind = self._behind.get(mac, set())
+            routed = behind | self._towards.get(mac, set())
+            if sum(not is_inside(address) for address in routed) >= _ROUTED:
+                self._gateways.add(mac)
+                self._gateway_addresses |= {address for address in behind if is_inside(address)}
+        self._towards.clear()
+        for address, (packets, multicast) in self._multicast.items():
+            if address[0] and packets >= _FEW and 2 * multicast >= packets:
+                self._serves.setdefault(address, "multicast")
+        self._multicast.clear()
+
+    def role(self, mac: int, address: Address) -> Role:
+        """What a sender was in training; an address behind a gateway's MAC but outside is a host."""
+        if address in self._gateway_addresses or (mac in self._gateways and not address[0]):
+            return "gateway"
+        return self._serves.get(address, "host")
+
+    def addresses(self, mac: int) -> int:
+        """How many addresses of one family were seen behind a MAC, link-local ones left out."""
+        behind = self._behind.get(mac, set())
+        fourth = sum(address[0] == 4 for address in behind)
+        return max(fourth, len(behind) - fourth)
+
+    def to_state(self) -> dict[str, Any]:
+        """What training taught, as plain values."""
+        return {
+            "behind": [[mac, sorted(map(list, addresses))] for mac, addresses in self._behind.items()],
+            "serves": [[list(address), role] for address, role in self._serves.items()],
+            "gateways": sorted(self._gateways),
+            "gateway_addresses": sorted(map(list, self._gateway_addresses)),
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "Roles":
+        """The inverse of `to_state`."""
+        roles = cls()
+        roles._behind = {mac: {_address(entry) for entry in entries} for mac, entries in state["behind"]}
+        roles._serves = {_address(entry): role for entry, role in state["serves"]}
+        roles._gateways = set(state["gateways"])
+        roles._gateway_addresses = {_address(entry) for entry in state["gateway_addresses"]}
+        return roles
+
+
+def _remember(table: dict[int, set[Address]], mac: int, address: Address) -> None:
+    addresses = table.get(mac)
+    if addresses is None:
+        if len(table) >= MOST_MACS:
+            return
+        addresses = table[mac] = set()
+    if len(addresses) < MOST_ADDRESSES:
+        addresses.add(address)
+
+
+def _address(entry: list[int]) -> Address:
+    version, hi, lo = entry
+    return version, hi, lo
+
+
+def _parsed(address: Address) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    version, hi, lo = address
+    return ipaddress.IPv4Address(lo) if version == 4 else ipaddress.IPv6Address(hi << 64 | lo)
+
+
+def is_link_local(address: Address) -> bool:
+    """Every host has such an address beside its own; unspecified ones count as well."""
+    parsed = _parsed(address)
+    return parsed.is_unspecified or (address[0] == 6 and parsed.is_link_local)
+
+
+def is_inside(address: Address) -> bool:
+    """Private or link-local: an address of the house rather than of the internet."""
+    return _parsed(address).is_private

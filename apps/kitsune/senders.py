@@ -1,0 +1,303 @@
+"""Scores become hot seconds of senders.
+
+A sender is an ingress port, a MAC and an address.  A second of capture time is hot for a sender when
+at least three, and at least half, of the packets charged to him score over the line.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import repeat, starmap
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.afterimage import seconds
+from apps.kitsune.conversations import Address, Conversations
+from apps.kitsune.kernel import Columns
+from apps.kitsune.roles import Roles
+
+HOT_PACKETS: Final = 3
+HOT_SHARE: Final = 0.5
+HISTORY_S: Final = 10
+MOST_SENDERS: Final = 131_072
+"""When more have been seen, those unknown to training and quiet for `HISTORY_S` are forgotten."""
+_BACKWARDS_S: Final = 10
+_GROUP_BIT: Final = 1 << 40
+
+Identity = tuple[str, int, int, Address]
+"""Switch, ingress port, MAC, address."""
+Evidence = Callable[[int], Any]
+"""Given a row of the batch: what explains its score."""
+
+
+@dataclass(slots=True)
+class Record:
+    """What is known of a sender."""
+
+    identity: Identity
+    training_rate: int = 0
+    training_destinations: int = 0
+    last_second: int = 0
+    hot: deque[int] = field(default_factory=deque)
+
+
+@dataclass(slots=True)
+class Tally:
+    """One sender's second."""
+
+    packets: int = 0
+    over: int = 0
+    peak: float = -math.inf
+    peak_row: int = -1
+    first_over: int = 0
+    destinations: set[Address] = field(default_factory=set)
+    evidence: Any = None
+
+    def mark(self, score: float, arrival: int, row: int) -> None:
+        """One more packet over the line."""
+        if not self.over:
+            self.first_over = arrival
+        self.over += 1
+        if not score <= self.peak:
+            self.peak, self.peak_row = score, row
+
+    def keep(self, evidence: Evidence) -> None:
+        """Takes the peak's evidence out of the batch, which is about to go."""
+        if self.peak_row >= 0:
+            self.evidence, self.peak_row = evidence(self.peak_row), -1
+
+
+class Packet(NamedTuple):
+    """What matters here of one row of a batch."""
+
+    switch: str
+    time: float
+    arrival: int
+    port: int
+    mac: int
+    to_mac: int
+    source: Address
+    destination: Address
+    to_multicast: bool
+    is_tcp: bool
+    sport: int
+    dport: int
+    udp_sport: int
+    quoted: int
+    flags: int
+
+
+@dataclass(frozen=True, slots=True)
+class HotSecond:
+    """A sender's second in which too many packets scored over the line."""
+
+    second: int
+    record: Record
+    tally: Tally
+    hot_seconds: int
+    """Hot seconds among the last ten, this one included."""
+
+
+class Senders:
+    """Charges scored packets to senders and closes seconds as capture time passes them."""
+
+    def __init__(self, roles: Roles | None = None) -> None:
+        self.roles = roles or Roles()
+        self.records: list[Record | None] = []
+        self.clock_jumps = 0
+        self._ids: dict[Identity, int] = {}
+        self._free: list[int] = []
+        self._conversations = Conversations()
+        self._second: int | None = None
+        self._training = True
+        self._tallies: dict[int, Tally] = {}
+        self._evidence: Evidence = lambda _row: None
+
+    def add(
+        self,
+        batch: Columns,
+        switch: str,
+        *,
+        scores: npt.NDArray[np.float64],
+        trained: int,
+        line: float,
+        evidence: Evidence,
+    ) -> list[HotSecond]:
+        """Takes a batch of which the first `trained` packets were training; returns what became hot."""
+        hot: list[HotSecond] = []
+        self._evidence = evidence
+        for row, packet in enumerate(_packets(batch, switch)):
+            second = int(packet.time)
+            if second != self._second:
+                hot += self._turn(second)
+            sender = self._sender(packet)
+            payer = self._payer(packet, sender)
+            tally = self._tallies.get(payer)
+            if tally is None:
+                tally = self._tallies[payer] = Tally()
+            tally.packets += 1
+            if payer == sender:
+                tally.destinations.add(packet.destination)
+            if row < trained:
+                self.roles.learn(
+                    packet.source, packet.udp_sport, packet.to_mac, packet.destination, packet.to_multicast
+                )
+                continue
+            if self._training:
+                self._end_training()
+            score = scores[row]
+            if not score < line:
+                tally.mark(float(score), packet.arrival, row)
+        for tally in self._tallies.values():
+            tally.keep(evidence)
+        return hot
+
+    def finish(self) -> list[HotSecond]:
+        """The capture has ended: closes the second that is still open."""
+        hot = list(self._close())
+        self._second = None
+        return hot
+
+    def known(self) -> list[Record]:
+        """All senders that are remembered."""
+        return [record for record in self.records if record is not None]
+
+    def to_state(self) -> dict[str, Any]:
+        """What training taught, as plain values."""
+        trained = [record for record in self.known() if record.training_rate]
+        return {
+            "roles": self.roles.to_state(),
+            "records": [[r.identity, r.training_rate, r.training_destinations] for r in trained],
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "Senders":
+        """Senders as a saved model knows them; training is over.
+
+        Raises `KeyError`, `TypeError` or `ValueError` when the state is not one.
+        """
+        senders = cls(Roles.from_state(state["roles"]))
+        senders._training = False
+        for (switch, port, mac, (version, hi, lo)), rate, destinations in state["records"]:
+            identity = (str(switch), int(port), int(mac), (int(version), int(hi), int(lo)))
+            senders.know(Record(identity, training_rate=int(rate), training_destinations=int(destinations)))
+        return senders
+
+    def _end_training(self) -> None:
+        self._training = False
+        self._note_rates()
+        self.roles.close_training()
+
+    def _turn(self, second: int) -> list[HotSecond]:
+        if self._second is not None and second < self._second:
+            if self._second - second <= _BACKWARDS_S:
+                return []  # a late packet counts in the second that is open
+            self.clock_jumps += 1
+            self._forget_history()
+        hot = list(self._close())
+        self._second = second
+        return hot
+
+    def _close(self) -> Iterator[HotSecond]:
+        if self._training:
+            self._note_rates()
+        second = self._second or 0
+        for payer, tally in self._tallies.items():
+            record = self.records[payer]
+            if record is None:
+                continue
+            record.last_second = second
+            if tally.over >= HOT_PACKETS and tally.over >= HOT_SHARE * tally.packets:
+                record.hot.append(second)
+                while record.hot[0] <= second - HISTORY_S:
+                    record.hot.popleft()
+                tally.keep(self._evidence)
+                yield HotSecond(second, record, tally, len(record.hot))
+        self._tallies = {}
+        if len(self._ids) > MOST_SENDERS:
+            self._forget(second)
+
+    def _note_rates(self) -> None:
+        for payer, tally in self._tallies.items():
+            record = self.records[payer]
+            if record is not None:
+                record.training_rate = max(record.training_rate, tally.packets)
+                record.training_destinations = max(record.training_destinations, len(tally.destinations))
+
+    def _forget(self, second: int) -> None:
+        for number, record in enumerate(self.records):
+            if record is not None and not record.training_rate and record.last_second < second - HISTORY_S:
+                del self._ids[record.identity]
+                self.records[number] = None
+                self._free.append(number)
+
+    def _forget_history(self) -> None:
+        """The clock was set back: rates and roles stay, hot seconds do not count any more."""
+        for record in self.known():
+            record.hot.clear()
+
+    def _sender(self, packet: Packet) -> int:
+        identity = (packet.switch, packet.port, packet.mac, packet.source)
+        number = self._ids.get(identity)
+        if number is None:
+            number = self.know(Record(identity, last_second=self._second or 0))
+        return number
+
+    def know(self, record: Record) -> int:
+        """Takes up a sender, new or from a saved model."""
+        if self._free:
+            number = self._free.pop()
+            self.records[number] = record
+        else:
+            number = len(self.records)
+            self.records.append(record)
+        self._ids[record.identity] = number
+        self.roles.see(record.identity[2], record.identity[3])
+        return number
+
+    def _payer(self, packet: Packet, sender: int) -> int:
+        if packet.sport < 0:
+            return sender
+        if packet.quoted:
+            key = (packet.is_tcp, packet.destination, packet.sport, packet.dport)
+            return self._conversations.payer_of_error(sender, packet.time, key)
+        key = (packet.is_tcp, packet.source, packet.sport, packet.dport)
+        reverse = (packet.is_tcp, packet.destination, packet.dport, packet.sport)
+        return self._conversations.payer(sender, packet.time, key, reverse, packet.flags)
+
+
+def _packets(batch: Columns, switch: str) -> Iterator[Packet]:
+    is_arp = batch["arp_op"] >= 0
+    is_tcp = batch["tcp_sport"] >= 0
+    multicast = batch["eth_dst"] & _GROUP_BIT != 0
+    return starmap(
+        Packet,
+        zip(
+            repeat(switch, len(is_arp)),
+            seconds(batch).tolist(),
+            batch["arrival"].tolist(),
+            batch["port"].tolist(),
+            batch["eth_src"].tolist(),
+            batch["eth_dst"].tolist(),
+            _addresses(batch, "src", is_arp),
+            _addresses(batch, "dst", is_arp),
+            multicast.tolist(),
+            is_tcp.tolist(),
+            np.where(is_tcp, batch["tcp_sport"], batch["udp_sport"]).tolist(),
+            np.where(is_tcp, batch["tcp_dport"], batch["udp_dport"]).tolist(),
+            np.where(batch["quoted"] != 0, -1, batch["udp_sport"]).tolist(),
+            batch["quoted"].tolist(),
+            batch["tcp_flags"].tolist(),
+            strict=True,
+        ),
+    )
+
+
+def _addresses(batch: Columns, side: str, is_arp: npt.NDArray[np.bool_]) -> Iterator[Address]:
+    """The IP address of each row, in ARP the one it speaks for."""
+    version = np.where(is_arp, 4, batch["ip_version"])
+    lo = np.where(is_arp, batch[f"arp_{side}_ip"], batch[f"ip_{side}_lo"])
+    return zip(version.tolist(), batch[f"ip_{side}_hi"].tolist(), lo.tolist(), strict=True)

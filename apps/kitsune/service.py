@@ -1,0 +1,143 @@
+"""Kitsune as an app: packet batches in, score summaries and alerts out.
+
+One instance is active, others stand by: the statistics of a packet depend on all packets before it,
+so instances cannot share one stream without changing scores.
+"""
+
+import logging
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import due.service
+from apps.kitsune.detector import Detector, DetectorSettings, Scored
+from apps.kitsune.kernel import load_kernel
+from apps.kitsune.model_file import load_model
+from apps.messages import Alert
+from due import NO_WAIT, Capability, Engine, Interest, Item
+
+PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
+SCORE: Final = "network.anomaly.kitsune.score"
+ALERT: Final = "network.anomaly.kitsune.alert"
+
+INTERESTS = (Interest(PACKETS),)
+CAPABILITIES = (
+    Capability(SCORE, delivery="reliable", archive="always"),
+    Capability(ALERT, delivery="reliable", archive="always"),
+)
+
+_log = logging.getLogger("kitsune")
+
+
+class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the detector, and of the app around it."""
+
+    load_model: str = ""
+    """File of a trained model; empty: train on the first packets."""
+    save_model: str = ""
+    """File to which the model is written when training ends and when the app stops; empty: nowhere."""
+
+
+class KitsuneService:
+    """Scores each batch as it comes; a batch that takes long holds back the stream, nothing is dropped."""
+
+    def __init__(self, engine: Engine, settings: Settings) -> None:
+        self._engine = engine
+        self._settings = settings
+        self._detector = _detector(settings)
+        self._told = bool(settings.load_model)
+        self._lock = threading.Lock()
+        self._packets = 0
+        self._alerts = 0
+        self._subscription: Any = None
+
+    def start(self) -> None:
+        """Subscribes; the engine is initialised."""
+        self._subscription = self._engine.observe(PACKETS).subscribe(self._score)
+
+    def tick(self) -> None:
+        """Nothing depends on wall time."""
+
+    def stop(self) -> None:
+        """Raises the alerts of the second that is still open."""
+        if self._subscription is not None:
+            self._subscription.dispose()
+        with self._lock:
+            self._write_alerts(self._detector.finish())
+            if self._settings.save_model and self._detector.model.is_trained:
+                self._detector.save(Path(self._settings.save_model))
+
+    def health(self) -> dict[str, Any]:
+        """Figures for people and dashboards."""
+        return {
+            "packets": self._packets,
+            "trained": self._detector.trained,
+            "training_packets": self._detector.model.training_packets,
+            "alerts": self._alerts,
+            "line": self._detector.line,
+            "training_warnings": self._detector.training_warnings,
+            "clock_jumps": self._detector.senders.clock_jumps,
+            **self._detector.afterimage.counts,
+        }
+
+    def _score(self, item: Item) -> None:
+        batch = item.value
+        if not len(batch):
+            return
+        switch = item.key.split(".")[3]
+        with self._lock:
+            scored, alerts = self._detector.process(batch, switch)
+            self._packets += len(batch)
+            event_time = int(batch["time_us"][-1]) * 1_000
+            self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
+            self._write_alerts(alerts)
+            if self._detector.model.is_trained and not self._told:
+                self._end_of_training()
+
+    def _end_of_training(self) -> None:
+        self._told = True
+        for warning in self._detector.training_warnings:
+            _log.warning("training: %s", warning)
+        if self._settings.save_model:
+            self._detector.save(Path(self._settings.save_model))
+
+    def _summary(self, batch: Any, switch: str, scored: Scored) -> dict[str, Any]:
+        arrival = batch["arrival"]
+        return {
+            "switch": switch,
+            "count": len(batch),
+            "trained": self._detector.trained,
+            "over": scored.over,
+            "max": float(scored.scores.max()),
+            "first_arrival": int(arrival[0]),
+            "last_arrival": int(arrival[-1]),
+            "arrival": arrival,
+            "score": scored.scores,
+            "time_us": batch["time_us"],
+            "state": scored.state,
+        }
+
+    def _write_alerts(self, alerts: list[Alert]) -> None:
+        for alert in alerts:
+            self._alerts += 1
+            _log.warning("%s", alert.reason)
+            self._engine.write(ALERT, alert.to_value(), [NO_WAIT], event_time=alert.event_time)
+
+
+def _detector(settings: Settings) -> Detector:
+    kernel = load_kernel()
+    model = None
+    if settings.load_model:
+        model = load_model(Path(settings.load_model), clip=settings.scale_limit, kernel=kernel)
+    return Detector(settings, model=model, kernel=kernel)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the app until SIGTERM or SIGINT."""
+    return due.service.run("kitsune", KitsuneService, Settings, INTERESTS, CAPABILITIES, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

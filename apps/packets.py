@@ -1,0 +1,283 @@
+"""The packet record: one row per frame, in columns, as packet headers travel on DUE.
+
+A `RecordBatch` with the columns of `PACKET_COLUMNS` is the value of every item under
+`network.packets.p4runtime_ctrl.<switch>.<port>`.  Field semantics are those of tshark with
+`occurrence=f` (first occurrence): an ICMP error carries the *quoted* TCP/UDP ports beside the outer
+addresses.  Absent is -1 for signed columns and 0 where the text says so.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from due import RecordBatch
+
+PACKET_COLUMNS: Final[dict[str, str]] = {
+    # where and when
+    "sequence": "u8",  # of this packet-in among all that the switch sent; gaps are losses
+    "arrival": "u8",  # number of the frame among all that reached the switch, from 0
+    "time_us": "i8",  # capture time, absolute us since the epoch, UTC
+    "port": "u2",  # ingress port of the switch
+    "length": "u4",  # bytes on the wire
+    # Ethernet; MAC addresses as integers
+    "eth_src": "u8",
+    "eth_dst": "u8",
+    "eth_type": "u2",  # after VLAN tags; 0 for 802.3 length fields
+    "vlan": "i4",  # outer VLAN id, -1 = untagged
+    # ARP (IPv4 over Ethernet only); arp_op -1 = not ARP
+    "arp_op": "i4",
+    "arp_src_mac": "u8",
+    "arp_src_ip": "u4",
+    "arp_dst_mac": "u8",
+    "arp_dst_ip": "u4",
+    # outermost IP header; ip_version 0 = none. 128-bit addresses as two halves, IPv4 in the low one
+    "ip_version": "u1",
+    "ip_src_hi": "u8",
+    "ip_src_lo": "u8",
+    "ip_dst_hi": "u8",
+    "ip_dst_lo": "u8",
+    "ip_proto": "i4",  # after IPv6 extension headers, -1 = no IP
+    # ports: first occurrence, so those quoted by an ICMP error count; -1 = absent
+    "tcp_sport": "i4",
+    "tcp_dport": "i4",
+    "udp_sport": "i4",
+    "udp_dport": "i4",
+    "quoted": "u1",  # 1 = the ports above come from a packet quoted in an ICMP error
+    # TCP of the packet itself (0 where there is none or it is only quoted)
+    "tcp_flags": "u1",
+    "tcp_seq": "u4",
+    "tcp_ack": "u4",
+    # ICMPv4 / ICMPv6 of the packet itself, -1 = absent
+    "icmp_type": "i4",
+    "icmp_code": "i4",
+    "icmp6_type": "i4",
+    "icmp6_code": "i4",
+}
+"""Column name to numpy dtype. All columns of a batch have the same length."""
+
+_VLAN_TAGS: Final = np.array([0x8100, 0x88A8, 0x9100], np.uint16)
+_EXTENSIONS: Final = np.array([0, 43, 44, 51, 60], np.uint8)
+_MAX_VLAN_TAGS: Final = 2
+_MAX_EXTENSIONS: Final = 3
+_SNAP: Final = 0xAAAA03000000
+_TCP, _UDP, _UDP_LITE, _ICMP, _ICMP6, _FRAGMENT, _AUTHENTICATION = 6, 17, 136, 1, 58, 44, 51
+_ICMP_ERRORS: Final = np.array([3, 4, 5, 11, 12], np.int32)
+_ICMP6_ERRORS: Final = np.array([1, 2, 3, 4], np.int32)
+
+_Array = npt.NDArray[Any]
+_Numbers = Sequence[int] | npt.NDArray[Any]
+
+
+def read_frames(
+    frames: Sequence[bytes],
+    *,
+    lengths: _Numbers,
+    times_us: _Numbers,
+    ports: _Numbers,
+    sequence: _Numbers,
+    arrival: _Numbers,
+) -> RecordBatch:
+    """Ethernet frames (whole, cut or zero-padded) as a record batch with all `PACKET_COLUMNS`.
+
+    `lengths` are bytes on the wire, `times_us` absolute capture time in microseconds; the five
+    number columns have one entry per frame (a `ValueError` names one that has not).  No frame is
+    refused: what is missing or malformed is absent in its row.
+
+    Differences from tshark: ports of a fragmented datagram stand in its first fragment (tshark
+    reassembles and shows them in the last); the inside of tunnels (IP in IP, GRE, VXLAN, PPPoE,
+    MPLS, IPsec over IPv4), of more than two VLAN tags and of more than three IPv6 extension headers
+    is not read; ARP other than IPv4 over Ethernet counts as not ARP.
+    """
+    given = {
+        "sequence": sequence,
+        "arrival": arrival,
+        "time_us": times_us,
+        "port": ports,
+        "length": lengths,
+    }
+    columns: dict[str, _Array] = {}
+    for name, kind in PACKET_COLUMNS.items():
+        if name in given:
+            columns[name] = np.asarray(given[name], dtype=kind)
+            if columns[name].shape != (len(frames),):
+                raise ValueError(
+                    f"read_frames: {len(frames)} frames, but {name} has shape {columns[name].shape}"
+                )
+        else:
+            columns[name] = np.full(len(frames), -1 if kind[0] == "i" else 0, dtype=kind)
+    _Reading(frames, columns).ethernet()
+    return RecordBatch(columns)
+
+
+class _Span(NamedTuple):
+    """Rows still being read, where their next header begins, and where their bytes end."""
+
+    rows: _Array
+    at: _Array
+    end: _Array
+
+    def only(self, keep: _Array) -> "_Span":
+        return _Span(self.rows[keep], self.at[keep], self.end[keep])
+
+
+class _Reading:
+    """One pass over a batch: every header is read for all rows that have it at once."""
+
+    def __init__(self, frames: Sequence[bytes], columns: dict[str, _Array]) -> None:
+        self._columns = columns
+        # frames end to end, and views that read a big-endian number at any byte
+        joined = b"".join(frames) + bytes(8)
+        self._views = {
+            width: np.ndarray((len(joined) - width + 1,), f">u{width}", joined, strides=(1,))
+            for width in (1, 2, 4, 8)
+        }
+        captured = np.fromiter(map(len, frames), np.int64, len(frames))
+        ends = np.cumsum(captured)
+        self._whole = _Span(np.arange(len(frames)), ends - captured, ends)
+
+    def _number(self, width: int, at: _Array) -> _Array:
+        return self._views[width][at].astype(f"u{width}")
+
+    def _mac(self, at: _Array) -> _Array:
+        return (self._number(2, at).astype(np.uint64) << np.uint64(32)) | self._number(4, at + 2)
+
+    def ethernet(self) -> None:
+        for name, offset in (("eth_dst", 0), ("eth_src", 6)):
+            whole = self._whole.only(self._whole.at + offset + 6 <= self._whole.end)
+            self._columns[name][whole.rows] = self._mac(whole.at + offset)
+        span = self._whole.only(self._whole.at + 14 <= self._whole.end)
+        kind = self._number(2, span.at + 12)
+        span = span._replace(at=span.at + 14)
+        span, kind = self._vlan_tags(span, kind)
+        self._columns["eth_type"][span.rows] = np.where(kind <= 1500, 0, kind)
+        span, kind = self._snap(span, kind)
+        self._arp(span.only(kind == 0x0806))
+        self._outer(span.only(kind == 0x0800), self._ipv4)
+        self._outer(span.only(kind == 0x86DD), self._ipv6)
+
+    def _vlan_tags(self, span: _Span, kind: _Array) -> tuple[_Span, _Array]:
+        for depth in range(_MAX_VLAN_TAGS):
+            tagged = np.flatnonzero(np.isin(kind, _VLAN_TAGS) & (span.at + 4 <= span.end))
+            if not len(tagged):
+                break
+            at = span.at[tagged]
+            if depth == 0:
+                self._columns["vlan"][span.rows[tagged]] = self._number(2, at) & 0xFFF
+            kind[tagged] = self._number(2, at + 2)
+            span.at[tagged] += 4
+        return span, kind
+
+    def _snap(self, span: _Span, kind: _Array) -> tuple[_Span, _Array]:
+        """802.3 frames whose LLC header names an EtherType."""
+        short = np.flatnonzero((kind <= 1500) & (span.at + 8 <= span.end))
+        short = short[self._mac(span.at[short]) == _SNAP]
+        if len(short):
+            at = span.at[short]
+            span.end[short] = np.minimum(span.end[short], at + kind[short])
+            kind[short] = self._number(2, at + 6)
+            span.at[short] += 8
+        return span, kind
+
+    def _arp(self, span: _Span) -> None:
+        span = span.only(span.at + 28 <= span.end)
+        hardware = self._number(2, span.at)
+        span = span.only(((hardware == 1) | (hardware == 6)) & (self._number(4, span.at + 2) == 0x08000604))
+        columns = self._columns
+        columns["arp_op"][span.rows] = self._number(2, span.at + 6)
+        columns["arp_src_mac"][span.rows] = self._mac(span.at + 8)
+        columns["arp_src_ip"][span.rows] = self._number(4, span.at + 14)
+        columns["arp_dst_mac"][span.rows] = self._mac(span.at + 18)
+        columns["arp_dst_ip"][span.rows] = self._number(4, span.at + 24)
+
+    def _outer(self, span: _Span, header: Callable[[_Span, bool], tuple[_Span, _Array]]) -> None:
+        if not len(span.rows):
+            return
+        span, protocol = header(span, True)
+        self._columns["ip_proto"][span.rows] = protocol
+        self._ports(span, protocol)
+        self._tcp(span.only(protocol == _TCP))
+        icmp = self._icmp(span.only(protocol == _ICMP), "icmp", _ICMP_ERRORS)
+        self._quoted(icmp, self._ipv4)
+        icmp6 = self._icmp(span.only(protocol == _ICMP6), "icmp6", _ICMP6_ERRORS)
+        self._quoted(icmp6, self._ipv6)
+
+    def _ipv4(self, span: _Span, outer: bool) -> tuple[_Span, _Array]:
+        span = span.only(span.at + 20 <= span.end)
+        first = self._number(1, span.at)
+        header = (first & 0xF).astype(np.int64) * 4
+        total = self._number(2, span.at + 2).astype(np.int64)
+        # total length 0 is what segmentation offload leaves in captures
+        sane = (first >> 4 == 4) & (header >= 20) & ((total >= header) | (total == 0))
+        span, header, total = span.only(sane), header[sane], total[sane]
+        if outer:
+            self._columns["ip_version"][span.rows] = 4
+            self._columns["ip_src_lo"][span.rows] = self._number(4, span.at + 12)
+            self._columns["ip_dst_lo"][span.rows] = self._number(4, span.at + 16)
+        protocol = self._number(1, span.at + 9)
+        later_fragment = self._number(2, span.at + 6) & 0x1FFF != 0
+        end = np.where(total > 0, np.minimum(span.end, span.at + total), span.end)
+        end = np.where(later_fragment, span.at, end)
+        return span._replace(at=span.at + header, end=end), protocol
+
+    def _ipv6(self, span: _Span, outer: bool) -> tuple[_Span, _Array]:
+        span = span.only(span.at + 40 <= span.end)
+        span = span.only(self._number(1, span.at) >> 4 == 6)
+        if outer:
+            self._columns["ip_version"][span.rows] = 6
+            for name, offset in (("ip_src_hi", 8), ("ip_src_lo", 16), ("ip_dst_hi", 24), ("ip_dst_lo", 32)):
+                self._columns[name][span.rows] = self._number(8, span.at + offset)
+        payload = self._number(2, span.at + 4).astype(np.int64)
+        protocol = self._number(1, span.at + 6)
+        end = np.where(payload > 0, np.minimum(span.end, span.at + 40 + payload), span.end)
+        span = span._replace(at=span.at + 40, end=end)
+        for _ in range(_MAX_EXTENSIONS):
+            more = np.flatnonzero(np.isin(protocol, _EXTENSIONS) & (span.at + 8 <= span.end))
+            if not len(more):
+                break
+            self._extension(span, protocol, more)
+        return span, protocol
+
+    def _extension(self, span: _Span, protocol: _Array, more: _Array) -> None:
+        """Steps over one extension header of the rows `more`, in place."""
+        at, kind = span.at[more], protocol[more]
+        units = self._number(1, at + 1).astype(np.int64)
+        length = np.where(kind == _AUTHENTICATION, (units + 2) * 4, (units + 1) * 8)
+        fragment = kind == _FRAGMENT
+        later = fragment & (self._number(2, at + 2) >> 3 != 0)
+        protocol[more] = self._number(1, at)
+        span.at[more] = at + np.where(fragment, 8, length)
+        span.end[more] = np.where(later, at, span.end[more])
+
+    def _ports(self, span: _Span, protocol: _Array) -> _Array:
+        """Writes source and destination port; returns the rows that have them."""
+        there = span.at + 4 <= span.end
+        for name, wanted in (
+            ("tcp", protocol == _TCP),
+            ("udp", (protocol == _UDP) | (protocol == _UDP_LITE)),
+        ):
+            found = span.only(there & wanted)
+            self._columns[f"{name}_sport"][found.rows] = self._number(2, found.at)
+            self._columns[f"{name}_dport"][found.rows] = self._number(2, found.at + 2)
+        return span.rows[there & np.isin(protocol, (_TCP, _UDP, _UDP_LITE))]
+
+    def _tcp(self, span: _Span) -> None:
+        span = span.only(span.at + 14 <= span.end)
+        self._columns["tcp_seq"][span.rows] = self._number(4, span.at + 4)
+        self._columns["tcp_ack"][span.rows] = self._number(4, span.at + 8)
+        self._columns["tcp_flags"][span.rows] = self._number(1, span.at + 13)
+
+    def _icmp(self, span: _Span, name: str, errors: _Array) -> _Span:
+        """Writes type and code; returns where errors quote the packet they answer."""
+        span = span.only(span.at + 2 <= span.end)
+        kind = self._number(1, span.at)
+        self._columns[f"{name}_type"][span.rows] = kind
+        self._columns[f"{name}_code"][span.rows] = self._number(1, span.at + 1)
+        error = span.only(np.isin(kind, errors))
+        return error._replace(at=error.at + 8)
+
+    def _quoted(self, span: _Span, header: Callable[[_Span, bool], tuple[_Span, _Array]]) -> None:
+        if len(span.rows):
+            span, protocol = header(span, False)
+            self._columns["quoted"][self._ports(span, protocol)] = 1

@@ -1,0 +1,99 @@
+"""KitNET as published, one numpy call per step, per autoencoder and per packet.  Only for tests and benchmarks."""
+
+import math
+
+import numpy as np
+from scipy.cluster.hierarchy import linkage, to_tree
+
+
+def sigmoid(x):
+    return 1.0 / (1 + np.exp(-x))
+
+
+class Autoencoder:
+    def __init__(self, visible):
+        hidden = math.ceil(visible * 0.75)
+        self.weights = np.random.RandomState(1234).uniform(-1 / visible, 1 / visible, (visible, hidden))
+        self.hidden_bias = np.zeros(hidden)
+        self.visible_bias = np.zeros(visible)
+        self.low = np.full(visible, np.inf)
+        self.high = np.full(visible, -np.inf)
+
+    def scaled(self, x):
+        return (x - self.low) / (self.high - self.low + 1e-16)
+
+    def pass_through(self, x):
+        y = sigmoid(np.dot(x, self.weights) + self.hidden_bias)
+        z = sigmoid(np.dot(y, self.weights.T) + self.visible_bias)
+        return y, x - z
+
+    def train(self, x):
+        self.high[x > self.high] = x[x > self.high]
+        self.low[x < self.low] = x[x < self.low]
+        x = self.scaled(x)
+        y, error = self.pass_through(x)
+        gradient = np.dot(error, self.weights) * y * (1 - y)
+        self.weights += 0.1 * (np.outer(x, gradient) + np.outer(error, y))
+        self.hidden_bias += 0.1 * gradient
+        self.visible_bias += 0.1 * error
+        return np.sqrt(np.mean(error**2))
+
+    def score(self, x):
+        _, error = self.pass_through(self.scaled(x))
+        return np.sqrt(np.mean(error**2))
+
+
+class FeatureMap:
+    def __init__(self, width):
+        self.total = np.zeros(width)
+        self.residual = np.zeros(width)
+        self.squares = np.zeros(width)
+        self.products = np.zeros((width, width))
+        self.count = 0
+
+    def update(self, x):
+        self.count += 1
+        self.total += x
+        residual = x - self.total / self.count
+        self.residual += residual
+        self.squares += residual**2
+        self.products += np.outer(residual, residual)
+
+    def groups(self, most):
+        roots = np.outer(np.sqrt(self.squares), np.sqrt(self.squares))
+        roots[roots == 0] = 1e-100
+        distance = 1 - self.products / roots
+        distance[distance < 0] = 0
+        upper = distance[np.triu_indices(len(distance), 1)]
+        return split(to_tree(linkage(upper)), most)
+
+
+def split(node, most):
+    if node.count <= most:
+        return [node.pre_order()]
+    return split(node.get_left(), most) + split(node.get_right(), most)
+
+
+class KitNet:
+    def __init__(self, width, most, fm_grace, ad_grace):
+        self.fm_grace, self.ad_grace, self.most = fm_grace, ad_grace, most
+        self.map = FeatureMap(width)
+        self.seen = 0
+        self.groups = None
+
+    def process(self, x):
+        if self.seen > self.fm_grace + self.ad_grace:
+            self.seen += 1
+            errors = np.array([a.score(x[g]) for a, g in zip(self.ensemble, self.groups, strict=True)])
+            return self.output.score(errors)
+        if self.groups is None:
+            self.map.update(x)
+            if self.seen == self.fm_grace:
+                self.groups = self.map.groups(self.most)
+                self.ensemble = [Autoencoder(len(group)) for group in self.groups]
+                self.output = Autoencoder(len(self.groups))
+        else:
+            errors = np.array([a.train(x[g]) for a, g in zip(self.ensemble, self.groups, strict=True)])
+            self.output.train(errors)
+        self.seen += 1
+        return 0.0
