@@ -1,0 +1,311 @@
+"""Replay a capture through the whole loop, once or twice, and say what happened.
+
+    Capture ─► feed ─► switch ─► controller ─► Kitsune ─► scores ─┐
+                 ▲                                                │ window of packets in flight
+                 └────────────────────────────────────────────────┘
+
+The feeder keeps a bounded number of packets in flight, counted by scored + dropped, so that no queue
+of the loop can overflow and the loop's delay, in packets, is small and known.
+"""
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from apps.messages import Alert, Confirmation, Decision
+from due import CONSUMER, Engine, Interest, Item
+from sdnator.captures import Capture
+from sdnator.errors import PipelineError
+from sdnator.flight import FlightLog
+from sdnator.pipeline import SWITCH_NAME, Pipeline, PipelinePlan
+from sdnator.survey import Survey
+from sdnator.wire import Feed
+
+CONFIRM_SECONDS = 5.0
+"""How long the last decisions may take to be confirmed."""
+CHUNK = 64
+"""Packets sent at a time, at most."""
+STALL_SECONDS = 30.0
+"""The loop has failed when nothing comes back for so long."""
+SETTLE_SECONDS = 0.5
+"""On a switch that gives no verdicts: silence for so long means that what is in flight was dropped."""
+POLL_SECONDS = 0.002
+PACKETS = "packets"
+"""The controller's name for the request of every packet."""
+INTERESTS = (
+    Interest("network.anomaly.kitsune.score"),
+    Interest("network.anomaly.kitsune.alert"),
+    Interest("network.block.firewall.*"),
+    Interest("network.confirmation.p4runtime_ctrl.*"),
+    Interest("network.switch.p4runtime_ctrl.*"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """How a capture is replayed."""
+
+    switch: str = "embedded"
+    inject: str | None = None
+    """Interface to send frames into, for a switch that is already running."""
+    fm_grace: int = 5_000
+    """Packets from which the feature map is learnt."""
+    ad_grace: int = 50_000
+    """Packets on which the autoencoders are trained."""
+    pace: float | None = None
+    """Capture seconds a wall second; None = as fast as the loop goes."""
+    window: int = 512
+    """Packets in flight, at most."""
+    keep: Path | None = None
+    """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
+
+    @property
+    def training_packets(self) -> int:
+        """Packets that Kitsune trains on: the reference trains on one more than asked for."""
+        return self.fm_grace + self.ad_grace + 1
+
+
+@dataclass(eq=False)
+class PassResult:
+    """What one pass through the loop gave."""
+
+    flight: FlightLog
+    mitigate: bool
+    seconds: float = 0.0
+    lost_on_the_way: int = 0
+    """Gaps in the packet-in sequence numbers, as the controller counted them."""
+    alerts: list[Alert] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+    confirmations: list[Confirmation] = field(default_factory=list)
+    sent_at: dict[int, float] = field(default_factory=dict)
+    """Wall time (monotonic) at which watched packets were sent."""
+    confirmed_at: list[float] = field(default_factory=list)
+    """Wall time of each confirmation."""
+
+
+Progress = Callable[[FlightLog, int], None]
+"""Called now and then with the flight log and the number of blocks so far."""
+
+
+class _Observer:
+    """What the replay hears on DUE; callbacks come from the engine's thread."""
+
+    def __init__(self, result: PassResult) -> None:
+        self._result = result
+        self.moved = threading.Condition()
+        self.switch: dict[str, Any] = {}
+        self.blocks = 0
+
+    def subscribe(self, engine: Engine) -> None:
+        engine.observe("network.anomaly.kitsune.score").subscribe(self._on_score)
+        engine.observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
+        engine.observe("network.block.firewall.*").subscribe(self._on_decision)
+        engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
+        engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
+
+    def _on_score(self, item: Item) -> None:
+        value = item.value
+        with self.moved:
+            self._result.flight.scored(value["arrival"], value["score"], value["state"] == 0)
+            self.moved.notify_all()
+
+    def _on_alert(self, item: Item) -> None:
+        with self.moved:
+            self._result.alerts.append(Alert.from_value(item.value))
+
+    def _on_decision(self, item: Item) -> None:
+        with self.moved:
+            self._result.decisions.append(Decision.from_value(item.value))
+
+    def _on_confirmation(self, item: Item) -> None:
+        confirmation = Confirmation.from_value(item.value)
+        with self.moved:
+            self._result.confirmations.append(confirmation)
+            self._result.confirmed_at.append(time.monotonic())
+            if confirmation.state == "installed":
+                self.blocks += 1
+
+    def _on_switch(self, item: Item) -> None:
+        with self.moved:
+            self.switch = item.value
+            self._result.lost_on_the_way = int(item.value["lost"])
+            self.moved.notify_all()
+
+
+class ReplayPass:
+    """One pass of a capture through a fresh pipeline.
+
+    Args:
+        survey: the capture, read once before.
+        options: how to replay.
+        mitigate: False = the firewall decides but nothing is installed.
+        watch: indices of packets whose time of sending matters.
+    """
+
+    def __init__(self, survey: Survey, options: ReplayOptions, *, mitigate: bool, watch: frozenset[int]) -> None:
+        self._survey = survey
+        self._options = options
+        self._watch = watch
+        self._result = PassResult(FlightLog(survey.packets, verdicts=options.switch == "embedded"), mitigate)
+        self._observer = _Observer(self._result)
+
+    def run(self, progress: Progress | None = None) -> PassResult:
+        """Run it to the last packet; raises PipelineError where a part fails or the loop stalls."""
+        options = self._options
+        name = "with-blocking" if self._result.mitigate else "kitsune-alone"
+        with tempfile.TemporaryDirectory(prefix="sdnator-", ignore_cleanup_errors=True) as temporary:
+            folder = Path(temporary) if options.keep is None else options.keep / name
+            folder.mkdir(parents=True, exist_ok=True)
+            plan = PipelinePlan(
+                folder=folder,
+                switch=options.switch,
+                inject=options.inject,
+                base_us=self._survey.base_us,
+                kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},
+                firewall={"rules": {"dry_run": not self._result.mitigate}},
+            )
+            with Pipeline(plan) as pipeline:
+                self._run(pipeline, progress)
+        return self._result
+
+    def _run(self, pipeline: Pipeline, progress: Progress | None) -> None:
+        engine = Engine()
+        engine.set_pubsub(pipeline.updates)
+        engine.set_db(pipeline.archive)
+        engine.init("replay", CONSUMER, interests=INTERESTS)
+        try:
+            self._observer.subscribe(engine)
+            self._wait_for_packets(pipeline, engine)
+            started = time.monotonic()
+            feed = pipeline.feed()
+            try:
+                self._feed(pipeline, feed, progress)
+            finally:
+                feed.close()
+            self._result.seconds = time.monotonic() - started
+        finally:
+            engine.close()
+
+    def _wait_for_packets(self, pipeline: Pipeline, engine: Engine) -> None:
+        """Wait until the controller has told the switch to send packets, because Kitsune wants them.
+
+        Its word may be older than our subscription, so the archive is asked as well.
+        """
+        deadline = time.monotonic() + STALL_SECONDS
+        while True:
+            states = [item.value for item in engine.get(f"network.switch.p4runtime_ctrl.{SWITCH_NAME}")]
+            with self._observer.moved:
+                latest = self._observer.switch or (states[-1] if states else {})
+            if latest.get("primary") and PACKETS in latest.get("telemetry", ()):
+                return
+            pipeline.check()
+            if time.monotonic() > deadline:
+                raise PipelineError(
+                    f"switch {SWITCH_NAME} did not begin to send packets within {STALL_SECONDS:.0f} s; "
+                    f"its last state: {latest or 'none'}"
+                )
+            time.sleep(0.05)
+
+    def _feed(self, pipeline: Pipeline, feed: Feed, progress: Progress | None) -> None:
+        flight = self._result.flight
+        begun = time.monotonic()
+        first_ns = int(self._survey.time_ns[0])
+        with Capture(self._survey.path) as capture:
+            frames = iter(capture)
+            while flight.sent < self._survey.packets:
+                room = self._wait_for_room(pipeline, feed, progress)
+                chunk = list(islice(frames, min(room, CHUNK)))
+                self._keep_pace(begun, (chunk[0].time_ns - first_ns) / 1e9)
+                # Counted first: a verdict or score may come back before `send` returns.
+                self._note_watched(flight.sent, len(chunk))
+                with self._observer.moved:
+                    flight.send(len(chunk))
+                feed.send(
+                    [frame.time_ns // 1_000 - self._survey.base_us for frame in chunk],
+                    [frame.length for frame in chunk],
+                    [frame.data for frame in chunk],
+                )
+        self._drain(pipeline, feed, progress)
+        self._await_confirmations(pipeline)
+
+    def _await_confirmations(self, pipeline: Pipeline) -> None:
+        """What the firewall has decided by now gets its answer from the switch."""
+        deadline = time.monotonic() + CONFIRM_SECONDS
+
+        def confirmed() -> bool:
+            answered = {confirmation.id for confirmation in self._result.confirmations}
+            return all(decision.dry_run or decision.id in answered for decision in self._result.decisions)
+
+        with self._observer.moved:
+            while not confirmed() and time.monotonic() < deadline:
+                pipeline.check()
+                self._observer.moved.wait(0.05)
+
+    def _note_watched(self, first: int, count: int) -> None:
+        for index in self._watch.intersection(range(first, first + count)):
+            self._result.sent_at[index] = time.monotonic()
+
+    def _keep_pace(self, begun: float, capture_seconds: float) -> None:
+        if self._options.pace is None:
+            return
+        ahead = begun + capture_seconds / self._options.pace - time.monotonic()
+        if ahead > 0:
+            time.sleep(ahead)
+
+    def _wait_for_room(self, pipeline: Pipeline, feed: Feed, progress: Progress | None) -> int:
+        self._await(pipeline, feed, progress, lambda flight: flight.in_flight < self._options.window)
+        return self._options.window - self._result.flight.in_flight
+
+    def _drain(self, pipeline: Pipeline, feed: Feed, progress: Progress | None) -> None:
+        self._await(pipeline, feed, progress, lambda flight: flight.in_flight == 0)
+
+    def _await(
+        self,
+        pipeline: Pipeline,
+        feed: Feed,
+        progress: Progress | None,
+        done: Callable[[FlightLog], bool],
+    ) -> None:
+        """Take verdicts and scores until `done`; raises PipelineError when nothing moves any more."""
+        flight = self._result.flight
+        last, since, looked = -1, time.monotonic(), 0.0
+        while True:
+            with self._observer.moved:
+                flight.judge(feed.verdicts())
+                if done(flight):
+                    return
+                self._observer.moved.wait(POLL_SECONDS)
+            now = time.monotonic()
+            if flight.decided != last:
+                last, since = flight.decided, now
+            elif now - since > SETTLE_SECONDS:
+                with self._observer.moved:
+                    flight.settle()
+            if now - looked > 0.1:
+                looked = now
+                pipeline.check()
+                if progress is not None:
+                    progress(flight, self._observer.blocks)
+            if now - since > STALL_SECONDS:
+                raise PipelineError(
+                    f"the loop stands still: {flight.in_flight} of {flight.sent} packets sent are neither scored "
+                    f"nor dropped after {STALL_SECONDS:.0f} s"
+                )
+
+
+def wall_seconds_to_block(result: PassResult, first_attack: int | None) -> float | None:
+    """Wall seconds from the sending of the first attack packet to the first installed block."""
+    begun = result.sent_at.get(first_attack) if first_attack is not None else None
+    if begun is None:
+        return None
+    installed = [
+        at
+        for confirmation, at in zip(result.confirmations, result.confirmed_at, strict=True)
+        if confirmation.state == "installed"
+    ]
+    return installed[0] - begun if installed else None
