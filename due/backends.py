@@ -1,0 +1,56 @@
+"""From a URL to a driver, and what is used where no URL is given."""
+
+import os
+from pathlib import Path
+
+from due.config import Options
+from due.drivers.base import ArchiveDriver, Spool, UpdatesDriver
+from due.drivers.redis import RedisUpdates
+from due.errors import InvalidOption
+
+
+def open_updates(url: str, options: Options) -> UpdatesDriver:
+    """The Data Updates driver of a URL; raises `InvalidOption`."""
+    return RedisUpdates(
+        url,
+        window=options.window_bytes,
+        retain=options.retain_bytes,
+        group_timeout=options.group_timeout,
+        backlog=options.backlog_bytes,
+    )
+
+
+def open_archive(url: str) -> ArchiveDriver:
+    """The Data Archives driver of a URL; raises `InvalidOption`, `ArchiveUnavailable`."""
+    if url.startswith("sqlite:"):
+        from due.drivers.sqlite import SqliteArchive
+
+        return SqliteArchive(url)
+    if url.startswith(("mongodb:", "mongodb+srv:")):
+        from due.drivers.mongodb import MongoArchive
+
+        return MongoArchive(url)
+    raise InvalidOption(f"Data Archives URL {url!r}: use sqlite:///path/file.db or mongodb://host/database")
+
+
+def open_spool(folder: Path, options: Options) -> Spool | None:
+    """A spool in `folder`; None where the options give it no space."""
+    if options.spool_bytes <= 0:
+        return None
+    from due.drivers.spool import DiskSpool
+
+    return DiskSpool(folder, options.spool_bytes)
+
+
+def default_updates(options: Options) -> str:
+    """The URL where none was given; empty: use the embedded server."""
+    return options.updates or os.environ.get("DUE_UPDATES", "")
+
+
+def default_archive(options: Options) -> str:
+    """The URL where none was given."""
+    return (
+        options.archive
+        or os.environ.get("DUE_ARCHIVE", "")
+        or f"sqlite://{options.folder().absolute() / 'archive.db'}"
+    )

@@ -1,0 +1,233 @@
+"""The contracts between the engine and its backends.
+
+    engine ──► UpdatesDriver  (Data Updates: Redis)           publisher() and receiver()
+    engine ──► archiver ──► ArchiveDriver (Data Archives: SQLite, MongoDB)
+                      └──► Spool          (disk, while the archive is away)
+
+A driver turns every error of its client library into a `due.errors.BackendError`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import msgspec
+
+from due.messages import Item, PackedFrame
+
+
+@runtime_checkable
+class ArchiveDriver(Protocol):
+    """Data Archives.  Made by a factory `open_archive(url)`-style constructor taking the URL.
+
+    Document fields of queries: dataKey, value (and value.*), timestamp, eventTime, appId, instanceId,
+    sequence.  Called from one thread at a time per instance for `insert*`/`prune`, and from any
+    thread, at the same time, for `find`.
+
+    Every method raises `ArchiveUnavailable` when trying the same call later may help (server away,
+    file locked, disk full) and `BackendError` when it will not; `find` raises `InvalidQuery`.
+    """
+
+    def insert(self, items: Sequence[Item]) -> None:
+        """Store items.  On return they are committed.  Idempotent on (instance_id, key, sequence)."""
+        ...
+
+    def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
+        """Store whole frames; means the same as `insert` of all their items.
+
+        This is the fast way and what the archiver uses: a frame may be stored as one row with its
+        payload untouched and decoded by `due.codec.unpack` when found.  A frame's items have one key,
+        one instance and consecutive sequence numbers from `frame.sequence`; their timestamps lie in
+        [first_timestamp, last_timestamp].  Idempotent on (instance_id, key, sequence of each item);
+        a frame is re-sent whole and with the same cut, so (instance_id, key, sequence) of the first
+        item suffices.  `frame.index` asks for item-wise storage with an index on values.
+        """
+        ...
+
+    def find(self, query: Mapping[str, Any]) -> list[Item]:
+        """Items that match a MongoDB-dialect query, oldest first (timestamp, then sequence).
+
+        A plain string under `dataKey` is a DUE key: wildcards allowed, fewer specs match more items
+        (`due.keys.Key.matches`).  Times are int ns or datetime (naive = UTC).
+        """
+        ...
+
+    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+        """Retention: delete items older than `before` (ns), then oldest first down to `max_bytes`.
+
+        Returns how many items were deleted.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release connections and files; further calls raise `BackendError`."""
+        ...
+
+
+@runtime_checkable
+class Spool(Protocol):
+    """A bounded queue of frames on disk, first in first out, that outlives the process.
+
+    Used by the archiver's thread only.  `take` does not remove: a crash between `take` and `done`
+    delivers the frames again, and the archive recognises them.
+    """
+
+    def put(self, frames: Sequence[PackedFrame]) -> int:
+        """Append; returns how many *items* did not fit (they are lost and the archiver counts them)."""
+        ...
+
+    def take(self, frames: int) -> list[PackedFrame]:
+        """Up to `frames` of the oldest frames, without removing them; [] when empty."""
+        ...
+
+    def done(self, frames: int) -> None:
+        """Remove that many of the oldest frames."""
+        ...
+
+    def __len__(self) -> int:
+        """Frames in the spool."""
+        ...
+
+    def close(self) -> None:
+        """Close files; what is in the spool stays for the next start."""
+        ...
+
+
+class Delivery(msgspec.Struct, frozen=True, gc=False):
+    """A payload that arrived."""
+
+    path: str
+    """The key's segments, or the name of a control channel."""
+    payload: bytes
+    token: str = ""
+    """Names it for `acknowledge`; empty for best-effort payloads, which need none."""
+    tries: int = 1
+    """How often it was handed to a consumer of the group, this time included."""
+
+
+class Publisher(Protocol):
+    """The sending half of a Data Updates connection.  Thread-safe; sends keep their order."""
+
+    def publish(self, path: str, payload: bytes) -> None:
+        """Send to all who are subscribed now (best effort); does not wait for the server's answer.
+
+        Raises `UpdatesUnavailable` when there is no connection: the payload is lost.
+        """
+        ...
+
+    def append(self, path: str, payload: bytes) -> None:
+        """Append to the reliable stream `path`; keeps the payload until its readers acknowledged it.
+
+        Blocks while the stream's window is full (back-pressure) and while the connection is away.
+        """
+        ...
+
+    def has_room(self, path: str) -> bool:
+        """Whether `append` to this path would go through without waiting for readers."""
+        ...
+
+    def settle(self, timeout: float | None = None) -> None:
+        """Return when the server has acknowledged everything sent so far; raises `Timeout`."""
+        ...
+
+    def poll(self) -> None:
+        """Periodic care: read acknowledgements, reconnect when due, re-send what the server lost."""
+        ...
+
+    def statistics(self) -> dict[str, int]:
+        """Counters for `health`."""
+        ...
+
+    def close(self) -> None:
+        """Close the connection; what is not acknowledged is lost."""
+        ...
+
+
+class Receiver(Protocol):
+    """The receiving half.  One thread calls `receive` and `acknowledge`; the rest is thread-safe."""
+
+    def subscribe(self, pattern: str) -> None:
+        """Receive best-effort payloads of a path; `*` and `**` as in keys."""
+        ...
+
+    def unsubscribe(self, pattern: str) -> None:
+        """The inverse of `subscribe`."""
+        ...
+
+    def follow(self, pattern: str, *, start: str = "") -> None:
+        """Also read the reliable streams whose path matches, existing and future ones.
+
+        `start`: "" = where the group stopped, or what is written from now on; else a stream id or "0"
+        for all that is kept: the group is set back to it.
+        """
+        ...
+
+    def unfollow(self, pattern: str) -> None:
+        """The inverse of `follow`."""
+        ...
+
+    def receive(self, timeout: float) -> list[Delivery]:
+        """What has arrived, in order; [] after `timeout` seconds or `wake`.
+
+        Reconnects with back-off by itself.
+        """
+        ...
+
+    def acknowledge(self, delivery: Delivery) -> None:
+        """The group is done with it.  May be sent with the next `receive`."""
+        ...
+
+    def activate(self, active: bool, *, take_over: bool = False) -> None:
+        """Read streams or rest.  `take_over`: the other members of the group are known to be gone."""
+        ...
+
+    def wake(self) -> None:
+        """Make `receive` return soon."""
+        ...
+
+    def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
+        """Put a payload that callbacks keep failing on where people can see it."""
+        ...
+
+    def aside(self) -> list[tuple[bytes, str]]:
+        """Payloads set aside for this group, oldest first, with reasons."""
+        ...
+
+    def drain(self) -> None:
+        """Take best-effort payloads off the server while the receiving thread is busy; any thread.
+
+        What exceeds the backlog limit is dropped; sequence numbers show it later.
+        """
+        ...
+
+    def renew(self) -> None:
+        """Tell producers that this reader lives; called about every second from any thread."""
+        ...
+
+    def statistics(self) -> dict[str, int]:
+        """Counters for `health`."""
+        ...
+
+    def close(self) -> None:
+        """Close connections.  Unacknowledged deliveries go to another member of the group."""
+        ...
+
+
+class UpdatesDriver(Protocol):
+    """Data Updates behind one URL."""
+
+    url: str
+
+    def publisher(self) -> Publisher:
+        """A new sending half."""
+        ...
+
+    def receiver(self, group: str, consumer: str, *, shared: bool = False) -> Receiver:
+        """A new receiving half: `consumer` of the readers `group`.
+
+        `shared`: members divide the streams among them, so order is not kept between them.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release what the driver itself holds."""
+        ...

@@ -1,0 +1,375 @@
+"""Data Archives on a MongoDB server, through pymongo.  URL: `mongodb://host/database?collection=name`.
+
+    <collection>         one document per frame or item: dataKey, appId, instanceId, count, and first and last
+                         of timestamp, eventTime and sequence; `value` where BSON holds it exactly, else `payload`
+    <collection>_keys    every dataKey, and how far apart the items of one of its documents may lie
+    <collection>_parts   the rest of payloads that are larger than a document may be
+
+A query narrows on the server by index on key and time; `query.matches` decides item by item.
+"""
+
+import math
+import os
+import threading
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from operator import attrgetter
+from typing import Any, TypeAlias
+from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
+
+from bson import Int64
+from bson.errors import BSONError
+from pymongo import MongoClient
+from pymongo.collection import Collection
+from pymongo.errors import BulkWriteError, ConnectionFailure, ExecutionTimeout, PyMongoError
+from pymongo.uri_parser import parse_uri
+
+from due.codec import pack, unpack
+from due.drivers.query import Condition, Query, parse
+from due.errors import ArchiveUnavailable, BackendError, InvalidOption
+from due.keys import ANY, Key
+from due.messages import Item, PackedFrame
+
+Document: TypeAlias = dict[str, Any]
+
+_PART_BYTES = 12 << 20
+_DUPLICATE = 11000
+_DOCUMENT_OVERHEAD = 300
+_MAX_NAMED_KEYS = 1000
+_INT64 = 2**63
+_SERVER_SELECTION_MS = "3000"
+_by_age = attrgetter("timestamp", "sequence", "instance_id", "key")
+
+
+class MongoArchive:
+    """`ArchiveDriver` over one collection; connects at the first call.  Raises InvalidOption for a wrong URL."""
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        options = dict(parse_qsl(parts.query, keep_blank_values=True))
+        self._collection = options.pop("collection", "items")
+        self._database = parts.path.strip("/") or "due"
+        options.setdefault("serverSelectionTimeoutMS", _SERVER_SELECTION_MS)
+        self._url = urlunsplit(parts._replace(query=urlencode(options), path="/" + parts.path.strip("/")))
+        self._shown = f"{parts.scheme}://{parts.hostname}/{self._database}"
+        if parts.scheme not in ("mongodb", "mongodb+srv") or not parts.netloc or "/" in self._database:
+            raise InvalidOption(f"archive URL {self._shown!r}: write mongodb://host:port/database")
+        if parts.scheme == "mongodb":
+            _check_options(self._url, self._shown)
+        self._lock = threading.Lock()
+        self._client: MongoClient[Document] | None = None
+        self._pid = 0
+        self._closed = False
+        self._spans: dict[str, tuple[int, int]] = {}
+
+    def insert(self, items: Sequence[Item]) -> None:
+        """Store items, one document each."""
+        with self._errors():
+            self._insert([_item_document(item) for item in items], [])
+
+    def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
+        """Store frames as they are; those that want an index, or are partly here, item by item."""
+        documents = []
+        for frame in frames:
+            if frame.index:
+                documents += [_item_document(item) for item in unpack(frame)]
+            else:
+                documents.append(_frame_document(frame))
+        with self._errors():
+            self._insert(documents, frames)
+
+    def find(self, query: Mapping[str, Any]) -> list[Item]:
+        """Items that match, oldest first (timestamp, then sequence)."""
+        parsed = parse(query)
+        with self._errors():
+            documents = self._candidates(parsed)
+        items = [item for document in documents for item in _items(document, parsed)]
+        items.sort(key=_by_age)
+        return items
+
+    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+        """Delete documents that are wholly older than `before`, then the oldest down to `max_bytes`."""
+        with self._errors():
+            deleted = 0 if before is None else self._prune_older(before)
+            if max_bytes is not None:
+                deleted += self._prune_larger(max_bytes)
+            return deleted
+
+    def close(self) -> None:
+        """Close connections; further calls raise BackendError."""
+        self._closed = True
+        with self._lock:
+            if self._client is not None and self._pid == os.getpid():
+                self._client.close()
+            self._client = None
+
+    # --- connection ----------------------------------------------------------------------------
+
+    def _table(self, suffix: str = "") -> Collection[Document]:
+        if self._closed:
+            raise BackendError(f"archive {self._shown} is closed")
+        with self._lock:
+            if self._client is None or self._pid != os.getpid():
+                self._client, self._pid, self._spans = MongoClient(self._url), os.getpid(), {}
+                self._make_indexes(self._client[self._database][self._collection])
+            return self._client[self._database][self._collection + suffix]
+
+    def _make_indexes(self, table: Collection[Document]) -> None:
+        try:
+            table.create_index([("dataKey", 1), ("timestamp", 1)])
+            table.create_index([("dataKey", 1), ("eventTime", 1)])
+            table.create_index([("instanceId", 1), ("dataKey", 1), ("lastSequence", 1)])
+        except PyMongoError:
+            self._client = None
+            raise
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (ConnectionFailure, ExecutionTimeout) as error:
+            raise ArchiveUnavailable(f"archive {self._shown}: {_short(error)}") from error
+        except (PyMongoError, BSONError) as error:
+            raise BackendError(f"archive {self._shown}: {_short(error)}") from error
+
+    # --- writing -------------------------------------------------------------------------------
+
+    def _insert(self, documents: Sequence[Document], frames: Sequence[PackedFrame]) -> None:
+        table = self._table()
+        by_name = {(frame.instance_id, frame.key, frame.sequence): frame for frame in frames}
+        fresh: dict[str, Document] = {}
+        for (instance, key), group in _streams(documents).items():
+            there = self._stored(table, instance, key, group)
+            for document in group:
+                overlap = [
+                    r for r in there if r[0] <= document["lastSequence"] and r[1] >= document["sequence"]
+                ]
+                if not overlap:
+                    fresh.setdefault(document["_id"], document)
+                elif document["count"] > 1 and overlap != [(document["sequence"], document["lastSequence"])]:
+                    items = unpack(by_name[instance, key, document["sequence"]])
+                    missing = (i for i in items if not any(a <= i.sequence <= b for a, b in overlap))
+                    fresh |= {one["_id"]: one for one in map(_item_document, missing)}
+        self._note_keys(fresh.values())
+        self._store(table, list(fresh.values()))
+
+    def _stored(
+        self, table: Collection[Document], instance: str, key: str, group: Sequence[Document]
+    ) -> list[tuple[int, int]]:
+        """Ranges of sequence numbers of this stream that are here and may be concerned."""
+        low = min(document["sequence"] for document in group)
+        high = max(document["lastSequence"] for document in group)
+        found = table.find(
+            {"instanceId": {"$eq": instance}, "dataKey": {"$eq": key}, "lastSequence": {"$gte": low}},
+            {"sequence": 1, "lastSequence": 1},
+        )
+        return [(int(d["sequence"]), int(d["lastSequence"])) for d in found if d["sequence"] <= high]
+
+    def _store(self, table: Collection[Document], documents: Sequence[Document]) -> None:
+        large = [document for document in documents if len(document.get("payload", b"")) > _PART_BYTES]
+        parts = [part for document in large for part in _split(document)]
+        for one in parts:
+            self._table("_parts").replace_one({"_id": {"$eq": one["_id"]}}, one, upsert=True)
+        if not documents:
+            return
+        try:
+            table.insert_many(documents, ordered=False)
+        except BulkWriteError as error:
+            faults = [fault for fault in error.details.get("writeErrors", ()) if fault["code"] != _DUPLICATE]
+            if faults or error.details.get("writeConcernErrors"):
+                raise
+
+    def _note_keys(self, documents: Iterable[Document]) -> None:
+        """Let readers know the keys, and how far apart the items of one document may lie."""
+        widest: dict[str, tuple[int, int]] = {}
+        for document in documents:
+            time, event = widest.get(document["dataKey"], (0, 0))
+            widest[document["dataKey"]] = (
+                max(time, document["lastTimestamp"] - document["timestamp"]),
+                max(event, document["lastEventTime"] - document["eventTime"]),
+            )
+        for key, (time, event) in widest.items():
+            known = self._spans.get(key)
+            if known is not None and time <= known[0] and event <= known[1]:
+                continue
+            spans = (2 * time, 2 * event)
+            change = {"$max": {"timeSpan": Int64(spans[0]), "eventSpan": Int64(spans[1])}}
+            self._table("_keys").update_one({"_id": {"$eq": key}}, change, upsert=True)
+            self._spans[key] = (max(spans[0], known[0]), max(spans[1], known[1])) if known else spans
+
+    # --- reading -------------------------------------------------------------------------------
+
+    def _candidates(self, query: Query) -> list[Document]:
+        named = list(query.conditions("dataKey"))
+        keys = list(self._table("_keys").find(_key_range(named)))
+
+        def lookup(condition: Condition) -> list[str]:
+            matches = Query(condition).matches
+            return [d["_id"] for d in keys if matches(Item(d["_id"], None, 0, 0, "", "", 0))]
+
+        spans = {
+            "timestamp": max((int(d.get("timeSpan", 0)) for d in keys), default=0),
+            "eventTime": max((int(d.get("eventSpan", 0)) for d in keys), default=0),
+        }
+        criteria = query.to_mongo(lookup, spans)
+        if not named and len(criteria) and len(keys) <= _MAX_NAMED_KEYS and "dataKey" not in criteria:
+            # without a key no index would be used
+            criteria = {"dataKey": {"$in": [d["_id"] for d in keys]}} | criteria
+        return [self._joined(document) for document in self._table().find(criteria)]
+
+    def _joined(self, document: Document) -> Document:
+        count = document.get("parts", 0)
+        if not count:
+            return document
+        names = [f"{document['_id']}#{n}" for n in range(count)]
+        parts = {d["_id"]: d["payload"] for d in self._table("_parts").find({"_id": {"$in": names}})}
+        return document | {"payload": b"".join(parts[name] for name in names if name in parts)}
+
+    # --- retention -----------------------------------------------------------------------------
+
+    def _prune_older(self, before: int) -> int:
+        deleted = 0
+        for key in [document["_id"] for document in self._table("_keys").find({})]:
+            old = {"dataKey": {"$eq": key}, "timestamp": {"$lt": before}, "lastTimestamp": {"$lt": before}}
+            deleted += self._delete(list(self._table().find(old, {"count": 1, "parts": 1})))
+        return deleted
+
+    def _prune_larger(self, max_bytes: int) -> int:
+        fields = {"timestamp": 1, "count": 1, "bytes": 1, "parts": 1}
+        documents = sorted(self._table().find({}, fields), key=lambda document: int(document["timestamp"]))
+        excess = sum(int(document["bytes"]) for document in documents) - max_bytes
+        old = []
+        for document in documents:
+            if excess <= 0:
+                break
+            excess -= int(document["bytes"])
+            old.append(document)
+        return self._delete(old)
+
+    def _delete(self, documents: Sequence[Document]) -> int:
+        for start in range(0, len(documents), 1000):
+            names = [document["_id"] for document in documents[start : start + 1000]]
+            self._table().delete_many({"_id": {"$in": names}})
+        parts = [f"{d['_id']}#{n}" for d in documents for n in range(d.get("parts", 0))]
+        if parts:
+            self._table("_parts").delete_many({"_id": {"$in": parts}})
+        return sum(int(document["count"]) for document in documents)
+
+
+def _check_options(url: str, shown: str) -> None:
+    """pymongo would only warn."""
+    try:
+        parse_uri(url, warn=False)
+    except (PyMongoError, ValueError, TypeError) as error:
+        raise InvalidOption(f"archive URL {shown!r}: {_short(error)}") from error
+
+
+def _streams(documents: Sequence[Document]) -> dict[tuple[str, str], list[Document]]:
+    streams: dict[tuple[str, str], list[Document]] = defaultdict(list)
+    for document in documents:
+        streams[document["instanceId"], document["dataKey"]].append(document)
+    return streams
+
+
+def _item_document(item: Item) -> Document:
+    document = _frame_document(pack([item]))
+    if _is_exact(item.value):
+        del document["payload"]
+        document["value"] = item.value
+    return document
+
+
+def _frame_document(frame: PackedFrame) -> Document:
+    return {
+        "_id": f"{frame.sequence}|{frame.key}|{frame.instance_id}",
+        "dataKey": frame.key,
+        "appId": frame.app_id,
+        "instanceId": frame.instance_id,
+        "count": frame.count,
+        "sequence": Int64(frame.sequence),
+        "lastSequence": Int64(frame.sequence + frame.count - 1),
+        "timestamp": Int64(frame.first_timestamp),
+        "lastTimestamp": Int64(frame.last_timestamp),
+        "eventTime": Int64(frame.first_event_time),
+        "lastEventTime": Int64(frame.last_event_time),
+        "bytes": len(frame.payload) + _DOCUMENT_OVERHEAD,
+        "payload": frame.payload,
+    }
+
+
+def _split(document: Document) -> Iterator[Document]:
+    """Move a large payload out of its document."""
+    payload, document["payload"] = document["payload"], b""
+    starts = range(0, len(payload), _PART_BYTES)
+    document["parts"] = len(starts)
+    for number, start in enumerate(starts):
+        yield {"_id": f"{document['_id']}#{number}", "payload": payload[start : start + _PART_BYTES]}
+
+
+def _items(document: Document, query: Query) -> Iterator[Item]:
+    if "payload" in document:
+        yield from filter(query.matches, unpack(document["payload"]))
+        return
+    item = Item(
+        key=document["dataKey"],
+        value=_plain(document.get("value")),
+        timestamp=int(document["timestamp"]),
+        event_time=int(document["eventTime"]),
+        app_id=document["appId"],
+        instance_id=document["instanceId"],
+        sequence=int(document["sequence"]),
+    )
+    if query.matches(item):
+        yield item
+
+
+def _is_exact(value: Any, depth: int = 0) -> bool:
+    """Whether BSON, and every server that speaks it, gives the value back as it is."""
+    kind = type(value)
+    if value is None or kind in (bool, bytes):
+        return True
+    if kind is int:
+        return bool(-_INT64 <= value < _INT64)
+    if kind is float:
+        return math.isfinite(value)
+    if kind is str:
+        return "\x00" not in value
+    if depth > 50:
+        return False
+    if kind is list:
+        return all(_is_exact(element, depth + 1) for element in value)
+    if kind is not dict:
+        return False
+    return all(_is_field(name) and _is_exact(element, depth + 1) for name, element in value.items())
+
+
+def _is_field(name: Any) -> bool:
+    return isinstance(name, str) and name != "" and not name.startswith("$") and not set(name) & {".", "\x00"}
+
+
+def _plain(value: Any) -> Any:
+    """A BSON value without BSON's own types."""
+    if isinstance(value, Int64):
+        return int(value)
+    if isinstance(value, list):
+        return [_plain(element) for element in value]
+    if isinstance(value, dict):
+        return {name: _plain(element) for name, element in value.items()}
+    return value
+
+
+def _key_range(named: Sequence[Condition]) -> Document:
+    """Filter on the table of keys: no key that meets the first condition lies outside."""
+    first = next((c for c in named if c.operator == "eq" and not c.negated), None)
+    if first is None:
+        return {}
+    pattern: Key = first.operand
+    prefix = pattern.path.partition(ANY)[0].removesuffix(".")
+    # '~' sorts behind every character that may follow in a key
+    return {"_id": {"$gte": prefix, "$lt": prefix + "~"}} if prefix else {}
+
+
+def _short(error: Exception) -> str:
+    text = str(error)
+    return text if len(text) <= 200 else text[:200] + " …"

@@ -1,0 +1,301 @@
+"""Data Updates on Redis or Valkey: pub/sub for best-effort keys, streams for reliable ones.
+
+publish ──PUBLISH due:<path>──►                 pipelined: replies are read later
+append  ──XADD due:stream:<path>──►             pipelined, kept until the readers acknowledged
+"""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import hiredis
+
+from due.backoff import Backoff
+from due.drivers.redis_receiver import RedisReceiver, channel_name
+from due.drivers.redis_streams import STREAMS, Entry, StreamLedger, parse_id, progress, stream_name
+from due.drivers.redis_wire import Wire, client
+from due.errors import BackendError, Timeout, UpdatesUnavailable
+
+log = logging.getLogger("due.updates")
+
+_READ_REPLIES_AT = 16
+_MOST_OUTSTANDING = 1024
+_CHECK_SECONDS = 0.02
+
+
+class RedisUpdates:
+    """The driver behind redis://, rediss:// and unix:// URLs."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        window: int = 16 << 20,
+        retain: int = 16 << 20,
+        group_timeout: float = 30.0,
+        backlog: int = 32 << 20,
+    ) -> None:
+        self.url = url
+        self._window = window
+        self._retain = retain
+        self._group_timeout = group_timeout
+        self._backlog = backlog
+        client(url).close()  # a wrong URL is reported now
+
+    def publisher(self) -> "RedisPublisher":
+        """A new sending half."""
+        return RedisPublisher(self.url, self._window, self._retain, self._group_timeout)
+
+    def receiver(self, group: str, consumer: str, *, shared: bool = False) -> RedisReceiver:
+        """A new receiving half."""
+        return RedisReceiver(self.url, group, consumer, shared=shared, backlog=self._backlog)
+
+    def close(self) -> None:
+        """Nothing is shared between the halves."""
+
+
+class RedisPublisher:
+    """One pipelined connection; see `due.drivers.base.Publisher`."""
+
+    def __init__(self, url: str, window: int, retain: int, group_timeout: float) -> None:
+        self._url = url
+        self._limits = (window, retain, group_timeout)
+        self._client = client(url)
+        self._lock = threading.RLock()
+        self._wire: Wire | None = None
+        self._outstanding: deque[Entry | None] = deque()
+        self._ledgers: dict[str, StreamLedger] = {}
+        self._channels: dict[str, bytes] = {}
+        self._run_id = b""
+        self._backoff = Backoff()
+        self._checked = 0.0
+        self._collect_at = 0
+        """No need to look for replies before so many are outstanding."""
+        self._closed = False
+        self._counts = {"refused": 0, "lost_disconnected": 0, "reconnects": 0, "held_back": 0, "resent": 0}
+        self._connect()
+
+    def publish(self, path: str, payload: bytes) -> None:
+        """See `Publisher.publish`."""
+        with self._lock:
+            if self._wire is None:
+                self._counts["lost_disconnected"] += 1
+                raise UpdatesUnavailable(f"no connection to {self._url}")
+            channel = self._channels.get(path) or self._channel(path)
+            try:
+                self._wire.send(b"PUBLISH", channel, payload)
+                self._outstanding.append(None)
+                self._collect()
+            except UpdatesUnavailable as error:
+                self._lose(error)
+                raise
+
+    def append(self, path: str, payload: bytes) -> None:
+        """See `Publisher.append`."""
+        ledger = self._ledgers.get(path) or self._announce(path)
+        while True:
+            with self._lock:
+                if self._closed:
+                    raise UpdatesUnavailable("the engine is closed")
+                if ledger.has_room(len(payload)):
+                    self._send_entry(ledger.add(payload))
+                    if not ledger.half_full:
+                        return
+                    break
+                self._counts["held_back"] += 1
+            self._make_room(ledger)
+        if time.monotonic() - self._checked > _CHECK_SECONDS:
+            self._check(ledger)
+
+    def has_room(self, path: str) -> bool:
+        """See `Publisher.has_room`."""
+        ledger = self._ledgers.get(path)
+        return ledger is None or ledger.has_room(0)
+
+    def settle(self, timeout: float | None = None) -> None:
+        """See `Publisher.settle`."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            with self._lock:
+                if self._wire is not None and not self._outstanding:
+                    return
+                if self._wire is not None:
+                    self._guarded_wait(0.05)
+                    continue
+                self.poll()
+            if deadline is not None and time.monotonic() > deadline:
+                raise Timeout(f"{self._url} did not acknowledge within {timeout} s")
+            time.sleep(0.01)
+
+    def poll(self) -> None:
+        """See `Publisher.poll`."""
+        with self._lock:
+            if self._wire is None:
+                if self._backoff.due(time.monotonic()):
+                    self._connect()
+                return
+            try:
+                self._collect_at = 0
+                self._collect(at_least=1)
+            except UpdatesUnavailable as error:
+                self._lose(error)
+        if time.monotonic() - self._checked > 5 * _CHECK_SECONDS:
+            for ledger in list(self._ledgers.values()):
+                if ledger.kept:
+                    self._check(ledger)
+
+    def statistics(self) -> dict[str, int]:
+        """Counters, and bytes kept for readers that have not acknowledged."""
+        with self._lock:
+            return {**self._counts, "kept_bytes": sum(x.kept_bytes for x in self._ledgers.values())}
+
+    def close(self) -> None:
+        """See `Publisher.close`."""
+        with self._lock:
+            self._closed = True
+            if self._wire is not None:
+                self._wire.close()
+                self._wire = None
+        self._client.close()
+
+    def _channel(self, path: str) -> bytes:
+        return self._channels.setdefault(path, channel_name(path))
+
+    def _announce(self, path: str) -> StreamLedger:
+        with self._lock:
+            ledger = self._ledgers.get(path)
+            if ledger is None:
+                ledger = self._ledgers[path] = StreamLedger(path, *self._limits)
+                if self._wire is not None:
+                    try:
+                        self._send_announcement(ledger)
+                    except UpdatesUnavailable as error:
+                        self._lose(error)
+            return ledger
+
+    def _send_announcement(self, ledger: StreamLedger) -> None:
+        assert self._wire is not None  # noqa: S101 - callers checked
+        self._wire.send(b"SADD", STREAMS, ledger.path)
+        self._wire.send(b"PUBLISH", STREAMS, ledger.path)
+        self._outstanding.extend((None, None))
+
+    def _send_entry(self, entry: Entry) -> None:
+        if self._wire is None:
+            return
+        try:
+            self._wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
+            self._outstanding.append(entry)
+            self._collect()
+        except UpdatesUnavailable as error:
+            self._lose(error)
+
+    def _make_room(self, ledger: StreamLedger) -> None:
+        """Wait a moment for readers or the connection."""
+        with self._lock:
+            self.poll() if self._wire is None else self._guarded_wait(0.001)
+        if not self._check(ledger) or not ledger.has_room(0):
+            time.sleep(0.002)
+
+    def _check(self, ledger: StreamLedger) -> bool:
+        """Ask how far the readers are and forget what they are done with."""
+        self._checked = time.monotonic()
+        try:
+            done = progress(self._client, ledger)
+            with self._lock:
+                ledger.acknowledged(done)
+                point = ledger.trim_point()
+            if point is not None:
+                self._client.xtrim(stream_name(ledger.path), minid=f"{point[0]}-{point[1]}", approximate=True)
+        except (BackendError, OSError):
+            return False
+        return True
+
+    def _collect(self, at_least: int = _READ_REPLIES_AT) -> None:
+        if len(self._outstanding) < max(at_least, self._collect_at) or self._wire is None:
+            return
+        self._take(self._wire.replies())
+        while len(self._outstanding) > _MOST_OUTSTANDING:
+            self._take(self._wire.wait())
+        self._collect_at = len(self._outstanding) + _READ_REPLIES_AT
+
+    def _guarded_wait(self, timeout: float) -> None:
+        if self._wire is None or not self._outstanding:
+            return
+        try:
+            self._take(self._wire.wait(timeout))
+        except UpdatesUnavailable as error:
+            self._lose(error)
+
+    def _take(self, replies: Iterable[Any]) -> None:
+        for reply in replies:
+            entry = self._outstanding.popleft()
+            if isinstance(reply, hiredis.ReplyError):
+                self._refused(reply, entry)
+            elif entry is not None:
+                entry.id = parse_id(reply)
+
+    def _refused(self, reply: Exception, entry: Entry | None) -> None:
+        self._counts["refused"] += 1
+        if self._counts["refused"] == 1:
+            log.error("Data Updates refused a message: %s", reply)
+        if entry is not None:  # kept, and sent again on the next connection
+            raise UpdatesUnavailable(f"the server refused an entry of {entry.path}: {reply}")
+
+    def _lose(self, error: Exception) -> None:
+        if self._wire is None:
+            return
+        self._wire.close()
+        self._wire = None
+        unanswered = sum(entry is None for entry in self._outstanding)
+        self._counts["lost_disconnected"] += unanswered
+        self._outstanding.clear()
+        delay = self._backoff.failed(time.monotonic())
+        log.warning("lost Data Updates at %s: %s; trying again in %.2f s", self._url, error, delay)
+
+    def _connect(self) -> None:
+        try:
+            wire = Wire(self._url)
+            run_id = _run_id(wire)
+        except UpdatesUnavailable as error:
+            delay = self._backoff.failed(time.monotonic())
+            log.warning("%s; trying again in %.2f s", error, delay)
+            return
+        self._backoff.succeeded()
+        self._wire = wire
+        if self._run_id:
+            self._counts["reconnects"] += 1
+            log.warning("connected to Data Updates at %s again", self._url)
+        try:
+            for ledger in self._ledgers.values():
+                self._restore(wire, ledger, restarted=run_id != self._run_id)
+            self._run_id = run_id
+        except UpdatesUnavailable as error:
+            self._lose(error)
+
+    def _restore(self, wire: Wire, ledger: StreamLedger, *, restarted: bool) -> None:
+        """Send what the server may not have: readers recognise repeats."""
+        self._guarded_settle(wire)
+        entries = list(ledger.kept)
+        if not restarted:
+            entries = [e for e in entries if e.id is None]
+        elif not wire.call("EXISTS", stream_name(ledger.path)):
+            entries = [*ledger.retained, *entries]
+        self._send_announcement(ledger)
+        for entry in entries:
+            self._counts["resent"] += 1
+            wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
+            self._outstanding.append(entry)
+            self._collect()
+
+    def _guarded_settle(self, wire: Wire) -> None:
+        while self._outstanding:
+            self._take(wire.wait())
+
+
+def _run_id(wire: Wire) -> bytes:
+    info = wire.call("INFO", "server")
+    text = info if isinstance(info, bytes) else b""
+    return next((line for line in text.splitlines() if line.startswith(b"run_id:")), b"run_id:unknown")

@@ -1,0 +1,144 @@
+"""The producer's side of reliable delivery: one Redis stream per path, and what its readers still need.
+
+    XADD ──reply──► kept (unacknowledged by readers) ──all live groups acknowledged──► retained (for replay)
+
+A payload stays in `kept` until every live group of readers has acknowledged it; `kept` is bounded by
+the window, and that bound is the back-pressure.  A group lives while one of its instances renewed its
+lease (hash `due:readers:<path>`, field `<group>/<instance>`, value unix ms, 0 = left) within
+`group_timeout`.  If the server comes back empty, retained and kept payloads are sent again; readers
+recognise repeats.  Readers' clocks must agree within a few seconds.
+"""
+
+import time
+from collections import deque
+from typing import Any
+
+import redis
+
+from due.errors import BackendError, UpdatesUnavailable
+
+STREAMS = "due:streams"
+"""Set of the paths that are streams, and the channel on which new ones are announced."""
+_OVERHEAD = 200
+
+
+def stream_name(path: str) -> str:
+    """The Redis key of a stream."""
+    return f"due:stream:{path}"
+
+
+def readers_name(path: str) -> str:
+    """The Redis hash of a stream's leases."""
+    return f"due:readers:{path}"
+
+
+class Entry:
+    """A payload on its way: its id is known once the server has answered."""
+
+    __slots__ = ("id", "path", "payload")
+
+    def __init__(self, path: str, payload: bytes) -> None:
+        self.path = path
+        self.payload = payload
+        self.id: tuple[int, int] | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes that count against the window."""
+        return len(self.payload) + _OVERHEAD
+
+
+class StreamLedger:
+    """What one producer has written to one stream and still keeps.  Not thread-safe."""
+
+    def __init__(self, path: str, window: int, retain: int, group_timeout: float) -> None:
+        self.path = path
+        self.kept: deque[Entry] = deque()
+        self.kept_bytes = 0
+        self.retained: deque[Entry] = deque()
+        self._retained_bytes = 0
+        self._window = window
+        self._retain = retain
+        self._group_timeout = group_timeout
+        self._leases: dict[str, float] = {}
+        self.announced = False
+
+    def has_room(self, size: int) -> bool:
+        """Whether a payload of that size fits; a lone big one always does."""
+        return not self.kept or self.kept_bytes + size + _OVERHEAD <= self._window
+
+    @property
+    def half_full(self) -> bool:
+        """Time to ask how far the readers are."""
+        return self.kept_bytes * 2 > self._window
+
+    def add(self, payload: bytes) -> Entry:
+        """Keep a payload that is about to be sent."""
+        entry = Entry(self.path, payload)
+        self.kept.append(entry)
+        self.kept_bytes += entry.size
+        return entry
+
+    def live_groups(self, leases: dict[str, float], now: float) -> set[str]:
+        """Groups to wait for: seen alive within the time-out, by the server or by us before it lost them."""
+        self._leases.update(leases)
+        self._leases = {f: at for f, at in self._leases.items() if now - at < self._group_timeout}
+        return {field.rpartition("/")[0] for field in self._leases}
+
+    def acknowledged(self, up_to: tuple[int, int]) -> None:
+        """All live groups are done with ids up to this one."""
+        while self.kept and (at := self.kept[0].id) is not None and at <= up_to:
+            entry = self.kept.popleft()
+            self.kept_bytes -= entry.size
+            self.retained.append(entry)
+            self._retained_bytes += entry.size
+
+    def trim_point(self) -> tuple[int, int] | None:
+        """Forget the oldest retained payloads over the limit; returns the id from which to keep."""
+        trimmed = False
+        while len(self.retained) > 1 and self._retained_bytes > self._retain:
+            self._retained_bytes -= self.retained.popleft().size
+            trimmed = True
+        return self.retained[0].id if trimmed else None
+
+
+def parse_id(text: bytes | str) -> tuple[int, int]:
+    """A stream id as a pair that compares."""
+    ms, _, number = (text.decode() if isinstance(text, bytes) else text).partition("-")
+    return int(ms), int(number or 0)
+
+
+def progress(client: redis.Redis, ledger: StreamLedger) -> tuple[int, int]:
+    """The id up to which every live group has acknowledged; infinite when there is none.
+
+    Raises `UpdatesUnavailable`.
+    """
+    name = stream_name(ledger.path)
+    try:
+        pipe: Any = client.pipeline(transaction=False)
+        pipe.hgetall(readers_name(ledger.path))
+        pipe.xinfo_groups(name)
+        leases, groups = pipe.execute(raise_on_error=False)
+        if isinstance(groups, redis.ResponseError):  # no such stream
+            groups = []
+        for answer in (leases, groups):
+            if isinstance(answer, Exception):
+                raise answer
+        live = ledger.live_groups({f.decode(): int(v) / 1000 for f, v in leases.items()}, time.time())
+        positions = [_position(client, name, g) for g in groups if g["name"].decode() in live]
+    except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
+        raise UpdatesUnavailable(f"the readers of {ledger.path} cannot be asked: {error}") from None
+    except redis.RedisError as error:
+        raise BackendError(f"the readers of {ledger.path} cannot be asked: {error}") from None
+    if len(positions) < len(live):
+        return (0, 0)
+    return min(positions, default=(2**63, 0))
+
+
+def _position(client: redis.Redis, name: str, group: dict[str, Any]) -> tuple[int, int]:
+    if group["pending"]:
+        lowest = client.xpending(name, group["name"])["min"]
+        if lowest is not None:
+            ms, number = parse_id(lowest)
+            return (ms, number - 1)
+    return parse_id(group["last-delivered-id"])

@@ -1,0 +1,161 @@
+"""One connection to a Redis-protocol server: commands out, replies in, no waiting in between.
+
+redis-py opens the connection (URL, TLS, AUTH, database); afterwards we speak RESP2 ourselves, because a
+pipelined, selectable connection is what the engine needs and redis-py's pub/sub costs several times the
+parsing (RESP3, its default, formats each push into a log line).
+"""
+
+import socket
+from collections.abc import Iterator
+from typing import Any, cast
+
+import hiredis
+import redis
+
+from due.errors import InvalidOption, UpdatesUnavailable
+
+_READ = 1 << 18
+_JOIN_BELOW = 1 << 14
+
+
+def client(url: str) -> redis.Redis:
+    """A plain redis-py client for commands off the hot path; raises `InvalidOption` for a wrong URL."""
+    try:
+        return redis.Redis.from_url(_redis_url(url), protocol=2, socket_timeout=10, socket_connect_timeout=5)
+    except ValueError as error:
+        raise InvalidOption(f"Data Updates URL {url!r}: {error}") from None
+
+
+def _redis_url(url: str) -> str:
+    for prefix in ("redis+unix://", "unix://"):
+        if url.startswith(prefix):
+            return "unix://" + url.removeprefix(prefix)
+    if url.startswith(("redis://", "rediss://")):
+        return url
+    raise InvalidOption(f"Data Updates URL {url!r}: use redis://host:port/0, rediss://… or unix:///path.sock")
+
+
+class Wire:
+    """A connected socket with a reply parser.  Every failure is an `UpdatesUnavailable`."""
+
+    def __init__(self, url: str) -> None:
+        pool = redis.ConnectionPool.from_url(
+            _redis_url(url), protocol=2, socket_timeout=None, socket_connect_timeout=5, retry=None
+        )
+        self._connection = cast("Any", pool.make_connection())
+        try:
+            self._connection.connect()
+        except (redis.RedisError, OSError) as error:
+            raise UpdatesUnavailable(f"Data Updates at {url} cannot be reached: {error}") from None
+        # redis-py has no public way to wait on several connections
+        self._socket: socket.socket = self._connection._sock  # noqa: SLF001
+        self._reader = hiredis.Reader()
+
+    def fileno(self) -> int:
+        """For select."""
+        return self._socket.fileno()
+
+    def send(self, *arguments: bytes | str | int) -> None:
+        """Send one command; a big last argument is not copied."""
+        last = arguments[-1]
+        if isinstance(last, bytes) and len(last) >= _JOIN_BELOW:
+            head = pack((*arguments[:-1], b""))
+            self._send_parts([head[:-5] + b"%d\r\n" % len(last), last, b"\r\n"])
+        else:
+            self.send_packed(pack(arguments))
+
+    def send_packed(self, data: bytes) -> None:
+        """Send packed commands."""
+        try:
+            self._socket.sendall(data)
+        except OSError as error:
+            raise UpdatesUnavailable(f"connection lost while sending: {error}") from None
+
+    def _send_parts(self, parts: list[bytes]) -> None:
+        try:
+            sent = self._socket.sendmsg(parts)
+            total = sum(map(len, parts))
+            if sent < total:
+                self._send_rest(parts, sent)
+        except NotImplementedError:  # TLS sockets cannot gather
+            self.send_packed(b"".join(parts))
+        except OSError as error:
+            raise UpdatesUnavailable(f"connection lost while sending: {error}") from None
+
+    def _send_rest(self, parts: list[bytes], sent: int) -> None:
+        for part in parts:
+            if sent < len(part):
+                self._socket.sendall(memoryview(part)[sent:])
+            sent = max(0, sent - len(part))
+
+    def replies(self) -> Iterator[Any]:
+        """Replies that have arrived; does not wait.  Error replies come as `hiredis.ReplyError`s."""
+        try:
+            data = self._socket.recv(_READ, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except ValueError:  # TLS sockets take no flags
+            data = self._receive_tls()
+        except OSError as error:
+            raise UpdatesUnavailable(f"connection lost: {error}") from None
+        yield from self._parsed(data)
+
+    def wait(self, timeout: float | None = None) -> Iterator[Any]:
+        """Like `replies`, but waits for the first bytes, at most `timeout` seconds."""
+        try:
+            self._socket.settimeout(timeout)
+            data = self._socket.recv(_READ)
+        except TimeoutError:
+            return
+        except OSError as error:
+            raise UpdatesUnavailable(f"connection lost: {error}") from None
+        finally:
+            if self._socket.fileno() >= 0:
+                self._socket.settimeout(None)
+        yield from self._parsed(data)
+
+    def call(self, *arguments: bytes | str | int) -> Any:
+        """Send one command and wait for its reply; only while nothing else is outstanding."""
+        self.send(*arguments)
+        while True:
+            for reply in self.wait():
+                return reply
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._connection.disconnect()
+
+    def _parsed(self, data: bytes) -> Iterator[Any]:
+        if not data:
+            raise UpdatesUnavailable("connection closed by the server")
+        self._reader.feed(data)
+        while (reply := self._next()) is not False:
+            yield reply
+
+    def _next(self) -> Any:
+        try:
+            return self._reader.gets()
+        except hiredis.ProtocolError as error:
+            raise UpdatesUnavailable(f"the server does not speak the Redis protocol: {error}") from None
+
+    def _receive_tls(self) -> bytes:
+        self._socket.settimeout(0.0)
+        try:
+            return self._socket.recv(_READ)
+        except OSError as error:
+            raise UpdatesUnavailable(f"connection lost: {error}") from None
+        finally:
+            self._socket.settimeout(None)
+
+
+def pack(arguments: tuple[bytes | str | int, ...]) -> bytes:
+    """One command as bytes."""
+    return cast("bytes", hiredis.pack_command(cast("Any", arguments)))  # its stub forgets the dots
+
+
+def glob(pattern: str) -> str | None:
+    """A key pattern as a Redis channel pattern that matches at least the same; None if it is exact."""
+    if "*" not in pattern:
+        return None
+    text = pattern.removesuffix("**").removesuffix(".") + "*" if pattern.endswith("**") else pattern
+    return "".join(f"\\{c}" if c in "?[]\\" else c for c in text)

@@ -1,0 +1,232 @@
+"""Data Archives in one file: SQLite in WAL mode, many processes at a time.
+
+A row holds one frame as it travelled, or the value of one item.  Queries narrow rows by index on
+key and time, then `query.matches` decides item by item.  URL: `sqlite:///folder/file.db`, with
+`?synchronous=full` to survive a power cut as well as a killed process.
+"""
+
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from heapq import merge
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, unquote, urlsplit
+
+from due.codec import decode_value, encode_value, unpack
+from due.drivers.query import Condition, Query, parse
+from due.drivers.sqlite_file import SqliteFile
+from due.errors import InvalidOption
+from due.messages import Item, PackedFrame
+
+_VALUE, _FRAME = 0, 1
+_ROW_OVERHEAD = 200
+_SYNCHRONOUS = ("normal", "full")
+_INSERT = "INSERT INTO frames VALUES(NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+_SELECT = (
+    "SELECT key_id, source_id, format, first_sequence, first_time, first_event, payload FROM frames WHERE "
+)
+_OVERLAP = """SELECT first_sequence, last_sequence FROM frames
+WHERE source_id = ? AND key_id = ? AND last_sequence >= ? ORDER BY last_sequence LIMIT 1"""
+_WIDEN = """UPDATE keys SET time_span = max(time_span, ?), event_span = max(event_span, ?) WHERE id = ?"""
+_OLDER = " FROM frames WHERE key_id = ? AND first_time < ? AND last_time < ?"
+_OLDEST = """SELECT first_time, id, count, length(payload) FROM frames WHERE key_id = ? ORDER BY first_time"""
+
+_by_identity = attrgetter("instance_id", "key", "sequence")
+_by_stream = attrgetter("instance_id", "key")
+_by_age = attrgetter("timestamp", "sequence", "instance_id", "key")
+
+
+class _Row(NamedTuple):
+    """One row of `frames`, in the order of its columns; `items` is its count."""
+
+    key: int
+    source: int
+    format: int
+    items: int
+    first_sequence: int
+    last_sequence: int
+    first_time: int
+    last_time: int
+    first_event: int
+    last_event: int
+    payload: bytes
+
+
+class SqliteArchive:
+    """`ArchiveDriver` over one file; opened at the first call.  Raises InvalidOption for a wrong URL."""
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        options = parse_qs(parts.query)
+        path = Path(unquote(parts.path))
+        synchronous = options.pop("synchronous", ["normal"])[-1].lower()
+        if parts.scheme != "sqlite" or parts.netloc or not path.name or not path.is_absolute():
+            raise InvalidOption(f"archive URL {url!r}: write sqlite:///folder/file.db")
+        if options or synchronous not in _SYNCHRONOUS:
+            raise InvalidOption(f"archive URL {url!r}: the only option is synchronous=normal or =full")
+        self._file = SqliteFile(path, synchronous)
+
+    def insert(self, items: Sequence[Item]) -> None:
+        """Store items, one row each."""
+        with self._file.writing() as connection:
+            self._insert_items(connection, items)
+
+    def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
+        """Store frames as they are; those that want an index, or are partly here, item by item."""
+        with self._file.writing() as connection:
+            for frame in frames:
+                row = self._frame_row(connection, frame)
+                overlap = _overlap(connection, row)
+                if overlap == (row.first_sequence, row.last_sequence):
+                    continue
+                if frame.index or overlap is not None:
+                    self._insert_items(connection, unpack(frame))
+                    continue
+                connection.execute(_INSERT, row)
+                self._widen(connection, row)
+
+    def find(self, query: Mapping[str, Any]) -> list[Item]:
+        """Items that match, oldest first (timestamp, then sequence)."""
+        parsed = parse(query)
+        with self._file.reading() as connection:
+            text, parameters = self._where(connection, parsed)
+            rows = connection.execute(_SELECT + text, parameters).fetchall()
+        items = [item for row in rows for item in self._items(row, parsed)]
+        items.sort(key=_by_age)
+        return items
+
+    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+        """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
+        with self._file.writing() as connection:
+            deleted = 0 if before is None else _prune_older(connection, before)
+            if max_bytes is not None:
+                deleted += _prune_larger(connection, max_bytes)
+        if deleted:
+            self._file.shrink()
+        return deleted
+
+    def close(self) -> None:
+        """Close the file; further calls raise BackendError."""
+        self._file.close()
+
+    def _insert_items(self, connection: sqlite3.Connection, items: Sequence[Item]) -> None:
+        for _, group in groupby(sorted(items, key=_by_identity), _by_stream):
+            rows = [self._item_row(connection, item) for item in group]
+            # sequence numbers that occur twice in one call: the first counts
+            rows = [
+                row for n, row in enumerate(rows) if not n or row.first_sequence != rows[n - 1].first_sequence
+            ]
+            if _overlap(connection, rows[0]._replace(last_sequence=rows[-1].last_sequence)) is not None:
+                rows = [row for row in rows if _overlap(connection, row) is None]
+            connection.executemany(_INSERT, rows)
+
+    def _item_row(self, connection: sqlite3.Connection, item: Item) -> _Row:
+        key = self._file.keys.id_of(connection, item.key)
+        source = self._file.sources.id_of(connection, item.app_id, item.instance_id)
+        number, time, event = item.sequence, item.timestamp, item.event_time
+        payload = encode_value(item.value)
+        return _Row(key, source, _VALUE, 1, number, number, time, time, event, event, payload)
+
+    def _frame_row(self, connection: sqlite3.Connection, frame: PackedFrame) -> _Row:
+        return _Row(
+            key=self._file.keys.id_of(connection, frame.key),
+            source=self._file.sources.id_of(connection, frame.app_id, frame.instance_id),
+            format=_FRAME,
+            items=frame.count,
+            first_sequence=frame.sequence,
+            last_sequence=frame.sequence + frame.count - 1,
+            first_time=frame.first_timestamp,
+            last_time=frame.last_timestamp,
+            first_event=frame.first_event_time,
+            last_event=frame.last_event_time,
+            payload=frame.payload,
+        )
+
+    def _widen(self, connection: sqlite3.Connection, row: _Row) -> None:
+        """Let readers know how far apart the items of one row may lie."""
+        time, event = row.last_time - row.first_time, row.last_event - row.first_event
+        known_time, known_event = self._file.spans.get(row.key, (0, 0))
+        if time > known_time or event > known_event:
+            # twice as much, or a slowly growing span would be written with every frame
+            spans = (max(2 * time, known_time), max(2 * event, known_event))
+            connection.execute(_WIDEN, (*spans, row.key))
+            self._file.spans[row.key] = spans
+
+    def _where(self, connection: sqlite3.Connection, query: Query) -> tuple[str, list[Any]]:
+        self._file.keys.refresh(connection)
+        self._file.sources.refresh(connection)
+        named = list(query.conditions("dataKey"))
+        keys = self._file.keys.meeting(named[0]) if named else list(self._file.keys.entries)
+        ids = "[" + ",".join(map(str, keys)) + "]"
+        among = "IN (SELECT value FROM json_each(?))"
+        spans = connection.execute(
+            f"SELECT max(time_span), max(event_span) FROM keys WHERE id {among}",  # noqa: S608 no text of others
+            (ids,),
+        ).fetchone()
+        text, parameters = query.to_sql(
+            self._lookup, {"timestamp": spans[0] or 0, "eventTime": spans[1] or 0}
+        )
+        # without a key no index would be used
+        return (text, parameters) if named else (f"key_id {among} AND {text}", [ids, *parameters])
+
+    def _lookup(self, condition: Condition) -> Sequence[int]:
+        table = self._file.keys if condition.field == "dataKey" else self._file.sources
+        return table.meeting(condition)
+
+    def _items(self, row: tuple[Any, ...], query: Query) -> Iterator[Item]:
+        key_id, source_id, kind, sequence, time, event, payload = row
+        if kind == _FRAME:
+            yield from filter(query.matches, unpack(payload))
+            return
+        (key,) = self._file.keys.entries[key_id]
+        app, instance = self._file.sources.entries[source_id]
+        item = Item(key, None, time, event, app, instance, sequence)
+        if query.matches_metadata(item):
+            item = Item(key, decode_value(payload), time, event, app, instance, sequence)
+            if not query.uses_value or query.matches(item):
+                yield item
+
+
+def _overlap(connection: sqlite3.Connection, row: _Row) -> tuple[int, int] | None:
+    """First and last sequence number of a stored row that shares items with this one."""
+    found = connection.execute(_OVERLAP, (row.source, row.key, row.first_sequence)).fetchone()
+    return found if found is not None and found[0] <= row.last_sequence else None
+
+
+def _prune_older(connection: sqlite3.Connection, before: int) -> int:
+    deleted = 0
+    for (key,) in connection.execute("SELECT id FROM keys").fetchall():
+        arguments = (key, before, before)
+        deleted += connection.execute("SELECT total(count)" + _OLDER, arguments).fetchone()[0]
+        connection.execute("DELETE" + _OLDER, arguments)
+    return int(deleted)
+
+
+def _prune_larger(connection: sqlite3.Connection, max_bytes: int) -> int:
+    excess = _used(connection) - max_bytes
+    deleted = 0
+    while excess > 0:
+        keys = connection.execute("SELECT id FROM keys").fetchall()
+        ids = []
+        for _, number, count, size in merge(*(connection.execute(_OLDEST, key) for key in keys)):
+            ids.append((number,))
+            deleted += count
+            excess -= size + _ROW_OVERHEAD
+            if excess <= 0:
+                break
+        if not ids:
+            break
+        connection.executemany("DELETE FROM frames WHERE id = ?", ids)
+        excess = _used(connection) - max_bytes
+    return deleted
+
+
+def _used(connection: sqlite3.Connection) -> int:
+    """Bytes of pages in use."""
+    pages, free, size = (
+        connection.execute(f"PRAGMA {name}").fetchone()[0]
+        for name in ("page_count", "freelist_count", "page_size")
+    )
+    return int((pages - free) * size)

@@ -1,0 +1,152 @@
+"""What stands between `write` and the batch: permission from the Coordinator, and the assigned pace.
+
+    item ──► BUFFER: held until the handshake ends     REFUSED: counted      UNWANTED: archive="always" only
+        └──► OPEN ──► pacer ──► Outlet.put
+
+Callers hold the outlet's lock.
+"""
+
+import threading
+import time
+from collections import deque
+from typing import Any
+
+import msgspec
+
+from due.drivers.base import Publisher
+from due.keeper import Keeper
+from due.membership import Verdict
+from due.outlet import ARCHIVE, Outlet, Waiting
+from due.pacing import Pacer
+
+
+class Gate:
+    """Applies permissions to the outlets of one engine."""
+
+    def __init__(self, keeper: Keeper, publisher: Publisher, hold_bytes: int) -> None:
+        self._keeper = keeper
+        self._publisher = publisher
+        self._hold_bytes = hold_bytes
+        self._changed = threading.Condition()
+        self._held_bytes = 0
+        self.counts = {"unwanted": 0, "refused": 0, "held_for_permission": 0, "replaced": 0}
+
+    def changed(self) -> None:
+        """Permissions may have changed: let waiting writers look again."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def write(self, outlet: Outlet, item: Waiting) -> bool:
+        """Place one item under the permission of now; see `Engine.write` for the result."""
+        self.review(outlet)
+        return self._place(outlet, item)
+
+    def review(self, outlet: Outlet) -> None:
+        """Apply the current permission; lets go what was held for it."""
+        if outlet.fast:
+            return
+        outlet.fast = True
+        with self._keeper.lock:
+            permission = self._keeper.member.permission(outlet.key)
+            outlet.epoch = self._keeper.member.epoch
+        capability = permission.capability
+        outlet.permission = permission
+        outlet.reliable = capability is not None and capability.delivery == "reliable"
+        outlet.index = capability is not None and capability.index
+        self._set_pace(
+            outlet, permission.frequency, queue=capability is not None and capability.pacing == "queue"
+        )
+        if permission.verdict is not Verdict.BUFFER and outlet.held:
+            held, outlet.held = outlet.held, deque()
+            self._held_bytes -= outlet.held_bytes
+            outlet.held_bytes = 0
+            for item in held:
+                self._place(outlet, item)
+        if permission.verdict is not Verdict.OPEN or outlet.pacer is not None:
+            outlet.fast = False
+
+    def service(self, outlet: Outlet, now: int) -> bool:
+        """The sender's visit: whether none is needed again before the next write."""
+        if outlet.reliable and not self._publisher.has_room(outlet.key.path):
+            return False
+        self.review(outlet)
+        pacer = outlet.pacer
+        while pacer is not None and (item := pacer.release(now)) is not None:
+            _put(outlet, item)
+        outlet.cut()
+        return pacer is None or pacer.due() is None
+
+    def _place(self, outlet: Outlet, item: Waiting) -> bool:
+        permission = outlet.permission
+        verdict = permission.verdict
+        if verdict is Verdict.BUFFER:
+            return self._hold(outlet, item)
+        if verdict is Verdict.REFUSED:
+            self.counts["refused"] += 1
+            return False
+        if verdict is Verdict.UNWANTED:
+            self.counts["unwanted"] += 1
+            capability = permission.capability
+            if capability is not None and capability.archive == "always" and item[1] & ARCHIVE:
+                outlet.put(item[0], ARCHIVE, item[3], item[4])
+            return False
+        if outlet.pacer is not None:
+            return self._pace(outlet, outlet.pacer, item)
+        _put(outlet, item)
+        return True
+
+    def _hold(self, outlet: Outlet, item: Waiting) -> bool:
+        """Keep it until permission is known; wait where too much is kept already."""
+        self.counts["held_for_permission"] += 1
+        while self._held_bytes > self._hold_bytes:
+            with self._changed:
+                self._changed.wait(0.05)
+            outlet.fast = False
+            self.review(outlet)
+            if outlet.permission.verdict is not Verdict.BUFFER:
+                return self._place(outlet, item)
+        size = _size(item[0])
+        outlet.held.append(item)
+        outlet.held_bytes += size
+        self._held_bytes += size
+        return True
+
+    def _pace(self, outlet: Outlet, pacer: Pacer[Waiting], item: Waiting) -> bool:
+        while pacer.full:
+            time.sleep(min(0.05, 1 / pacer.frequency))
+            released = pacer.release(time.time_ns())
+            if released is not None:
+                _put(outlet, released)
+                outlet.cut()
+        before = pacer.replaced
+        leaves = pacer.offer(item, time.time_ns())
+        self.counts["replaced"] += pacer.replaced - before
+        if leaves is None:
+            outlet.dirty()
+        else:
+            _put(outlet, leaves)
+        return True
+
+    def _set_pace(self, outlet: Outlet, frequency: float | None, *, queue: bool) -> None:
+        old = outlet.pacer
+        if old is not None and (old.frequency, old.queue) == (frequency, queue):
+            return
+        outlet.pacer = Pacer(frequency, queue=queue) if frequency else None
+        for item in old.drain() if old is not None else ():
+            if outlet.pacer is None:
+                _put(outlet, item)
+            else:
+                self._pace(outlet, outlet.pacer, item)
+
+
+def _put(outlet: Outlet, item: Waiting) -> None:
+    value, mode, no_wait, event_time, now = item
+    outlet.put(value, mode, event_time, now)
+    if no_wait:
+        outlet.cut()
+
+
+def _size(value: Any) -> int:
+    if isinstance(value, bytes | str):
+        return len(value)
+    return memoryview(value).nbytes if isinstance(value, msgspec.Raw) else 16

@@ -1,0 +1,323 @@
+"""How an engine and the Coordinator find each other: the messages, and what a member does on them.
+
+    engine ──Registration──► due.registration.<app>   on init and on every change of its declarations
+    engine ──Heartbeat─────► due.heartbeat.<app>      every `heartbeat` seconds; `offline` once at the end
+    engine ◄──Assignments─── due.assignment.<app>     what is wanted of the app, and which instance is active
+
+All are ordinary best-effort items (PUB_ONLY, NO_WAIT) whose value is `message.to_value()`.
+Rules for the Coordinator:
+ - it answers every Registration with Assignments to that app, and sends Assignments again whenever they change;
+ - a Heartbeat of an unknown instance, of another `revision` than the registered one or with another
+   `version` than the last sent is answered with the current Assignments: the instance sees in `revisions`
+   that it is unknown and registers again (so a restarted Coordinator knows all within two heartbeats);
+ - `epoch` grows with each change of the active instance and never falls: a new Coordinator starts above
+   the highest `epoch` in the heartbeats; Assignments with a lower epoch than seen are ignored;
+ - `active` is "" for shared apps (every instance works) and while no instance is chosen for a standby app
+   that has only consumers' duties it is the instance that reads.
+
+`Member` holds the decisions.  Pure: no socket, no clock, no thread; time is an argument (seconds, monotonic).
+"""
+
+import enum
+from typing import Any, Literal, Self
+
+import msgspec
+
+from due.keys import Key
+from due.messages import Assignment, Capability, Frequency, Instances, Interest
+
+REGISTRATION = "due.registration"
+HEARTBEAT = "due.heartbeat"
+ASSIGNMENT = "due.assignment"
+
+
+class _Message(msgspec.Struct, frozen=True, kw_only=True):
+    def to_value(self) -> dict[str, Any]:
+        """The message as a DUE value."""
+        value = msgspec.to_builtins(self)
+        return dict(value)
+
+    @classmethod
+    def from_value(cls, value: object) -> Self:
+        """Read one from the wire; raises `msgspec.ValidationError`."""
+        return msgspec.convert(value, cls)
+
+
+class Registration(_Message, frozen=True, kw_only=True):
+    """What one instance can make and wants."""
+
+    app_id: str
+    instance_id: str
+    instances: Instances = "standby"
+    revision: int
+    """Grows with each change of what follows."""
+    capabilities: tuple[Capability, ...] = ()
+    interests: tuple[Interest, ...] = ()
+    producer: bool = True
+    consumer: bool = True
+    heartbeat: float
+    """Seconds between its heartbeats."""
+    started: int
+    """UTC, ns: the order of instances."""
+    host: str = ""
+    pid: int = 0
+
+
+class Heartbeat(_Message, frozen=True, kw_only=True):
+    """A sign of life."""
+
+    app_id: str
+    instance_id: str
+    state: Literal["online", "offline"] = "online"
+    revision: int
+    """Of its registration."""
+    version: int = 0
+    """Of the Assignments it follows; 0: none yet."""
+    epoch: int = 0
+    """The highest seen."""
+    active: bool = False
+    """Whether it works now (a standby instance that waits says False)."""
+    written: int = 0
+    """Items written since its start."""
+    received: int = 0
+    """Items received since its start."""
+
+
+class Incompatible(_Message, frozen=True, kw_only=True):
+    """An interest that cannot be satisfied as asked, as DDS reports incompatible QoS."""
+
+    key: str
+    """The interest's key."""
+    reason: str
+
+
+class Assignments(_Message, frozen=True, kw_only=True):
+    """What the Coordinator wants of all instances of one app."""
+
+    app_id: str
+    coordinator: str
+    """The Coordinator's instance id."""
+    version: int
+    """Changes with the content; never 0."""
+    epoch: int
+    active: str = ""
+    """The instance that works; "" = every instance does."""
+    revisions: dict[str, int]
+    """The registrations it knows: instance id to revision."""
+    assignments: tuple[Assignment, ...] = ()
+    incompatible: tuple[Incompatible, ...] = ()
+
+
+class Phase(enum.Enum):
+    """How far the handshake is."""
+
+    WAITING = "waiting"
+    """No word from a Coordinator yet: declared keys are buffered."""
+    ALONE = "alone"
+    """The handshake timed out: declared keys are written as if wanted."""
+    COORDINATED = "coordinated"
+    """Assignments rule."""
+
+
+class Verdict(enum.Enum):
+    """What becomes of an item under a key."""
+
+    OPEN = "open"
+    BUFFER = "buffer"
+    UNWANTED = "unwanted"
+    """Nobody wants it: archived only where the capability says always."""
+    REFUSED = "refused"
+    """This instance is not the active one, or was fenced off."""
+
+
+class Permission(msgspec.Struct, frozen=True):
+    """How to treat the items of one concrete key, until `Member.changes` moves on."""
+
+    verdict: Verdict
+    capability: Capability | None = None
+    frequency: float | None = None
+    """Items a second; None: unpaced."""
+
+
+class Member:
+    """One instance's view of its membership."""
+
+    def __init__(
+        self,
+        registration: Registration,
+        *,
+        now: float,
+        handshake_timeout: float,
+        coordinated: bool = True,
+    ) -> None:
+        self.registration = registration
+        self.phase = Phase.WAITING if coordinated else Phase.ALONE
+        self.current: Assignments | None = None
+        self.changes = 0
+        """Grows when permissions may have changed."""
+        self.epoch = 0
+        self._coordinated = coordinated
+        self._deadline = now + handshake_timeout
+        self._handshake_timeout = handshake_timeout
+        self._register_at = now
+        self._beat_at = now
+        self._fenced_until = 0.0
+        self._fenced = False
+
+    @property
+    def active(self) -> bool:
+        """Whether this instance works: speaks for its app, and reads for it."""
+        if self._fenced:
+            return False
+        return self.current is None or self.current.active in ("", self.registration.instance_id)
+
+    @property
+    def reading(self) -> bool:
+        """Whether it may read streams: a standby instance first waits to hear whether it is the active one."""
+        return self.active and (self.phase is not Phase.WAITING or self.registration.instances == "shared")
+
+    @property
+    def announced(self) -> bool:
+        """Whether a Coordinator is looked for."""
+        return self._coordinated
+
+    @property
+    def assignments(self) -> tuple[Assignment, ...]:
+        """What is wanted of this instance now."""
+        return self.current.assignments if self.current is not None and self.active else ()
+
+    def declare(
+        self,
+        now: float,
+        *,
+        capabilities: tuple[Capability, ...] | None = None,
+        interests: tuple[Interest, ...] | None = None,
+    ) -> None:
+        """Replace what the registration says."""
+        old = self.registration
+        self.registration = msgspec.structs.replace(
+            old,
+            revision=old.revision + 1,
+            capabilities=old.capabilities if capabilities is None else capabilities,
+            interests=old.interests if interests is None else interests,
+        )
+        self._register_at = now
+        self.changes += 1
+
+    def tick(self, now: float, *, written: int = 0, received: int = 0) -> list[Registration | Heartbeat]:
+        """What to send now.  Call at least once per heartbeat."""
+        if self.phase is Phase.WAITING and now >= self._deadline:
+            self.phase = Phase.ALONE
+            self.changes += 1
+        if self._fenced and now >= self._fenced_until:
+            self._fenced = False
+            self.changes += 1
+        if not self._coordinated:
+            return []
+        messages: list[Registration | Heartbeat] = []
+        if now >= self._register_at:
+            self._register_at = float("inf")
+            messages.append(self.registration)
+        if now >= self._beat_at:
+            self._beat_at = max(self._beat_at + self.registration.heartbeat, now)
+            messages.append(self.beat(written=written, received=received))
+        return messages
+
+    def next_tick(self) -> float:
+        """When `tick` has something to do again."""
+        if not self._coordinated:
+            return float("inf")
+        return min(self._register_at, self._beat_at)
+
+    def beat(
+        self, state: Literal["online", "offline"] = "online", *, written: int = 0, received: int = 0
+    ) -> Heartbeat:
+        """A heartbeat as of now."""
+        return Heartbeat(
+            app_id=self.registration.app_id,
+            instance_id=self.registration.instance_id,
+            state=state,
+            revision=self.registration.revision,
+            version=self.current.version if self.current else 0,
+            epoch=self.epoch,
+            active=self.active,
+            written=written,
+            received=received,
+        )
+
+    def assigned(self, message: Assignments, now: float) -> bool:
+        """Take the Coordinator's word; returns whether anything changed for this instance."""
+        if message.app_id != self.registration.app_id or message.epoch < self.epoch:
+            return False
+        me = self.registration.instance_id
+        if message.revisions.get(me) != self.registration.revision:
+            self._register_at = min(self._register_at, now)
+            if me not in message.revisions:
+                return False
+        before = (self.phase, self.active, self.assignments, self.epoch)
+        self.current = message
+        self.epoch = message.epoch
+        self.phase = Phase.COORDINATED
+        self._fenced = False
+        changed = before != (self.phase, self.active, self.assignments, self.epoch)
+        self.changes += changed
+        return changed
+
+    def paused(self, now: float) -> bool:
+        """This process was stopped for longer than a Coordinator waits: another may be active by now.
+
+        Writes are buffered until the Coordinator says who is active, or stays silent for the handshake
+        time-out.  Returns whether this applies (only the active instance of a standby app).
+        """
+        standby = self.current is not None and self.current.active != ""
+        if not standby or not self.active:
+            return False
+        self._fenced = True
+        self._fenced_until = now + self._handshake_timeout
+        self._beat_at = now
+        self._register_at = now
+        self.changes += 1
+        return True
+
+    def permission(self, key: Key) -> Permission:
+        """How to treat items written under the concrete `key`."""
+        capability = self.capability(key)
+        if self._fenced:
+            return Permission(Verdict.BUFFER, capability)
+        if not self.active:
+            return Permission(Verdict.REFUSED, capability)
+        if capability is None:
+            return Permission(Verdict.OPEN)
+        if self.phase is Phase.WAITING:
+            return Permission(Verdict.BUFFER, capability)
+        cap = most(capability.frequency)
+        if self.phase is Phase.ALONE:
+            return Permission(Verdict.OPEN, capability, cap)
+        wanted = [a.frequency for a in self.assignments if Key.parse(a.key).matches(key)]
+        if not wanted:
+            return Permission(Verdict.UNWANTED, capability)
+        rates = [rate for rate in wanted if rate is not None]
+        rate = max(rates) if len(rates) == len(wanted) else None
+        return Permission(Verdict.OPEN, capability, cap if rate is None else rate)
+
+    def capability(self, key: Key) -> Capability | None:
+        """The first declared capability under which `key` falls."""
+        return next((c for c in self.registration.capabilities if Key.parse(c.key).offers(key)), None)
+
+    def wanted(self, key: Key) -> bool:
+        """Whether somebody wants what `key` (wildcards allowed) names, or nobody is there to ask."""
+        if not self.active or self.phase is Phase.WAITING:
+            return False
+        if self.phase is Phase.ALONE:
+            return True
+        return any(key.offers(Key.parse(a.key)) for a in self.assignments)
+
+
+def least(frequency: Frequency) -> float | None:
+    """The minimum rate an interest asks for; None: as it comes."""
+    return frequency[0] if isinstance(frequency, tuple) else frequency
+
+
+def most(frequency: Frequency) -> float | None:
+    """The maximum rate: of a capability what it can make, of a pair its second number; None: no limit."""
+    return frequency[1] if isinstance(frequency, tuple) else frequency

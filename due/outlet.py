@@ -1,0 +1,147 @@
+"""What one engine writes under one concrete key: numbering, batching, and what waits for permission.
+
+    write ──► put ──► buffer ──cut──► sink(frame, payload, mode)      cut by bytes, by time, by NO_WAIT
+                └──► big values: a frame of their own, copied once
+
+Callers hold `lock`.  No I/O here: the sink does it.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from due.codec import Frame, encode_frame, encode_single, encode_value, freeze
+from due.keys import Key
+from due.membership import Permission, Verdict
+from due.messages import RecordBatch
+from due.pacing import Pacer
+
+PUBLISH = 1
+"""Mode bit: goes to Data Updates."""
+ARCHIVE = 2
+"""Mode bit: goes to Data Archives."""
+BOTH = PUBLISH | ARCHIVE
+
+Sink = Callable[["Outlet", Frame, bytes, int], None]
+Waiting = tuple[Any, int, bool, int | None, int]
+"""(frozen value, mode, NO_WAIT, event time, timestamp)"""
+
+_ITEM_OVERHEAD = 12
+
+
+class Outlet:
+    """The items of one (instance, key)."""
+
+    def __init__(
+        self,
+        key: Key,
+        app_id: str,
+        instance_id: str,
+        *,
+        frame_bytes: int,
+        single_bytes: int,
+        sink: Sink,
+        dirty: Callable[["Outlet"], None],
+    ) -> None:
+        self.key = key
+        self.lock = threading.Lock()
+        self.fast = False
+        """Nothing stands between `write` and `put`; anyone may set it False, only the holder of `lock` True."""
+        self.permission = Permission(Verdict.BUFFER)
+        self.pacer: Pacer[Waiting] | None = None
+        self.held: deque[Waiting] = deque()
+        self.held_bytes = 0
+        self.reliable = False
+        self.index = False
+        self.epoch = 0
+        self.sequence = 0
+        """Of the newest item; items in the buffer have theirs already."""
+        self.published = 0
+        self._identity = (key.text, app_id, instance_id)
+        self._frame_bytes = frame_bytes
+        self._single_bytes = single_bytes
+        self._sink = sink
+        self._dirty = dirty
+        self._mode = BOTH
+        self._size = 0
+        self._values: list[Any] = []
+        self._times: list[int] = []
+        self._events: list[int] | None = None
+
+    def dirty(self) -> None:
+        """Ask for a visit of the sender."""
+        self._dirty(self)
+
+    def put(self, value: Any, mode: int, event_time: int | None, now: int) -> None:
+        """Number one item and buffer it, or send it now if it is big; raises `UnsupportedValue`."""
+        if type(value) is bytes:
+            size = len(value)
+        else:
+            value, size = self._sized(value)
+        if size >= self._single_bytes:
+            self._put_single(value, mode, event_time, now)
+            return
+        if mode != self._mode:
+            self.cut()
+            self._mode = mode
+        if not self._values:
+            self._dirty(self)
+        self.sequence += 1
+        self._values.append(value)
+        self._times.append(now)
+        if self._events is not None:
+            self._events.append(now if event_time is None else event_time)
+        elif event_time is not None:
+            self._events = [*self._times[:-1], event_time]
+        self._size += size + _ITEM_OVERHEAD
+        if self._size >= self._frame_bytes:
+            self.cut()
+
+    def cut(self) -> None:
+        """Send what is buffered as one frame."""
+        values = self._values
+        if not values:
+            return
+        count = len(values)
+        frame = self._head(self.sequence - count + 1, self._times, self._events, self._mode, count)
+        frame.values = values
+        self._values, self._times, self._events, self._size = [], [], None, 0
+        self._sink(self, frame, encode_frame(frame), self._mode)
+
+    def _put_single(self, value: Any, mode: int, event_time: int | None, now: int) -> None:
+        self.cut()
+        events = None if event_time is None else [event_time]
+        published = self.published
+        head = self._head(self.sequence + 1, [now], events, mode, 1)
+        try:
+            payload = encode_single(head, value)
+        except Exception:
+            self.published = published
+            raise
+        self.sequence += 1
+        self._sink(self, head, payload, mode)
+
+    def _head(
+        self, sequence: int, times: list[int], events: list[int] | None, mode: int, count: int
+    ) -> Frame:
+        before = self.published
+        if mode & PUBLISH:
+            self.published += count
+        return Frame(*self._identity, self.epoch, sequence, before, times, events, [])
+
+    def _sized(self, value: Any) -> tuple[Any, int]:
+        kind = type(value)
+        if kind is RecordBatch:
+            return value, self._single_bytes
+        if kind is np.ndarray and value.nbytes >= self._single_bytes:
+            return value, value.nbytes
+        if kind in (int, float, bool, type(None)):
+            return freeze(value), 9
+        if kind is str:
+            return freeze(value), len(value)
+        encoded = encode_value(value)
+        return msgspec.Raw(encoded), len(encoded)

@@ -1,0 +1,160 @@
+"""Running an app as a process: options, signals, the ready line, ticks, health, an orderly end.
+
+    python -m apps.kitsune.service --updates URL --archive URL --settings FILE.json
+
+One JSON line on stdout when the app is ready, logs on stderr; SIGTERM or SIGINT: `stop()`, flush, offline
+heartbeat, exit 0.  The process ends with the one that started it (Linux: with the starting thread).
+Exit codes: 2 wrong options, 1 a backend or the app failed.
+"""
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+
+from due.config import Options
+from due.drivers.embedded_redis import die_with_parent
+from due.engine import Engine
+from due.errors import DueError, InvalidOption
+from due.messages import CONSUMER, PRODUCER, PUB_ONLY, Capability, Instances, Interest
+
+log = logging.getLogger("due.service")
+
+TICK_SECONDS = 0.05
+_TICKS_PER_HEALTH = 20
+HEALTH = "due.health"
+"""`due.health.<app>`: the app's and the engine's health, every second, best effort."""
+
+S = TypeVar("S")
+
+
+class Service(Protocol):
+    """What `run` drives; all methods are called in the main thread."""
+
+    def start(self) -> None:
+        """The engine is initialised: subscribe."""
+        ...
+
+    def tick(self) -> None:
+        """Called about every 50 ms."""
+        ...
+
+    def stop(self) -> None:
+        """Write what is still to be written."""
+        ...
+
+    def health(self) -> dict[str, Any]:
+        """Counters, for people and metrics."""
+        ...
+
+
+def run(  # noqa: PLR0917 - the order in which an app declares itself
+    app_id: str,
+    service: Callable[[Engine, Any], Service],
+    settings: type[Any],
+    interests: Iterable[Interest] = (),
+    capabilities: Iterable[Capability] = (),
+    argv: Sequence[str] | None = None,
+    *,
+    instances: Instances = "standby",
+) -> int:
+    """Run one app until a signal ends it; returns the exit code."""
+    arguments = _parser(app_id).parse_args(argv)
+    logging.basicConfig(
+        level=arguments.log.upper(),
+        stream=sys.stderr,
+        format=f"%(asctime)s {app_id} %(levelname)s %(name)s: %(message)s",
+    )
+    parent = os.getppid()
+    if not arguments.stay:
+        die_with_parent(signal.SIGTERM)
+    try:
+        chosen = read_struct(arguments.settings, settings)
+        engine = Engine(_options(arguments))
+        engine.init(
+            app_id,
+            PRODUCER | CONSUMER,
+            interests=interests,
+            capabilities=capabilities,
+            instances=arguments.instances or instances,
+        )
+    except (DueError, OSError) as error:
+        print(f"{app_id}: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InvalidOption) else 1
+    stop = _stop_event()
+    if os.getppid() != parent and not arguments.stay:
+        stop.set()
+    try:
+        return _drive(app_id, service(engine, chosen), engine, stop)
+    finally:
+        engine.close()
+
+
+def read_struct(path: str, kind: type[S]) -> S:
+    """A JSON file as a settings Struct, all defaults where no file is named; raises `InvalidOption`."""
+    try:
+        text = Path(path).read_bytes() if path else b"{}"
+        return msgspec.json.decode(text, type=kind)
+    except OSError as error:
+        raise InvalidOption(f"settings file {path}: {error.strerror}") from None
+    except msgspec.MsgspecError as error:
+        raise InvalidOption(f"settings file {path}: {error}") from None
+
+
+def _parser(app_id: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=app_id, description=f"Run the app {app_id}.")
+    parser.add_argument("--updates", default="", help="Data Updates URL: redis://, rediss:// or unix://")
+    parser.add_argument("--archive", default="", help="Data Archives URL: sqlite:///file.db or mongodb://")
+    parser.add_argument("--settings", default="", help="JSON file with the app's settings")
+    parser.add_argument("--engine", default="", help="JSON file with options of the DUE engine")
+    parser.add_argument("--directory", default="", help="folder for spool and embedded defaults")
+    parser.add_argument("--instances", default="", choices=("", "standby", "shared"))
+    parser.add_argument("--log", default="info", choices=("debug", "info", "warning", "error"))
+    parser.add_argument("--stay", action="store_true", help="do not end with the parent process")
+    return parser
+
+
+def _options(arguments: argparse.Namespace) -> Options:
+    options = read_struct(arguments.engine, Options)
+    given = {
+        name: value for name in ("updates", "archive", "directory") if (value := getattr(arguments, name))
+    }
+    return msgspec.structs.replace(options, **given)
+
+
+def _stop_event() -> threading.Event:
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda _number, _frame: stop.set())
+    return stop
+
+
+def _drive(app_id: str, app: Service, engine: Engine, stop: threading.Event) -> int:
+    try:
+        app.start()
+    except (DueError, OSError) as error:
+        log.error("could not start: %s", error)  # noqa: TRY400 - one clear line
+        return 1
+    print(json.dumps({"ready": True, "app": app_id, "pid": os.getpid()}), flush=True)
+    ticks = 0
+    try:
+        while not stop.wait(TICK_SECONDS):
+            app.tick()
+            ticks += 1
+            if ticks % _TICKS_PER_HEALTH == 0:
+                engine.write(f"{HEALTH}.{app_id}", _health(app, engine), [PUB_ONLY])
+    finally:
+        app.stop()
+    return 0
+
+
+def _health(app: Service, engine: Engine) -> dict[str, Any]:
+    return {"app": app.health(), "engine": engine.health()}

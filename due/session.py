@@ -1,0 +1,264 @@
+"""What exists between `init` and `close`: the parts of an engine, wired together."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from due.archiver import Archiver
+from due.backends import open_archive, open_spool, open_updates
+from due.codec import Frame, packed
+from due.config import Options
+from due.dispatcher import Dispatcher
+from due.drivers.base import ArchiveDriver
+from due.drivers.embedded_redis import EmbeddedServer, shared_server
+from due.errors import DueError, Timeout, UpdatesUnavailable
+from due.gate import Gate
+from due.keeper import Keeper
+from due.keys import Key
+from due.membership import Member, Registration
+from due.messages import Assignment, AssignmentCallback, Interest
+from due.observation import Observation
+from due.outlet import ARCHIVE, PUBLISH, Outlet
+from due.sender import Sender
+
+log = logging.getLogger("due")
+
+
+class Session:
+    """The parts, their start and their end."""
+
+    def __init__(
+        self, options: Options, registration: Registration, *, updates_url: str, archive_url: str
+    ) -> None:
+        self._options = options
+        self._archive_url = archive_url
+        self._server: EmbeddedServer | None = None
+        if not updates_url:
+            updates_url, self._server = shared_server(options.folder())
+        self._driver = open_updates(updates_url, options)
+        self.publisher = self._driver.publisher()
+        app, me = registration.app_id, registration.instance_id
+        shared = registration.instances == "shared"
+        receiver = self._driver.receiver(app, me, shared=shared)
+        self.dispatcher = Dispatcher(receiver, shared=shared, tries=options.tries)
+        member = Member(
+            registration,
+            now=time.monotonic(),
+            handshake_timeout=options.handshake_timeout,
+            coordinated=options.coordinated,
+        )
+        pause = options.pause_limit or max(1.0, 3 * options.heartbeat)
+        self.keeper = Keeper(
+            member, self._driver.receiver(app, me), self.publisher, self.dispatcher, pause=pause
+        )
+        self.keeper.say = self._say
+        self.keeper.changed = self._changed
+        self.keeper.written = lambda: sum(o.sequence for o in list(self.outlets.values()))
+        self.gate = Gate(self.keeper, self.publisher, options.handshake_bytes)
+        self.sender = Sender(options.linger, self.gate.service)
+        self.outlets: dict[str, Outlet] = {}
+        """By canonical key."""
+        self._said: dict[str, Outlet] = {}
+        self._observed: list[Observation] = []
+        self._declared = registration.interests
+        self._archiver: Archiver | None = None
+        self._archive: ArchiveDriver | None = None
+        self._lock = threading.RLock()
+        self._unpublished = 0
+        self._told: tuple[Assignment, ...] | None = None
+        self._callback: AssignmentCallback | None = None
+
+    def start(self) -> None:
+        """Start the threads and register."""
+        self.sender.start()
+        self.keeper.start()
+        self.dispatcher.start()
+
+    def outlet(self, key: Key) -> Outlet:
+        """The outlet of a key."""
+        with self._lock:
+            outlet = self.outlets.get(key.text)
+            if outlet is None:
+                outlet = self.outlets[key.text] = self._new_outlet(key)
+            return outlet
+
+    def flush_outlet(self, outlet: Outlet) -> bool:
+        """Send what is buffered; False while items wait for permission or for their pace."""
+        with outlet.lock:
+            self.gate.review(outlet)
+            outlet.cut()
+            return not outlet.held and (outlet.pacer is None or outlet.pacer.due() is None)
+
+    def flush(self, timeout: float) -> None:
+        """See `Engine.flush`."""
+        deadline = time.monotonic() + timeout
+        for outlet in list(self.outlets.values()):
+            while not self.flush_outlet(outlet):
+                if time.monotonic() > deadline:
+                    raise Timeout(f"{outlet.key} still waits for permission or its pace after {timeout} s")
+                time.sleep(0.005)
+        self.publisher.settle(max(0.1, deadline - time.monotonic()))
+        if self._archiver is not None:
+            self._archiver.flush(max(0.1, deadline - time.monotonic()))
+
+    def flush_archive(self, timeout: float) -> None:
+        """What this engine wrote so far is in the archive."""
+        for outlet in list(self.outlets.values()):
+            self.flush_outlet(outlet)
+        if self._archiver is not None:
+            self._archiver.flush(timeout)
+
+    def archive(self) -> ArchiveDriver:
+        """Data Archives, opened when first needed."""
+        with self._lock:
+            if self._archive is None:
+                self._archive = open_archive(self._archive_url)
+            return self._archive
+
+    def opened(self, observation: Observation) -> None:
+        """An observation got its first subscriber."""
+        with self._lock:
+            self._observed.append(observation)
+        self._declare_interests()
+        self.dispatcher.open(observation)
+
+    def closed(self, observation: Observation) -> None:
+        """It lost its last."""
+        with self._lock:
+            self._observed.remove(observation)
+        self._declare_interests()
+        self.dispatcher.shut(observation)
+
+    def on_assignments(self, callback: AssignmentCallback) -> None:
+        """See `Engine.on_assignments`."""
+        self._callback = callback
+        self._tell()
+
+    def health(self) -> dict[str, Any]:
+        """See `Engine.health`."""
+        member = self.keeper.member
+        health: dict[str, Any] = {
+            "app": member.registration.app_id,
+            "instance": member.registration.instance_id,
+            "phase": member.phase.value,
+            "active": member.active,
+            "epoch": member.epoch,
+            "written": self.keeper.written(),
+            "unpublished": self._unpublished,
+            **self.gate.counts,
+            "updates": self.publisher.statistics(),
+            "receiving": self.dispatcher.statistics(),
+        }
+        if self._archiver is not None:
+            health["archive"] = self._archiver.statistics()
+        return health
+
+    def close(self) -> None:
+        """Stop everything, in the order in which data flows; what was written is sent first."""
+        self.dispatcher.close()
+        with _reported("what was written last could not be sent"):
+            self.flush(5.0)
+        self.sender.close()
+        self.keeper.close()
+        with _reported("the goodbye could not be sent"):
+            self.publisher.settle(1.0)
+        self.publisher.close()
+        if self._archiver is not None:
+            self._archiver.close()
+        if self._archive is not None:
+            self._archive.close()
+        self._driver.close()
+        if self._server is not None:
+            self._server.stop()
+
+    def _new_outlet(self, key: Key) -> Outlet:
+        registration = self.keeper.member.registration
+        return Outlet(
+            key,
+            registration.app_id,
+            registration.instance_id,
+            frame_bytes=self._options.frame_bytes,
+            single_bytes=self._options.single_bytes,
+            sink=self._sink,
+            dirty=self.sender.dirty,
+        )
+
+    def _sink(self, outlet: Outlet, frame: Frame, payload: bytes, mode: int) -> None:
+        if mode & PUBLISH:
+            self._publish(outlet, payload, len(frame.timestamps))
+        if mode & ARCHIVE:
+            archiver = self._archiver or self._open_archiver()
+            archiver.put(packed(frame, payload, index=outlet.index))
+
+    def _publish(self, outlet: Outlet, payload: bytes, count: int) -> None:
+        if outlet.reliable:
+            self.publisher.append(outlet.key.path, payload)
+            return
+        try:
+            self.publisher.publish(outlet.key.path, payload)
+        except UpdatesUnavailable:
+            self._unpublished += count
+
+    def _open_archiver(self) -> Archiver:
+        with self._lock:
+            if self._archiver is None:
+                o = self._options
+                registration = self.keeper.member.registration
+                spool = open_spool(o.folder() / "spool" / registration.app_id / registration.instance_id, o)
+                self._archiver = Archiver(
+                    self.archive(),
+                    spool,
+                    queue_bytes=o.archive_queue_bytes,
+                    batch=o.archive_batch,
+                    linger=o.archive_linger,
+                )
+            return self._archiver
+
+    def _say(self, text: str, value: object) -> None:
+        """Write a membership message, past all permissions."""
+        outlet = self._said.get(text)
+        if outlet is None:
+            outlet = self._said[text] = self._new_outlet(Key(text))
+        with outlet.lock:
+            outlet.put(value, PUBLISH, None, time.time_ns())
+            outlet.cut()
+
+    def _changed(self) -> None:
+        """Permissions may have changed."""
+        for outlet in list(self.outlets.values()):
+            outlet.fast = False
+            self.sender.dirty(outlet)
+        self.gate.changed()
+        self._tell()
+
+    def _tell(self) -> None:
+        callback = self._callback
+        if callback is None:
+            return
+        with self.keeper.lock:
+            wanted = self.keeper.member.assignments
+        if wanted != self._told:
+            self._told = wanted
+            self.dispatcher.post(lambda: callback(wanted))
+
+    def _declare_interests(self) -> None:
+        with self._lock:
+            observed = tuple(Interest(o.key.text, o.frequency) for o in self._observed)
+        interests = tuple(dict.fromkeys((*self._declared, *observed)))
+        with self.keeper.lock:
+            member = self.keeper.member
+            if interests == member.registration.interests:
+                return
+            member.declare(time.monotonic(), interests=interests)
+        self.keeper.wake()
+
+
+@contextmanager
+def _reported(what: str) -> Iterator[None]:
+    try:
+        yield
+    except DueError as error:
+        log.error("%s: %s", what, error)  # noqa: TRY400 - no trace needed

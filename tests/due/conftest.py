@@ -1,0 +1,43 @@
+"""A real Data Updates server and engines on it, closed after each test."""
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from due import CONSUMER, PRODUCER, Engine, Options
+from due.drivers.embedded_redis import EmbeddedServer
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedServer]:
+    """One server for all tests of a session; tests use keys of their own."""
+    with EmbeddedServer(tmp_path_factory.mktemp("updates")) as running:
+        yield running
+
+
+@pytest.fixture
+def make_engine(server, tmp_path) -> Iterator[Callable[..., Engine]]:
+    """Makes initialised engines without a Coordinator unless `coordinated=True` is given."""
+    made = []
+
+    def make(app_id, role=PRODUCER | CONSUMER, *, url=None, archive=None, init=None, **options):
+        options = {"coordinated": False, "directory": str(tmp_path / "due"), **options}
+        engine = Engine(Options(**options))
+        engine.set_pubsub(url or server.url)
+        engine.set_db(archive or f"sqlite://{tmp_path / 'archive.db'}")
+        engine.init(app_id, role, **(init or {}))
+        made.append(engine)
+        return engine
+
+    yield make
+    for engine in made:
+        engine.close()
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    """Return when the condition holds; the watchdog is generous."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened in time"
+        time.sleep(0.005)

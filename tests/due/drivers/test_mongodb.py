@@ -1,0 +1,130 @@
+"""The MongoDB archive over a real connection: outages, large payloads, plain documents for other readers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pymongo import MongoClient
+
+from due.codec import pack
+from due.drivers import mongodb
+from due.drivers.mongodb import MongoArchive
+from due.errors import ArchiveUnavailable, InvalidOption
+from due.messages import Item
+from tests.due.drivers.mongo_server import mongo_server, nx_server
+
+T0 = 1_700_000_000_000_000_000
+
+
+def items(count: int, *, key: str = "a.b", start: int = 1) -> list[Item]:
+    return [Item(key, {"n": n}, T0 + n, T0 + n, "app", "i", n) for n in range(start, start + count)]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with mongo_server(tmp_path_factory.mktemp("mongo")) as url:
+        yield url
+
+
+@pytest.fixture
+def url(server: str, request: pytest.FixtureRequest) -> str:
+    return f"{server}?collection={request.node.name.partition('[')[0]}"
+
+
+@pytest.fixture
+def archive(url: str) -> Iterator[MongoArchive]:
+    archive = MongoArchive(url)
+    yield archive
+    archive.prune(max_bytes=0)
+    archive.close()
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "mongodb://",
+        "mongodb:///db",
+        "sqlite:///x",
+        "mongodb://host/a/b",
+        "mongodb://host/?authMechanism=nonsense",
+    ],
+)
+def test_wrong_urls_are_refused(url: str) -> None:
+    with pytest.raises(InvalidOption, match="mongodb"):
+        MongoArchive(url)
+
+
+def test_a_password_is_not_shown() -> None:
+    archive = MongoArchive("mongodb://user:secret@127.0.0.1:1/db?serverSelectionTimeoutMS=50")
+    with pytest.raises(ArchiveUnavailable) as raised:
+        archive.find({})
+    assert "secret" not in str(raised.value)
+    archive.close()
+
+
+def test_a_server_that_is_away_is_unavailable_and_then_takes_all(tmp_path: Path) -> None:
+    frames = [pack(items(10, start=start)) for start in (1, 11)]
+    with nx_server(tmp_path, db=str(tmp_path / "nx.db")) as url:
+        archive = MongoArchive(url + "?serverSelectionTimeoutMS=300")
+        archive.insert_frames(frames[:1])
+    with pytest.raises(ArchiveUnavailable):
+        archive.insert_frames(frames)
+    port = int(url.rpartition(":")[2].partition("/")[0])
+    with nx_server(tmp_path, db=str(tmp_path / "nx.db"), port=port):
+        archive.insert_frames(frames)
+        assert [item.sequence for item in archive.find({"dataKey": "a.b"})] == list(range(1, 21))
+        archive.close()
+
+
+def test_payloads_beyond_a_documents_size_are_stored_in_parts(
+    archive: MongoArchive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mongodb, "_PART_BYTES", 1000)
+    value = bytes(range(256)) * 20
+    large = Item("a.large", value, T0, T0, "app", "i", 1)
+    archive.insert_frames([pack([large])])
+    archive.insert_frames([pack([large])])
+    (found,) = archive.find({"dataKey": "a.large"})
+    assert found == large
+    assert archive.prune(before=T0 + 1) == 1
+    assert archive.find({}) == []
+
+
+def test_other_clients_read_plain_documents(archive: MongoArchive, url: str) -> None:
+    archive.insert_frames([pack(items(2), index=True)])
+    client: MongoClient[dict[str, object]] = MongoClient(url.partition("?")[0])
+    collection = client.get_default_database()["test_other_clients_read_plain_documents"]
+    document = collection.find_one({"dataKey": {"$eq": "a.b"}, "value.n": {"$eq": 2}})
+    client.close()
+    assert document is not None
+    shown = {
+        name: document[name]
+        for name in ("value", "timestamp", "eventTime", "appId", "instanceId", "sequence")
+    }
+    assert shown == {
+        "value": {"n": 2},
+        "timestamp": T0 + 2,
+        "eventTime": T0 + 2,
+        "appId": "app",
+        "instanceId": "i",
+        "sequence": 2,
+    }
+
+
+def test_wide_frames_are_found_by_another_reader(archive: MongoArchive, url: str) -> None:
+    wide = [Item("a.wide", n, T0 + n * 10**9, T0 + n, "app", "i", n) for n in range(1, 11)]
+    archive.insert_frames([pack(wide)])
+    reader = MongoArchive(url)
+    assert [i.value for i in reader.find({"dataKey": "a.*", "timestamp": {"$gte": T0 + 9 * 10**9}})] == [
+        9,
+        10,
+    ]
+    reader.close()
+
+
+def test_names_that_bson_does_not_take_are_still_found(archive: MongoArchive) -> None:
+    value = {"a.b": 1, "$c": 2, "": 3, "big": 2**63 - 1}
+    archive.insert([Item("a", value, T0, T0, "app", "i", 1)])
+    (found,) = archive.find({"value.$c": 2})
+    assert found.value == value
+    assert len(archive.find({"value.big": {"$gt": 2**62}})) == 1

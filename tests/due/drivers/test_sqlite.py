@@ -1,0 +1,209 @@
+"""The file archive: many processes at a time, index use, honest errors, nothing left open over a fork."""
+
+import multiprocessing
+import os
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from due.codec import pack
+from due.drivers import sqlite_file
+from due.drivers.query import parse
+from due.drivers.sqlite import SqliteArchive
+from due.errors import ArchiveUnavailable, BackendError, InvalidOption
+from due.messages import Item
+
+T0 = 1_700_000_000_000_000_000
+ROOT = Path(__file__).parents[3]
+
+
+def items(
+    count: int, *, key: str = "a.b", start: int = 1, instance: str = "i", step: int = 1000
+) -> list[Item]:
+    return [
+        Item(key, n, T0 + n * step, T0 + n * step, "app", instance, n) for n in range(start, start + count)
+    ]
+
+
+def opened(folder: Path) -> SqliteArchive:
+    return SqliteArchive(f"sqlite://{folder}/archive.db")
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["sqlite:archive", "sqlite://", "sqlite://host/archive.db", "mysql:///a.db", "sqlite:///a.db?synchronous=off",
+     "sqlite:///a.db?cache=1"],
+)  # fmt: skip
+def test_wrong_urls_are_refused(url: str) -> None:
+    with pytest.raises(InvalidOption, match="sqlite"):
+        SqliteArchive(url)
+
+
+def test_nothing_is_opened_before_the_first_call(tmp_path: Path) -> None:
+    archive = opened(tmp_path / "not yet")
+    assert not (tmp_path / "not yet").exists()
+    archive.insert(items(1))
+    archive.close()
+    assert (tmp_path / "not yet" / "archive.db").exists()
+
+
+def test_full_synchronisation_is_an_option(tmp_path: Path) -> None:
+    archive = SqliteArchive(f"sqlite://{tmp_path}/archive.db?synchronous=full")
+    archive.insert(items(1))
+    assert len(archive.find({})) == 1
+    archive.close()
+
+
+def test_many_processes_write_and_read_one_file(tmp_path: Path) -> None:
+    program = """
+import sys
+from pathlib import Path
+from tests.due.drivers.test_sqlite import items, opened
+from due.codec import pack
+archive = opened(Path(sys.argv[1]))
+for start in range(1, 501, 50):
+    archive.insert_frames([pack(items(50, key=f"a.{sys.argv[2]}", start=start, instance=sys.argv[2]))])
+    archive.insert(items(1, key="shared", start=start))
+    assert len(archive.find({"dataKey": f"a.{sys.argv[2]}"})) == start + 49
+"""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    writers = [
+        subprocess.Popen([sys.executable, "-c", program, str(tmp_path), f"w{n}"], env=environment)
+        for n in range(4)
+    ]
+    assert [writer.wait(120) for writer in writers] == [0] * 4
+    archive = opened(tmp_path)
+    assert len(archive.find({"dataKey": "a.*"})) == 2000
+    assert len(archive.find({"dataKey": "shared"})) == 10, "the same items from four writers"
+    archive.close()
+
+
+def test_a_reader_sees_keys_that_others_add_later(tmp_path: Path) -> None:
+    reader, writer = opened(tmp_path), opened(tmp_path)
+    assert reader.find({"dataKey": "a.*"}) == []
+    for n, key in enumerate(("a.x", "a.y", "b.z"), 1):
+        writer.insert(items(1, key=key))
+        assert len(reader.find({"dataKey": "a.*"})) == min(n, 2)
+        assert len(reader.find({"dataKey": {"$nin": ["b.*"]}})) == min(n, 2)
+    reader.close()
+    writer.close()
+
+
+def _read_in_child(archive: SqliteArchive, result: "multiprocessing.Queue[int]") -> None:
+    archive.insert(items(1, key="child"))
+    result.put(len(archive.find({})))
+    archive.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_opens_its_own(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    archive.insert(items(3))
+    assert len(archive.find({})) == 3
+    context = multiprocessing.get_context("fork")
+    result = context.Queue()
+    child = context.Process(target=_read_in_child, args=(archive, result))
+    child.start()
+    assert result.get(timeout=60) == 4
+    child.join(60)
+    archive.insert(items(1, key="parent"))
+    assert len(archive.find({})) == 5
+    archive.close()
+
+
+def test_a_range_query_uses_the_index_for_frames_and_items(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    archive.insert_frames([pack(items(100, start=start, key="framed")) for start in range(1, 5001, 100)])
+    archive.insert(items(5000, key="single"))
+    file = sqlite3.connect(tmp_path / "archive.db")
+    for key in ("framed", "single"):
+        query = {"dataKey": key, "timestamp": {"$gte": T0 + 2_000_000, "$lt": T0 + 2_100_000}}
+        assert [i.value for i in archive.find(query)] == list(range(2000, 2100))
+    for field, index in (("timestamp", "frames_time"), ("eventTime", "frames_event")):
+        parsed = parse({"dataKey": "framed", field: {"$gte": T0, "$lt": T0 + 100}})
+        text, parameters = parsed.to_sql(lambda _: [1], {"timestamp": 100, "eventTime": 100})
+        explain = "EXPLAIN QUERY PLAN SELECT payload FROM frames WHERE " + text  # noqa: S608 our own
+        plan = file.execute(explain, parameters).fetchall()
+        assert any(index in step[3] for step in plan), plan
+        assert all("SCAN frames" not in step[3] for step in plan), plan
+    file.close()
+    archive.close()
+
+
+def test_frames_of_any_length_in_time_are_found(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    long = [Item("a.b", n, T0 + n * 10**9, T0 - n * 10**9, "app", "i", n) for n in range(1, 101)]
+    archive.insert_frames([pack(items(10, key="a.c")), pack(long)])
+    reader = opened(tmp_path)
+    for first in (1, 50, 100):
+        found = reader.find({"dataKey": "a.*", "timestamp": {"$gte": T0 + first * 10**9}})
+        assert [i.value for i in found] == list(range(first, 101))
+        found = reader.find({"eventTime": {"$lte": T0 - first * 10**9}})
+        assert [i.value for i in found] == list(range(first, 101))
+    reader.close()
+    archive.close()
+
+
+def test_a_locked_file_is_unavailable_and_works_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_file, "_BUSY_S", 0.05)
+    archive = opened(tmp_path)
+    archive.insert(items(1))
+    other = sqlite3.connect(tmp_path / "archive.db", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(ArchiveUnavailable, match="locked"):
+        archive.insert(items(1, key="new.key", start=2))
+    assert len(archive.find({})) == 1, "readers are not held up"
+    other.execute("COMMIT")
+    other.close()
+    archive.insert(items(1, key="new.key", start=2))
+    assert len(archive.find({"dataKey": "new.key"})) == 1
+    archive.close()
+
+
+def test_a_folder_that_cannot_be_made_is_unavailable(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ArchiveUnavailable, match="file"):
+        opened(tmp_path / "file").find({})
+
+
+def test_another_kind_of_file_is_an_error_for_good(tmp_path: Path) -> None:
+    (tmp_path / "archive.db").write_bytes(b"no database at all" * 1000)
+    with pytest.raises(BackendError, match="is it an archive") as raised:
+        opened(tmp_path).insert(items(1))
+    assert not isinstance(raised.value, ArchiveUnavailable)
+
+
+def test_a_file_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    archive.insert(items(1))
+    archive.close()
+    file = sqlite3.connect(tmp_path / "archive.db")
+    file.execute("PRAGMA user_version = 99")
+    file.close()
+    with pytest.raises(BackendError, match="newer version"):
+        opened(tmp_path).find({})
+
+
+def test_a_failed_call_leaves_nothing_behind(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    bad = Item("b", object(), 1, 1, "app", "i", 1)
+    for _ in range(2):
+        with pytest.raises(TypeError):
+            archive.insert([*items(3, key="a"), bad])
+    assert archive.find({}) == []
+    archive.insert(items(3, key="a"))
+    assert len(archive.find({"dataKey": "a"})) == 3
+    archive.close()
+
+
+def test_deleted_space_is_used_again_or_given_back(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    archive.insert([Item("a", bytes(10_000), n, n, "app", "i", n) for n in range(1, 501)])
+    assert archive.prune(before=400) == 399
+    archive.close()
+    assert (tmp_path / "archive.db").stat().st_size < 2_500_000

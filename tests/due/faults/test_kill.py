@@ -1,0 +1,173 @@
+"""kill -9 of the server, the producer or the consumer loses nothing of a reliable stream."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from due.drivers.embedded_redis import EmbeddedServer
+from due.drivers.redis_wire import Wire
+
+ROOT = Path(__file__).parents[3]
+
+
+class Program:
+    """A started process with its output in a file."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        self.output = folder / f"{arguments[0]}-{time.monotonic_ns()}.txt"
+        command = [sys.executable, "-m", "tests.due.faults.programs", *map(str, arguments)]
+        with self.output.open("wb") as out:
+            self.process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=out)
+
+    def lines(self) -> list[str]:
+        return self.output.read_text().splitlines()
+
+    def wait_for(self, text: str, seconds: float = 90.0) -> str:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            found = [line for line in self.lines() if line.startswith(text)]
+            if found:
+                return found[-1]
+            assert self.process.poll() in (None, 0), "the program failed"
+            time.sleep(0.02)
+        raise AssertionError(f"{text!r} not seen; last lines {self.lines()[-3:]}")
+
+    def numbers(self) -> list[int]:
+        return [int(line.split()[1]) for line in self.lines() if line[:1].isdigit() and " " in line]
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdin:
+            self.process.stdin.close()
+
+
+@pytest.fixture
+def programs(tmp_path) -> Iterator:
+    started = []
+
+    def start(*arguments):
+        started.append(Program(tmp_path, *arguments))
+        return started[-1]
+
+    yield start
+    for program in started:
+        program.kill()
+
+
+@pytest.fixture
+def own_server(tmp_path) -> Iterator[EmbeddedServer]:
+    with EmbeddedServer(tmp_path / "updates") as server:
+        yield server
+
+
+@pytest.mark.parametrize("durable", [False, True], ids=["volatile", "append_only"])
+def test_killed_server(programs, tmp_path, durable):
+    count = 200_000
+    with EmbeddedServer(tmp_path / "u", durable=durable) as server:
+        consumer = programs("consume", server.url, "reader", count, 0)
+        consumer.wait_for("ready")
+        producer = programs("produce", server.url, "reliable", count, 50)
+        producer.wait_for("50000")
+        server.kill()
+        time.sleep(0.3)
+        server.start()
+        producer.wait_for("flushed")
+        assert consumer.wait_for("gaps").startswith("gaps 0")
+        assert consumer.numbers() == list(range(count))
+
+
+def test_killed_consumer(programs, own_server):
+    count = 20_000
+    first = programs("consume", own_server.url, "reader", count, 0.1)
+    first.wait_for("ready")
+    producer = programs("produce", own_server.url, "reliable", count, 20)
+    first.wait_for("3000 ")
+    first.kill()
+    seen = first.numbers()
+    second = programs("consume", own_server.url, "reader", count - len(seen), 0)
+    deadline = time.monotonic() + 60
+    while set(seen) | set(second.numbers()) != set(range(count)):
+        assert time.monotonic() < deadline, f"{len(seen)} + {len(second.numbers())} of {count}"
+        time.sleep(0.05)
+    producer.wait_for("flushed")
+    again = second.numbers()
+    assert again == sorted(again), "order is kept after the take-over"
+
+
+def test_killed_producer(programs, own_server):
+    consumer = programs("consume", own_server.url, "reader", 10**9, 0)
+    consumer.wait_for("ready")
+    producer = programs("produce", own_server.url, "reliable", 10_000, 20)
+    producer.wait_for("flushed")
+    producer.kill()
+    deadline = time.monotonic() + 30
+    while len(consumer.numbers()) < 10_000:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    programs("produce", own_server.url, "reliable", 5_000, 20).wait_for("flushed")
+    while len(consumer.numbers()) < 15_000:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert consumer.numbers() == [*range(10_000), *range(5_000)]
+
+
+def _used_memory(url: str) -> int:
+    wire = Wire(url)
+    info = wire.call("INFO", "memory").decode()
+    wire.close()
+    return int(next(line for line in info.splitlines() if line.startswith("used_memory:")).split(":")[1])
+
+
+def test_a_slow_consumer_holds_a_reliable_producer_back(programs, own_server):
+    consumer = programs("consume", own_server.url, "reader", 30_000, 0.2)
+    consumer.wait_for("ready")
+    producer = programs("produce", own_server.url, "reliable", 30_000, 1000)
+    peak = 0
+    while not any(line.startswith("gaps") for line in consumer.lines()):
+        peak = max(peak, _used_memory(own_server.url))
+        time.sleep(0.1)
+    assert consumer.wait_for("gaps").startswith("gaps 0")
+    assert consumer.numbers() == list(range(30_000))
+    producer.wait_for("flushed")
+    assert peak < 48 << 20, "window and retained payloads, no more"
+
+
+def test_a_slow_consumer_of_best_effort_data_is_told_of_gaps(programs, own_server):
+    consumer = programs("consume", own_server.url, "reader", 10**9, 0.5)
+    consumer.wait_for("ready")
+    producer = programs("produce", own_server.url, "best_effort", 600_000, 1000)
+    peak = 0
+    while not any(line.startswith("flushed") for line in producer.lines()):
+        peak = max(peak, _used_memory(own_server.url))
+        time.sleep(0.05)
+    assert peak < 400 << 20
+    last = consumer.numbers()
+    assert last == sorted(last)
+    assert len(last) < 600_000
+
+
+def test_the_server_dies_with_its_killed_parent(tmp_path):
+    code = (
+        "import sys, time\n"
+        "from due.drivers.embedded_redis import EmbeddedServer\n"
+        f"server = EmbeddedServer({str(tmp_path / 's')!r}).start()\n"
+        "print(server.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=ROOT)
+    assert parent.stdout is not None
+    with parent.stdout:
+        pid = int(parent.stdout.readline())
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.wait()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2]:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)

@@ -1,0 +1,204 @@
+"""Engines under a Coordinator: production on demand, pace, one active instance, refusal of the others.
+
+The Coordinator here is a scripted one that says what the test wants; the real one has its own tests.
+"""
+
+import time
+
+import pytest
+
+from due import NO_WAIT, PUB_ONLY, Capability, Interest
+from due.membership import ASSIGNMENT, Assignments, Registration
+from due.messages import Assignment
+from tests.due.conftest import wait_for
+
+FAST = {"coordinated": True, "handshake_timeout": 5.0, "heartbeat": 0.05}
+
+
+class Script:
+    """Hears registrations and answers each with what it is told to."""
+
+    def __init__(self, engine) -> None:
+        self.engine = engine
+        self.registrations: dict[str, Registration] = {}
+        self.heartbeats = []
+        self.say: dict[str, dict] = {}
+        self.version = 0
+        self.sent: dict[str, int] = {}
+        engine.observe("due.registration.*").subscribe(self._registered)
+        engine.observe("due.heartbeat.*").subscribe(self._beaten)
+
+    def _registered(self, item) -> None:
+        registration = Registration.from_value(item.value)
+        self.registrations[registration.instance_id] = registration
+        if registration.app_id in self.say:
+            self.assign(registration.app_id)
+
+    def _beaten(self, item) -> None:
+        self.heartbeats.append(item.value)
+        app = item.value["app_id"]
+        if app in self.say and item.value["version"] != self.sent.get(app):
+            self.assign(app)
+
+    def assign(self, app: str, **changes) -> None:
+        self.say[app] = {**self.say.get(app, {}), **changes}
+        self.version += 1
+        self.sent[app] = self.version
+        revisions = {i: r.revision for i, r in self.registrations.items() if r.app_id == app}
+        fields = {"epoch": 1, "revisions": revisions, "version": self.version, **self.say[app]}
+        message = Assignments(app_id=app, coordinator="script", **fields)
+        self.engine.write(f"{ASSIGNMENT}.{app}", message.to_value(), [PUB_ONLY, NO_WAIT])
+
+
+@pytest.fixture
+def script(make_engine) -> Script:
+    return Script(make_engine("coordinator"))
+
+
+def _wants(key, frequency=None, epoch=1):
+    return (Assignment(key, frequency, epoch, key),)
+
+
+def test_items_written_before_the_handshake_are_kept_in_order(make_engine, script):
+    consumer = make_engine("early_reader")
+    got = []
+    consumer.observe("t.early.**").subscribe(lambda item: got.append(item.value))
+    engine = make_engine(
+        "early", init={"capabilities": [Capability("t.early.**", delivery="reliable")]}, **FAST
+    )
+    assert all(engine.write("t.early.x", number) for number in range(100))
+    wait_for(lambda: engine.instance_id in script.registrations)
+    assert got == []
+    script.assign("early", assignments=_wants("t.early.**"))
+    wait_for(lambda: len(got) == 100)
+    assert engine.write("t.early.x", 100)
+    wait_for(lambda: len(got) == 101)
+    assert got == list(range(101))
+
+
+def test_without_an_answer_items_go_out_as_if_wanted(make_engine):
+    engine = make_engine(
+        "alone", init={"capabilities": [Capability("t.alone")]}, coordinated=True, handshake_timeout=0.2
+    )
+    got = []
+    engine.observe("t.alone").subscribe(lambda item: got.append(item.value))
+    assert engine.write("t.alone", 1)
+    wait_for(lambda: got == [1])
+    assert engine.health()["phase"] == "alone"
+
+
+def test_what_nobody_wants_is_not_produced(make_engine, script):
+    init = {"capabilities": [Capability("t.quiet.a"), Capability("t.quiet.b", archive="always")]}
+    engine = make_engine("quiet", init=init, **FAST)
+    changes = []
+    engine.on_assignments(lambda wanted: changes.append([a.key for a in wanted]))
+    script.say["quiet"] = {"assignments": ()}
+    wait_for(lambda: engine.health()["phase"] == "coordinated")
+    assert engine.write("t.quiet.a", 1) is False
+    assert engine.write("t.quiet.b", 2) is False
+    assert [item.value for item in engine.get("t.quiet.*")] == [2]
+    assert not engine.wanted("t.quiet.a")
+    script.assign("quiet", assignments=_wants("t.quiet.*"))
+    wait_for(lambda: changes[-1:] == [["t.quiet.*"]])
+    assert engine.wanted("t.quiet.a")
+    assert engine.write("t.quiet.a", 3) is True
+    assert engine.health()["unwanted"] == 2
+
+
+def test_interests_are_registered_and_withdrawn(make_engine, script):
+    engine = make_engine("curious", init={"interests": [Interest("t.fixed", 2.0)]}, **FAST)
+    script.say["curious"] = {}
+
+    def registered():
+        known = script.registrations.get(engine.instance_id)
+        return [i.key for i in known.interests] if known else None
+
+    wait_for(lambda: registered() == ["t.fixed"])
+    subscription = engine.observe("t.more.*").subscribe(print)
+    wait_for(lambda: registered() == ["t.fixed", "t.more.*"])
+    subscription.dispose()
+    wait_for(lambda: registered() == ["t.fixed"])
+
+
+def test_writes_keep_the_assigned_pace(make_engine, script):
+    reader = make_engine("paced_reader")
+    got = []
+    reader.observe("t.pace.*").subscribe(got.append)
+    capabilities = [Capability("t.pace.latest"), Capability("t.pace.queue", pacing="queue")]
+    engine = make_engine("paced", init={"capabilities": capabilities}, **FAST)
+    script.say["paced"] = {"assignments": _wants("t.pace.*", 20.0)}
+    wait_for(lambda: engine.health()["phase"] == "coordinated")
+    for number in range(10):
+        engine.write("t.pace.latest", number)
+        engine.write("t.pace.queue", number)
+    engine.flush()
+    wait_for(lambda: sum(i.key == "t.pace.queue" for i in got) == 10)
+    latest = [i.value for i in got if i.key == "t.pace.latest"]
+    assert latest == [0, 9]
+    assert [i.value for i in got if i.key == "t.pace.queue"] == list(range(10))
+    assert engine.health()["replaced"] == 8
+
+
+def test_only_the_active_instance_speaks_and_reads_and_a_new_epoch_moves_both(make_engine, script):
+    writer = make_engine("feeder", init={"capabilities": [Capability("t.feed", delivery="reliable")]})
+    watcher = make_engine("watcher")
+    said = []
+    watcher.observe("t.pair.said").subscribe(lambda item: said.append(item.value))
+    script.say["pair"] = {"active": "nobody"}
+    pair, read = [], []
+    for name in range(2):
+        engine = make_engine("pair", **FAST)
+        engine.observe("t.feed").subscribe(lambda item, name=name: read.append((name, item.value)))
+        pair.append(engine)
+    wait_for(lambda: len([1 for r in script.registrations.values() if r.app_id == "pair"]) == 2)
+    script.assign("pair", epoch=2, active=pair[0].instance_id)
+    wait_for(lambda: pair[0].health()["active"] and not pair[1].health()["active"])
+    for value in range(5):
+        writer.write("t.feed", value, [NO_WAIT])
+    wait_for(lambda: len(read) == 5)
+    assert pair[0].write("t.pair.said", "first", [NO_WAIT]) is True
+    assert pair[1].write("t.pair.said", "second", [NO_WAIT]) is False
+    script.assign("pair", epoch=3, active=pair[1].instance_id)
+    wait_for(lambda: pair[1].health()["active"] and not pair[0].health()["active"])
+    for value in range(5, 10):
+        writer.write("t.feed", value, [NO_WAIT])
+    wait_for(lambda: len(read) == 10)
+    assert pair[0].write("t.pair.said", "first again", [NO_WAIT]) is False
+    assert pair[1].write("t.pair.said", "second again", [NO_WAIT]) is True
+    wait_for(lambda: len(said) == 2)
+    assert read == [(0, n) for n in range(5)] + [(1, n) for n in range(5, 10)]
+    assert said == ["first", "second again"]
+    assert pair[0].health()["refused"] == 1
+
+
+def test_frames_of_an_older_epoch_are_dropped_and_counted(make_engine):
+    from due.codec import Frame, encode_frame
+
+    engine = make_engine("fence")
+    got = []
+    engine.observe("t.fence").subscribe(lambda item: got.append(item.value))
+    publisher = engine._session.publisher
+    sent = ((4, "old", 0), (5, "new", 0), (4, "old", 1), (5, "new", 1))
+    for epoch, instance, before in sent:
+        frame = Frame("t.fence", "app", instance, epoch, before + 1, before, [time.time_ns()], None, [epoch])
+        publisher.publish("t.fence", encode_frame(frame))
+    wait_for(lambda: len(got) == 3)
+    assert got == [4, 5, 5]
+    assert engine.health()["receiving"]["fenced"] == 1
+
+
+def test_the_last_heartbeat_says_offline(make_engine, script):
+    engine = make_engine("mortal", **FAST)
+    script.say["mortal"] = {}
+    wait_for(lambda: any(b["app_id"] == "mortal" and b["version"] for b in script.heartbeats))
+    engine.close()
+    wait_for(lambda: any(b["app_id"] == "mortal" and b["state"] == "offline" for b in script.heartbeats))
+
+
+def test_control_garbage_is_survived(make_engine, script):
+    engine = make_engine("robust", **FAST)
+    script.engine.write("due.assignment.robust", {"nonsense": 1}, [PUB_ONLY, NO_WAIT])
+    script.engine._session.publisher.publish("due.assignment.robust", b"garbage")
+    script.say["robust"] = {}
+    engine.observe("t.robust").subscribe(print)
+    wait_for(lambda: engine.health()["phase"] == "coordinated")

@@ -1,0 +1,167 @@
+"""A member buffers, then works alone or as assigned; it never speaks under an older epoch or while in doubt."""
+
+import pytest
+
+from due.keys import Key
+from due.membership import (
+    Assignments,
+    Heartbeat,
+    Incompatible,
+    Member,
+    Phase,
+    Registration,
+    Verdict,
+)
+from due.messages import Assignment, Capability, Interest
+
+PACKETS = Capability("n.packets.ctrl.**", frequency=50.0)
+KEY = Key("n.packets.ctrl.s1.all")
+
+
+def _member(**options) -> Member:
+    registration = Registration(
+        app_id="ctrl", instance_id="me", revision=1, capabilities=(PACKETS,), heartbeat=0.5, started=1
+    )
+    return Member(registration, now=0.0, handshake_timeout=1.0, **options)
+
+
+def _assignments(**changes) -> Assignments:
+    fields = {
+        "app_id": "ctrl",
+        "coordinator": "c",
+        "version": 1,
+        "epoch": 1,
+        "active": "me",
+        "revisions": {"me": 1},
+    }
+    return Assignments(**{**fields, **changes})
+
+
+def _wants(key: str, frequency: float | None = None) -> Assignment:
+    return Assignment(key, frequency, 1, PACKETS.key)
+
+
+def test_it_registers_and_beats_at_its_rate():
+    member = _member()
+    assert [type(m) for m in member.tick(0.0)] == [Registration, Heartbeat]
+    assert member.tick(0.3) == []
+    assert [type(m) for m in member.tick(0.5)] == [Heartbeat]
+    member.declare(0.6, interests=(Interest("a.b"),))
+    assert member.next_tick() == 0.6
+    (registration,) = member.tick(0.6)
+    assert (registration.revision, registration.interests) == (2, (Interest("a.b"),))
+
+
+def test_without_a_coordinator_it_buffers_then_works_alone():
+    member = _member()
+    assert member.permission(KEY).verdict is Verdict.BUFFER
+    assert not member.wanted(KEY)
+    assert not member.reading
+    member.tick(1.0)
+    assert member.phase is Phase.ALONE
+    assert member.permission(KEY).verdict is Verdict.OPEN
+    assert member.permission(KEY).frequency == 50.0
+    assert member.wanted(KEY)
+    assert member.reading
+
+
+def test_undeclared_keys_are_always_open():
+    assert _member().permission(Key("other.key")).verdict is Verdict.OPEN
+
+
+def test_an_uncoordinated_member_is_silent():
+    member = _member(coordinated=False)
+    assert member.tick(0.0) == []
+    assert member.permission(KEY).verdict is Verdict.OPEN
+
+
+def test_only_what_is_wanted_is_open():
+    member = _member()
+    assert member.assigned(_assignments(), 0.1)
+    assert member.permission(KEY).verdict is Verdict.UNWANTED
+    assert member.assigned(_assignments(assignments=(_wants("n.packets.*.s1.**"),)), 0.2)
+    assert member.permission(KEY).verdict is Verdict.OPEN
+    assert member.permission(Key("n.packets.ctrl.s2.all")).verdict is Verdict.UNWANTED
+    assert member.wanted(Key("n.packets.ctrl.s1.7"))
+    assert member.wanted(Key("n.packets.ctrl.**"))
+    assert not member.wanted(Key("n.packets.ctrl.s2.*"))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "rate"), [([10.0, 20.0], 20.0), ([10.0, None], 50.0), ([None], 50.0), ([5.0], 5.0)]
+)
+def test_the_rate_is_the_highest_wanted(wanted, rate):
+    member = _member()
+    member.assigned(_assignments(assignments=tuple(_wants("n.packets.**", f) for f in wanted)), 0.1)
+    assert member.permission(KEY).frequency == rate
+
+
+def test_it_registers_again_when_the_coordinator_does_not_know_it():
+    member = _member()
+    member.tick(0.0)
+    assert not member.assigned(_assignments(revisions={}), 0.1)
+    assert member.phase is Phase.WAITING
+    assert [type(m) for m in member.tick(0.1)] == [Registration]
+    member.assigned(_assignments(revisions={"me": 0}), 0.2)
+    assert [type(m) for m in member.tick(0.2)] == [Registration]
+
+
+def test_a_standby_instance_neither_speaks_nor_reads():
+    member = _member()
+    member.assigned(_assignments(active="other", assignments=(_wants("n.**"),)), 0.1)
+    assert member.permission(KEY).verdict is Verdict.REFUSED
+    assert member.permission(Key("other.key")).verdict is Verdict.REFUSED
+    assert not member.reading
+    assert member.assignments == ()
+    member.assigned(_assignments(epoch=2, assignments=(_wants("n.**"),)), 0.2)
+    assert member.permission(KEY).verdict is Verdict.OPEN
+
+
+def test_an_older_epoch_is_ignored():
+    member = _member()
+    member.assigned(_assignments(epoch=5, active="other"), 0.1)
+    assert not member.assigned(_assignments(epoch=4), 0.2)
+    assert member.permission(KEY).verdict is Verdict.REFUSED
+    assert not member.assigned(_assignments(app_id="else", epoch=9), 0.2)
+
+
+def test_after_a_pause_it_buffers_until_it_is_told_who_is_active():
+    member = _member()
+    member.assigned(_assignments(assignments=(_wants("n.**"),)), 0.1)
+    assert member.paused(10.0)
+    assert member.permission(KEY).verdict is Verdict.BUFFER
+    assert [type(m) for m in member.tick(10.0)] == [Registration, Heartbeat]
+    member.assigned(_assignments(epoch=2, active="other"), 10.1)
+    assert member.permission(KEY).verdict is Verdict.REFUSED
+
+
+def test_after_a_pause_without_a_coordinator_it_goes_on():
+    member = _member()
+    member.assigned(_assignments(assignments=(_wants("n.**"),)), 0.1)
+    member.paused(10.0)
+    member.tick(11.0)
+    assert member.permission(KEY).verdict is Verdict.OPEN
+
+
+def test_a_shared_or_lonely_instance_need_not_ask_after_a_pause():
+    assert not _member().paused(10.0)
+    shared = _member()
+    shared.assigned(_assignments(active=""), 0.1)
+    assert not shared.paused(10.0)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        _member().registration,
+        _member().beat("offline", written=3),
+        _assignments(
+            assignments=(_wants("n.**", 2.5),), incompatible=(Incompatible(key="a.b", reason="too fast"),)
+        ),
+    ],
+    ids=lambda m: type(m).__name__,
+)
+def test_messages_survive_the_wire(message):
+    from due.codec import decode_value, encode_value
+
+    assert type(message).from_value(decode_value(encode_value(message.to_value()))) == message
