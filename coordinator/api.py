@@ -41,6 +41,7 @@ _MAX_ITEMS = 10_000
 _DEFAULT_ITEMS = 1000
 _QUEUE_ITEMS = 1000
 _STOP_S = 5.0
+_WINDOWS_NS = (60 * 10**9, 3600 * 10**9, 86_400 * 10**9, 2**62)
 _POLICY_VIOLATION = 1008
 
 
@@ -181,18 +182,23 @@ class _Handlers:
             await run_in_threadpool(subscription.dispose)
 
     def _answer(self, query: dict[str, Any], request: Request) -> Response:
-        """The youngest `limit` items, oldest first; `since` and `until` are ns."""
-        bounds = {
-            operator: int(request.query_params[name])
-            for name, operator in (("since", "$gte"), ("until", "$lt"))
-            if name in request.query_params
-        }
-        limit = min(int(request.query_params.get("limit", _DEFAULT_ITEMS)), _MAX_ITEMS)
-        if bounds:
-            query = {"$and": [query, {"timestamp": bounds}]}
-        found = self._north.engine.get(query)
-        kept = found[-limit:] if limit > 0 else []
-        return JSONResponse({"items": [views.item(one) for one in kept], "omitted": len(found) - len(kept)})
+        """The youngest `limit` items, oldest first; `since` and `until` are ns.
+
+        Looks at the last minute first and farther back while there is too little: the archive may be large.
+        """
+        since = int(request.query_params.get("since", 0))
+        until = int(request.query_params.get("until", time.time_ns() + 1))
+        limit = min(max(int(request.query_params.get("limit", _DEFAULT_ITEMS)), 1), _MAX_ITEMS)
+        found: list[Item] = []
+        start = until
+        for window in _WINDOWS_NS:
+            start = max(since, until - window)
+            bounds = {"timestamp": {"$gte": start, "$lt": until}}
+            found = self._north.engine.get({"$and": [query, bounds]})
+            if len(found) >= limit or start == since:
+                break
+        shown = [views.item(one) for one in found[-limit:]]
+        return JSONResponse({"items": shown, "more": len(found) > limit or start > since})
 
 
 class _Feed:

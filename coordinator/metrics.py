@@ -16,6 +16,7 @@ _COUNTERS = {
     "heartbeats": "Heartbeats received",
     "misunderstood": "Membership messages that were not understood",
     "assignments_sent": "Assignments sent",
+    "retention_deleted": "Items deleted from the archive for their age or its size",
     "failovers": "Changes of the working instance because the former was lost",
 }
 

@@ -47,7 +47,7 @@ _SCHEMAS: dict[str, Any] = {
         "type": "object",
         "properties": {
             "items": {"type": "array", "items": {"$ref": "#/components/schemas/Item"}},
-            "omitted": {"type": "integer", "description": "older items beyond the limit"},
+            "more": {"type": "boolean", "description": "there may be older items"},
         },
     },
     "Error": {

@@ -158,7 +158,9 @@ class Registry:
     def beat(self, message: Heartbeat, now: float) -> None:
         """A sign of life, or the good-bye."""
         app = self._app(message.app_id)
-        app.epoch = max(app.epoch, message.epoch)
+        if message.epoch > app.epoch:
+            # what is older than it knows an instance does not obey
+            app.epoch, self._dirty = message.epoch, True
         known = app.instances.get(message.instance_id)
         self._hear(known, now)
         if message.state == "offline":
@@ -266,7 +268,7 @@ class Registry:
     def _hear(self, sender: Instance | None, now: float) -> None:
         """When known ones speak again after a silence of all, nobody is blamed for the silence."""
         heard, self._heard = self._heard, now
-        if heard is None or sender is None:
+        if heard is None or sender is None or now - heard <= self._shortest_timeout_s:
             return
         known = [one for app in self._apps.values() for one in app.instances.values()]
         blamed = [

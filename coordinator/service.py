@@ -3,6 +3,7 @@
     due.registration.*, due.heartbeat.* ──► Registry ──► due.assignment.<app>
     due.leader.coordinator ◄──────────────► Leadership
     HTTP on loopback ──► api.py ──► views of the registry, the archive, live data
+    Retention ──► Data Archives, where a limit of age or size is set
 
 Run it with `python -m coordinator.service`; it is an app like any other and registers with itself.
 """
@@ -20,9 +21,11 @@ import msgspec
 from coordinator.api import Api, Northbound
 from coordinator.leadership import Claim, Leadership
 from coordinator.registry import Registry
+from coordinator.retention import Retention
 from coordinator.selection import STRATEGIES
 from due import NO_WAIT, PUB_ONLY, Capability, DueError, Engine, Interest, Item
 from due import service as due_service
+from due.backends import default_archive, open_archive
 from due.errors import InvalidOption
 from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
 
@@ -63,6 +66,13 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     leader_interval_s: float = 0.2
     """Seconds between announcements; a leader silent for three of them is replaced."""
 
+    retain_s: float = 0.0
+    """Items older than so many seconds are deleted from the archive; 0: never."""
+    retain_bytes: int = 0
+    """Beyond this size of the archive the oldest items are deleted; 0: no limit."""
+    retain_every_s: float = 60.0
+    """Seconds between two looks at age and size."""
+
     def __post_init__(self) -> None:
         if self.selection not in STRATEGIES:
             raise ValueError(f"selection {self.selection!r}: one of {', '.join(sorted(STRATEGIES))}")
@@ -93,6 +103,13 @@ class CoordinatorService:
         self._counts = {"registrations": 0, "heartbeats": 0, "misunderstood": 0, "assignments_sent": 0}
         self._apps_health: dict[str, Any] = {}
         self._api: Api | None = None
+        self._retention = Retention(
+            lambda: open_archive(default_archive(engine.options)),
+            lambda: self._leadership.leading,
+            age_s=settings.retain_s,
+            max_bytes=settings.retain_bytes,
+            every_s=settings.retain_every_s,
+        )
 
     def start(self) -> None:
         """Listen; raises InvalidOption if the HTTP address cannot be had."""
@@ -105,6 +122,7 @@ class CoordinatorService:
             self._engine.observe(key).subscribe(handler)
         if self._settings.http:
             self._serve()
+        self._retention.start()
 
     def tick(self) -> None:
         """Announce, look for the silent, send what changed."""
@@ -131,6 +149,7 @@ class CoordinatorService:
             self._write(_LEADER, msgspec.to_builtins(self._leadership.resigned()))
         if self._api is not None:
             self._api.stop()
+        self._retention.stop()
 
     def health(self) -> dict[str, Any]:
         """State of this Coordinator and its counters."""
@@ -144,6 +163,7 @@ class CoordinatorService:
                 "instances": states,
                 "failovers": self._registry.failovers,
                 "http": self._api.url if self._api is not None else "",
+                "retention_deleted": self._retention.deleted,
                 **self._counts,
             }
 

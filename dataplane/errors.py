@@ -1,11 +1,11 @@
 """Errors of the embedded switch.
 
-    DataplaneError
-    ├── ProgramError         the JSON is not a program that this target can run (program.py)
-    │   └── Unsupported      it is well-formed, but uses something outside the documented subset
-    ├── CompilerError        the generated C could not be built (compiler/)
-    ├── InvalidIndex         an index outside a counter, meter or register array (externs.py)
-    └── TableError           see tables.py
+DataplaneError
+├── ProgramError         the JSON is not a program that this target can run (program.py)
+│   └── Unsupported      it is well-formed, but uses something outside the documented subset
+├── CompilerError        the generated C could not be built (compiler/)
+├── InvalidIndex         an index outside a counter, meter or register array (externs.py)
+└── TableError           see tables.py
 """
 
 
@@ -17,7 +17,7 @@ class ProgramError(DataplaneError):
     """The JSON cannot be read as a BMv2 program."""
 
 
-class Unsupported(ProgramError):
+class Unsupported(ProgramError):  # noqa: N818 - what the program is, here
     """The program uses a part of BMv2 that this target does not have; the text names it and its place."""
 
 
@@ -25,5 +25,5 @@ class CompilerError(DataplaneError):
     """The generated C could not be compiled or loaded."""
 
 
-class InvalidIndex(DataplaneError):
+class InvalidIndex(DataplaneError):  # noqa: N818 - named as the tables' errors are
     """An array index that the program did not declare."""

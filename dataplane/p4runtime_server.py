@@ -1,5 +1,6 @@
 """The P4Runtime service of the embedded switch: gRPC in front of a Device."""
 
+import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -138,6 +139,7 @@ class P4RuntimeServer:
     def __init__(
         self, device: Device, address: str, credentials: grpc.ServerCredentials | None = None
     ) -> None:
+        _check(address)
         self._pool = ThreadPoolExecutor(MAX_STREAMS + _UNARY_WORKERS, thread_name_prefix="p4runtime")
         self._server = grpc.server(self._pool, options=_OPTIONS)
         servicer = Servicer(device)
@@ -163,6 +165,21 @@ class P4RuntimeServer:
         """End all calls, at the latest after `grace` seconds."""
         self._server.stop(grace).wait()
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _check(address: str) -> None:
+    """Try the address first: gRPC would write lines of its own about a failure.  Raises ServerError."""
+    host, _, port = address.rpartition(":")
+    try:
+        family, kind, _, _, where = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[
+            0
+        ]
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(where)
+    except (OSError, ValueError, OverflowError) as error:
+        cause = getattr(error, "strerror", None) or error
+        raise ServerError(f"cannot listen on {address}: {cause}; choose another HOST:PORT") from error
 
 
 def _stream_handler(servicer: Servicer) -> grpc.GenericRpcHandler:

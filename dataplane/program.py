@@ -45,8 +45,8 @@ MAX_WIDTH = 512
 HASHES = frozenset({"crc32", "crc32_custom", "crc16", "crc16_custom", "csum16", "cksum16", "identity"})
 HASHES |= {"xor16", "xor32", "crcCCITT"}
 
-_BINARY = frozenset("+ - * / % & | ^ << >> == != < <= > >= and or".split())
-_BINARY |= {"two_comp_mod", "usat_cast", "sat_cast"}
+_BINARY = frozenset({"+", "-", "*", "/", "%", "&", "|", "^", "<<", ">>", "and", "or"})
+_BINARY |= {"==", "!=", "<", "<=", ">", ">=", "two_comp_mod", "usat_cast", "sat_cast"}
 _UNARY = frozenset({"~", "not", "d2b", "b2d"})
 _REFUSED = ("parse_vsets", "header_unions", "header_union_stacks", "extern_instances")
 
@@ -126,7 +126,7 @@ class _Reader:
             name=str(self.doc.get("program", "")),
             headers=self.headers,
             stacks=self.stacks,
-            errors={name: code for name, code in self.doc.get("errors", [])},
+            errors=dict(self.doc.get("errors", [])),
             parser=self.parser(self.doc["parsers"][0]),
             ingress=pipelines["ingress"],
             egress=pipelines["egress"],
@@ -372,7 +372,7 @@ class _Reader:
                 return [tree.Advance(self.expression(p[0]))]
             if op == "shift":
                 return [tree.Advance(tree.Const(int(p[0]) * 8))]
-            self.refuse(f"parser operation {op}")
+            return self.refuse(f"parser operation {op}")
 
     def extract(self, p: list[_Json]) -> tree.Extract:
         kind, name = p[0]["type"], p[0]["value"]
@@ -424,7 +424,7 @@ class _Reader:
         keys = tuple(self.key(k) for k in data["key"])
         following = {self.actions[n].spec.name: n for n in actions}
         default = data.get("default_entry")
-        constant = bool(default) and default.get("action_const", False)
+        constant = default is not None and bool(default.get("action_const", False))
         after = data["next_tables"]
         by_hit = "__HIT__" in after
         node = tree.TableNode(
@@ -455,8 +455,10 @@ class _Reader:
             del self.tables[data["name"]]
         return node
 
-    def hidden_action(self, table: str, default: _Json) -> int | None:
+    def hidden_action(self, table: str, default: _Json | None) -> int | None:
         """The action of a table that p4c made around a statement; p4info does not know it."""
+        if default is None:
+            return None
         number = self.action_numbers[default["action_id"]]
         return number if table.startswith("tbl_") and not self.actions[number].spec.params else None
 
@@ -478,9 +480,7 @@ class _Reader:
         name = data.get("name") or ".".join(data["target"])
         return KeySpec(name, kind, width), target, mask
 
-    def const_entry(
-        self, data: _Json, keys: tuple[tuple[KeySpec, Expression, int], ...]
-    ) -> tree.ConstEntry:
+    def const_entry(self, data: _Json, keys: tuple[tuple[KeySpec, Expression, int], ...]) -> tree.ConstEntry:
         parts = []
         for item, (spec, _, _) in zip(data["match_key"], keys, strict=True):
             parts.append(self.const_key(item, spec))

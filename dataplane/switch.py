@@ -83,7 +83,9 @@ class Switch:
         self.backend = self._machine.backend
         numbers = {a.spec.name: a.number for a in program.actions}
         self.tables = {
-            name: Table(spec, self._machine.tables[name], self._numbers(name, numbers), self.lock, self.now_us)
+            name: Table(
+                spec, self._machine.tables[name], self._numbers(name, numbers), self.lock, self.now_us
+            )
             for name, spec in program.tables.items()
         }
         self.counters = {

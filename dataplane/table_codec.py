@@ -21,6 +21,7 @@ class TableCodec:
     def __init__(self, table: BoundTable) -> None:
         self.table = table
         self.name = table.spec.name
+        self._needs_priority = table.spec.needs_priority
         self._by_action_id = {action.id: action for action in table.actions}
         self._by_action_name = {action.spec.name: action for action in table.actions}
         keys = list(zip(table.field_ids, table.kinds, table.spec.keys, strict=True))
@@ -61,7 +62,7 @@ class TableCodec:
     def priority(self, message: Any) -> int:
         """The entry's priority, checked against the table's key.  Raises InvalidArgument."""
         priority: int = message.priority
-        if self.table.spec.needs_priority:
+        if self._needs_priority:
             if priority <= 0:
                 raise InvalidArgument(f"table {self.name}: priority must be 1 or more, it is {priority}")
         elif priority:
@@ -84,6 +85,8 @@ class TableCodec:
         return found.spec.name, self._params(found, message.action.params)
 
     def _params(self, action: BoundAction, given: Any) -> tuple[int, ...]:
+        if not action.param_ids and not given:
+            return ()
         values = {param.param_id: param.value for param in given}
         if len(values) != len(given) or values.keys() != set(action.param_ids):
             raise InvalidArgument(
@@ -184,7 +187,15 @@ def _number(data: bytes, width: int, what: str) -> int:
 
 def _read_exact(key: KeySpec, what: str) -> Reader:
     width = key.width
-    return lambda field: Exact(_number(field.value, width, what))
+
+    def read(field: Any) -> MatchValue:
+        data = field.value
+        value = int.from_bytes(data, "big")
+        if value >> width or not data:
+            _number(data, width, what)
+        return Exact(value)
+
+    return read
 
 
 def _read_optional(key: KeySpec, what: str) -> Reader:

@@ -1,11 +1,11 @@
 """Match-action tables: entries, their validation and their per-entry state.
 
-    DataplaneError (errors.py)
-    └── TableError
-        ├── AlreadyExists    insert of a key that is there
-        ├── NotFound         modify, delete or read of a key that is not
-        ├── TableFull        the program's `size` is reached
-        └── InvalidEntry     wrong kind, width, action, parameter, priority or a constant table
+DataplaneError (errors.py)
+└── TableError
+    ├── AlreadyExists    insert of a key that is there
+    ├── NotFound         modify, delete or read of a key that is not
+    ├── TableFull        the program's `size` is reached
+    └── InvalidEntry     wrong kind, width, action, parameter, priority or a constant table
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from threading import RLock
 
-from dataplane.compiler.machine import RangePart, TableStore
+from dataplane.compiler.machine import RangePart, Row, TableStore
 from dataplane.errors import DataplaneError
 from dataplane.externs import CounterValue, MeterConfig
 from dataplane.tree import ConstEntry, KeySpec, MatchKind, TableSpec
@@ -23,19 +23,19 @@ class TableError(DataplaneError):
     """A table operation that was refused."""
 
 
-class AlreadyExists(TableError):
+class AlreadyExists(TableError):  # noqa: N818 - the protocol's own words
     """An entry with this match (and priority) is in the table."""
 
 
-class NotFound(TableError):
+class NotFound(TableError):  # noqa: N818 - the protocol's own words
     """No entry with this match (and priority)."""
 
 
-class TableFull(TableError):
+class TableFull(TableError):  # noqa: N818 - the protocol's own words
     """The table holds as many entries as the program gave it room for."""
 
 
-class InvalidEntry(TableError):
+class InvalidEntry(TableError):  # noqa: N818 - the protocol's own words
     """The entry does not fit the table's key or actions."""
 
 
@@ -135,6 +135,7 @@ class Table:
     def _add(self, entry: TableEntry) -> None:
         value, mask, ranges, rank = self._compiled(entry.match, entry.priority)
         number, params = self._checked_action(entry.action, entry.params)
+        row = Row(value, mask, ranges, rank, number, params)
         if entry.idle_timeout_ns:
             self._check_timeout(entry)
         key = (entry.match, entry.priority)
@@ -143,7 +144,7 @@ class Table:
         if len(self._slots) >= self.spec.size:
             raise TableFull(f"table {self.name} is full: its size in the program is {self.spec.size}")
         slot = heappop(self._free) if self._free else len(self._slots)
-        self._store.insert(slot, value, mask, ranges, rank, number, params, self._clock())
+        self._store.insert(slot, row, self._clock())
         self._slots[key] = slot
         self._entries[key] = entry
         if entry.idle_timeout_ns:

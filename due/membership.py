@@ -9,7 +9,8 @@ Rules for the Coordinator:
  - it answers every Registration with Assignments to that app, and sends Assignments again whenever they change;
  - a Heartbeat of an unknown instance, of another `revision` than the registered one or with another
    `version` than the last sent is answered with the current Assignments: the instance sees in `revisions`
-   that it is unknown and registers again (so a restarted Coordinator knows all within two heartbeats);
+   that it is unknown, registers again and beats at once (so a restarted Coordinator knows all, and who
+   was active, within two heartbeats);
  - `epoch` grows with each change of the active instance and never falls: a new Coordinator starts above
    the highest `epoch` in the heartbeats; Assignments with a lower epoch than seen are ignored;
  - `active` is "" for shared apps (every instance works) and while no instance is chosen for a standby app
@@ -172,6 +173,11 @@ class Member:
         return self.current is None or self.current.active in ("", self.registration.instance_id)
 
     @property
+    def asking(self) -> bool:
+        """Whether it was stopped for long and does not know yet if it is still the active one."""
+        return self._fenced
+
+    @property
     def reading(self) -> bool:
         """Whether it may read streams: a standby instance first waits to hear whether it is the active one."""
         return self.active and (self.phase is not Phase.WAITING or self.registration.instances == "shared")
@@ -253,6 +259,7 @@ class Member:
         if message.revisions.get(me) != self.registration.revision:
             self._register_at = min(self._register_at, now)
             if me not in message.revisions:
+                self._beat_at = now  # a new Coordinator shall know at once whether we are the active one
                 return False
         before = (self.phase, self.active, self.assignments, self.epoch)
         self.current = message

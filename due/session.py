@@ -50,7 +50,7 @@ class Session:
             handshake_timeout=options.handshake_timeout,
             coordinated=options.coordinated,
         )
-        pause = options.pause_limit or max(1.0, 3 * options.heartbeat)
+        pause = options.pause_limit or 3 * options.heartbeat
         self.keeper = Keeper(
             member, self._driver.receiver(app, me), self.publisher, self.dispatcher, pause=pause
         )
@@ -145,6 +145,7 @@ class Session:
             "instance": member.registration.instance_id,
             "phase": member.phase.value,
             "active": member.active,
+            "asking": member.asking,
             "epoch": member.epoch,
             "written": self.keeper.written(),
             "unpublished": self._unpublished,
@@ -207,7 +208,7 @@ class Session:
             if self._archiver is None:
                 o = self._options
                 registration = self.keeper.member.registration
-                spool = open_spool(o.folder() / "spool" / registration.app_id / registration.instance_id, o)
+                spool = open_spool(o.folder() / "spool" / registration.app_id, o)
                 self._archiver = Archiver(
                     self.archive(),
                     spool,

@@ -69,6 +69,8 @@ class GunzipStream(io.RawIOBase):
         self._file = file
         self._unpacker = zlib.decompressobj(wbits=31)
         self._fresh = True
+        self._rest = b""
+        """Read from the file, but belonging to the next member."""
         self.fault = ""
         self.delivered = 0
         """Unpacked bytes handed out so far."""
@@ -84,7 +86,8 @@ class GunzipStream(io.RawIOBase):
 
     def _next(self, size: int) -> bytes:
         while not self.fault:
-            packed = self._unpacker.unconsumed_tail or self._file.read(65_536)
+            packed = self._unpacker.unconsumed_tail or self._rest or self._file.read(65_536)
+            self._rest = b""
             if not packed:
                 self.fault = "" if self._fresh else "the gzip stream ends too early"
                 return b""
@@ -101,11 +104,9 @@ class GunzipStream(io.RawIOBase):
         return b""
 
     def _start_member(self) -> None:
-        rest = self._unpacker.unused_data.lstrip(b"\0")  # tape blocks are padded with zeros
+        self._rest = self._unpacker.unused_data.lstrip(b"\0")  # tape blocks are padded with zeros
         self._unpacker = zlib.decompressobj(wbits=31)
         self._fresh = True
-        if rest:
-            self._file.seek(-len(rest), io.SEEK_CUR)
 
 
 def read_pcap(stream: BinaryIO, magic: bytes) -> Iterator[CapturedFrame]:

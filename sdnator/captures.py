@@ -160,13 +160,11 @@ class Capture:
         self.close()
 
     def _start(self) -> Iterator[CapturedFrame]:
-        stream: BinaryIO = self._file
-        magic = stream.read(4)
-        if magic[:2] == GZIP_MAGIC:
-            stream.seek(0)
+        stream = self._file
+        if stream.peek(2)[:2] == GZIP_MAGIC:
             self._gunzip = GunzipStream(stream)
-            stream = cast(BinaryIO, io.BufferedReader(self._gunzip, _BUFFER))
-            magic = stream.read(4)
+            stream = io.BufferedReader(self._gunzip, _BUFFER)
+        magic = stream.read(4)
         if magic in PCAP_MAGICS:
             return read_pcap(stream, magic)
         if magic == PCAPNG_MAGIC:
@@ -204,9 +202,9 @@ class Capture:
         )
 
 
-def _open(path: Path) -> BinaryIO:
+def _open(path: Path) -> io.BufferedReader:
     try:
-        return path.open("rb", buffering=_BUFFER)
+        return io.BufferedReader(io.FileIO(path), _BUFFER)
     except FileNotFoundError:
         raise MissingCapture(f"{path}: no such file; check the path of the capture") from None
     except IsADirectoryError:

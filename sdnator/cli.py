@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -59,7 +59,7 @@ def replay(
     fm_grace: Annotated[int | None, typer.Option(help="Packets for the feature map.", min=1)] = None,
     ad_grace: Annotated[int | None, typer.Option(help="Packets for the autoencoders.", min=1)] = None,
     pace: Annotated[str, typer.Option(help="max, or a multiple of real time: 1x, 10x.")] = "max",
-    window: Annotated[int, typer.Option(help="Packets in flight, at most.", min=1, max=65_536)] = 512,
+    window: Annotated[int, typer.Option(help="Packets in flight, at most.", min=1, max=65_536)] = 128,
     report: Annotated[Path | None, typer.Option(help="Folder for the report.", metavar="DIR")] = None,
     keep: Annotated[Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
@@ -104,14 +104,24 @@ def demo(
     run_demo(folder, seed, as_json=as_json)
 
 
+class _Interrupted(BaseException):
+    """Ctrl-C. Not KeyboardInterrupt: the command line library would end the program without a word."""
+
+
+def _interrupt(*_: object) -> NoReturn:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C does not wait for a clean end
+    raise _Interrupted
+
+
 def main() -> None:
     """Entry point: errors become one line and an exit code, Ctrl-C becomes 130."""
+    signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
     except SdnatorError as error:
         print(f"sdnator: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except _Interrupted:
         print("sdnator: interrupted; nothing was left running", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:

@@ -165,16 +165,15 @@ def _writing(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        where = error.filename or out
         raise BadInput(
-            f"{where}: cannot be written ({error.strerror or error}); choose a folder that exists and is yours"
+            f"{out}: cannot be written ({error.strerror or error}); choose a folder that exists and is yours"
         ) from None
 
 
 @contextmanager
 def _packets(what: str) -> Iterator[Callable[[int], None]]:
     columns = (TextColumn(what), BarColumn(), TextColumn("{task.completed:,} packets"))
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done: bar.update(task, completed=done)
 
@@ -182,6 +181,6 @@ def _packets(what: str) -> Iterator[Callable[[int], None]]:
 @contextmanager
 def _bytes(what: str) -> Iterator[Callable[[int, int | None], None]]:
     columns = (TextColumn(what), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from apps.messages import Alert, Confirmation, Decision
+from dataplane.capture_port import CaptureError
 from due import CONSUMER, Engine, Interest, Item
 from sdnator.captures import Capture
 from sdnator.errors import PipelineError
-from sdnator.flight import FlightLog
+from sdnator.flight import FlightLog, PacketState
 from sdnator.pipeline import SWITCH_NAME, Pipeline, PipelinePlan
 from sdnator.survey import Survey
 from sdnator.wire import Feed
@@ -35,6 +36,7 @@ STALL_SECONDS = 30.0
 SETTLE_SECONDS = 0.5
 """On a switch that gives no verdicts: silence for so long means that what is in flight was dropped."""
 POLL_SECONDS = 0.002
+LOOK_SECONDS = 0.1
 PACKETS = "packets"
 """The controller's name for the request of every packet."""
 INTERESTS = (
@@ -59,7 +61,7 @@ class ReplayOptions:
     """Packets on which the autoencoders are trained."""
     pace: float | None = None
     """Capture seconds a wall second; None = as fast as the loop goes."""
-    window: int = 512
+    window: int = 128
     """Packets in flight, at most."""
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
@@ -79,6 +81,10 @@ class PassResult:
     seconds: float = 0.0
     lost_on_the_way: int = 0
     """Gaps in the packet-in sequence numbers, as the controller counted them."""
+    uncounted_drops: int = 0
+    """Packets taken for dropped that no drop counter of the switch knows: they were lost."""
+    drops_counted: dict[str, int] = field(default_factory=dict)
+    """Drop counter of each block, by its id, as the switch last said."""
     alerts: list[Alert] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     confirmations: list[Confirmation] = field(default_factory=list)
@@ -134,6 +140,8 @@ class _Observer:
         with self.moved:
             self.switch = item.value
             self._result.lost_on_the_way = int(item.value["lost"])
+            for block in item.value["blocks"]:
+                self._result.drops_counted[str(block["id"])] = int(block["packets"])
             self.moved.notify_all()
 
 
@@ -153,6 +161,7 @@ class ReplayPass:
         self._watch = watch
         self._result = PassResult(FlightLog(survey.packets, verdicts=options.switch == "embedded"), mitigate)
         self._observer = _Observer(self._result)
+        self._looked = 0.0
 
     def run(self, progress: Progress | None = None) -> PassResult:
         """Run it to the last packet; raises PipelineError where a part fails or the loop stalls."""
@@ -185,6 +194,9 @@ class ReplayPass:
             feed = pipeline.feed()
             try:
                 self._feed(pipeline, feed, progress)
+            except CaptureError as error:
+                pipeline.check()  # says which part died, and how
+                raise PipelineError(str(error)) from error
             finally:
                 feed.close()
             self._result.seconds = time.monotonic() - started
@@ -220,7 +232,8 @@ class ReplayPass:
             while flight.sent < self._survey.packets:
                 room = self._wait_for_room(pipeline, feed, progress)
                 chunk = list(islice(frames, min(room, CHUNK)))
-                self._keep_pace(begun, (chunk[0].time_ns - first_ns) / 1e9)
+                self._keep_pace(pipeline, progress, begun, (chunk[0].time_ns - first_ns) / 1e9)
+                self._look(pipeline, progress)
                 # Counted first: a verdict or score may come back before `send` returns.
                 self._note_watched(flight.sent, len(chunk))
                 with self._observer.moved:
@@ -231,7 +244,11 @@ class ReplayPass:
                     [frame.data for frame in chunk],
                 )
         self._drain(pipeline, feed, progress)
+        self._looked = 0.0
+        self._look(pipeline, progress)
         self._await_confirmations(pipeline)
+        if not pipeline.gives_verdicts:
+            self._await_drop_counters(pipeline)
 
     def _await_confirmations(self, pipeline: Pipeline) -> None:
         """What the firewall has decided by now gets its answer from the switch."""
@@ -246,16 +263,38 @@ class ReplayPass:
                 pipeline.check()
                 self._observer.moved.wait(0.05)
 
+    def _await_drop_counters(self, pipeline: Pipeline) -> None:
+        """Without verdicts the switch's own counters say whether what seems dropped was dropped."""
+        deadline = time.monotonic() + CONFIRM_SECONDS
+        dropped = self._result.flight.count(PacketState.DROPPED)
+        with self._observer.moved:
+            while sum(self._result.drops_counted.values()) < dropped and time.monotonic() < deadline:
+                pipeline.check()
+                self._observer.moved.wait(0.05)
+            self._result.uncounted_drops = max(0, dropped - sum(self._result.drops_counted.values()))
+
     def _note_watched(self, first: int, count: int) -> None:
         for index in self._watch.intersection(range(first, first + count)):
             self._result.sent_at[index] = time.monotonic()
 
-    def _keep_pace(self, begun: float, capture_seconds: float) -> None:
+    def _keep_pace(
+        self, pipeline: Pipeline, progress: Progress | None, begun: float, capture_seconds: float
+    ) -> None:
         if self._options.pace is None:
             return
-        ahead = begun + capture_seconds / self._options.pace - time.monotonic()
-        if ahead > 0:
-            time.sleep(ahead)
+        due_at = begun + capture_seconds / self._options.pace
+        while (ahead := due_at - time.monotonic()) > 0:
+            time.sleep(min(ahead, LOOK_SECONDS))
+            self._look(pipeline, progress)
+
+    def _look(self, pipeline: Pipeline, progress: Progress | None) -> None:
+        """Now and then: is every part alive, and how far are we?"""
+        now = time.monotonic()
+        if now - self._looked > LOOK_SECONDS:
+            self._looked = now
+            pipeline.check()
+            if progress is not None:
+                progress(self._result.flight, self._observer.blocks)
 
     def _wait_for_room(self, pipeline: Pipeline, feed: Feed, progress: Progress | None) -> int:
         self._await(pipeline, feed, progress, lambda flight: flight.in_flight < self._options.window)
@@ -273,7 +312,7 @@ class ReplayPass:
     ) -> None:
         """Take verdicts and scores until `done`; raises PipelineError when nothing moves any more."""
         flight = self._result.flight
-        last, since, looked = -1, time.monotonic(), 0.0
+        last, since = -1, time.monotonic()
         while True:
             with self._observer.moved:
                 flight.judge(feed.verdicts())
@@ -283,14 +322,10 @@ class ReplayPass:
             now = time.monotonic()
             if flight.decided != last:
                 last, since = flight.decided, now
-            elif now - since > SETTLE_SECONDS:
+            elif now - since > SETTLE_SECONDS and self._observer.blocks:
                 with self._observer.moved:
                     flight.settle()
-            if now - looked > 0.1:
-                looked = now
-                pipeline.check()
-                if progress is not None:
-                    progress(flight, self._observer.blocks)
+            self._look(pipeline, progress)
             if now - since > STALL_SECONDS:
                 raise PipelineError(
                     f"the loop stands still: {flight.in_flight} of {flight.sent} packets sent are neither scored "

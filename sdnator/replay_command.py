@@ -1,6 +1,8 @@
 """What `sdnator replay` and `sdnator demo` show: progress, summary, JSON, report."""
 
 import json
+import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -8,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -46,6 +49,7 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
     """Check the options; raises BadInput that names the wrong one."""
     if (request.fm_grace is None) != (request.ad_grace is None):
         raise BadInput("--fm-grace and --ad-grace go together: give both, or --train N")
+    check_switch(request.switch, request.inject)
     fm_grace = request.train // TRAIN_SHARE
     ad_grace = request.train - fm_grace
     if request.fm_grace is not None and request.ad_grace is not None:
@@ -59,6 +63,23 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
         window=request.window,
         keep=request.keep,
     )
+
+
+def check_switch(switch: str, inject: str | None) -> None:
+    """Refuse a switch that cannot be used; raises BadInput."""
+    if switch == "embedded":
+        return
+    if switch == "bmv2":
+        if shutil.which("simple_switch_grpc") is None:
+            raise BadInput("--switch bmv2: simple_switch_grpc is not installed; install BMv2, or use --switch embedded")
+        if os.geteuid() != 0:
+            raise BadInput("--switch bmv2: veth pairs need root; run as root, or use --switch embedded")
+        return
+    host, _, port = switch.rpartition(":")
+    if not host or not port.isdecimal():
+        raise BadInput(f"--switch {switch}: give embedded, bmv2 or HOST:PORT")
+    if inject is None:
+        raise BadInput(f"--switch {switch}: frames need a way into it; add --inject IFACE")
 
 
 def _pace(text: str) -> float | None:
@@ -141,8 +162,8 @@ def show(found: dict[str, Any]) -> None:
         table.add_row(label, value)
     out.print(table)
     for block in found["blocks"]:
-        out.print(f"[bold red]blocked[/] {block['address']} at packet {block['packet']:,} ({block['handle']})")
-        out.print(f"        {block['reason']}")
+        out.print(f"[bold red]blocked[/] {block['address']} at packet {block['packet']:,} ({escape(block['handle'])})")
+        out.print(f"        {escape(block['reason'])}")
     if "report" in found:
         out.print(f"report: {found['report']}")
 
@@ -192,7 +213,7 @@ def run_demo(folder: Path, seed: int, *, as_json: bool) -> None:
             fm_grace=None,
             ad_grace=None,
             pace="max",
-            window=512,
+            window=128,
             report=folder / "report",
             keep=None,
             as_json=as_json,

@@ -83,7 +83,13 @@ def run(
 
     alone = one_pass("Kitsune alone", False) if both or not mitigate else None
     blocking = one_pass("with blocking", True) if mitigate else None
-    return ReplayOutcome(surveyed, labels, alone, blocking, surveyed.notes(), time.monotonic() - begun)
+    notes = surveyed.notes()
+    if options.switch != "embedded":
+        notes.append(
+            f"switch {options.switch} stamps packets with its own clock, not with capture time: features and scores "
+            "follow the speed of the replay (--pace 1x keeps them comparable), and block times are wall times"
+        )
+    return ReplayOutcome(surveyed, labels, alone, blocking, notes, time.monotonic() - begun)
 
 
 def figures(outcome: ReplayOutcome) -> dict[str, Any]:
@@ -91,7 +97,7 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
     result = outcome.reported
     flight = result.flight
     trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
-    blocks = block_rows(result.decisions, result.confirmations)
+    blocks = block_rows(outcome.survey, result.decisions, result.confirmations)
     first_attack = None
     attack: dict[str, Any] = {}
     if outcome.labels is not None:
@@ -106,9 +112,9 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "mitigation": result.mitigate,
         "packets_in": flight.sent,
         "packets_scored": trained + scored,
-        "packets_dropped": flight.count(PacketState.DROPPED),
+        "packets_dropped": flight.count(PacketState.DROPPED) - result.uncounted_drops,
         "packets_not_copied": flight.count(PacketState.NOT_COPIED),
-        "packets_lost": flight.in_flight + result.lost_on_the_way,
+        "packets_lost": max(flight.in_flight + result.uncounted_drops, result.lost_on_the_way),
         "training_packets": trained,
         "alerts": len(result.alerts),
         "blocks": blocks,

@@ -13,6 +13,7 @@ It is written into a folder beside its place and moved there when it is whole.
 
 import os
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,10 +95,14 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
     there = folder.absolute().parent
     while not there.exists() and there != there.parent:
         there = there.parent
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+    try:
+        # Asking for permission is not enough: some folders refuse even root.
+        Path(tempfile.mkdtemp(prefix=".sdnator-", dir=there)).rmdir()
+    except OSError as error:
         raise ReportError(
-            f"--report {folder}: {there} is not writable; give another folder or change its permissions"
-        )
+            f"--report {folder}: {there} is not writable ({error.strerror}); "
+            "give another folder or change its permissions"
+        ) from None
 
 
 def write_report(data: ReportData, folder: str | os.PathLike[str]) -> Path:

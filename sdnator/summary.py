@@ -44,8 +44,14 @@ def from_attackers(survey: Survey, labels: Labels) -> NDArray[np.bool_]:
     return found | np.isin(survey.ipv4_src, np.array(addresses, np.uint32))
 
 
-def block_rows(decisions: Sequence[Decision], confirmations: Sequence[Confirmation]) -> list[dict[str, Any]]:
-    """One row for each block that the switch installed, in the order of installing."""
+def block_rows(
+    survey: Survey, decisions: Sequence[Decision], confirmations: Sequence[Confirmation]
+) -> list[dict[str, Any]]:
+    """One row for each block that the switch installed, in the order of installing.
+
+    `time` is the capture time of the packet before which the block was in force, not that of the
+    decision: the packets that were in flight between them count as time to block.
+    """
     by_id = {decision.id: decision for decision in reversed(decisions) if decision.action == "block"}
     rows = []
     for confirmation in confirmations:
@@ -57,7 +63,8 @@ def block_rows(decisions: Sequence[Decision], confirmations: Sequence[Confirmati
                 "id": decision.id,
                 "address": decision.target.address,
                 "reason": decision.reason,
-                "time": decision.event_time / 1e9,
+                "time": int(survey.time_ns[min(confirmation.arrival, survey.packets - 1)]) / 1e9,
+                "decided": decision.event_time / 1e9,
                 "packet": confirmation.arrival,
                 "handle": confirmation.handle,
             }

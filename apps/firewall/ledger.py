@@ -17,6 +17,8 @@ SECOND = 1_000_000_000
 PROBATION_S = 600
 STILL_GOING_RATIO = 3.0
 """A block is extended while its drops exceed the training rate this many times."""
+STILL_GOING_WINDOW_S = 60
+"""Drops are averaged over this long: floods pause for breath."""
 STILL_GOING_FLOOR = 1.0
 """... and this many packets a second, for senders whose training rate is next to nothing."""
 
@@ -27,10 +29,17 @@ class Block:
 
     decision: Decision
     training_rate: float
-    drops: int = 0
-    drops_at: int = 0
-    drop_rate: float = 0.0
+    readings: deque[tuple[int, int]] = field(default_factory=deque)
+    """Capture time and drop counter of the last minute, oldest first."""
     state: str = "decided"
+
+    @property
+    def drop_rate(self) -> float:
+        """Dropped packets a second over the last minute."""
+        if len(self.readings) < 2:
+            return 0.0
+        (begun, first), (ended, last) = self.readings[0], self.readings[-1]
+        return (last - first) * SECOND / (ended - begun)
 
 
 @dataclass
@@ -92,7 +101,7 @@ class Ledger:
             dry_run=self.rules.dry_run,
             first_packet=alert.first_packet,
         )
-        self.blocks[decision.id] = Block(decision, alert.training_rate, drops_at=now)
+        self.blocks[decision.id] = Block(decision, alert.training_rate, deque([(now, 0)]))
         self._recent.append(now)
         return decision
 
@@ -108,10 +117,11 @@ class Ledger:
     def count_drops(self, decision_id: str, packets: int, now: int) -> None:
         """Take a reading of a block's drop counter."""
         block = self.blocks.get(decision_id)
-        if block is None or now <= block.drops_at:
+        if block is None or now <= block.readings[-1][0]:
             return
-        block.drop_rate = (packets - block.drops) * SECOND / (now - block.drops_at)
-        block.drops, block.drops_at = packets, now
+        block.readings.append((now, packets))
+        while len(block.readings) > 2 and block.readings[1][0] <= now - STILL_GOING_WINDOW_S * SECOND:
+            block.readings.popleft()
 
     def due(self, now: int) -> list[Decision]:
         """Decisions that time alone brings: extended blocks and lifted ones."""

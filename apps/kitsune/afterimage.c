@@ -8,8 +8,8 @@
  * needed.  The order of floating-point operations on each stream and link stays the published one.
  *
  * Bounded mode keeps only the last packets of a log: who has missed more catches up in closed form,
- * one step however many packets, which differs in rounding.  It forgets streams that have decayed, and
- * never holds more than the given numbers of streams and links.
+ * one step however many packets, which differs in rounding.  It forgets streams that have decayed, never
+ * holds more than the given numbers of streams and links, and its clock never runs backwards.
  *
  * Build with -ffp-contract=off -fno-builtin-pow: pow(x, 2) and x * x differ in the last bit, and the
  * variance of a constant stream consists of such bits.
@@ -21,6 +21,8 @@
 
 #define FEATURES 100
 #define HUB_DEGREE 8
+#define HUBS_ASKED 32 /* bounded mode */
+#define SET_BACK 60.0 /* bounded mode, s: a packet this much too old means that the clock was set back */
 #define LOG_KEPT 256 /* bounded mode; a power of two */
 
 static const double LAMBDA[SCALES] = {5, 3, 1, 0.1, 0.01};
@@ -92,7 +94,8 @@ static void insert(AfterImage *self, Stream *s, double v, double t)
         s->cf2[k] += square;
         s->w[k] += 1;
         s->mean[k] = s->cf1[k] / s->w[k];
-        s->var[k] = fabs(s->cf2[k] / s->w[k] - pow(s->mean[k], 2));
+        s->mean_squared[k] = pow(s->mean[k], 2);
+        s->var[k] = fabs(s->cf2[k] / s->w[k] - s->mean_squared[k]);
         s->std[k] = sqrt(s->var[k]);
     }
     s->packets++;
@@ -178,7 +181,7 @@ static void catch_up(AfterImage *self, const Table *table, int32_t at)
 {
     Stream *s = &table->stream[at];
     if (self->bounded) {
-        if (s->hub_links > HUB_DEGREE)
+        if (s->hub_links > HUBS_ASKED)
             return; /* too many to ask each: its links wait until they are addressed */
         account_long_misses(self, table, at);
     }
@@ -321,8 +324,8 @@ static void put_2d(const Table *table, const Link *link, double *out)
     EACH_SCALE(k)
     {
         double *o = out + 7 * k, cov = link->cf3[k] / link->w3[k], both = a->std[k] * b->std[k];
-        o[3] = sqrt(pow(a->var[k], 2) + pow(b->var[k], 2));
-        o[4] = sqrt(pow(a->mean[k], 2) + pow(b->mean[k], 2));
+        o[3] = sqrt(a->var_squared[k] + b->var_squared[k]);
+        o[4] = sqrt(a->mean_squared[k] + b->mean_squared[k]);
         o[5] = cov;
         o[6] = both != 0 ? cov / both : 0;
     }
@@ -350,7 +353,11 @@ static void speak(AfterImage *self, Table *table, int32_t at, double v, double t
     Stream *s = &table->stream[at];
     catch_up(self, table, at);
     insert(self, s, v, t);
-    EACH_SCALE(k) residual[k] = v - s->mean[k];
+    EACH_SCALE(k)
+    {
+        residual[k] = v - s->mean[k];
+        s->var_squared[k] = pow(s->var[k], 2);
+    }
     tell_links(self, table, at, residual, t);
 }
 
@@ -418,6 +425,12 @@ static void prefetch_packet(const AfterImage *self, const Names *names)
 
 /* ---- interface ---- */
 
+/* Grows with every change of the interface, so that a library left over from before is noticed. */
+int32_t kitsune_kernel_version(void)
+{
+    return 1;
+}
+
 AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon)
 {
     AfterImage *self = calloc(1, sizeof *self);
@@ -425,6 +438,7 @@ AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, 
         return NULL;
     self->bounded = bounded;
     self->horizon = horizon;
+    self->clock = -HUGE_VAL;
     for (int i = 0; i < 4; i++) {
         Table *table = &self->table[i];
         if (pool_start(&table->streams, sizeof(Stream), bounded ? max_streams : 0)
@@ -444,6 +458,18 @@ void afterimage_free(AfterImage *self)
         pool_end(&table->links);
     }
     free(self);
+}
+
+static double steady(AfterImage *self, double t)
+{
+    if (!self->bounded)
+        return t;
+    if (t + self->offset < self->clock - SET_BACK)
+        self->offset = self->clock - t;
+    t += self->offset;
+    if (t > self->clock)
+        self->clock = t;
+    return self->clock;
 }
 
 static void packet(AfterImage *self, const Names *names, double v, double t, double *out)
@@ -466,7 +492,7 @@ int afterimage_update(AfterImage *self, const Columns *columns, long n, double *
             read_names(columns, i + 1, &names[(i + 1) & 1]);
             prefetch_packet(self, &names[(i + 1) & 1]);
         }
-        packet(self, &names[i & 1], columns->length[i], columns->time[i], out);
+        packet(self, &names[i & 1], columns->length[i], steady(self, columns->time[i]), out);
     }
     return self->failed ? -1 : 0;
 }

@@ -39,8 +39,9 @@ class AfterImage:
     Args:
         mode: "reference" is exact and unbounded, as published.  "bounded" holds at most `max_streams`
             and `max_links` in each of its tables, forgets streams idle for `horizon` seconds, and its
-            cost per packet does not grow with the number of a host's peers; features differ in
-            rounding, and for links between two busy hosts.
+            cost per packet does not grow with the number of a host's peers.  Its clock never runs
+            backwards.  Features differ in rounding where a host has missed many packets of a busy
+            peer, and in covariance where two hosts each talk to many busy ones.
         kernel: None uses the Python twin.
     """
 

@@ -5,6 +5,7 @@ what it has missed when it is next needed: packet by packet while the log still 
 form from the hub's damped sums.
 """
 
+import math
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,9 @@ from apps.kitsune.kernel import Columns
 from apps.kitsune.text_keys import TextKeys, text_keys
 
 HUB_DEGREE: Final = 8
+HUBS_ASKED: Final = 32
+SET_BACK_S: Final = 60.0
+"""A packet this much too old means that the clock was set back."""
 _FORGET_AT_ONCE: Final = 3
 
 
@@ -52,7 +56,7 @@ class BoundedTable(Table):
         self.links.move_to_end(pair)
 
     def prepare(self, stream: Stream) -> None:
-        if len(stream.hub_links) > HUB_DEGREE:
+        if len(stream.hub_links) > HUBS_ASKED:
             return  # too many to ask each: its links wait until they are addressed
         pending = []
         for link in reversed(stream.hub_links):
@@ -153,6 +157,8 @@ class PythonEngine:
     """The four tables of AfterImage."""
 
     def __init__(self, bounded: bool, max_streams: int, max_links: int, horizon: float) -> None:
+        self._bounded = bounded
+        self._clock, self._offset = -math.inf, 0.0
         self._mac_ip, self._hosts, self._jitter, self._sockets = self._tables = [
             BoundedTable(max_streams, max_links, horizon) if bounded else Table() for _ in range(4)
         ]
@@ -160,10 +166,17 @@ class PythonEngine:
     def update(self, columns: Columns, out: npt.NDArray[np.float64]) -> None:
         """Writes the features of each row of the columns."""
         for row, keys in zip(out, text_keys(columns), strict=True):
-            row[:] = self._features(keys)
+            row[:] = self._features(keys, self._steady(keys.time) if self._bounded else keys.time)
 
-    def _features(self, keys: TextKeys) -> list[float]:
-        size, time = keys.length, keys.time
+    def _steady(self, time: float) -> float:
+        """Bounded mode's clock, which never runs backwards."""
+        if time + self._offset < self._clock - SET_BACK_S:
+            self._offset = self._clock - time
+        self._clock = max(self._clock, time + self._offset)
+        return self._clock
+
+    def _features(self, keys: TextKeys, time: float) -> list[float]:
+        size = keys.length
         groups = (
             self._mac_ip.packet(keys.sender, size, time),
             self._hosts.packet_to(keys.source, keys.destination, size, time),

@@ -22,7 +22,8 @@ typedef struct {
     Key key;
     double last, touched;
     double cf1[SCALES], cf2[SCALES], w[SCALES];
-    double mean[SCALES], var[SCALES], std[SCALES]; /* as of the stream's own last packet */
+    /* as of the stream's own last packet */
+    double mean[SCALES], mean_squared[SCALES], var[SCALES], var_squared[SCALES], std[SCALES];
     /* bounded mode: damped sums over a hub's own packets, as of the latest of them */
     double spoken, count[SCALES], residuals[SCALES];
     uint64_t packets;
@@ -58,7 +59,7 @@ typedef struct AfterImage {
     Table table[4];
     Memo memo[MEMO_SLOTS];
     uint64_t order, evicted_idle, evicted_full;
-    double horizon;
+    double horizon, clock, offset;
     int bounded;
     int failed;
 } AfterImage;

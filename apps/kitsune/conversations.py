@@ -20,6 +20,11 @@ Key = tuple[bool, Address, int, int]
 """TCP or UDP, initiator's address, initiator's port, the other port."""
 
 
+def is_tcp_reply(tcp_flags: int) -> bool:
+    """SYN-ACK or RST: nobody begins a conversation with these."""
+    return bool(tcp_flags & _RST) or tcp_flags & (_SYN | _ACK) == _SYN | _ACK
+
+
 class _Entry:
     __slots__ = ("credit", "sender", "time")
 
@@ -41,7 +46,7 @@ class Conversations:
         """Who pays for a TCP or UDP packet that `sender` sent under `key` at `time` (seconds)."""
         is_tcp = key[0]
         begun = None if is_tcp and tcp_flags & (_SYN | _ACK) == _SYN else self._find(reverse, time)
-        reply = not is_tcp or tcp_flags & _RST or tcp_flags & (_SYN | _ACK) == _SYN | _ACK
+        reply = not is_tcp or is_tcp_reply(tcp_flags)
         if begun is None:
             if not (is_tcp and reply):
                 self._begin(key, sender, time)

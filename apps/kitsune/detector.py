@@ -11,7 +11,7 @@ import numpy.typing as npt
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
 from apps.kitsune.kernel import Columns, Kernel
 from apps.kitsune.kitnet import KitNet
-from apps.kitsune.model_file import Model, save_model
+from apps.kitsune.model_file import Model, NotAModelError, save_model
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.reasons import Explanation, reason
 from apps.kitsune.senders import HotSecond, Senders
@@ -50,6 +50,23 @@ class DetectorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     clip: float = 1e6
     """Bounded mode: limit of scaled features, so that one that was constant in training keeps the score finite."""
 
+    def __post_init__(self) -> None:
+        least = {
+            "fm_grace": 1,
+            "ad_grace": 1,
+            "max_ae": 1,
+            "calibration_packets": 2,
+            "max_streams": 2,
+            "max_links": 1,
+            "false_alarms_per_hour": 0,
+        }
+        for name, value in least.items():
+            if not getattr(self, name) >= value:
+                raise ValueError(f"{name}={getattr(self, name)}: must be at least {value}")
+        for name in ("threshold", "horizon", "clip"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)}: must be greater than 0")
+
     @property
     def scale_limit(self) -> float:
         """`clip` where it applies."""
@@ -81,6 +98,7 @@ class Detector:
     Args:
         settings: all options.
         model: a saved model; then nothing is trained.
+        retrain: go on training the saved model, with its feature map, on the first packets.
         kernel: None uses the Python twins.
     """
 
@@ -89,6 +107,7 @@ class Detector:
         settings: DetectorSettings = _DEFAULTS,
         *,
         model: Model | None = None,
+        retrain: bool = False,
         kernel: Kernel | None = None,
     ) -> None:
         self.settings = settings
@@ -102,6 +121,8 @@ class Detector:
         self.training_warnings: list[str] = []
         self._check = TrainingCheck()
         self._trained_at_us = 0
+        self.senders = Senders()
+        self.calibration = Calibration(settings.calibration_packets)
         if model is None:
             self.model = KitNet(
                 fm_grace=settings.fm_grace,
@@ -110,8 +131,9 @@ class Detector:
                 clip=settings.scale_limit,
                 kernel=kernel,
             )
-            self.senders = Senders()
-            self.calibration = Calibration(settings.calibration_packets)
+        elif retrain:
+            self.model = model.network
+            self.model.retrain(settings.fm_grace, settings.ad_grace)
         else:
             self._take(model)
         self.line = self._line()
@@ -167,11 +189,16 @@ class Detector:
     def _take(self, model: Model) -> None:
         self.model = model.network
         notes = model.notes
-        self.senders = Senders.from_state(notes["senders"])
-        benign = None if notes["benign"] is None else Benign(**notes["benign"])
+        try:
+            benign = Benign(**notes["benign"]) if notes.get("benign") else None
+            self.senders = Senders.from_state(notes.get("senders"))
+            self._trained_at_us = int(notes.get("trained_at_us", 0))
+            self.training_warnings = [str(warning) for warning in notes.get("training_warnings", ())]
+        except (KeyError, TypeError, ValueError) as error:
+            raise NotAModelError(
+                f"the model's notes are damaged ({error}); train again and save it anew"
+            ) from error
         self.calibration = Calibration(self.settings.calibration_packets, benign)
-        self._trained_at_us = int(notes["trained_at_us"])
-        self.training_warnings = list(notes["training_warnings"])
 
     def _line(self) -> float:
         benign = self.calibration.benign

@@ -16,6 +16,9 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
+VERSION: Final = 1
+"""Of the interface; the library says which it has."""
+
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
 
 PACKET_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
@@ -43,6 +46,7 @@ _DECLARATIONS: Final = (
     "typedef struct {"
     + "".join(f"const {c_type} *{name};" for name, c_type, _ in PACKET_FIELDS)
     + """} Columns;
+    int32_t kitsune_kernel_version(void);
     typedef struct AfterImage AfterImage;
     AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon);
     void afterimage_free(AfterImage *);
@@ -78,15 +82,19 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
     ffi = cffi.FFI()
     ffi.cdef(_DECLARATIONS)
     try:
-        return Kernel(ffi, ffi.dlopen(str(path)))
-    except OSError as error:
-        warnings.warn(
-            f"Kitsune runs on its Python twin, about 200 times slower: {error}. "
-            "Install a C compiler and reinstall SDNator to get the kernel.",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-        return None
+        lib = ffi.dlopen(str(path))
+        if lib.kitsune_kernel_version() == VERSION:
+            return Kernel(ffi, lib)
+        problem = f"{path} belongs to another version"
+    except (OSError, AttributeError) as error:
+        problem = str(error)
+    warnings.warn(
+        f"Kitsune runs on its Python twin, dozens of times slower: {problem}. "
+        "Install a C compiler and reinstall SDNator (pip install) to get the kernel.",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+    return None
 
 
 def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:

@@ -19,6 +19,8 @@ from apps.kitsune.kernel import Kernel, contiguous
 _Array = npt.NDArray[np.float64]
 _SEED = 1234
 _BLOCK = 1024
+_LANES = 16
+"""Rows that the kernel scores at a time."""
 
 
 @dataclass
@@ -176,6 +178,10 @@ class KitNet:
             self._train(contiguous(features, "f8"))
             self.trained += len(features)
 
+    def retrain(self, fm_grace: int, ad_grace: int) -> None:
+        """Trains on from where it is, with the same feature map, for another `training_packets`."""
+        self.fm_grace, self.ad_grace, self.trained = fm_grace, ad_grace, 0
+
     def score(self, features: _Array) -> tuple[_Array, _Array]:
         """Scores rows of features without learning; needs a finished feature map."""
         if not len(features):
@@ -219,6 +225,10 @@ class KitNet:
 
     def _score_in_kernel(self, kernel: Kernel, features: _Array) -> tuple[_Array, _Array]:
         layers = [_c_layer(kernel, layer) for layer in self._layers()]
+        count = len(features)
+        spare = -count % _LANES
+        if spare:
+            features = np.concatenate([features, np.zeros((spare, self.width))])
         errors = np.empty((len(features), len(self.feature_map)))
         scores = np.empty(len(features))
         scratch = self._scratch()
@@ -226,11 +236,11 @@ class KitNet:
             kernel.pointer("double", array) for array in (features, scratch, errors, scores)
         )
         kernel.lib.kitnet_score(*layers, rows, len(features), self.width, self.clip, work, rmse, out)
-        return scores, errors
+        return scores[:count], errors[:count]
 
     def _scratch(self) -> _Array:
         units = sum(sum(layer.weights.shape) for layer in self._layers())
-        return np.empty(4 * units)
+        return np.empty(_LANES * units)
 
 
 def _c_layer(kernel: Kernel, layer: Layer) -> Any:

@@ -15,8 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.kitsune.afterimage import seconds
-from apps.kitsune.conversations import Address, Conversations
+from apps.kitsune.blocked import Blocked
+from apps.kitsune.conversations import Address, Conversations, is_tcp_reply
 from apps.kitsune.kernel import Columns
+from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.roles import Roles
 
 HOT_PACKETS: Final = 3
@@ -110,6 +112,7 @@ class Senders:
         self.clock_jumps = 0
         self._ids: dict[Identity, int] = {}
         self._free: list[int] = []
+        self.blocked = Blocked()
         self._conversations = Conversations()
         self._second: int | None = None
         self._training = True
@@ -135,6 +138,8 @@ class Senders:
                 hot += self._turn(second)
             sender = self._sender(packet)
             payer = self._payer(packet, sender)
+            if payer == sender and self.blocked and self._answers_blocked(packet):
+                continue
             tally = self._tallies.get(payer)
             if tally is None:
                 tally = self._tallies[payer] = Tally()
@@ -174,14 +179,14 @@ class Senders:
         }
 
     @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "Senders":
-        """Senders as a saved model knows them; training is over.
+    def from_state(cls, state: dict[str, Any] | None) -> "Senders":
+        """Senders as a saved model knows them (None: it knows none); training is over.
 
         Raises `KeyError`, `TypeError` or `ValueError` when the state is not one.
         """
-        senders = cls(Roles.from_state(state["roles"]))
+        senders = cls(Roles.from_state(state["roles"]) if state else None)
         senders._training = False
-        for (switch, port, mac, (version, hi, lo)), rate, destinations in state["records"]:
+        for (switch, port, mac, (version, hi, lo)), rate, destinations in state["records"] if state else ():
             identity = (str(switch), int(port), int(mac), (int(version), int(hi), int(lo)))
             senders.know(Record(identity, training_rate=int(rate), training_destinations=int(destinations)))
         return senders
@@ -257,6 +262,13 @@ class Senders:
         self._ids[record.identity] = number
         self.roles.see(record.identity[2], record.identity[3])
         return number
+
+    def _answers_blocked(self, packet: Packet) -> bool:
+        """An answer to a conversation that could not be seen, because who began it is blocked."""
+        answer = packet.quoted or packet.udp_sport >= 0 or is_tcp_reply(packet.flags)
+        return bool(answer) and self.blocked.covers(
+            packet.switch, mac_text(packet.to_mac), ip_text(*packet.destination)
+        )
 
     def _payer(self, packet: Packet, sender: int) -> int:
         if packet.sport < 0:

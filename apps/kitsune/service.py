@@ -14,15 +14,16 @@ from typing import Any, Final
 import due.service
 from apps.kitsune.detector import Detector, DetectorSettings, Scored
 from apps.kitsune.kernel import load_kernel
-from apps.kitsune.model_file import load_model
-from apps.messages import Alert
+from apps.kitsune.model_file import ModelFileError, load_model
+from apps.messages import Alert, Decision
 from due import NO_WAIT, Capability, Engine, Interest, Item
 
 PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
+BLOCKS: Final = "network.block.firewall.*"
 SCORE: Final = "network.anomaly.kitsune.score"
 ALERT: Final = "network.anomaly.kitsune.alert"
 
-INTERESTS = (Interest(PACKETS),)
+INTERESTS = (Interest(PACKETS), Interest(BLOCKS))
 CAPABILITIES = (
     Capability(SCORE, delivery="reliable", archive="always"),
     Capability(ALERT, delivery="reliable", archive="always"),
@@ -51,19 +52,22 @@ class KitsuneService:
         self._lock = threading.Lock()
         self._packets = 0
         self._alerts = 0
-        self._subscription: Any = None
+        self._subscriptions: list[Any] = []
 
     def start(self) -> None:
         """Subscribes; the engine is initialised."""
-        self._subscription = self._engine.observe(PACKETS).subscribe(self._score)
+        self._subscriptions = [
+            self._engine.observe(BLOCKS).subscribe(self._on_decision),
+            self._engine.observe(PACKETS).subscribe(self._score),
+        ]
 
     def tick(self) -> None:
         """Nothing depends on wall time."""
 
     def stop(self) -> None:
         """Raises the alerts of the second that is still open."""
-        if self._subscription is not None:
-            self._subscription.dispose()
+        for subscription in self._subscriptions:
+            subscription.dispose()
         with self._lock:
             self._write_alerts(self._detector.finish())
             if self._settings.save_model and self._detector.model.is_trained:
@@ -81,6 +85,10 @@ class KitsuneService:
             "clock_jumps": self._detector.senders.clock_jumps,
             **self._detector.afterimage.counts,
         }
+
+    def _on_decision(self, item: Item) -> None:
+        with self._lock:
+            self._detector.senders.blocked.decide(Decision.from_value(item.value))
 
     def _score(self, item: Item) -> None:
         batch = item.value
@@ -136,7 +144,11 @@ def _detector(settings: Settings) -> Detector:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the app until SIGTERM or SIGINT."""
-    return due.service.run("kitsune", KitsuneService, Settings, INTERESTS, CAPABILITIES, argv)
+    try:
+        return due.service.run("kitsune", KitsuneService, Settings, INTERESTS, CAPABILITIES, argv)
+    except ModelFileError as error:
+        print(f"kitsune: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import numpy.typing as npt
 _Array = npt.NDArray[np.float64]
 _UPPER = 0.99
 _TINY = 1e-300
+_MOST_LOG = 700.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +29,14 @@ class Benign:
 
     @classmethod
     def of(cls, scores: _Array, seconds: float) -> "Benign":
-        """Fits scores that were seen within some seconds of capture time; needs at least two scores.
+        """Fits scores that were seen within some seconds of capture time; `ValueError` for less than two.
 
         The spread is the larger of the standard deviation and what the upper hundredth shows,
         because the upper tail is what counts and is often the heavier one.
         """
-        logs = np.log(np.maximum(scores[np.isfinite(scores)], _TINY))
+        logs = np.log(scores[np.isfinite(scores) & (scores > 0)])
         if len(logs) < 2:
-            raise ValueError(f"a fit needs at least 2 finite scores, not {len(logs)}")
+            raise ValueError(f"a fit needs at least 2 positive scores, not {len(logs)}")
         middle, upper = np.quantile(logs, (0.5, _UPPER))
         spread = max(float(logs.std()), float(upper - middle) / NormalDist().inv_cdf(_UPPER))
         rate = len(scores) / max(seconds, 1.0) * 3600
@@ -46,7 +47,7 @@ class Benign:
         if not false_alarms_per_hour > 0:
             raise ValueError(f"false_alarms_per_hour={false_alarms_per_hour}: must be greater than 0")
         tail = min(false_alarms_per_hour / self.packets_per_hour, 0.5)
-        return math.exp(self.log_mean - NormalDist().inv_cdf(tail) * self.log_spread)
+        return math.exp(min(self.log_mean - NormalDist().inv_cdf(tail) * self.log_spread, _MOST_LOG))
 
     def drift(self, scores: _Array) -> float:
         """How far the median of other benign scores has moved, in spreads; 0 = not at all."""
@@ -90,6 +91,6 @@ class Calibration:
     def close(self, now: float) -> None:
         """Fits what there is, if it is enough for a fit."""
         scores = np.concatenate(self._scores) if self._scores else np.zeros(0)
-        if self.benign is None and np.isfinite(scores).sum() > 1:
+        if self.benign is None and (np.isfinite(scores) & (scores > 0)).sum() > 1:
             self.benign = Benign.of(scores, abs(now - self._begun))
         self._scores = []

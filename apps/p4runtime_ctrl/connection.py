@@ -8,6 +8,7 @@ moment for the chief, then asks for its place.
 import queue
 import threading
 import time
+from itertools import groupby
 from typing import Any, Final, Protocol
 
 import grpc
@@ -27,13 +28,14 @@ class Listener(Protocol):
     def became_backup(self) -> None: ...
     def lost(self, cause: str) -> None: ...
     def packets(self, messages: list[Any]) -> None: ...
+    def digests(self, lists: list[Any]) -> None: ...
     def other(self, message: Any) -> None: ...
 
 
 class Connection:
     """Keeps the stream to one switch open and its listener informed.
 
-    Packet-ins are handed over in order, in lists: as soon as the listener is free again and at most
+    Packet-ins and digests are handed over in their order, in lists: as soon as the listener is free again and at most
     `linger_s` after the first of them, never more than `batch` at once.  While the listener is busy
     at most four batches wait; then reading stops and gRPC's flow control holds the switch.
     """
@@ -46,7 +48,7 @@ class Connection:
         *,
         batch: int = 1024,
         linger_s: float = 0.002,
-        longest_pause_s: float = 1.0,
+        longest_pause_s: float = 0.5,
         chief: bool = True,
     ) -> None:
         self._address = address
@@ -62,7 +64,8 @@ class Connection:
         self._stub: Any = None
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._election_id: Any = None
-        self._primary: bool | None = None
+        self._told: tuple[bool, Any] | None = None
+        """What the listener knows: primary or not, and under which election id its writes go."""
         self._chief = chief
         self._patience: threading.Timer | None = None
         name = address.target
@@ -115,7 +118,7 @@ class Connection:
     def _one_stream(self) -> str:
         """Open the stream, read it to its end, say why it ended."""
         self._requests = queue.SimpleQueue()
-        self._primary = None
+        self._told = None
         with self._address.channel() as stream, self._address.channel() as calls:
             self._stub = P4RuntimeStub(calls)
             self._claim(self._usual_id())
@@ -148,6 +151,9 @@ class Connection:
         kind = message.WhichOneof("update")
         if kind == "packet":
             self._gather(message.packet)
+        elif kind == "digest":
+            self._acknowledge(message.digest)
+            self._gather(message.digest)
         elif kind == "arbitration":
             self._arbitrated(message.arbitration)
         else:
@@ -161,9 +167,10 @@ class Connection:
             self._fill_the_place(max(highest + 1, self._usual_id()))
             return
         primary = arbitration.status.code == _PRIMARY
-        if primary == self._primary:
+        told = (primary, self._election_id if primary else None)
+        if told == self._told:
             return
-        self._primary = primary
+        self._told = told
         if primary:
             session = Session(self._stub, self._address, self._pipeline, self._election_id)
             self._listener.became_primary(session)
@@ -183,9 +190,15 @@ class Connection:
             self._patience.cancel()
             self._patience = None
 
-    def _gather(self, packet: Any) -> None:
+    def _acknowledge(self, digest: Any) -> None:
+        request = p4runtime.StreamMessageRequest()
+        request.digest_ack.digest_id = digest.digest_id
+        request.digest_ack.list_id = digest.list_id
+        self._requests.put(request)
+
+    def _gather(self, message: Any) -> None:
         gathered = self._gathered
-        gathered.append(packet)
+        gathered.append(message)
         count = len(gathered)
         if count != 1 and count % self._batch:
             return
@@ -207,6 +220,8 @@ class Connection:
                 del self._gathered[: len(messages)]
                 with self._changed:
                     self._changed.notify_all()
-                self._listener.packets(messages)
+                for kind, run in groupby(messages, key=type):
+                    take = self._listener.packets if kind is p4runtime.PacketIn else self._listener.digests
+                    take(list(run))
                 if len(self._gathered) < self._batch:
                     break

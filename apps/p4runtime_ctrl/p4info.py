@@ -118,6 +118,13 @@ class Program:
             )
         return fields
 
+    def digest(self, struct: str) -> list[tuple[str, int]]:
+        """Members of a digest by name and width; raises `ProgramError` where the program has none such."""
+        if struct not in self.message.type_info.structs:
+            raise ProgramError(f"the program has no digest {struct!r}; load the program of SDNator")
+        members = self.message.type_info.structs[struct].members
+        return [(member.name, member.type_spec.bitstring.bit.bitwidth) for member in members]
+
     def entry(self, update: TableUpdate) -> Any:
         """The P4Runtime `TableEntry` that an update means.
 

@@ -21,16 +21,15 @@ from typing import Any, Final
 import due.service
 from apps.messages import Confirmation, Decision, TableCommand
 from apps.p4runtime_ctrl.connection import Connection
-from apps.p4runtime_ctrl.demand import ALL, PREFIX, Offer, requests_for
+from apps.p4runtime_ctrl.demand import ALL, KINDS, Demand, Offer, demand_for, key_of
 from apps.p4runtime_ctrl.errors import ControllerError, ProgramError, SwitchError
 from apps.p4runtime_ctrl.history import DECISIONS, commands_of, decisions_for, is_for, read
+from apps.p4runtime_ctrl.outbound import Outbound
 from apps.p4runtime_ctrl.p4info import Program
-from apps.p4runtime_ctrl.packet_in import PacketReader
-from apps.p4runtime_ctrl.session import Address, Pipeline, Session
+from apps.p4runtime_ctrl.readings import Readings
+from apps.p4runtime_ctrl.session import Address, Pipeline, Session, credentials
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.switch import Switch
-from apps.p4runtime_ctrl.telemetry import Request
-from apps.packets import read_frames
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item
 
 INTERESTS = (
@@ -41,16 +40,19 @@ INTERESTS = (
 )
 CAPABILITIES = (
     Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
+    Capability("network.frames.p4runtime_ctrl.*.*", delivery="reliable"),
+    Capability("network.digests.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.confirmation.p4runtime_ctrl.*", delivery="reliable", archive="always"),
     Capability("network.switch.p4runtime_ctrl.*", archive="always"),
 )
 
+_DATA: Final = tuple(key_of(kind, "*", "*") for kind in KINDS)
 _LOG = logging.getLogger(__name__)
 _JOBS: Final = 10_000
 _ALIVE_S: Final = 1.0
-_SECOND_US: Final = 1_000_000
-_STARTING: Final = "starting"
 _START_S: Final = 10.0
+_COUNTING_SHARE: Final = 5
+"""Reading counters takes at most one part in so many of the worker's time."""
 _LOOK_EVERY_S: Final = 0.25
 
 
@@ -71,7 +73,9 @@ class Agent:
         self._mine = mine
         self._settings = settings
         self._program = Program(pipeline.p4info)
-        self._reader = PacketReader(self._program, mine.base_us)
+        by_digest = settings.telemetry == "digest"
+        self._outbound = Outbound(mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest)
+        self._progress = self._outbound.progress
         self._program_name = Path(settings.program).name
         forward = {int(port): egress for port, egress in mine.forward.items()}
         self._switch = Switch(
@@ -84,6 +88,7 @@ class Agent:
             copies_session=settings.copy_session,
             cpu_port=settings.cpu_port,
             timeout_s=settings.timeout_s,
+            credentials=credentials(settings.tls_ca, settings.tls_certificate, settings.tls_key),
         )
         self._connection = Connection(
             address, pipeline, self, batch=settings.batch, linger_s=settings.linger_ms / 1000
@@ -95,15 +100,17 @@ class Agent:
         self._connected = False
         self._was_backup = False
         self._recent: deque[Decision] = deque(maxlen=_JOBS)
-        self._published: dict[str, int] = {}
-        self._blocks: list[dict[str, Any]] = []
+        self._readings = Readings()
         self._counting = threading.Event()
         self._counted_second = 0
         self._counted_at = 0.0
+        self._count_after = 0.0
         self._alive_at = 0.0
         self._secret_at = float("-inf")
         self._stated = (0, 0, 0.0)
-        self._change = _STARTING
+        self._change = "starting"
+        self.settled = threading.Event()
+        """The first attempt to reach the switch has ended, well or badly."""
 
     # -- from the service ---------------------------------------------------------------------
 
@@ -115,11 +122,6 @@ class Agent:
 
     def stand(self, *, chief: bool) -> None:
         self._connection.stand(chief=chief)
-
-    @property
-    def settled(self) -> bool:
-        """Whether the first attempt to reach the switch has ended, well or badly."""
-        return self._change != _STARTING
 
     def stop(self) -> None:
         self._put(self._leave)
@@ -134,8 +136,8 @@ class Agent:
     def command(self, command: TableCommand) -> None:
         self._put(partial(self._command, command))
 
-    def want(self, requests: dict[str, Request]) -> None:
-        self._put(partial(self._want, requests))
+    def want(self, demand: Demand) -> None:
+        self._put(partial(self._want, demand))
 
     def say_again(self) -> None:
         """Somebody new may be listening: the state is best effort and said on change only."""
@@ -155,7 +157,7 @@ class Agent:
             self._secret_at = now
             self._put(self._change_secret)
         received, lost, stated_at = self._stated
-        if now - stated_at > 1 and (received, lost) != (self._reader.received, self._reader.lost):
+        if now - stated_at > 1 and (received, lost) != (self._heard(), self._progress.lost):
             self._put(self._write_state)
 
     def health(self) -> dict[str, Any]:
@@ -174,20 +176,23 @@ class Agent:
         self._put(partial(self._lose, cause))
 
     def packets(self, messages: list[Any]) -> None:
-        """The hot path: one record batch for each key that somebody wants."""
-        packets = self._reader.read(messages)
-        for segment, bit in list(self._published.items()):
-            chosen = packets.matching(bit)
-            if len(chosen):
-                key = f"{PREFIX}.{self.name}.{segment}"
-                at = int(chosen.time_us[-1]) * 1000
-                self._engine.write(key, chosen.batch(read_frames), [NO_WAIT], event_time=at)
-        if self._reader.time_us // _SECOND_US != self._counted_second:
-            self._count_soon()
+        self._outbound.packets(messages)
+        self._count_each_second()
+
+    def digests(self, lists: list[Any]) -> None:
+        self._outbound.digests(lists)
+        self._count_each_second()
 
     def other(self, message: Any) -> None:
         if message.WhichOneof("update") == "idle_timeout_notification":
             self._put(partial(self._expire, list(message.idle_timeout_notification.table_entry)))
+
+    def _publish(self, key: str, value: Any, event_time: int) -> None:
+        self._engine.write(key, value, [NO_WAIT], event_time=event_time)
+
+    def _count_each_second(self) -> None:
+        if self._outbound.second != self._counted_second:
+            self._count_soon()
 
     # -- the worker ---------------------------------------------------------------------------
 
@@ -237,8 +242,10 @@ class Agent:
         except SwitchError:
             self._connection.break_off()
             raise
+        finally:
+            self.settled.set()
         if report.program_loaded:
-            self._reader.expect_first()
+            self._progress.expect_first()
         self._session = session
         self._confirm(report.confirmations)
         _LOG.info("%s: primary; %s", self.name, report)
@@ -248,12 +255,14 @@ class Agent:
         self._connected = True
         self._was_backup = True
         self._session = None
+        self.settled.set()
         self._say("backup: another controller is primary")
 
     def _lose(self, cause: str) -> None:
         if self._connected:
             _LOG.warning("%s: lost: %s", self.name, cause)
         self._connected = False
+        self.settled.set()
         self._say(f"lost: {cause}")
 
     def _leave(self) -> None:
@@ -264,20 +273,17 @@ class Agent:
         if not decisions:
             return
         self._confirm(self._switch.decide(decisions, self._session))
-        self._counted_second = 0
         self._count_soon()
 
     def _command(self, command: TableCommand) -> None:
         self._confirm(self._switch.command(command, self._session))
 
-    def _want(self, requests: dict[str, Request]) -> None:
-        """What is not wanted any more stops being published first, what is new is published at once."""
-        wanted = {segment: request.bit for segment, request in requests.items() if request.copy}
-        self._published = wanted
-        refused = self._switch.want(tuple(requests.values()), self._session)
-        for text in refused:
+    def _want(self, demand: Demand) -> None:
+        """What is not wanted any more is not published any more; what is new is, before it is asked for."""
+        self._outbound.route(demand)
+        for text in self._switch.want(demand.requests, self._session):
             _LOG.error("%s: %s", self.name, text)
-        names = ", ".join(request.name for request in requests.values()) or "nothing"
+        names = ", ".join(request.name for request in demand.requests) or "nothing"
         self._say(f"telemetry: {names}")
 
     def _expire(self, entries: Iterable[Any]) -> None:
@@ -295,36 +301,44 @@ class Agent:
         """Have block counters read, unless that is under way, not due, or there is nothing to count."""
         if self._counting.is_set() or self._session is None or not self._switch.blocks:
             return
-        if time.monotonic() - self._counted_at < self._settings.counters_ms / 1000:
+        if time.monotonic() < self._count_after:
             return
         self._counting.set()
         self._put(self._count)
 
     def _count(self) -> None:
+        began = time.monotonic()
         try:
             if self._session is not None:
-                self._blocks = self._switch.count_blocks(self._session)
+                self._readings.take(self._switch.count_blocks(self._session))
                 self._write_state()
         finally:
-            self._counted_second = self._reader.time_us // _SECOND_US
+            self._counted_second = self._outbound.second
             self._counted_at = time.monotonic()
+            spent = self._counted_at - began
+            self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
             self._counting.clear()
 
     def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
         key = f"network.confirmation.p4runtime_ctrl.{self.name}"
-        for confirmation in confirmations:
-            self._engine.write(key, confirmation.to_value(), [NO_WAIT], event_time=confirmation.event_time)
+        waiting = list(confirmations)
+        for place, confirmation in enumerate(waiting, start=1):
+            flags = [NO_WAIT] if place == len(waiting) else []
+            self._engine.write(key, confirmation.to_value(), flags, event_time=confirmation.event_time)
 
     def _say(self, change: str) -> None:
         self._change = change
         self._write_state()
 
     def _write_state(self) -> None:
-        self._stated = (self._reader.received, self._reader.lost, time.monotonic())
+        self._stated = (self._heard(), self._progress.lost, time.monotonic())
         if not self._switch.blocks:
-            self._blocks = []
+            self._readings.take([])
         key = f"network.switch.p4runtime_ctrl.{self.name}"
         self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
+
+    def _heard(self) -> int:
+        return self._progress.received + self._progress.reported
 
     def _state(self) -> dict[str, Any]:
         event_time, arrival = self._now()
@@ -335,18 +349,20 @@ class Agent:
             "target": self._mine.target or self._mine.address,
             "program": self._program_name,
             "fail": self._mine.fail,
-            "telemetry": [request.name for request in self._switch.requests],
-            "packet_in": self._reader.received,
-            "lost": self._reader.lost,
-            "restarts": self._reader.restarts,
+            "telemetry": [request.name for request in self._switch.requests or ()],
+            "packet_in": self._progress.received,
+            "digests": self._progress.reported,
+            "lost": self._progress.lost,
+            "restarts": self._progress.restarts,
             "arrival": arrival,
             "event_time": event_time,
-            "blocks": self._blocks,
+            "blocks": self._readings.shown,
+            "blocks_total": self._switch.blocks,
             "change": self._change,
         }
 
     def _now(self) -> tuple[int, int]:
-        return self._reader.time_us * 1000, self._reader.arrival
+        return self._progress.time_us * 1000, self._progress.arrival
 
     def _restore(self) -> None:
         """Desired state from Data Archives, and what was heard since."""
@@ -373,7 +389,8 @@ class P4RuntimeCtrlService:
         self._offers: dict[str, Offer] = {}
         self._wanted: tuple[str, ...] = ()
         self._demand = threading.Lock()
-        self._asked: dict[str, dict[str, Request]] = {name: {} for name in self._agents}
+        self._asked: dict[str, Demand] = {}
+        self._by_digest = settings.telemetry == "digest"
         self._chief = True
         self._looked_at = 0.0
 
@@ -390,8 +407,8 @@ class P4RuntimeCtrlService:
         self._engine.observe("network.telemetry.*.*").subscribe(self._on_offer)
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
-        while time.monotonic() < deadline and not all(agent.settled for agent in self._agents.values()):
-            time.sleep(0.01)
+        for agent in self._agents.values():
+            agent.settled.wait(max(0.0, deadline - time.monotonic()))
 
     def tick(self) -> None:
         for agent in self._agents.values():
@@ -403,10 +420,14 @@ class P4RuntimeCtrlService:
 
     def _look_at_duty(self) -> None:
         """DUE says which instance of this app works; that one is the chief of its switches, too."""
-        chief = bool(self._engine.health()["active"])
+        health = self._engine.health()
+        if health["asking"]:
+            return  # stopped for a moment: nobody has taken over yet, as far as anybody knows
+        chief = bool(health["active"])
         if chief != self._chief:
             _LOG.info("%s", "active: claiming the switches" if chief else "standby: leaving the switches")
             self._chief = chief
+            self._asked.clear()
             for agent in self._agents.values():
                 agent.stand(chief=chief)
 
@@ -442,22 +463,27 @@ class P4RuntimeCtrlService:
     def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
         with self._demand:
             self._wanted = tuple(
-                assignment.key for assignment in assignments if assignment.capability.startswith(PREFIX)
+                assignment.key for assignment in assignments if assignment.capability in _DATA
             )
         self._demand_changed()
         for agent in self._agents.values():
             agent.say_again()
 
     def _demand_changed(self) -> None:
-        """Tell agents what is wanted of them; everything while no Coordinator is there to ask."""
+        """Tell agents what is wanted of them; everything while no Coordinator is there to ask.
+
+        A standby instance is told nothing of demand, and leaves the switches' telemetry as it is.
+        """
+        if not self._chief:
+            return
         with self._demand:
             for name, agent in self._agents.items():
-                everything = f"{PREFIX}.{name}.{ALL}"
+                everything = key_of("packets", name, ALL)
                 wanted = (*self._wanted, everything) if self._engine.wanted(everything) else self._wanted
-                requests = requests_for(name, wanted, self._offers)
-                if requests != self._asked[name]:
-                    self._asked[name] = requests
-                    agent.want(requests)
+                demand = demand_for(name, wanted, self._offers, by_digest=self._by_digest)
+                if demand != self._asked.get(name):
+                    self._asked[name] = demand
+                    agent.want(demand)
 
 
 def load_pipeline(settings: Settings) -> Pipeline:

@@ -6,17 +6,21 @@ The calls have a channel of their own, so that a held-up stream never delays a w
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import grpc
 
 from apps.p4runtime_ctrl.desired_state import Change
-from apps.p4runtime_ctrl.errors import NotPrimary, SwitchError, Unreachable
+from apps.p4runtime_ctrl.errors import NotPrimary, ProgramError, SwitchError, Unreachable
 from apps.p4runtime_ctrl.switch import Outcome
 from p4rt import P4RuntimeStub, p4runtime, status
 
 _METADATA_BYTES: Final = 16 << 20  # a failed batch explains each of its updates in trailing metadata
 _BATCH: Final = 5_000
+_DIGEST_WAITS_NS: Final = 2_000_000
+_DIGEST_LIST: Final = 512
+_DIGEST_ACK_NS: Final = 1_000_000_000
 _CHANNEL_OPTIONS: Final = (
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
@@ -66,6 +70,17 @@ class Address:
         return grpc.insecure_channel(self.target, options=_CHANNEL_OPTIONS)
 
 
+def credentials(ca: str, certificate: str, key: str) -> grpc.ChannelCredentials | None:
+    """TLS by files of certificates, None without `ca`; raises `ProgramError` naming one that cannot be read."""
+    if not ca:
+        return None
+    try:
+        parts = [Path(name).read_bytes() if name else None for name in (ca, key, certificate)]
+    except OSError as error:
+        raise ProgramError(f"TLS file {error.filename}: {error.strerror}") from error
+    return grpc.ssl_channel_credentials(*parts)
+
+
 class Session:
     """Calls to a switch while this controller is primary (a `switch.Transport`)."""
 
@@ -102,6 +117,14 @@ class Session:
                 f"{self._address.target}: clone session {self._address.copies_session}"
                 f" to port {self._address.cpu_port} refused: {outcome.message}"
             )
+
+    def ensure_digests(self) -> None:
+        for digest in self._pipeline.p4info.digests:
+            outcome = self._write_digest(p4runtime.Update.INSERT, digest.preamble.id)
+            if outcome.code:
+                outcome = self._write_digest(p4runtime.Update.MODIFY, digest.preamble.id)
+            if outcome.code:
+                raise SwitchError(f"{self._address.target}: digest {digest.preamble.name}: {outcome.message}")
 
     def write(self, changes: Sequence[Change]) -> list[Outcome]:
         updates = [change.update for change in changes]
@@ -145,6 +168,15 @@ class Session:
         session.session_id = self._address.copies_session
         if kind != p4runtime.Update.DELETE:
             session.replicas.add(egress_port=self._address.cpu_port, instance=1)
+        return self._write_updates([update])[0]
+
+    def _write_digest(self, kind: int, digest_id: int) -> Outcome:
+        update = p4runtime.Update(type=kind)
+        update.entity.digest_entry.digest_id = digest_id
+        config = update.entity.digest_entry.config
+        config.max_timeout_ns = _DIGEST_WAITS_NS
+        config.max_list_size = _DIGEST_LIST
+        config.ack_timeout_ns = _DIGEST_ACK_NS
         return self._write_updates([update])[0]
 
     def _write_updates(self, updates: list[Any]) -> list[Outcome]:

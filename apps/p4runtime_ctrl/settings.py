@@ -33,6 +33,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """The compiled program, BMv2 JSON."""
     p4info: str
     """Its p4info in protobuf text format."""
+    telemetry: Literal["packet-in", "digest"] = "packet-in"
+    """Where record batches of packets come from: copied frames, or digests of the switch's parser."""
     batch: int = 1024
     """Most packets in one record batch."""
     linger_ms: float = 2.0
@@ -42,6 +44,11 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     copy_session: int = 1
     """Clone session that the program copies frames to."""
     cpu_port: int = 510
+    tls_ca: str = ""
+    """File of the certificate that signed the switches'; empty: no TLS."""
+    tls_certificate: str = ""
+    """Files of the controller's own certificate and key, where switches ask for them."""
+    tls_key: str = ""
     timeout_s: float = 5.0
     """A switch that does not answer a call for this long is given up and connected again."""
     counters_ms: int = 20

@@ -50,6 +50,9 @@ class Transport(Protocol):
     def ensure_copies(self) -> None:
         """Clone session towards the controller."""
 
+    def ensure_digests(self) -> None:
+        """Digests of the program are sent in lists."""
+
     def write(self, changes: Sequence[Change]) -> list[Outcome]:
         """One outcome for each change, in order; each succeeds or fails by itself."""
 
@@ -106,7 +109,8 @@ class Switch:
     ) -> None:
         self.name = name
         self.program = program
-        self.requests: tuple[Request, ...] = ()
+        self.requests: tuple[Request, ...] | None = None
+        """What the switch is to send; None while nobody has said: then it is left as it is."""
         self.fail = fail
         self._clock = clock
         self._classifier = Classifier(program)
@@ -147,6 +151,7 @@ class Switch:
         """Read, compare, write the difference in one batch."""
         report = BringUp(program_loaded=transport.ensure_program())
         transport.ensure_copies()
+        transport.ensure_digests()
         standing = [entry for entry in self._desired if is_standing(entry)]
         standing += [entry for entry in self._classifier.entries(()) if is_standing(entry)]
         read = [entry for entry in transport.read_entries() if not entry.is_const]
@@ -157,7 +162,7 @@ class Switch:
         changes = self._plan(present, telemetry)
         for change, outcome in zip(changes, transport.write(changes) if changes else [], strict=True):
             self._note(report, change, outcome)
-        self._telemetry = self._classifier.entries(self.requests)
+        self._telemetry = telemetry if self.requests is None else self._classifier.entries(self.requests)
         report.confirmations = self._confirm_pending(report)
         return report
 
@@ -191,7 +196,7 @@ class Switch:
         Raises `TelemetryError` or `EntryError` for requests that cannot be held: then nothing changes.
         """
         wanted = tuple(requests)
-        kept = [request for request in wanted if request in self.requests]
+        kept = [request for request in wanted if request in (self.requests or ())]
         desired = self._classifier.entries(wanted)
         self.requests = wanted
         if transport is None:
@@ -265,7 +270,9 @@ class Switch:
         plain = difference(self._desired, present)
         forward = [change for change in plain if entry_key(change.entry) in wires]
         others = [change for change in plain if entry_key(change.entry) not in wires]
-        packets = self._classifier.transition(telemetry, self.requests, kept=())
+        packets: list[Change] = []
+        if self.requests is not None:
+            packets = self._classifier.transition(telemetry, self.requests, kept=())
         return forward + others + packets if self.fail == "open" else others + packets + forward
 
     def _note(self, report: BringUp, change: Change, outcome: Outcome) -> None:

@@ -1,8 +1,8 @@
 """From the typed tree to something that runs: generated C where a compiler is, generated Python elsewhere.
 
-    tree ── layout (what is kept of a packet) ── simplify (masks that do nothing) ── control (nested blocks)
-                                                                     ├── python_code ── python_machine
-                                                                     └── c_code ─────── c_machine
+tree ── layout (what is kept of a packet) ── simplify (masks that do nothing) ── control (nested blocks)
+                                                                 ├── python_code ── python_machine
+                                                                 └── c_code ─────── c_machine
 """
 
 import logging

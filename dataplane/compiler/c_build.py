@@ -47,7 +47,9 @@ def library(text: str, declarations: str) -> tuple[Any, Any]:
     """
     cc = compiler()
     if cc is None:
-        raise CompilerError("no C compiler found (tried $CC, cc, gcc, clang): install one or use backend=python")
+        raise CompilerError(
+            "no C compiler found (tried $CC, cc, gcc, clang): install one or use backend=python"
+        )
     digest = hashlib.sha256("\0".join([text, cc, *FLAGS]).encode()).hexdigest()[:32]
     ffi = cffi.FFI()
     ffi.cdef(declarations)

@@ -8,9 +8,10 @@ from typing import Any
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
 from dataplane.compiler.c_build import library
-from dataplane.compiler.c_code import generate, key_places, table_words, words
-from dataplane.compiler.machine import Batch, KeyPlace, RangePart, Replicas
-from dataplane.tree import ArraySpec, Program, TableSpec
+from dataplane.compiler.c_code import generate
+from dataplane.compiler.c_statements import key_places, table_words, words
+from dataplane.compiler.machine import Batch, KeyPlace, Replicas, Row
+from dataplane.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
 _DECLARATIONS = """
 void *dp_new(uint32_t cpu_port);
@@ -65,7 +66,6 @@ class CTable:
         self._words, places = key_places(spec) if spec.keys else (0, ())
         self.place = KeyPlace(places)
         self._stride = stride
-        self._param_words = {}
         widths = {a.name: tuple(words(p.width) for p in a.params) for a in spec.actions}
         self._narrow = all(w == 1 for counts in widths.values() for w in counts)
         self._counts: dict[int, tuple[int, ...]] = {}
@@ -82,34 +82,24 @@ class CTable:
     def _key(self, value: int) -> Any:
         return self._ffi.new("uint64_t[]", [(value >> 64 * i) & _WORD for i in range(self._words)] or [0])
 
-    def insert(
-        self,
-        slot: int,
-        value: int,
-        mask: int,
-        ranges: tuple[RangePart, ...],
-        rank: int,
-        action: int,
-        params: Sequence[int],
-        now_us: int,
-    ) -> None:
+    def insert(self, slot: int, row: Row, now_us: int) -> None:
         parts = self._ffi.NULL
-        if ranges:
+        if row.ranges:
             flat = chain.from_iterable(
-                (r.shift // 64, r.shift % 64, (1 << r.width) - 1, r.low, r.high) for r in ranges
+                (r.shift // 64, r.shift % 64, (1 << r.width) - 1, r.low, r.high) for r in row.ranges
             )
             parts = self._ffi.new("uint64_t[]", list(flat))
         self._lib.dp_insert(
             self._handle,
             self._number,
             slot,
-            self._key(value),
-            self._key(mask),
-            len(ranges),
+            self._key(row.value),
+            self._key(row.mask),
+            len(row.ranges),
             parts,
-            rank,
-            action,
-            self._params(action, params),
+            row.rank,
+            row.action,
+            self._params(row.action, row.params),
             now_us,
         )
 
@@ -224,10 +214,10 @@ class CMachine:
             for number, spec in program.digests.items()
         }
 
-    def _know_actions(self, program: Program, node: object) -> None:
-        table = self.tables.get(getattr(node, "name", ""))
-        if table is not None:
-            for number in getattr(node, "actions", ()):
+    def _know_actions(self, program: Program, node: Node) -> None:
+        table = self.tables.get(node.name)
+        if table is not None and isinstance(node, TableNode):
+            for number in node.actions:
                 params = program.actions[number].spec.params
                 table.know_action(number, tuple(words(p.width) for p in params))
 

@@ -24,7 +24,6 @@ from dataplane.tree import (
     TableNode,
 )
 
-
 NO_ACTION = -1
 """What runs on a miss in a table without default action."""
 
@@ -148,6 +147,7 @@ class Generator(ABC):
     @abstractmethod
     def nothing(self) -> None: ...
 
+    @abstractmethod
     def begin_action(self, number: int) -> None:
         """The body of this action follows."""
 

@@ -121,8 +121,8 @@ def make(program: Program) -> Layout:
             for header in group:
                 table[header] = everything
     layout = Layout()
-    for name, header in program.headers.items():
-        fields = header.type.fields
+    for name, instance in program.headers.items():
+        fields = instance.type.fields
         layout.fields[name] = tuple(f for f in fields if f.name in used[name] and not f.varbit)
         layout.written[name] = tuple(f for f in fields if f.name in written[name] and not f.varbit)
     layout.packet_headers = tuple(n for n, h in program.headers.items() if not h.metadata)

@@ -6,7 +6,7 @@ have checked every number; tables are addressed by slots that `tables.Table` han
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 Replicas = tuple[tuple[int, int], ...]
 """(port, instance) of each copy."""
@@ -39,23 +39,23 @@ class RangePart:
     high: int
 
 
+class Row(NamedTuple):
+    """An entry as the back ends look it up: largest rank wins, then the lowest slot."""
+
+    value: int
+    mask: int
+    ranges: tuple[RangePart, ...]
+    rank: int
+    action: int
+    params: tuple[int, ...]
+
+
 class TableStore(Protocol):
     """Entries of one table, by slot."""
 
     place: KeyPlace
 
-    def insert(
-        self,
-        slot: int,
-        value: int,
-        mask: int,
-        ranges: tuple[RangePart, ...],
-        rank: int,
-        action: int,
-        params: Sequence[int],
-        now_us: int,
-    ) -> None:
-        """Largest rank wins, then the lowest slot."""
+    def insert(self, slot: int, row: Row, now_us: int) -> None: ...
 
     def replace(self, slot: int, action: int, params: Sequence[int]) -> None: ...
 
@@ -100,10 +100,20 @@ class Machine(Protocol):
     """A program with its state, ready to run."""
 
     backend: str
-    tables: Mapping[str, TableStore]
-    counters: Mapping[str, CounterStore]
-    meters: Mapping[str, MeterStore]
-    registers: Mapping[str, RegisterStore]
+    text: str
+    """What was generated."""
+
+    @property
+    def tables(self) -> Mapping[str, TableStore]: ...
+
+    @property
+    def counters(self) -> Mapping[str, CounterStore]: ...
+
+    @property
+    def meters(self) -> Mapping[str, MeterStore]: ...
+
+    @property
+    def registers(self) -> Mapping[str, RegisterStore]: ...
 
     def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> Batch: ...
 

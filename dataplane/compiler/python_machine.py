@@ -13,7 +13,8 @@ from dataplane import externs
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
 from dataplane.compiler.machine import Batch, Replicas
-from dataplane.compiler.python_code import NO_TRUNCATION, Slots, generate
+from dataplane.compiler.python_code import generate
+from dataplane.compiler.python_statements import NO_TRUNCATION, Slots
 from dataplane.compiler.python_tables import (
     PythonCounters,
     PythonMeters,

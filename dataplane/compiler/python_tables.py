@@ -8,7 +8,7 @@ from bisect import insort
 from collections.abc import Sequence
 from operator import attrgetter
 
-from dataplane.compiler.machine import KeyPlace, RangePart
+from dataplane.compiler.machine import KeyPlace, RangePart, Row
 from dataplane.externs import Meter
 from dataplane.tree import ArraySpec, TableSpec
 
@@ -81,22 +81,13 @@ class PythonTable:
                     break
         return found
 
-    def insert(
-        self,
-        slot: int,
-        value: int,
-        mask: int,
-        ranges: tuple[RangePart, ...],
-        rank: int,
-        action: int,
-        params: Sequence[int],
-        now_us: int,
-    ) -> None:
-        entry = Entry(action, tuple(params))
+    def insert(self, slot: int, row: Row, now_us: int) -> None:
+        entry = Entry(row.action, row.params)
         entry.meter = Meter(per_byte=self._per_byte)
         entry.hit = now_us
-        entry.value, entry.mask, entry.ranges = value & mask, mask, ranges
-        entry.order = (-rank, slot)
+        mask = row.mask
+        entry.value, entry.mask, entry.ranges = row.value & mask, mask, row.ranges
+        entry.order = (-row.rank, slot)
         self._slots[slot] = entry
         group = self._groups.get(mask)
         if group is None:
@@ -147,10 +138,7 @@ class PythonTable:
 
 
 def _within(key: int, ranges: tuple[RangePart, ...]) -> bool:
-    for part in ranges:
-        if not part.low <= (key >> part.shift) & ((1 << part.width) - 1) <= part.high:
-            return False
-    return True
+    return all(r.low <= (key >> r.shift) & ((1 << r.width) - 1) <= r.high for r in ranges)
 
 
 class PythonCounters:

@@ -260,7 +260,9 @@ typedef struct {
 typedef struct {
     i64 best;
     u32 *heads, size, count, used;
-    u64 *mask;
+    /* the key words that this mask looks at, and the bits of them in which all entries agree */
+    u32 n, at[KEY_WORDS];
+    u64 mask[KEY_WORDS], agreed[KEY_WORDS], value[KEY_WORDS];
 } group;
 
 typedef struct {
@@ -272,13 +274,20 @@ typedef struct {
     u32 *list;
 } table;
 
-INLINE u64 key_hash(const u64 *k, const u64 *mask, u32 words) {
+INLINE u64 key_hash(const u64 *k, const group *g) {
     u64 h = 0x9E3779B97F4A7C15ull;
-    for (u32 i = 0; i < words; i++) {
-        h = (h ^ (k[i] & mask[i])) * 0xD6E8FEB86659FD93ull;
+    for (u32 i = 0; i < g->n; i++) {
+        h = (h ^ (k[g->at[i]] & g->mask[i])) * 0xD6E8FEB86659FD93ull;
         h ^= h >> 32;
     }
     return h;
+}
+
+/* could any entry of the group have these bits? */
+INLINE int group_may(const group *g, const u64 *k) {
+    u64 d = 0;
+    for (u32 i = 0; i < g->n; i++) d |= (k[g->at[i]] ^ g->value[i]) & g->agreed[i];
+    return !d;
 }
 
 INLINE int in_ranges(const entry *e, const u64 *k) {
@@ -295,13 +304,14 @@ INLINE entry *table_find(const table *t, const u64 *k, u32 words) {
     for (u32 i = 0; i < t->listed; i++) {
         const group *g = &t->group[t->list[i]];
         if (found && g->best > found->order) break;
-        u32 at = g->heads[key_hash(k, g->mask, words) & (g->size - 1)];
+        if (!group_may(g, k)) continue;
+        u32 at = g->heads[key_hash(k, g) & (g->size - 1)];
         for (; at != NONE; at = t->entries[at].next) {
             entry *e = &t->entries[at];
             if (found && e->order > found->order) break;
             const u64 *v = t->keys + (u64)at * words;
             u64 difference = 0;
-            for (u32 w = 0; w < words; w++) difference |= (k[w] & g->mask[w]) ^ v[w];
+            for (u32 w = 0; w < g->n; w++) difference |= (k[g->at[w]] & g->mask[w]) ^ v[g->at[w]];
             if (!difference && in_ranges(e, k)) {
                 found = e;
                 break;
@@ -324,7 +334,7 @@ static void table_grow(table *t, u32 slot) {
 
 static void group_link(table *t, group *g, u32 slot) {
     entry *e = &t->entries[slot];
-    u32 *at = &g->heads[key_hash(t->keys + (u64)slot * t->words, g->mask, t->words) & (g->size - 1)];
+    u32 *at = &g->heads[key_hash(t->keys + (u64)slot * t->words, g) & (g->size - 1)];
     while (*at != NONE && t->entries[*at].order < e->order) at = &t->entries[*at].next;
     e->next = *at;
     *at = slot;
@@ -351,11 +361,20 @@ static void table_list(table *t) {
     t->listed = n;
 }
 
-static u32 table_group(table *t, const u64 *mask) {
+static int same_mask(const group *g, const u64 *mask, u32 words) {
+    u32 j = 0;
+    for (u32 i = 0; i < words; i++) {
+        u64 own = j < g->n && g->at[j] == i ? g->mask[j++] : 0;
+        if (own != mask[i]) return 0;
+    }
+    return 1;
+}
+
+static u32 table_group(table *t, const u64 *mask, const u64 *value) {
     u32 free = t->groups;
     for (u32 i = 0; i < t->groups; i++) {
         if (!t->group[i].used) free = i;
-        else if (!memcmp(t->group[i].mask, mask, t->words * 8)) return i;
+        else if (same_mask(&t->group[i], mask, t->words)) return i;
     }
     if (free == t->groups) {
         t->group = realloc(t->group, (t->groups + 1) * sizeof(group));
@@ -365,8 +384,13 @@ static u32 table_group(table *t, const u64 *mask) {
     g->used = 1;
     g->count = 0;
     g->best = INT64_MAX;
-    g->mask = realloc(g->mask, t->words * 8 + 8);
-    memcpy(g->mask, mask, t->words * 8);
+    g->n = 0;
+    for (u32 i = 0; i < t->words; i++) {
+        if (!mask[i]) continue;
+        g->at[g->n] = i;
+        g->mask[g->n] = g->agreed[g->n] = mask[i];
+        g->value[g->n++] = value[i] & mask[i];
+    }
     group_resize(t, free, 16);
     return free;
 }
@@ -392,9 +416,10 @@ PLAIN void table_insert(table *t, u32 slot, const u64 *value, const u64 *mask, u
     }
     for (u32 i = 0; i < t->words; i++) t->keys[(u64)slot * t->words + i] = value[i] & mask[i];
     memcpy(t->params + (u64)slot * t->stride, params, t->stride * 8);
-    e->group = table_group(t, mask);
+    e->group = table_group(t, mask, value);
     e->used = 1;
     group *g = &t->group[e->group];
+    for (u32 i = 0; i < g->n; i++) g->agreed[i] &= ~(value[g->at[i]] ^ g->value[i]);
     g->count++;
     if (g->count > g->size) group_resize(t, e->group, g->size * 4);
     else group_link(t, g, slot);
@@ -407,7 +432,7 @@ PLAIN void table_insert(table *t, u32 slot, const u64 *value, const u64 *mask, u
 PLAIN void table_remove(table *t, u32 slot) {
     entry *e = &t->entries[slot];
     group *g = &t->group[e->group];
-    u32 *at = &g->heads[key_hash(t->keys + (u64)slot * t->words, g->mask, t->words) & (g->size - 1)];
+    u32 *at = &g->heads[key_hash(t->keys + (u64)slot * t->words, g) & (g->size - 1)];
     while (*at != slot) at = &t->entries[*at].next;
     *at = e->next;
     e->used = 0;
@@ -428,10 +453,7 @@ PLAIN void table_free(table *t) {
         if (t->entries[i].used) free(t->entries[i].range);
         free(t->entries[i].meter);
     }
-    for (u32 i = 0; i < t->groups; i++) {
-        free(t->group[i].heads);
-        free(t->group[i].mask);
-    }
+    for (u32 i = 0; i < t->groups; i++) free(t->group[i].heads);
     free(t->entries);
     free(t->keys);
     free(t->params);

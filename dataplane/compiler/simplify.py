@@ -117,7 +117,8 @@ def _arithmetic(op: str, a: Bounds, b: Bounds) -> Bounds:
 def _shift(op: str, a: Bounds, b: Bounds) -> Bounds:
     least, most = min(b.low, _LARGEST_SHIFT), min(b.high, _LARGEST_SHIFT)
     if op == ">>":
-        return Bounds(a.low >> (least if a.low >= 0 else 0), max(a.high >> least, 0))
+        ends = [a.low >> least, a.low >> most, a.high >> least, a.high >> most]
+        return Bounds(min(ends), max(ends))
     return Bounds(min(a.low << most, a.low << least), max(a.high << most, a.high << least))
 
 

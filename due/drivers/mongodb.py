@@ -26,7 +26,8 @@ from pymongo.errors import BulkWriteError, ConnectionFailure, ExecutionTimeout, 
 from pymongo.uri_parser import parse_uri
 
 from due.codec import pack, unpack
-from due.drivers.query import Condition, Query, parse
+from due.drivers.query import Query, parse
+from due.drivers.query_tree import Condition
 from due.errors import ArchiveUnavailable, BackendError, InvalidOption
 from due.keys import ANY, Key
 from due.messages import Item, PackedFrame

@@ -6,7 +6,7 @@ key and time, then `query.matches` decides item by item.  URL: `sqlite:///folder
 """
 
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from heapq import merge
 from itertools import groupby
 from operator import attrgetter
@@ -15,13 +15,15 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from due.codec import decode_value, encode_value, unpack
-from due.drivers.query import Condition, Query, parse
+from due.drivers.query import Query, parse
+from due.drivers.query_tree import Condition
 from due.drivers.sqlite_file import SqliteFile
 from due.errors import InvalidOption
 from due.messages import Item, PackedFrame
 
 _VALUE, _FRAME = 0, 1
 _ROW_OVERHEAD = 200
+_PRUNE_ROWS = 5000
 _SYNCHRONOUS = ("normal", "full")
 _INSERT = "INSERT INTO frames VALUES(NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _SELECT = (
@@ -30,7 +32,8 @@ _SELECT = (
 _OVERLAP = """SELECT first_sequence, last_sequence FROM frames
 WHERE source_id = ? AND key_id = ? AND last_sequence >= ? ORDER BY last_sequence LIMIT 1"""
 _WIDEN = """UPDATE keys SET time_span = max(time_span, ?), event_span = max(event_span, ?) WHERE id = ?"""
-_OLDER = " FROM frames WHERE key_id = ? AND first_time < ? AND last_time < ?"
+_OLDER = "SELECT id, count FROM frames WHERE key_id = ? AND first_time < ? AND last_time < ? LIMIT ?"
+_DELETE = "DELETE FROM frames WHERE id = ?"
 _OLDEST = """SELECT first_time, id, count, length(payload) FROM frames WHERE key_id = ? ORDER BY first_time"""
 
 _by_identity = attrgetter("instance_id", "key", "sequence")
@@ -99,13 +102,24 @@ class SqliteArchive:
 
     def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
         """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
-        with self._file.writing() as connection:
-            deleted = 0 if before is None else _prune_older(connection, before)
-            if max_bytes is not None:
-                deleted += _prune_larger(connection, max_bytes)
+        deleted = 0
+        if before is not None:
+            deleted += self._in_steps(lambda connection: _prune_older(connection, before))
+        if max_bytes is not None:
+            deleted += self._in_steps(lambda connection: _prune_larger(connection, max_bytes))
         if deleted:
             self._file.shrink()
         return deleted
+
+    def _in_steps(self, step: Callable[[sqlite3.Connection], int]) -> int:
+        """Many short transactions, so that writers in other processes get their turn."""
+        deleted = 0
+        while True:
+            with self._file.writing() as connection:
+                count = step(connection)
+            if not count:
+                return deleted
+            deleted += count
 
     def close(self) -> None:
         """Close the file; further calls raise BackendError."""
@@ -178,7 +192,7 @@ class SqliteArchive:
     def _items(self, row: tuple[Any, ...], query: Query) -> Iterator[Item]:
         key_id, source_id, kind, sequence, time, event, payload = row
         if kind == _FRAME:
-            yield from filter(query.matches, unpack(payload))
+            yield from _matching(unpack(payload), query)
             return
         (key,) = self._file.keys.entries[key_id]
         app, instance = self._file.sources.entries[source_id]
@@ -189,6 +203,14 @@ class SqliteArchive:
                 yield item
 
 
+def _matching(items: list[Item], query: Query) -> Iterator[Item]:
+    """Of one key that matches already."""
+    if query.time_range is None:
+        return filter(query.matches, items)
+    first, last = query.time_range
+    return (item for item in items if first <= item.timestamp <= last)
+
+
 def _overlap(connection: sqlite3.Connection, row: _Row) -> tuple[int, int] | None:
     """First and last sequence number of a stored row that shares items with this one."""
     found = connection.execute(_OVERLAP, (row.source, row.key, row.first_sequence)).fetchone()
@@ -196,30 +218,27 @@ def _overlap(connection: sqlite3.Connection, row: _Row) -> tuple[int, int] | Non
 
 
 def _prune_older(connection: sqlite3.Connection, before: int) -> int:
-    deleted = 0
     for (key,) in connection.execute("SELECT id FROM keys").fetchall():
-        arguments = (key, before, before)
-        deleted += connection.execute("SELECT total(count)" + _OLDER, arguments).fetchone()[0]
-        connection.execute("DELETE" + _OLDER, arguments)
-    return int(deleted)
+        old = connection.execute(_OLDER, (key, before, before, _PRUNE_ROWS)).fetchall()
+        if old:
+            connection.executemany(_DELETE, [(number,) for number, _ in old])
+            return sum(count for _, count in old)
+    return 0
 
 
 def _prune_larger(connection: sqlite3.Connection, max_bytes: int) -> int:
     excess = _used(connection) - max_bytes
-    deleted = 0
-    while excess > 0:
-        keys = connection.execute("SELECT id FROM keys").fetchall()
-        ids = []
-        for _, number, count, size in merge(*(connection.execute(_OLDEST, key) for key in keys)):
-            ids.append((number,))
-            deleted += count
-            excess -= size + _ROW_OVERHEAD
-            if excess <= 0:
-                break
-        if not ids:
+    if excess <= 0:
+        return 0
+    keys = connection.execute("SELECT id FROM keys").fetchall()
+    deleted, ids = 0, []
+    for _, number, count, size in merge(*(connection.execute(_OLDEST, key) for key in keys)):
+        ids.append((number,))
+        deleted += count
+        excess -= size + _ROW_OVERHEAD
+        if excess <= 0 or len(ids) >= _PRUNE_ROWS:
             break
-        connection.executemany("DELETE FROM frames WHERE id = ?", ids)
-        excess = _used(connection) - max_bytes
+    connection.executemany(_DELETE, ids)
     return deleted
 
 

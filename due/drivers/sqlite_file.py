@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from due.drivers.query import Condition, Query
+from due.drivers.query import Query
+from due.drivers.query_tree import Condition
 from due.errors import ArchiveUnavailable, BackendError
 from due.messages import Item
 

@@ -16,6 +16,9 @@ FIN, SYN, RST, PSH, ACK = 0x01, 0x02, 0x04, 0x08, 0x10
 MIN_FRAME: Final = 60
 """Shortest Ethernet frame as captures show it, without the check sequence."""
 
+_LINUX_SYN: Final = bytes.fromhex("020405b4 0402 080a0000000100000000 01 030307")
+"""Segment size, selective acknowledgement, time stamps, window scale."""
+
 _IPV4 = struct.Struct("!BBHHHBBH4s4s")
 _TCP = struct.Struct("!HHIIBBHHH")
 _ARP = struct.Struct("!HHBBH6s4s6s4s")
@@ -88,6 +91,12 @@ def tcp(
     head = _TCP.pack(sport, dport, seq, ack, offset, flags, window, 0, 0) + options + payload
     total = checksum(_pseudo(src, dst, TCP, len(head) + more) + head)
     return head[:16] + total.to_bytes(2, "big") + head[18:]
+
+
+def syn_options(size: int) -> bytes:
+    """Options of a SYN in `size` bytes (a multiple of four, at most 40): as Linux sends them where 20 fit."""
+    chosen = _LINUX_SYN if size >= len(_LINUX_SYN) else _LINUX_SYN[:4] if size >= 4 else b""
+    return chosen.ljust(size, b"\0")
 
 
 def icmp(kind: int, code: int, rest: bytes, payload: bytes = b"") -> bytes:

@@ -16,7 +16,6 @@ from sdnator.captures import CaptureWriter
 from sdnator.datasets import frames
 from sdnator.tshark_tsv import TYPE_LOOPBACK, TsharkRow, TsvError, read_rows
 
-_MSS = b"\x02\x04\x05\xb4"
 _STP_GROUP = 0x0180C2000000
 _STP, _CDP = b"\x42\x42\x03", b"\xaa\xaa\x03\x00\x00\x0c\x20\x00"
 _ALL_NODES = 0xFF02_0000_0000_0000_0000_0000_0000_0001
@@ -128,9 +127,9 @@ def _ipv4(row: TsharkRow) -> bytes:
 def _tcp(row: TsharkRow, src: bytes, dst: bytes, room: int) -> bytes:
     ports = (row.tcp_sport, row.tcp_dport)
     if row.length == frames.MIN_FRAME:  # six bytes of it are options or padding
-        return frames.tcp(src, dst, *ports, frames.SYN, options=_MSS)
+        return frames.tcp(src, dst, *ports, frames.SYN, options=frames.syn_options(4))
     if 24 <= room <= 60 and room % 4 == 0:
-        return frames.tcp(src, dst, *ports, frames.SYN, options=_MSS + b"\1" * (room - 24))
+        return frames.tcp(src, dst, *ports, frames.SYN, options=frames.syn_options(room - 20))
     return frames.tcp(src, dst, *ports, frames.ACK, payload=bytes(max(room - 20, 0)))
 
 
@@ -145,7 +144,7 @@ def _icmp(row: TsharkRow, src: bytes, dst: bytes, room: int) -> bytes:
     if row.tcp_sport >= 0:
         proto, ports = frames.TCP, (row.tcp_sport, row.tcp_dport)
         options = max(min(quoted_room - 20, 40), 0) & ~3
-        inner = frames.tcp(dst, src, *ports, frames.SYN, options=b"\1" * options)
+        inner = frames.tcp(dst, src, *ports, frames.SYN, options=frames.syn_options(options))
     else:
         proto, ports = frames.UDP, (row.udp_sport, row.udp_dport)
         inner = frames.udp(dst, src, *ports, bytes(max(quoted_room - 8, 0)))

@@ -64,16 +64,17 @@ def splice(
                 writer.write(frame.time_ns + offset, frame.data, frame.length)
                 if writer.packets % 1_000 == 0:
                     progress(writer.packets)
-    labels = [part.labels for part in parts]
-    write_labels(
-        labels_path(out),
-        Labels.of(
-            [flag for label in labels for flag in label.attack.tolist()],
-            [label.attacker(index) for label in labels for index in range(len(label))],
-        ),
-    )
+        write_labels(labels_path(out), _joined([part.labels for part in parts]))
     cuts = tuple(part.cut for part in parts if part.cut is not None)
-    return Spliced(Path(out), labels_path(out), len(labels[0]), len(labels[1]), shift, cuts)
+    first, second = (len(part.labels) for part in parts)
+    return Spliced(Path(out), labels_path(out), first, second, shift, cuts)
+
+
+def _joined(parts: list[Labels]) -> Labels:
+    return Labels.of(
+        [flag for labels in parts for flag in labels.attack.tolist()],
+        [labels.attacker(index) for labels in parts for index in range(len(labels))],
+    )
 
 
 class _Part:

@@ -114,7 +114,7 @@ def _udp(sent: Sent, snap: int) -> bytes:
 def _tcp(sent: Sent, snap: int) -> bytes:
     room = sent.length - 34
     syn = bool(sent.flags & frames.SYN)
-    options = bytes.fromhex("020405b4") + b"\1" * min((room - 24) & ~3, 36) if syn and room >= 24 else b""
+    options = frames.syn_options(min((room - 20) & ~3, 40)) if syn and room >= 24 else b""
     size = max(room - 20 - len(options), 0) if sent.length > frames.MIN_FRAME else len(sent.payload)
     payload = sent.payload[:size].ljust(min(size, max(snap - 54, 0)), b"\0")
     more = size - len(payload)

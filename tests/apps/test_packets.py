@@ -3,6 +3,7 @@
 import gzip
 import socket
 import struct
+import subprocess
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apps.packets import PACKET_COLUMNS, read_frames
+from tests.apps.kitsune.traffic import FIELDS as TSHARK_FIELDS
 from tests.naive.frames import read_frame
-from tests.requirements import shared_data
+from tests.requirements import optional_program, shared_data
 
 MACS = bytes.fromhex("0200000000020200000000 01".replace(" ", ""))
 CAPTURES = ("synflood_one_source", "ssh_guessing", "ftp_bruteforce", "synflood_spoofed")
@@ -135,6 +137,23 @@ def test_equals_tshark_on_the_real_capture(pad):
         next(text)
         for number in range(len(frames)):
             assert tshark_row(batch, number) == next(text).rstrip("\n").split("\t")
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_equals_an_installed_tshark(name):
+    tshark = optional_program("tshark")
+    path = shared_data(f"captures/{name}.pcap")
+    fields = [part for field in TSHARK_FIELDS for part in ("-e", field)]
+    options = ["-T", "fields", "-E", "header=n", "-E", "occurrence=f", *fields]
+    done = subprocess.run(
+        [tshark, "-n", "-r", str(path), *options], capture_output=True, text=True, check=True
+    )
+    times, lengths, frames = zip(*pcap(path), strict=True)
+    batch = read(frames, lengths, times)
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(frames)
+    for number, line in enumerate(lines):
+        assert tshark_row(batch, number) == line.split("\t")
 
 
 @pytest.mark.parametrize("name", CAPTURES)

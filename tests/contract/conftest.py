@@ -66,8 +66,9 @@ def bare(connect) -> Controller:
 
 
 @pytest.fixture
-def controller(bare, config) -> Controller:
+def controller(target, bare, config) -> Controller:
     """A primary on a switch with the feature program, freshly set and empty."""
+    target.drain()
     for entity in _replications(bare):
         bare.write(entity)
     bare.set_pipeline(config)

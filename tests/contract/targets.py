@@ -13,7 +13,7 @@ from dataplane.bmv2 import Bmv2
 from dataplane.switch import Backend
 from tests.dataplane.embedded import Embedded
 
-_WAIT_S = 10.0
+_WAIT_S = 5.0
 _QUIET_S = 0.15
 
 
@@ -26,6 +26,7 @@ class Target(Protocol):
     def inject(self, port: int, *frames: bytes) -> None: ...
     def sent(self, port: int, count: int) -> list[bytes]: ...
     def quiet(self, port: int) -> bool: ...
+    def drain(self) -> None: ...
     def close(self) -> None: ...
 
 
@@ -49,6 +50,10 @@ class EmbeddedTarget:
     def quiet(self, port: int) -> bool:
         time.sleep(_QUIET_S)
         return not self._switch.memory[port].outgoing
+
+    def drain(self) -> None:
+        for port in self._switch.memory.values():
+            port.outgoing.clear()
 
     def close(self) -> None:
         self._switch.close()
@@ -86,23 +91,35 @@ class Bmv2Target:
         self._frames: defaultdict[int, queue.SimpleQueue[bytes]] = defaultdict(queue.SimpleQueue)
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._channel = grpc.insecure_channel(self._switch.packet_address)
-        call = self._channel.stream_stream(
+        self._stream = self._channel.stream_stream(
             "/p4.bm.DataplaneInterface/PacketStream",
             request_serializer=self._request.SerializeToString,
             response_deserializer=response.FromString,
         )
-        self._call = call(iter(self._requests.get, None), wait_for_ready=True)
-        self._thread = threading.Thread(target=self._receive, daemon=True)
-        self._thread.start()
+        self._call: Any = None
 
-    def _receive(self) -> None:
+    def _open(self) -> None:
+        """BMv2 takes packets only some time after its first pipeline was set."""
+        deadline = time.monotonic() + _WAIT_S
+        while time.monotonic() < deadline:
+            self._requests = queue.SimpleQueue()
+            self._call = self._stream(iter(self._requests.get, None), wait_for_ready=True)
+            time.sleep(_QUIET_S)
+            if not self._call.done():
+                threading.Thread(target=self._receive, args=(self._call,), daemon=True).start()
+                return
+            self._requests.put(None)
+
+    def _receive(self, call: Any) -> None:
         try:
-            for response in self._call:
+            for response in call:
                 self._frames[response.port].put(response.packet)
         except grpc.RpcError:
             return
 
     def inject(self, port: int, *frames: bytes) -> None:
+        if self._call is None:
+            self._open()
         for frame in frames:
             self._requests.put(self._request(device_id=1, port=port, packet=frame))
 
@@ -119,9 +136,12 @@ class Bmv2Target:
         time.sleep(_QUIET_S)
         return self._frames[port].empty()
 
+    def drain(self) -> None:
+        self._frames.clear()
+
     def close(self) -> None:
         self._requests.put(None)
-        self._call.cancel()
-        self._thread.join(5)
+        if self._call is not None:
+            self._call.cancel()
         self._channel.close()
         self._switch.close()

@@ -1,5 +1,6 @@
 """The HTTP API shows the registry, reads the archive and live data, and refuses other sites."""
 
+import asyncio
 import json
 import threading
 import time
@@ -12,10 +13,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from coordinator import api
 from coordinator.api import Api, Northbound, application
 from coordinator.openapi import document
 from coordinator.registry import Registry
-from due import Capability, Engine, Interest, Options
+from due import Capability, Engine, Interest, Item, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from due.membership import Heartbeat, Registration
 
@@ -60,7 +62,14 @@ def registry() -> Registry:
 @pytest.fixture
 def north(engine: Engine, registry: Registry) -> Northbound:
     def health() -> dict[str, Any]:
-        counts = ("registrations", "heartbeats", "misunderstood", "assignments_sent", "failovers")
+        counts = (
+            "registrations",
+            "heartbeats",
+            "misunderstood",
+            "assignments_sent",
+            "failovers",
+            "retention_deleted",
+        )
         return {"leading": True, **dict.fromkeys(counts, 3)}
 
     return Northbound(engine, registry, threading.Lock(), health, lambda: {"p": {"health": b"x"}}, EVENTS)
@@ -68,11 +77,11 @@ def north(engine: Engine, registry: Registry) -> Northbound:
 
 @pytest.fixture
 def client(north: Northbound) -> Iterator[httpx.Client]:
-    api = Api(north, "127.0.0.1", 0)
-    api.start()
-    with httpx.Client(base_url=api.url, trust_env=False) as client:
+    server = Api(north, "127.0.0.1", 0)
+    server.start()
+    with httpx.Client(base_url=server.url, trust_env=False) as client:
         yield client
-    api.stop()
+    server.stop()
 
 
 def observed(client: httpx.Client, key: str) -> str:
@@ -123,11 +132,12 @@ def test_get_reads_the_archive(client: httpx.Client, engine: Engine) -> None:
         engine.write("get.it", {"n": n, "nan": float("nan"), "bytes": b"x"})
     answer = client.get("/get", params={"key": "get.*", "limit": 2}).json()
     assert [one["value"]["n"] for one in answer["items"]] == [3, 4]
-    assert answer["omitted"] == 3
+    assert answer["more"] is True
     assert answer["items"][0]["value"]["nan"] == "nan"
     query = json.dumps({"value.n": {"$lt": 2}})
     answer = client.get("/get", params={"key": "get.it", "query": query}).json()
     assert [one["value"]["n"] for one in answer["items"]] == [0, 1]
+    assert answer["more"] is False
     since = answer["items"][1]["timestamp"]
     answer = client.get("/get", params={"key": "get.it", "since": since, "until": since + 1}).json()
     assert [one["value"]["n"] for one in answer["items"]] == [1]
@@ -157,6 +167,18 @@ def test_observe_sends_items_as_they_come(client: httpx.Client, engine: Engine) 
         done.set()
         writer.join()
     assert (received["dataKey"], received["value"]) == ("live.x", 42)
+
+
+def test_a_slow_reader_misses_the_oldest_and_is_told() -> None:
+    async def scenario() -> tuple[list[Item], int]:
+        feed = api._Feed(asyncio.get_running_loop())
+        for n in range(1500):
+            feed.put(Item("a", n, n, n, "app", "i", n))
+        return await feed.take()
+
+    items, missed = asyncio.run(scenario())
+    assert missed == 500
+    assert [item.value for item in items] == list(range(500, 1500))
 
 
 def test_observe_explains_a_wrong_key(client: httpx.Client) -> None:

@@ -49,6 +49,9 @@ class World:
         self.told |= {message.app_id: message for message in sent}
         return sent
 
+    def wanted(self, app: str) -> list[str]:
+        return [assignment.key for assignment in self.told[app].assignments]
+
     def states(self) -> dict[str, str]:
         return {one.registration.instance_id: state.value for one, state in self.registry.instances()}
 
@@ -61,7 +64,7 @@ def first(candidates: Sequence[Candidate]) -> Candidate:
 def test_joining_is_answered_with_what_is_wanted() -> None:
     world = World()
     world.join("p", "p1", capabilities=(Capability("a.b", 10.0),))
-    assert len(world.told["p"].assignments) == 0
+    assert world.wanted("p") == []
     assert world.told["p"].active == "p1"
     assert world.told["p"].revisions == {"p1": 1}
     world.join("c", "c1", interests=(Interest("a.*", 5.0),))
@@ -74,7 +77,7 @@ def test_leaving_withdraws_what_was_wanted() -> None:
     world.join("p", "p1", capabilities=(Capability("a.b"),))
     world.join("c", "c1", interests=(Interest("a.b"),))
     world.beat("c", "c1", state="offline")
-    assert world.told["p"].assignments == ()
+    assert world.wanted("p") == []
     assert world.states() == {"p1": "active", "c1": "offline"}
 
 
@@ -83,7 +86,7 @@ def test_a_changed_declaration_is_matched_anew() -> None:
     world.join("p", "p1", capabilities=(Capability("a.b"), Capability("x")))
     world.join("c", "c1", interests=(Interest("a.b"),))
     world.join("c", "c1", revision=2, interests=(Interest("x"),))
-    assert [a.key for a in world.told["p"].assignments] == ["x"]
+    assert world.wanted("p") == ["x"]
     assert world.told["c"].revisions == {"c1": 2}
 
 
@@ -139,6 +142,16 @@ def test_every_epoch_is_above_the_last() -> None:
         epochs.append(world.told["app"].epoch)
         world.beat("app", f"i{n}", state="offline")
     assert epochs == sorted(set(epochs))
+
+
+def test_an_instance_that_knows_a_later_epoch_is_told_in_that_epoch() -> None:
+    world = World()
+    world.join("app", "i1")
+    world.beat("app", "i1", epoch=5000)
+    assert world.told["app"].epoch >= 5000
+    version = world.told["app"].version
+    world.beat("app", "i1")
+    assert world.told["app"].version == version
 
 
 def test_an_unknown_instance_is_asked_to_register() -> None:
@@ -231,12 +244,12 @@ def test_the_only_instance_keeps_its_place_over_an_outage() -> None:
     epoch = world.told["app"].epoch
     world.run(2.0, [("p", "p1")])
     assert world.states()["i1"] == "unresponsive"
-    assert len(world.told["p"].assignments) == 0
+    assert world.wanted("p") == []
     world.beat("app", "i1")
     world.send()
     assert world.states()["i1"] == "active"
     assert world.told["app"].epoch == epoch
-    assert [a.key for a in world.told["p"].assignments] == ["a"]
+    assert world.wanted("p") == ["a"]
 
 
 def test_who_is_gone_for_long_is_forgotten_but_its_epoch_is_not() -> None:

@@ -17,7 +17,7 @@ _OPTIONS = (
     ("grpc.max_metadata_size", 16 << 20),
     ("grpc.absolute_max_metadata_size", 16 << 20),
 )
-TIMEOUT_S = 20.0
+TIMEOUT_S = 10.0
 
 
 def program_config(program: Path) -> Any:
@@ -42,6 +42,11 @@ class Controller:
         self.digests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.others: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.arbitrations: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.sinks: dict[str, Any] = {
+            "packet": self.packets,
+            "digest": self.digests,
+            "arbitration": self.arbitrations,
+        }
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._call = self.stub.StreamChannel(iter(self._requests.get, None))
         self.ended = threading.Event()
@@ -49,11 +54,10 @@ class Controller:
         self._thread.start()
 
     def _receive(self) -> None:
-        kinds = {"packet": self.packets, "digest": self.digests, "arbitration": self.arbitrations}
         try:
             for response in self._call:
                 kind = response.WhichOneof("update")
-                kinds.get(kind, self.others).put(getattr(response, kind))
+                self.sinks.get(kind, self.others).put(getattr(response, kind))
         except grpc.RpcError as error:
             self.error = error
         self.ended.set()
@@ -109,11 +113,14 @@ class Controller:
         )
         return self.stub.GetForwardingPipelineConfig(request, timeout=TIMEOUT_S).config
 
-    def write(self, *updates: Any, atomicity: str = "CONTINUE_ON_ERROR") -> Any:
+    def write_request(self, *updates: Any, atomicity: str = "CONTINUE_ON_ERROR") -> Any:
         request = p4runtime.WriteRequest(device_id=self.device_id, role=self.role, updates=updates)
         self._number(request.election_id)
         request.atomicity = getattr(p4runtime.WriteRequest, atomicity)
-        return self.stub.Write(request, timeout=3 * TIMEOUT_S)
+        return request
+
+    def write(self, *updates: Any, atomicity: str = "CONTINUE_ON_ERROR") -> Any:
+        return self.stub.Write(self.write_request(*updates, atomicity=atomicity), timeout=3 * TIMEOUT_S)
 
     def read(self, *entities: Any) -> list[Any]:
         request = p4runtime.ReadRequest(device_id=self.device_id, entities=entities)
@@ -137,7 +144,8 @@ class Controller:
 
 def update_errors(error: grpc.RpcError) -> list[Any]:
     """The p4.v1.Error messages of a failed Write or Read."""
-    for key, value in error.trailing_metadata() or ():
+    metadata: Any = error.trailing_metadata()
+    for key, value in metadata or ():
         if key == "grpc-status-details-bin":
             packed = status.Status.FromString(value)
             errors = []

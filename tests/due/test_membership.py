@@ -101,7 +101,7 @@ def test_it_registers_again_when_the_coordinator_does_not_know_it():
     member.tick(0.0)
     assert not member.assigned(_assignments(revisions={}), 0.1)
     assert member.phase is Phase.WAITING
-    assert [type(m) for m in member.tick(0.1)] == [Registration]
+    assert [type(m) for m in member.tick(0.1)] == [Registration, Heartbeat]
     member.assigned(_assignments(revisions={"me": 0}), 0.2)
     assert [type(m) for m in member.tick(0.2)] == [Registration]
 

@@ -4,28 +4,29 @@ As slow as the published code, and the denominator of the benchmark.  Only for t
 """
 
 import math
+from collections.abc import Mapping
 
 LAMBDAS = (5, 3, 1, 0.1, 0.01)
 
 
 class Stream:
-    def __init__(self, name, rate, time, is_jitter):
+    def __init__(self, name: str, rate: float, time: float, is_jitter: bool) -> None:
         self.name = name
         self.rate = rate
         self.is_jitter = is_jitter
-        self.linear_sum = 0
-        self.squared_sum = 0
+        self.linear_sum: float = 0
+        self.squared_sum: float = 0
         self.weight = 1e-20
         self.last = time
         self.cached_mean = math.nan
         self.cached_variance = math.nan
         self.cached_deviation = math.nan
-        self.links = []
+        self.links: list[Link] = []
 
-    def insert(self, value, time):
+    def insert(self, value: float, time: float) -> None:
         if self.is_jitter:
             gap = time - self.last
-            value = gap if gap > 0 else 0
+            value = max(0, gap)
         self.decay(time)
         self.linear_sum += value
         self.squared_sum += math.pow(value, 2)
@@ -36,7 +37,7 @@ class Stream:
         for link in self.links:
             link.update(self.name, value, time)
 
-    def decay(self, time):
+    def decay(self, time: float) -> None:
         gap = time - self.last
         if gap > 0:
             factor = math.pow(2, -self.rate * gap)
@@ -45,34 +46,34 @@ class Stream:
             self.weight = self.weight * factor
             self.last = time
 
-    def mean(self):
+    def mean(self) -> float:
         if math.isnan(self.cached_mean):
             self.cached_mean = self.linear_sum / self.weight
         return self.cached_mean
 
-    def variance(self):
+    def variance(self) -> float:
         if math.isnan(self.cached_variance):
             self.cached_variance = abs(self.squared_sum / self.weight - math.pow(self.mean(), 2))
         return self.cached_variance
 
-    def deviation(self):
+    def deviation(self) -> float:
         if math.isnan(self.cached_deviation):
             self.cached_deviation = math.sqrt(self.variance())
         return self.cached_deviation
 
-    def statistics(self):
+    def statistics(self) -> list[float]:
         return [self.weight, self.mean(), self.variance()]
 
 
 class Link:
-    def __init__(self, first, second, time):
+    def __init__(self, first: Stream, second: Stream, time: float) -> None:
         self.ends = [first, second]
-        self.residuals = [0, 0]
-        self.product_sum = 0
+        self.residuals: list[float] = [0, 0]
+        self.product_sum: float = 0
         self.weight = 1e-20
         self.last = time
 
-    def update(self, name, value, time):
+    def update(self, name: str, value: float, time: float) -> None:
         near = 0 if name == self.ends[0].name else 1
         far = 1 - near
         self.ends[far].decay(time)
@@ -88,10 +89,10 @@ class Link:
         self.weight += 1
         self.residuals[near] = residual
 
-    def covariance(self):
+    def covariance(self) -> float:
         return self.product_sum / self.weight
 
-    def statistics(self):
+    def statistics(self) -> list[float]:
         first, second = self.ends
         radius = math.sqrt(math.pow(first.variance(), 2) + math.pow(second.variance(), 2))
         magnitude = math.sqrt(math.pow(first.mean(), 2) + math.pow(second.mean(), 2))
@@ -101,21 +102,21 @@ class Link:
 
 
 class Database:
-    def __init__(self):
-        self.streams = {}
+    def __init__(self) -> None:
+        self.streams: dict[str, Stream] = {}
 
-    def stream(self, name, rate, time, is_jitter=False):
+    def stream(self, name: str, rate: float, time: float, is_jitter: bool = False) -> Stream:
         key = name + "_" + str(rate)
         if key not in self.streams:
             self.streams[key] = Stream(name, rate, time, is_jitter)
         return self.streams[key]
 
-    def one(self, name, time, value, rate, is_jitter=False):
+    def one(self, name: str, time: float, value: float, rate: float, is_jitter: bool = False) -> list[float]:
         stream = self.stream(name, rate, time, is_jitter)
         stream.insert(value, time)
         return stream.statistics()
 
-    def pair(self, name, peer, time, value, rate):
+    def pair(self, name: str, peer: str, time: float, value: float, rate: float) -> list[float]:
         result = self.one(name, time, value, rate)
         first = self.stream(name, rate, time)
         second = self.stream(peer, rate, time)
@@ -133,13 +134,13 @@ class Database:
 class AfterImage:
     """`update` takes the fields that tshark writes, as text, and returns 100 features."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.mac_ip = Database()
         self.hosts = Database()
         self.jitter = Database()
         self.sockets = Database()
 
-    def update(self, fields):
+    def update(self, fields: Mapping[str, str]) -> list[float]:  # noqa: C901 - one screen, as published
         time, size = float(fields["frame.time_epoch"]), int(fields["frame.len"])
         source_mac, destination_mac = fields["eth.src"], fields["eth.dst"]
         if fields["ip.src"] or fields["ip.dst"]:
@@ -160,7 +161,10 @@ class AfterImage:
             sockets = (source_mac, destination_mac)
         else:
             sockets = (source + source_port, destination + destination_port)
-        mac_ip, hosts, gaps, between = [], [], [], []
+        mac_ip: list[float] = []
+        hosts: list[float] = []
+        gaps: list[float] = []
+        between: list[float] = []
         for rate in LAMBDAS:
             mac_ip += self.mac_ip.one(source_mac + source, time, size, rate)
         for rate in LAMBDAS:

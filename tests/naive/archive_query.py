@@ -67,10 +67,8 @@ def _field(name: str, values: list[Any], operand: Any) -> bool:
 def _operator(name: str, values: list[Any], op: str, arg: Any, whole: Mapping[str, Any]) -> bool:
     if op == "$not":
         return not _field(name, values, arg)
-    if op == "$ne":
-        return not _operator(name, values, "$eq", arg, whole)
-    if op == "$nin":
-        return not _operator(name, values, "$in", arg, whole)
+    if op in ("$ne", "$nin"):
+        return not _operator(name, values, {"$ne": "$eq", "$nin": "$in"}[op], arg, whole)
     if op == "$in":
         return any(_operator(name, values, "$eq", one, whole) for one in arg)
     if op == "$exists":

@@ -1,17 +1,22 @@
 """KitNET as published, one numpy call per step, per autoencoder and per packet.  Only for tests and benchmarks."""
 
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.cluster.hierarchy import linkage, to_tree
 
+Array = npt.NDArray[np.float64]
 
-def sigmoid(x):
-    return 1.0 / (1 + np.exp(-x))
+
+def sigmoid(x: Array) -> Array:
+    with np.errstate(over="ignore"):
+        return np.asarray(1.0 / (1 + np.exp(-x)))
 
 
 class Autoencoder:
-    def __init__(self, visible):
+    def __init__(self, visible: int) -> None:
         hidden = math.ceil(visible * 0.75)
         self.weights = np.random.RandomState(1234).uniform(-1 / visible, 1 / visible, (visible, hidden))
         self.hidden_bias = np.zeros(hidden)
@@ -19,15 +24,15 @@ class Autoencoder:
         self.low = np.full(visible, np.inf)
         self.high = np.full(visible, -np.inf)
 
-    def scaled(self, x):
-        return (x - self.low) / (self.high - self.low + 1e-16)
+    def scaled(self, x: Array) -> Array:
+        return np.asarray((x - self.low) / (self.high - self.low + 1e-16))
 
-    def pass_through(self, x):
+    def pass_through(self, x: Array) -> tuple[Array, Array]:
         y = sigmoid(np.dot(x, self.weights) + self.hidden_bias)
         z = sigmoid(np.dot(y, self.weights.T) + self.visible_bias)
         return y, x - z
 
-    def train(self, x):
+    def train(self, x: Array) -> float:
         self.high[x > self.high] = x[x > self.high]
         self.low[x < self.low] = x[x < self.low]
         x = self.scaled(x)
@@ -36,22 +41,22 @@ class Autoencoder:
         self.weights += 0.1 * (np.outer(x, gradient) + np.outer(error, y))
         self.hidden_bias += 0.1 * gradient
         self.visible_bias += 0.1 * error
-        return np.sqrt(np.mean(error**2))
+        return float(np.sqrt(np.mean(error**2)))
 
-    def score(self, x):
+    def score(self, x: Array) -> float:
         _, error = self.pass_through(self.scaled(x))
-        return np.sqrt(np.mean(error**2))
+        return float(np.sqrt(np.mean(error**2)))
 
 
 class FeatureMap:
-    def __init__(self, width):
+    def __init__(self, width: int) -> None:
         self.total = np.zeros(width)
         self.residual = np.zeros(width)
         self.squares = np.zeros(width)
         self.products = np.zeros((width, width))
         self.count = 0
 
-    def update(self, x):
+    def update(self, x: Array) -> None:
         self.count += 1
         self.total += x
         residual = x - self.total / self.count
@@ -59,7 +64,7 @@ class FeatureMap:
         self.squares += residual**2
         self.products += np.outer(residual, residual)
 
-    def groups(self, most):
+    def groups(self, most: int) -> list[list[int]]:
         roots = np.outer(np.sqrt(self.squares), np.sqrt(self.squares))
         roots[roots == 0] = 1e-100
         distance = 1 - self.products / roots
@@ -68,25 +73,27 @@ class FeatureMap:
         return split(to_tree(linkage(upper)), most)
 
 
-def split(node, most):
+def split(node: Any, most: int) -> list[list[int]]:
     if node.count <= most:
         return [node.pre_order()]
     return split(node.get_left(), most) + split(node.get_right(), most)
 
 
 class KitNet:
-    def __init__(self, width, most, fm_grace, ad_grace):
+    def __init__(self, width: int, most: int, fm_grace: int, ad_grace: int) -> None:
         self.fm_grace, self.ad_grace, self.most = fm_grace, ad_grace, most
         self.map = FeatureMap(width)
         self.seen = 0
-        self.groups = None
+        self.groups: list[list[int]] = []
+        self.ensemble: list[Autoencoder] = []
+        self.output = Autoencoder(1)
 
-    def process(self, x):
+    def process(self, x: Array) -> float:
         if self.seen > self.fm_grace + self.ad_grace:
             self.seen += 1
             errors = np.array([a.score(x[g]) for a, g in zip(self.ensemble, self.groups, strict=True)])
             return self.output.score(errors)
-        if self.groups is None:
+        if not self.groups:
             self.map.update(x)
             if self.seen == self.fm_grace:
                 self.groups = self.map.groups(self.most)

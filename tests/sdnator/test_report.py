@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from typing import Any
 
 import numpy as np
@@ -145,12 +144,10 @@ def test_a_folder_in_use_is_left_alone(tmp_path):
         check_folder(tmp_path / "thesis.tex" / "r")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_an_unwritable_folder_is_found_before_the_work(tmp_path):
-    tmp_path.chmod(0o500)
+def test_an_unwritable_folder_is_found_before_the_work():
+    """Tried, not asked of the system: /proc refuses root as well."""
     with pytest.raises(ReportError, match="not writable"):
-        check_folder(tmp_path / "deep" / "r")
-    tmp_path.chmod(0o700)
+        check_folder("/proc/report")
 
 
 def test_half_a_report_never_shows(tmp_path, monkeypatch):

@@ -105,5 +105,5 @@ def test_block_row_counts_what_the_switch_installed():
         Confirmation(id="b", switch="s1", state="failed", action="block", event_time=SECOND),
         Confirmation(id="a", switch="s1", state="exists", action="block", event_time=2 * SECOND),
     ]
-    rows = block_rows([first, extended, failed], confirmations)
-    assert [(row["id"], row["reason"], row["packet"], row["time"]) for row in rows] == [("a", "hot", 9, 1.0)]
+    rows = block_rows(surveyed(*[CAMERA] * 12), [first, extended, failed], confirmations)
+    assert [(row["id"], row["reason"], row["packet"], row["time"]) for row in rows] == [("a", "hot", 9, 9.0)]

@@ -58,6 +58,16 @@ def test_block_is_extended_while_the_attack_goes_on():
     assert "still going on" in extended.reason
 
 
+def test_pause_of_the_flood_does_not_end_the_block():
+    """The rate counts over a minute: half a minute of silence is a pause."""
+    ledger = Ledger(Rules())
+    decision = opened(ledger)
+    end = decision.expires
+    for before_end, drops in ((120, 0), (60, 6_000), (30, 12_000), (1, 12_000), (0, 12_000)):
+        ledger.count_drops(decision.id, drops, end - before_end * SECOND)
+    assert ledger.due(end)[0].action == "block"
+
+
 def test_drops_at_the_training_rate_do_not_extend():
     """A camera that only does its usual work is given another chance."""
     ledger = Ledger(Rules())

@@ -2,6 +2,8 @@
 
 import gzip
 import socket
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -9,14 +11,30 @@ from apps.packets import PACKET_COLUMNS
 from due import RecordBatch
 from tests.requirements import shared_data
 
-FIELDS = (
-    "frame.time_epoch frame.len eth.src eth.dst ip.src ip.dst tcp.srcport tcp.dstport udp.srcport udp.dstport "
-    "icmp.type icmp.code arp.opcode arp.src.hw_mac arp.src.proto_ipv4 arp.dst.hw_mac arp.dst.proto_ipv4 "
-    "ipv6.src ipv6.dst"
-).split()
+FIELDS = [
+    "frame.time_epoch",
+    "frame.len",
+    "eth.src",
+    "eth.dst",
+    "ip.src",
+    "ip.dst",
+    "tcp.srcport",
+    "tcp.dstport",
+    "udp.srcport",
+    "udp.dstport",
+    "icmp.type",
+    "icmp.code",
+    "arp.opcode",
+    "arp.src.hw_mac",
+    "arp.src.proto_ipv4",
+    "arp.dst.hw_mac",
+    "arp.dst.proto_ipv4",
+    "ipv6.src",
+    "ipv6.dst",
+]
 
 
-def blank(count, **columns):
+def blank(count: int, **columns: Any) -> RecordBatch:
     """A batch of `count` packets in which only the given columns say something."""
     batch = {
         name: np.full(count, -1 if kind[0] == "i" else 0, dtype=kind) for name, kind in PACKET_COLUMNS.items()
@@ -28,11 +46,11 @@ def blank(count, **columns):
     return RecordBatch(batch)
 
 
-def part(batch, start, stop):
+def part(batch: RecordBatch, start: int, stop: int) -> RecordBatch:
     return RecordBatch({name: batch[name][start:stop] for name in batch})
 
 
-def tsv_rows(limit=None):
+def tsv_rows(limit: int | None = None) -> Iterator[dict[str, str]]:
     """tshark's fields of the real packets, as text."""
     with gzip.open(shared_data("kitsune/mirai_38k.tsv.gz"), "rt") as text:
         next(text)
@@ -42,16 +60,16 @@ def tsv_rows(limit=None):
             yield dict(zip(FIELDS, line.rstrip("\n").split("\t"), strict=True))
 
 
-def batch_of(rows):
+def batch_of(rows: Iterable[Mapping[str, str]]) -> RecordBatch:
     """tshark's fields as a batch."""
-    columns = {name: [] for name in PACKET_COLUMNS}
+    columns: dict[str, list[int]] = {name: [] for name in PACKET_COLUMNS}
     for number, fields in enumerate(rows):
         for name, value in _columns(number, fields).items():
             columns[name].append(value)
     return RecordBatch({name: np.array(columns[name], dtype=kind) for name, kind in PACKET_COLUMNS.items()})
 
 
-def _columns(number, fields):
+def _columns(number: int, fields: Mapping[str, str]) -> dict[str, int]:
     seconds, fraction = fields["frame.time_epoch"].split(".")
     version = 4 if fields["ip.src"] else 6 if fields["ipv6.src"] else 0
     prefix = "ip" if version == 4 else "ipv6"
@@ -93,11 +111,11 @@ def _columns(number, fields):
     }
 
 
-def _mac(text):
+def _mac(text: str) -> int:
     return int(text.replace(":", ""), 16) if text else 0
 
 
-def _halves(text):
+def _halves(text: str) -> tuple[int, int]:
     if not text:
         return 0, 0
     if ":" not in text:
@@ -106,12 +124,12 @@ def _halves(text):
     return int.from_bytes(packed[:8], "big"), int.from_bytes(packed[8:], "big")
 
 
-def real(limit=None):
+def real(limit: int | None = None) -> RecordBatch:
     """The real packets as a batch."""
     return batch_of(tsv_rows(limit))
 
 
-def tshark_fields(batch, times):
+def tshark_fields(batch: RecordBatch, times: Iterable[str]) -> Iterator[dict[str, str]]:
     """The text fields that tshark would show for each row; `times` in seconds as text."""
     for number, time in enumerate(times):
         value = {name: int(batch[name][number]) for name in PACKET_COLUMNS}
@@ -136,11 +154,11 @@ def tshark_fields(batch, times):
         }
 
 
-def _shown(value):
+def _shown(value: int) -> str:
     return "" if value < 0 else str(value)
 
 
-def _address(value, side):
+def _address(value: Mapping[str, int], side: str) -> str:
     hi, lo = value[f"ip_{side}_hi"], value[f"ip_{side}_lo"]
     if value["ip_version"] == 4:
         return socket.inet_ntoa(lo.to_bytes(4, "big"))

@@ -48,6 +48,7 @@ class FakeSwitch:
         self.entries = {}
         self.defaults = {}
         self.copies = {}
+        self.digests = {}
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -142,6 +143,9 @@ class FakeSwitch:
         if update.entity.WhichOneof("entity") == "packet_replication_engine_entry":
             session = update.entity.packet_replication_engine_entry.clone_session_entry
             return _store(self.copies, session.session_id, session, update.type)
+        if update.entity.WhichOneof("entity") == "digest_entry":
+            digest = update.entity.digest_entry
+            return _store(self.digests, digest.digest_id, digest, update.type)
         entry = update.entity.table_entry
         if self.config is None:
             return p4runtime.Error(canonical_code=code_pb2.FAILED_PRECONDITION, message="no program")

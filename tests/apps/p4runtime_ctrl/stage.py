@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +13,12 @@ import numpy as np
 
 from apps.messages import Decision
 from apps.messages import Target as Sender
+from apps.p4runtime_ctrl.connection import Connection
+from apps.p4runtime_ctrl.session import Address, Pipeline
 from dataplane.capture_port import CaptureFeed
-from due import Engine, Interest, Item, Options
+from due import Engine, Item, Options
 from due.drivers.embedded_redis import EmbeddedServer
-from tests.apps.p4runtime_ctrl.programs import P4INFO, PROGRAM
+from tests.apps.p4runtime_ctrl.programs import P4INFO, PROGRAM, program
 from tests.apps.p4runtime_ctrl.targets import Target
 
 BASE_US = 1_540_446_400_000_000
@@ -77,7 +80,8 @@ class Stage:
             "forward": {"1": 2},
             **self._switch_options,
         }
-        settings = {"switches": [switch], "program": str(PROGRAM), "p4info": str(P4INFO), **options}
+        switches = options.pop("switches", [switch])
+        settings = {"switches": switches, "program": str(PROGRAM), "p4info": str(P4INFO), **options}
         return self.run("apps.p4runtime_ctrl.service", settings)
 
     def kill(self, process: subprocess.Popen[str]) -> None:
@@ -136,6 +140,32 @@ def block(number: int, source: int, action: str = "block") -> Decision:
     )
 
 
+class Bystander:
+    """A primary that does nothing: the embedded switch holds a capture's frames while it has none."""
+
+    def __init__(self, address: str, *, rank: int = 1) -> None:
+        pipeline = Pipeline(PROGRAM.read_bytes(), program().message)
+        self._primary = threading.Event()
+        self._connection = Connection(Address(address, 1, rank), pipeline, self)
+
+    def __enter__(self) -> "Bystander":
+        self._connection.open()
+        assert self._primary.wait(20)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+
+    def became_primary(self, _session: object) -> None:
+        self._primary.set()
+
+    def became_backup(self) -> None: ...
+    def lost(self, cause: str) -> None: ...
+    def packets(self, messages: object) -> None: ...
+    def digests(self, lists: object) -> None: ...
+    def other(self, message: object) -> None: ...
+
+
 class Heard:
     """What an engine hears of some keys."""
 
@@ -153,6 +183,3 @@ class Heard:
     def stop(self) -> None:
         for subscription in self.subscriptions:
             subscription.dispose()
-
-
-INTEREST = Interest

@@ -42,6 +42,9 @@ class Listener:
         self.gate.wait(10)
         self._note(lambda: self.lists.append(messages))
 
+    def digests(self, lists):
+        pass
+
     def other(self, message):
         self._note(lambda: self.others.append(message))
 

@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
+from scapy.utils import RawPcapReader
 
-from apps.packets import PACKET_COLUMNS
+from apps.messages import TableCommand, TableUpdate
+from apps.packets import PACKET_COLUMNS, read_frames
+from dataplane.capture_port import CaptureFeed
 from due import Capability
 from tests.apps.p4runtime_ctrl.stage import BASE_US, PACKETS, Heard, Stage, block, end, frame, wait_for
+from tests.apps.p4runtime_ctrl.targets import Target
+from tests.requirements import shared_data
 
 DECISIONS = Capability("network.block.firewall.*", delivery="reliable", archive="always")
 CONFIRMATIONS = "network.confirmation.p4runtime_ctrl.*"
@@ -83,13 +88,154 @@ def test_packets_of_one_port_are_a_key_of_their_own(stage):
     engine = stage.engine("listener")
     one, other = "network.packets.p4runtime_ctrl.s1.1", "network.packets.p4runtime_ctrl.s1.2"
     heard = Heard(engine, one, other, STATE)
-    wait_for(lambda: any(v["telemetry"] == ["port1", "port2"] for v in heard.values("switch")), why=stage.log)
+    wait_for(lambda: any(v["telemetry"] == ["port2", "port1"] for v in heard.values("switch")), why=stage.log)
     feed = stage.feed()
     feed.send([1, 2], [60, 60], [frame(1), frame(2)])
     wait_for(lambda: any(item.key == one for item in heard.items), why=stage.log)
     assert sum(len(item.value) for item in heard.items if item.key == one) == 2
     assert not any(item.key == other for item in heard.items)
     feed.close()
+
+
+def real_frames():
+    """Times in us since the first second, lengths on the wire and bytes, of a real capture."""
+    reader = RawPcapReader(str(shared_data("kitsune/mirai2000.pcap")))
+    with reader:
+        found = [(m.sec * 1_000_000 + m.usec, m.wirelen, data) for data, m in reader]
+    first = found[0][0] // 1_000_000 * 1_000_000
+    return [t - first for t, _, _ in found], [length for _, length, _ in found], [f for _, _, f in found]
+
+
+def test_digests_give_the_same_records_as_copied_frames(stage):
+    times, lengths, frames = real_frames()
+    stage.controller(telemetry="digest")
+    engine = stage.engine("listener")
+    heard = Heard(engine, PACKETS, STATE)
+    wait_for(lambda: any(v["telemetry"] == ["packets"] for v in heard.values("switch")), why=stage.log)
+    feed = stage.feed()
+    feed.send(times, lengths, frames)
+    wait_for(lambda: len(heard.arrivals()) == len(frames), why=stage.log)
+    wait_for(lambda: heard.values("switch")[-1]["digests"] == len(frames), why=stage.log)
+    state = heard.values("switch")[-1]
+    assert (state["packet_in"], state["lost"]) == (0, 0)
+    batches = [item.value for item in heard.items if item.key == PACKETS]
+    got = {name: np.concatenate([batch[name] for batch in batches]) for name in PACKET_COLUMNS}
+    padded = [frame.ljust(length, b"\0")[:256] for frame, length in zip(frames, lengths, strict=True)]
+    count = np.arange(len(frames))
+    want = read_frames(
+        padded,
+        lengths=lengths,
+        times_us=np.array(times) + BASE_US,
+        ports=np.ones(len(frames)),
+        sequence=count + 1,
+        arrival=count,
+    )
+    different = {name: int((got[name] != want[name]).sum()) for name in PACKET_COLUMNS}
+    assert not {name: rows for name, rows in different.items() if rows}
+    feed.close()
+
+
+def test_frames_are_published_to_who_wants_them(stage):
+    stage.controller()
+    engine = stage.engine("listener")
+    heard = Heard(engine, "network.frames.p4runtime_ctrl.s1.all", STATE)
+    wait_for(lambda: any(v["telemetry"] == ["packets"] for v in heard.values("switch")), why=stage.log)
+    feed = stage.feed()
+    feed.send([1, 2], [60, 60], [frame(1), frame(2)])
+    wait_for(
+        lambda: sum(len(value["frames"]) for value in heard.values("network.frames")) == 2, why=stage.log
+    )
+    (value,) = heard.values("network.frames")
+    assert value["frames"] == [frame(1), frame(2)]
+    assert read_frames(**value)["ip_src_lo"].tolist() == [0x0A000001, 0x0A000002]
+    feed.close()
+
+
+def test_an_offer_is_sent_under_its_name_while_observed(stage):
+    stage.controller()
+    offers = Capability("network.telemetry.listener.*", delivery="reliable", archive="always")
+    engine = stage.engine("listener", capabilities=(offers,))
+    heard = Heard(engine, "network.packets.p4runtime_ctrl.s1.dns", STATE)
+    offer = {"name": "dns", "bit": 3, "conditions": {"src": "10.0.0.2", "protocol": 17, "dport": 53}}
+    engine.write("network.telemetry.listener.dns", offer)
+    wait_for(lambda: any(v["telemetry"] == ["dns"] for v in heard.values("switch")), why=stage.log)
+    feed = stage.feed()
+    feed.send([1, 2, 3], [60] * 3, [frame(1), frame(2), frame(3)])
+    wait_for(lambda: heard.values("network.packets"), why=stage.log)
+    assert [batch["arrival"].tolist() for batch in heard.values("network.packets")] == [[1]]
+    engine.write("network.telemetry.listener.dns", {**offer, "active": False})
+    wait_for(lambda: heard.values("switch")[-1]["telemetry"] == [], why=stage.log)
+    feed.close()
+
+
+def test_idle_entries_are_removed_by_the_capture_clock(stage):
+    stage.controller()
+    commands = Capability("network.p4_command.listener.*", delivery="reliable", archive="always")
+    engine = stage.engine("listener", capabilities=(commands,))
+    heard = Heard(engine, CONFIRMATIONS, STATE)
+    entry = TableUpdate(
+        kind="insert",
+        table="block_src",
+        match={"is_ipv4": 1, "src": "10.0.0.1"},
+        action="drop_src",
+        idle_timeout_ns=2_000_000_000,
+    )
+    wrong = TableUpdate(
+        kind="insert", table="block_src", match={"is_ipv4": 1, "src": "10.0.0.300"}, action="drop_src"
+    )
+    engine.write("network.p4_command.listener.s1", TableCommand(id="c1", updates=(entry,)).to_value())
+    engine.write("network.p4_command.listener.s1", TableCommand(id="c2", updates=(wrong,)).to_value())
+    wait_for(lambda: len(heard.values("confirmation")) == 2, why=stage.log)
+    good, bad = heard.values("confirmation")
+    assert (good["id"], good["state"]) == ("c1", "installed")
+    assert (bad["id"], bad["state"]) == ("c2", "failed")
+    assert "ingress.block_src src: '10.0.0.300' is no number" in bad["cause"]
+    feed = stage.feed()
+    for second in range(8):
+        feed.send([second * 1_000_000], [60], [frame(2)])
+    wait_for(lambda: any(v["state"] == "expired" for v in heard.values("confirmation")), why=stage.log)
+    assert heard.values("confirmation")[-1]["handle"] == good["handle"]
+    feed.close()
+
+
+def test_two_switches_are_kept_apart(stage, tmp_path):
+    sockets = tmp_path / "second.sock"
+    other = Target("embedded", tmp_path, ports=(f"1=capture:{sockets}", "2=null"))
+    other.start()
+    try:
+        stage.controller(
+            switches=[
+                {"name": "s1", "address": stage.target.address, "forward": {"1": 2}},
+                {"name": "s2", "address": other.address, "forward": {"1": 2}, "base_us": 5_000_000},
+            ]
+        )
+        engine = stage.engine(capabilities=(DECISIONS,))
+        heard = Heard(engine, "network.packets.p4runtime_ctrl.*.all", CONFIRMATIONS, "network.switch.**")
+
+        def telling():
+            return {v["switch"] for v in heard.values("network.switch") if v["telemetry"] == ["packets"]}
+
+        wait_for(lambda: telling() == {"s1", "s2"}, why=stage.log)
+        engine.write("network.block.firewall.ipv4", block(1, 1).to_value())
+        wait_for(lambda: len(heard.values("confirmation")) == 1, why=stage.log)
+        feeds = {"s1": stage.feed(), "s2": CaptureFeed(str(sockets))}
+        for feed in feeds.values():
+            feed.send([1, 2], [60, 60], [frame(1), frame(2)])
+        wait_for(lambda: len(heard.values("network.packets")) >= 2, why=stage.log)
+        got = {item.key: item.value for item in heard.items if "network.packets" in item.key}
+        assert got["network.packets.p4runtime_ctrl.s1.all"]["arrival"].tolist() == [1]
+        assert got["network.packets.p4runtime_ctrl.s2.all"]["arrival"].tolist() == [0, 1]
+        assert got["network.packets.p4runtime_ctrl.s2.all"]["time_us"].tolist() == [5_000_001, 5_000_002]
+        other.kill()
+        wait_for(
+            lambda: any(v["switch"] == "s2" and not v["connected"] for v in heard.values("network.switch"))
+        )
+        engine.write("network.block.firewall.ipv4", block(2, 2).to_value())
+        wait_for(lambda: any(v["id"] == "d2" for v in heard.values("confirmation")), why=stage.log)
+        for feed in feeds.values():
+            feed.close()
+    finally:
+        other.stop()
 
 
 def test_wrong_settings_are_one_clear_line(tmp_path, capsys):

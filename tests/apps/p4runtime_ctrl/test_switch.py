@@ -27,6 +27,9 @@ class Held:
     def ensure_copies(self):
         pass
 
+    def ensure_digests(self):
+        pass
+
     def read_entries(self):
         return list(self.entries)
 
@@ -243,6 +246,19 @@ def test_telemetry_follows_what_is_wanted():
     switch.want([], held)
     assert held.batches[before][0] == "ingress.telemetry_active[default]"
     assert str(switch.bring_up(held)) == "nothing to change"
+
+
+def test_while_demand_is_unknown_telemetry_is_left_as_it_is():
+    held, switch = Held(), make()
+    switch.want([PACKETS], None)
+    switch.bring_up(held)
+    heir = make()
+    assert str(heir.bring_up(held)) == "nothing to change"
+    before = len(held.batches)
+    assert heir.want([PACKETS], held) == []
+    assert len(held.batches) == before
+    heir.want([], held)
+    assert held.batches[before][0] == "ingress.telemetry_active[default]"
 
 
 def test_counters_name_the_decision():

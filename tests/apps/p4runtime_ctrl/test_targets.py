@@ -45,6 +45,9 @@ class Attached:
     def packets(self, messages):
         pass
 
+    def digests(self, lists):
+        pass
+
     def other(self, message):
         pass
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from due.drivers.query import Condition, parse
+from due.drivers.query import parse
+from due.drivers.query_tree import Condition
 from due.errors import InvalidKey, InvalidQuery
 from due.messages import Item, RecordBatch
 

@@ -3,9 +3,10 @@
 import sys
 import time
 
-from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Options
+from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Options
 
 KEY = "fault.stream"
+SPEECH = "fault.speech.speaker"
 OPTIONS = Options(coordinated=False, window_bytes=4 << 20)
 
 
@@ -55,5 +56,33 @@ def consume(url: str, app: str, count: str, delay_ms: str) -> None:
     engine.close()
 
 
+def speak(url: str, name: str, heartbeat: str) -> None:
+    """One of several standby instances: writes its name and a number every 5 ms, says what came of it."""
+    engine = Engine(Options(heartbeat=float(heartbeat), handshake_timeout=10.0))
+    engine.set_pubsub(url)
+    engine.init("speaker", PRODUCER, capabilities=[Capability(SPEECH, delivery="reliable")])
+    print("instance", engine.instance_id, flush=True)
+    number, spoke = 0, None
+    while True:
+        written = engine.write(SPEECH, [name, number], [PUB_ONLY, NO_WAIT])
+        number += written
+        if written != spoke:
+            spoke = written
+            print("active" if written else "standby", time.time(), flush=True)
+        time.sleep(0.005)
+
+
+def listen(url: str) -> None:
+    """Hear the speakers: `sequence name number epoch` of each item."""
+    engine = Engine(Options(heartbeat=0.1))
+    engine.set_pubsub(url)
+    engine.init("listener", CONSUMER)
+    engine.observe(SPEECH).subscribe(
+        lambda item: print(time.time(), item.value[0], item.value[1], item.timestamp, flush=True)
+    )
+    print("ready", flush=True)
+    sys.stdin.readline()
+
+
 if __name__ == "__main__":
-    {"produce": produce, "consume": consume}[sys.argv[1]](*sys.argv[2:])
+    {"produce": produce, "consume": consume, "speak": speak, "listen": listen}[sys.argv[1]](*sys.argv[2:])

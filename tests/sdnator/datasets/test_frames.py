@@ -110,6 +110,17 @@ def test_ipv6_neighbour_and_llc():
     assert Dot3(frames.llc(MAC_B, MAC_A, b"\x42\x42\x03abc"))[LLC].dsap == 0x42
 
 
+@pytest.mark.parametrize(
+    ("size", "names"),
+    [(0, []), (4, ["MSS"]), (12, ["MSS", "EOL"]), (20, ["MSS", "SAckOK", "Timestamp", "NOP", "WScale"])],
+)
+def test_syn_options(size, names):
+    options = frames.syn_options(size)
+    assert len(options) == size
+    segment = frames.tcp(IP_A, IP_B, 1, 2, frames.SYN, options=options)
+    assert list(dict.fromkeys(name for name, _ in TCP(segment).options)) == names
+
+
 def test_pad():
     assert frames.pad(b"x") == b"x" + bytes(59)
     assert frames.pad(b"x" * 70) == b"x" * 70

@@ -1,13 +1,16 @@
 """Frames rebuilt from tshark's table show every reader of headers what the table says."""
 
+import gzip
+import subprocess
+
 import numpy as np
 import pytest
 
 from apps.packets import PACKET_COLUMNS, read_frames
 from sdnator.captures import Capture
 from sdnator.datasets.rebuild import RebuildError, frame, rebuild
-from sdnator.tshark_tsv import TsharkRow, as_columns, read_rows
-from tests.requirements import shared_data
+from sdnator.tshark_tsv import COLUMNS, TsharkRow, as_columns, read_rows
+from tests.requirements import optional_program, shared_data
 
 GUESSED = {"tcp_flags", "tcp_seq", "tcp_ack", "icmp6_type", "icmp6_code"}
 """Columns of the packet record that the table does not have."""
@@ -128,3 +131,14 @@ def test_nanoseconds_are_kept(tmp_path):
     with pytest.raises(RebuildError, match="line 3"):
         rebuild(table, out)
     assert [path.name for path in tmp_path.iterdir()] == ["t.tsv"]
+
+
+def test_tshark_writes_the_same_table_again(tmp_path):
+    """The real tshark finds in the rebuilt frames, byte for byte, the table that they were rebuilt from."""
+    tshark = optional_program("tshark")
+    table, out = shared_data("kitsune/mirai_38k.tsv.gz"), tmp_path / "out.pcap"
+    rebuild(table, out)
+    fields = [word for name in COLUMNS for word in ("-e", name)]
+    command = [tshark, "-r", str(out), "-T", "fields", *fields, "-E", "header=y", "-E", "occurrence=f"]
+    made = subprocess.run(command, capture_output=True, check=True)
+    assert made.stdout == gzip.decompress(table.read_bytes())

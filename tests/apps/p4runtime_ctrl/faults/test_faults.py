@@ -6,7 +6,7 @@ import pytest
 
 from due import Capability
 from tests.apps.p4runtime_ctrl.cable import Cable
-from tests.apps.p4runtime_ctrl.stage import PACKETS, Heard, Stage, block, frame, wait_for
+from tests.apps.p4runtime_ctrl.stage import PACKETS, Bystander, Heard, Stage, block, frame, wait_for
 
 DECISIONS = Capability("network.block.firewall.*", delivery="reliable", archive="always")
 CONFIRMATIONS = "network.confirmation.p4runtime_ctrl.*"
@@ -39,17 +39,6 @@ class Firewall:
     def state(self):
         states = self.heard.values("network.switch")
         return states[-1] if states else {}
-
-    def wait_until_up(self, changes=1):
-        def up():
-            told = [
-                v["change"] for v in self.heard.values("network.switch") if v["change"].startswith("primary")
-            ]
-            return (
-                len(set(told) | set()) and len(told) >= changes and self.state()["telemetry"] == ["packets"]
-            )
-
-        wait_for(up, why=self.stage.log)
 
 
 def verdicts(feed, sources):
@@ -107,7 +96,8 @@ def test_the_controller_is_killed(stage):
     feed = stage.feed()
     assert verdicts(feed, [1, 2, 3]) == [BLOCKED, BLOCKED, FREE]
     stage.kill(first)
-    assert verdicts(feed, [1, 2, 3]) == [BLOCKED, BLOCKED, FREE], "fail open: entries and wires stay"
+    with Bystander(stage.target.address):
+        assert verdicts(feed, [1, 2, 3]) == [BLOCKED, BLOCKED, FREE], "fail open: entries and wires stay"
     firewall.decide(3, wait=None)
     firewall.decide(2, "unblock", wait=None)
     stage.controller()
@@ -171,7 +161,8 @@ def test_a_standby_controller_takes_over(stage):
     stage.controller()
     firewall.decide(2)
     stage.kill(first)
-    firewall.decide(3)
+    third = firewall.decide(3, wait=None)
+    wait_for(lambda: {(third, "installed"), (third, "exists")} & set(firewall.said()), why=stage.log)
     wait_for(
         lambda: firewall.state()["primary"] and firewall.state()["telemetry"] == ["packets"], why=stage.log
     )
@@ -189,7 +180,8 @@ def test_what_happens_to_traffic_without_a_controller_is_configured(tmp_path, fa
         assert verdicts(feed, [4]) == [FORWARDED]
         controller.terminate()
         controller.wait(20)
-        assert verdicts(feed, [4]) == [without_controller]
+        with Bystander(stage.target.address):
+            assert verdicts(feed, [4]) == [without_controller]
         stage.controller()
         assert verdicts(feed, [4]) == [FORWARDED]
         feed.close()

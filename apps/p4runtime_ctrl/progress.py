@@ -1,0 +1,138 @@
+"""How far a switch's stream has come: numbers, losses, capture time.
+
+The switch gives one sequence of numbers to the frames that it copies or reports.  They come in two
+ordered streams, packet-ins and digests; a number is lost when all streams that are expected to come
+have passed it, or the silent one is far behind.
+"""
+
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Source = Literal["packet", "digest"]
+_WRAP: Final = 1 << 32
+_HALF: Final = _WRAP // 2
+_HORIZON: Final = 1 << 16
+"""A stream so many numbers behind the other is not waited for."""
+
+
+class Progress:
+    """Counts of one switch."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        """Packet-ins."""
+        self.reported = 0
+        """Digests."""
+        self.restarts = 0
+        """How often the numbers began anew."""
+        self.arrival = 0
+        """Newest frame seen, by its number at the switch."""
+        self.time_us = 0
+        """Capture time of the newest frame seen."""
+        self.expected: frozenset[Source] = frozenset(("packet",))
+        """Streams that bring numbers."""
+        self._lost = 0
+        self._passed: dict[Source, int] = {}
+        self._gaps: list[tuple[int, int]] = []
+        self._highest: int | None = None
+
+    @property
+    def lost(self) -> int:
+        """Numbers that never came."""
+        return self._lost
+
+    def expect_first(self) -> None:
+        """The switch was given its program just now: the next number is 1."""
+        if self._highest is None:
+            self._highest = 0
+
+    def packets(
+        self, sequence: NDArray[np.uint64], arrival: NDArray[np.uint64], time_us: NDArray[np.int64]
+    ) -> None:
+        """Copied frames, in the order of their stream."""
+        self.received += len(sequence)
+        self._note("packet", sequence, arrival, time_us)
+
+    def digests(
+        self, sequence: NDArray[np.uint64], arrival: NDArray[np.uint64], time_us: NDArray[np.int64]
+    ) -> None:
+        """Reported frames; those that were neither copied nor asked for have number 0."""
+        self.reported += len(sequence)
+        self._note("digest", sequence, arrival, time_us)
+
+    def _note(
+        self,
+        source: Source,
+        sequence: NDArray[np.uint64],
+        arrival: NDArray[np.uint64],
+        time_us: NDArray[np.int64],
+    ) -> None:
+        if not len(sequence):
+            return
+        self.time_us = max(self.time_us, int(time_us[-1]))
+        numbers = sequence[sequence != 0].astype(np.int64)
+        if not len(numbers):
+            return
+        # after a break in both streams the first number may be lower: then the switch began anew
+        first = self._highest if self._highest and not self._passed else int(numbers[0]) - 1
+        before = self._passed.get(source, first)
+        backwards = np.flatnonzero(np.diff(numbers, prepend=before) % _WRAP >= _HALF)
+        start = 0
+        for begin in backwards:
+            self._pass(source, numbers[start:begin])
+            self._begin_anew()
+            start = int(begin)
+        self._pass(source, numbers[start:])
+        self.arrival = int(arrival[-1])
+
+    def _begin_anew(self) -> None:
+        """A switch that counts from 1 again: what it sent before the first that came is lost, too."""
+        self._settle(everything=True)
+        self.restarts += 1
+        self._passed.clear()
+        self._highest = 0
+
+    def _pass(self, source: Source, numbers: NDArray[np.int64]) -> None:
+        if not len(numbers):
+            return
+        if self._highest is None:
+            self._highest = int(numbers[0]) - 1
+        highest = self._highest
+        known = numbers[numbers <= highest]
+        if len(known) and self._gaps:
+            self._fill(known)
+        fresh = numbers[len(known) :]
+        if len(fresh):
+            starts = np.concatenate(([highest], fresh[:-1]))
+            for row in np.flatnonzero(fresh - starts > 1):
+                self._gaps.append((int(starts[row]) + 1, int(fresh[row])))
+            self._highest = int(fresh[-1])
+        self._passed[source] = int(numbers[-1])
+        self._settle()
+
+    def _fill(self, numbers: NDArray[np.int64]) -> None:
+        """Numbers of gaps that the other stream had left."""
+        left: list[tuple[int, int]] = []
+        for first, end in self._gaps:
+            inside = numbers[(numbers >= first) & (numbers < end)].tolist()
+            edges = [first - 1, *inside, end]
+            left += [(a + 1, b) for a, b in pairwise(edges) if b - a > 1]
+        self._gaps = left
+
+    def _settle(self, *, everything: bool = False) -> None:
+        """Gaps that nobody can fill any more are losses."""
+        if not self._gaps:
+            return
+        highest = self._highest or 0
+        passed = min((self._passed.get(source, 0) for source in self.expected), default=highest)
+        passed = max(passed, highest - _HORIZON)
+        waiting = []
+        for first, end in self._gaps:
+            over = end if everything else min(end, passed + 1)
+            self._lost += max(0, over - first)
+            if max(first, over) < end:
+                waiting.append((max(first, over), end))
+        self._gaps = waiting

@@ -1,0 +1,291 @@
+"""The adapter without I/O: what is wanted → what the switch shall do; what it sends → results.
+
+keys wanted ─► requests ─► plan ─► offers (classifier bits) and entries of counting stages
+packets, frames ─► merge ─► host operators ─┐
+reports of counting stages ─────────────────┴─► outputs, each under the keys that asked for it
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from apps.messages import TableUpdate
+from apps.sonata_adapter.catalogue import Template
+from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine
+from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.handshake import Handshakes
+from apps.sonata_adapter.keys import HANDSHAKE, Request, request_of
+from apps.sonata_adapter.merge import Merger
+from apps.sonata_adapter.planner import Entry, Plan, QueryPlan, SwitchLimits, plan
+from apps.sonata_adapter.reports import Reports
+from apps.sonata_adapter.results import Captured, Output, Result
+from due import RecordBatch
+
+
+class Source(msgspec.Struct, frozen=True, order=True):
+    """A stream of the controller: `network.<kind>.p4runtime_ctrl.*.<name>`."""
+
+    kind: str
+    """packets, frames or digests."""
+    name: str
+
+
+class Changes(msgspec.Struct, frozen=True):
+    """What to tell the controller, in this order."""
+
+    withdraw: tuple[dict[str, Any], ...] = ()
+    """Offers that end."""
+    updates: tuple[TableUpdate, ...] = ()
+    """Entries of counting stages, for every switch."""
+    offer: tuple[dict[str, Any], ...] = ()
+    """Offers that begin or change."""
+    refused: tuple[tuple[str, str], ...] = ()
+    """Keys that cannot be served, and what would do."""
+
+
+class Written(msgspec.Struct, frozen=True):
+    """An output and the keys to write it under."""
+
+    keys: tuple[str, ...]
+    output: Output
+
+
+class _Station:
+    """What is kept for one switch."""
+
+    def __init__(self, limit: int, lateness_us: int) -> None:
+        self.host = HostEngine(limit=limit, lateness_us=lateness_us)
+        self.merger = Merger()
+        self.reports: dict[str, Reports] = {}
+        self.base_us = 0
+        self.now_us: int | None = None
+
+
+class Control:
+    """All decisions of the adapter.  Not thread-safe: one thread calls at a time."""
+
+    def __init__(
+        self,
+        templates: Mapping[str, Template],
+        *,
+        limits: SwitchLimits | None = None,
+        keys_limit: int = DEFAULT_LIMIT,
+        lateness_us: int = DEFAULT_LATENESS_US,
+    ) -> None:
+        self._templates = templates
+        self._limits = limits or SwitchLimits()
+        self._keys_limit = keys_limit
+        self._lateness_us = lateness_us
+        self._stations: dict[str, _Station] = {}
+        self._requests: dict[str, Request] = {}
+        self._outputs: dict[str, tuple[str, ...]] = {}
+        self._refused: dict[str, str] = {}
+        self.plan = Plan((), ())
+
+    @property
+    def requests(self) -> list[Request]:
+        """What is in force, by identity."""
+        return list(self._requests.values())
+
+    @property
+    def refused(self) -> Mapping[str, str]:
+        """Keys that cannot be served, and why."""
+        return self._refused
+
+    @property
+    def sources(self) -> set[Source]:
+        """Streams to observe now; none when nothing is wanted."""
+        found = {Source("digests", _name(bit)) for bit in self.plan.entries}
+        found |= {
+            Source("frames" if copy.payload else "packets", _name(copy.bit)) for copy in self.plan.copies
+        }
+        return found
+
+    def want(self, keys: Iterable[str]) -> Changes:
+        """These keys are wanted from now on, and no others."""
+        requests, outputs, refused = self._read(keys)
+        new_refusals = tuple((key, why) for key, why in refused.items() if key not in self._refused)
+        self._refused = refused
+        self._outputs = {identity: tuple(sorted(found)) for identity, found in outputs.items()}
+        before, old = self.plan, self._requests
+        self._requests = requests
+        self.plan = plan(list(requests.values()), self._limits, before=before)
+        for station in self._stations.values():
+            self._refit(station, old)
+        return Changes(
+            withdraw=self._withdrawn(before),
+            updates=self._updates(before),
+            offer=self._offered(before),
+            refused=new_refusals,
+        )
+
+    def everything(self) -> Changes:
+        """All that is in force, for a controller that has just come."""
+        none = Plan((), ())
+        return Changes(updates=self._updates(none), offer=self._offered(none))
+
+    def switch(self, name: str, base_us: int) -> bool:
+        """A switch is there; returns whether it is new."""
+        new = name not in self._stations
+        self._station(name).base_us = base_us
+        return new
+
+    def packets(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
+        """Copied packets of one of the sources, at `now` (seconds of any clock)."""
+        station = self._station(switch)
+        return self._processed(station, station.merger.put(name, batch, now))
+
+    def digests(self, switch: str, name: str, batch: RecordBatch) -> list[Written]:
+        """Reports of counting stages."""
+        station = self._station(switch)
+        bit = int(name[1:])
+        written: list[Written] = []
+        if len(batch):
+            station.now_us = max(int(batch["time_us"].max()), station.now_us or 0)
+        for found in self.plan.queries:
+            if any(entry.bit == bit for entry in found.entries) and found.identity in station.reports:
+                written += self._addressed(station.reports[found.identity].take(bit, batch))
+        return written
+
+    def tick(self, now: float) -> list[Written]:
+        """Let go what has waited long enough."""
+        written: list[Written] = []
+        for station in self._stations.values():
+            written += self._processed(station, station.merger.release(now))
+        return written
+
+    def advance(self, switch: str, now_us: int) -> list[Written]:
+        """Capture time of a switch has come to `now_us`, though no packet may have come here."""
+        station = self._station(switch)
+        station.now_us = max(now_us, station.now_us or 0)
+        return self._addressed(station.host.advance(now_us))
+
+    def finish(self) -> list[Written]:
+        """No more packets will come."""
+        written: list[Written] = []
+        for station in self._stations.values():
+            written += self._processed(station, station.merger.flush())
+            written += self._addressed(station.host.finish())
+        return written
+
+    def health(self) -> dict[str, Any]:
+        """Counters for people."""
+        stations = self._stations.values()
+        return {
+            "queries": {
+                one.identity: "switch" if one.in_switch else f"host: {one.reason}"
+                for one in self.plan.queries
+            },
+            "bits": len(self.plan.entries) + len(self.plan.copies),
+            "host_packets": sum(station.host.packets for station in stations),
+            "late": sum(station.host.late for station in stations),
+            "disordered": sum(station.merger.disordered for station in stations),
+            "without_payload": sum(station.host.without_payload for station in stations),
+            "reports": sum(report.tuples for station in stations for report in station.reports.values()),
+            "refused": len(self._refused),
+        }
+
+    def _read(self, keys: Iterable[str]) -> tuple[dict[str, Request], dict[str, set[str]], dict[str, str]]:
+        requests: dict[str, Request] = {}
+        outputs: dict[str, set[str]] = {}
+        refused: dict[str, str] = {}
+        for key in sorted(set(keys)):
+            try:
+                request = request_of(key, self._templates)
+            except SonataError as error:
+                refused[key] = str(error)
+                continue
+            if request is not None:
+                requests.setdefault(request.identity, request)
+                outputs.setdefault(request.identity, set()).add(request.output)
+        return requests, outputs, refused
+
+    def _station(self, name: str) -> _Station:
+        station = self._stations.get(name)
+        if station is None:
+            station = self._stations[name] = _Station(self._keys_limit, self._lateness_us)
+            self._refit(station, {})
+        return station
+
+    def _refit(self, station: _Station, old: Mapping[str, Request]) -> None:
+        """Make a switch's operators those of the plan."""
+        host = {one.identity for one in self.plan.queries if not one.in_switch}
+        for identity in old.keys() - host:
+            station.host.remove(identity)
+        for identity in sorted(host - station.host.names):
+            station.host.add(self._requests[identity].query)
+        station.merger.expect({_name(copy.bit) for copy in self.plan.copies}, 0.0)
+        reports = {}
+        for one in self.plan.queries:
+            if one.in_switch:
+                held = station.reports.get(one.identity)
+                reports[one.identity] = held or self._new_reports(one, station)
+        station.reports = reports
+
+    def _new_reports(self, one: QueryPlan, station: _Station) -> Reports:
+        query = self._requests[one.identity].query
+        return Reports(query, one, base_us=station.base_us, since_us=station.now_us)
+
+    def _processed(self, station: _Station, batch: RecordBatch | None) -> list[Written]:
+        return [] if batch is None else self._addressed(station.host.process(batch))
+
+    def _addressed(self, outputs: Sequence[Output]) -> list[Written]:
+        return [
+            Written(self._outputs[output.query], output)
+            for output in outputs
+            if output.query in self._outputs
+        ]
+
+    def _withdrawn(self, before: Plan) -> tuple[dict[str, Any], ...]:
+        now = {**{bit: True for bit in self.plan.entries}, **{copy.bit: True for copy in self.plan.copies}}
+        gone = [bit for bit in (*before.entries, *(copy.bit for copy in before.copies)) if bit not in now]
+        return tuple({"name": _name(bit), "bit": bit, "active": False} for bit in gone)
+
+    def _offered(self, before: Plan) -> tuple[dict[str, Any], ...]:
+        known = {entry.bit: entry.match for entry in before.entries.values()}
+        found = [
+            _offer(entry.bit, entry.match, copy=False)
+            for entry in self.plan.entries.values()
+            if known.get(entry.bit) != entry.match
+        ]
+        copied = {copy.bit: copy.match for copy in before.copies}
+        found += [
+            _offer(copy.bit, copy.match, copy=True)
+            for copy in self.plan.copies
+            if copied.get(copy.bit) != copy.match
+        ]
+        return tuple(found)
+
+    def _updates(self, before: Plan) -> tuple[TableUpdate, ...]:
+        old, new = before.entries, self.plan.entries
+        found = [_update("delete", entry) for bit, entry in old.items() if new.get(bit) != entry]
+        for bit, entry in sorted(new.items()):
+            params = entry.params(self.plan.repeated(bit))
+            if old.get(bit) != entry:
+                found.append(_update("insert", entry, params))
+            elif before.repeated(bit) != self.plan.repeated(bit):
+                found.append(_update("modify", entry, params))
+        return tuple(found)
+
+
+def _name(bit: int) -> str:
+    return f"q{bit}"
+
+
+def _offer(bit: int, match: Mapping[str, Any], *, copy: bool) -> dict[str, Any]:
+    """The value of `network.telemetry.sonata_adapter.<name>`."""
+    return {"name": _name(bit), "bit": bit, "conditions": dict(match), "copy": copy, "active": True}
+
+
+def _update(kind: Any, entry: Entry, params: Mapping[str, int] | None = None) -> TableUpdate:
+    map_of_bit = hex(1 << entry.bit)
+    return TableUpdate(
+        kind=kind,
+        table=f"ingress.count_{entry.stage}.queries",
+        match={"query_map": [map_of_bit, map_of_bit]},
+        action=f"ingress.count_{entry.stage}.count",
+        # numbers of more than 64 bits do not travel as such
+        params={} if params is None else {name: hex(value) for name, value in params.items()},
+        priority=1 + entry.bit,
+    )

@@ -1,0 +1,318 @@
+"""All host queries over one stream of packet batches, windowed on capture time.
+
+    batch ─► windows [n·W, (n+1)·W) ─► operators, shared among queries ─► crossings at once
+                                                                      └─► tables when the window closes
+
+A window closes when a packet is `lateness_us` beyond its end (at most one window), or on `advance` or
+`finish`.  Packets of a closed window are left out and counted in `late`.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import numpy as np
+
+from apps.sonata_adapter.columns import Packets, Rows, Tuples, column_of, plain_value
+from apps.sonata_adapter.dataflow import (
+    Crossing,
+    DistinctNode,
+    Node,
+    Outcome,
+    PacketSource,
+    ReduceNode,
+    Stream,
+    Table,
+    TableJoin,
+    compile_query,
+    kinds_of,
+    sources,
+)
+from apps.sonata_adapter.expressions import Kind, kind_of
+from apps.sonata_adapter.operators import (
+    Crossed,
+    DistinctOperator,
+    ReduceOperator,
+    Reported,
+    Update,
+    filtered,
+)
+from apps.sonata_adapter.query import PACKET_KINDS, Query
+from apps.sonata_adapter.relations import Relation
+from apps.sonata_adapter.results import Captured, Output, Result
+from due import RecordBatch
+
+DEFAULT_LIMIT: Final = 1 << 20
+DEFAULT_LATENESS_US: Final = 500_000
+
+
+class _Running:
+    """A query in force."""
+
+    def __init__(self, query: Query, since_us: int | None) -> None:
+        self.name = query.name
+        self.window_us = query.window_us
+        self.outcome: Outcome = compile_query(query)
+        self.kinds = query.fields
+        self.since_us = since_us
+        """Capture time when it came into force; None: before the first packet."""
+
+    def nodes(self) -> list[Node]:
+        return sources(self.outcome) if isinstance(self.outcome, Table) else [self.outcome.node]
+
+
+class _Window:
+    """State of all operators of one window length in one window."""
+
+    def __init__(self, start_us: int, length_us: int, limit: int) -> None:
+        self.start_us = start_us
+        self.length_us = length_us
+        self._limit = limit
+        self._distincts: dict[DistinctNode, DistinctOperator] = {}
+        self._reduces: dict[ReduceNode, ReduceOperator] = {}
+        self._reported: dict[str, Reported] = {}
+
+    def feed(self, node: Node, packets: Packets, memo: dict[Node, Rows | Update]) -> Rows | Update:
+        """What the packets make of a node; each node takes them once."""
+        found = memo.get(node)
+        if found is None:
+            found = memo[node] = self._feed(node, packets, memo)
+        return found
+
+    def _feed(self, node: Node, packets: Packets, memo: dict[Node, Rows | Update]) -> Rows | Update:
+        if isinstance(node, PacketSource):
+            return filtered(packets.once if node.once else packets, node.filters)
+        rows = self.feed(node.source, packets, memo)
+        assert not isinstance(rows, Update)  # noqa: S101 - nothing in a graph stands behind a reduce
+        if isinstance(node, DistinctNode):
+            distinct = self._distincts.get(node)
+            if distinct is None:
+                distinct = self._distincts[node] = DistinctOperator(node, self._limit)
+            return distinct.take(rows)
+        reduce = self._reduces.get(node)
+        if reduce is None:
+            reduce = self._reduces[node] = ReduceOperator(node, self._limit)
+        return reduce.take(rows)
+
+    def reported(self, query: str) -> Reported:
+        return self._reported.setdefault(query, Reported(self._limit))
+
+    def relation(self, table: Table) -> Relation:
+        """A table after all its steps."""
+        tuples = filtered(self._table(table.node), table.filters)
+        columns = {name: column_of(value, tuples) for name, value in table.names}
+        relation = Relation(columns, len(tuples))
+        for step in table.steps:
+            other = self.relation(step.other) if isinstance(step, TableJoin) else None
+            relation = relation.apply(step, other)
+        return relation
+
+    def _table(self, node: Node) -> Tuples:
+        if isinstance(node, DistinctNode):
+            distinct = self._distincts.get(node) or DistinctOperator(node, 1)
+            return distinct.table()
+        assert isinstance(node, ReduceNode)  # noqa: S101 - packets alone make no table
+        reduce = self._reduces.get(node) or ReduceOperator(node, 1)
+        return reduce.table()
+
+    def error(self, nodes: Iterable[Node]) -> str:
+        """Why results that rest on these nodes are estimates; empty: they are exact."""
+        found = [text for node in nodes for text in self._errors(node)]
+        return "; ".join(dict.fromkeys(found))
+
+    def _errors(self, node: Node) -> Iterator[str]:
+        if isinstance(node, PacketSource):
+            return
+        operator = self._distincts.get(node) if isinstance(node, DistinctNode) else self._reduces.get(node)
+        if operator is not None and operator.error:
+            yield operator.error
+        yield from self._errors(node.source)
+
+
+class HostEngine:
+    """Runs queries over batches; pure: time comes with the packets.
+
+    `limit` is the number of keys that one operator keeps exactly in one window.
+    """
+
+    def __init__(self, *, limit: int = DEFAULT_LIMIT, lateness_us: int = DEFAULT_LATENESS_US) -> None:
+        self._limit = limit
+        self._lateness_us = lateness_us
+        self._queries: dict[str, _Running] = {}
+        self._windows: dict[tuple[int, int], _Window] = {}
+        self._closed: dict[int, int] = {}
+        self.watermark_us: int | None = None
+        self.packets = 0
+        self.late = 0
+        self.without_payload = 0
+        self.results = 0
+
+    @property
+    def names(self) -> set[str]:
+        """Queries in force."""
+        return set(self._queries)
+
+    def add(self, query: Query) -> None:
+        """Bring a query into force under its name; raises `InvalidQuery`."""
+        self._queries[query.name] = _Running(query, self.watermark_us)
+
+    def remove(self, name: str) -> None:
+        """Forget a query; what is open in its windows is not reported."""
+        self._queries.pop(name, None)
+        lengths = {running.window_us for running in self._queries.values()}
+        self._windows = {key: window for key, window in self._windows.items() if key[0] in lengths}
+
+    def process(self, batch: RecordBatch) -> list[Output]:
+        """What the packets bring about, in order."""
+        if not len(batch) or not self._queries:
+            return []
+        self.packets += len(batch)
+        times = batch["time_us"]
+        first, last = int(times.min()), int(times.max())
+        whole = Packets(batch)
+        outputs: list[Output] = []
+        for length, queries in self._by_length().items():
+            for index, packets in self._windows_of(whole, length, first, last):
+                outputs += self._feed(length, index, packets, queries, batch)
+        self.without_payload += whole.without_payload
+        outputs += self.advance(last)
+        self.results += len(outputs)
+        return outputs
+
+    def advance(self, now_us: int) -> list[Output]:
+        """Capture time has come to `now_us`: close what is over."""
+        self.watermark_us = max(now_us, self.watermark_us or now_us)
+        over = [
+            key
+            for key in self._windows
+            if (key[1] + 1) * key[0] + min(self._lateness_us, key[0]) <= self.watermark_us
+        ]
+        return self._close(over)
+
+    def finish(self) -> list[Output]:
+        """No more packets will come: close all windows."""
+        return self._close(list(self._windows))
+
+    def _by_length(self) -> dict[int, list[_Running]]:
+        found: dict[int, list[_Running]] = {}
+        for running in self._queries.values():
+            found.setdefault(running.window_us, []).append(running)
+        return found
+
+    def _windows_of(
+        self, whole: Packets, length: int, first: int, last: int
+    ) -> Iterator[tuple[int, Packets]]:
+        closed = self._closed.get(length, -1)
+        if first // length == last // length:
+            if first // length > closed:
+                yield first // length, whole
+            else:
+                self.late += len(whole)
+            return
+        indices = whole.batch["time_us"] // length
+        for index in np.unique(indices).tolist():
+            rows = np.flatnonzero(indices == index)
+            if index > closed:
+                yield index, Packets(whole.batch, rows)
+            else:
+                self.late += len(rows)
+
+    def _feed(
+        self, length: int, index: int, packets: Packets, queries: list[_Running], batch: RecordBatch
+    ) -> Iterator[Output]:
+        window = self._windows.get((length, index))
+        if window is None:
+            window = self._windows[length, index] = _Window(index * length, length, self._limit)
+        memo: dict[Node, Rows | Update] = {}
+        for running in queries:
+            for node in running.nodes():
+                window.feed(node, packets, memo)
+            match running.outcome:
+                case Crossing():
+                    yield from self._crossings(running, running.outcome, window, memo, batch)
+                case Stream():
+                    yield from _captured(running, running.outcome, memo)
+                case Table():
+                    pass
+
+    def _crossings(
+        self,
+        running: _Running,
+        outcome: Crossing,
+        window: _Window,
+        memo: dict[Node, Rows | Update],
+        batch: RecordBatch,
+    ) -> Iterator[Output]:
+        found = memo[outcome.node]
+        if isinstance(found, Update):
+            crossed = found.crossed(outcome.threshold, window.reported(running.name))
+        else:
+            assert isinstance(found, Tuples)  # noqa: S101 - of a distinct
+            crossed = Crossed(found, np.ones(len(found), dtype=np.bool_))
+        tuples = crossed.tuples
+        if not len(tuples):
+            return
+        inner = kinds_of(outcome.node)
+        columns = [(name, kind_of(value, inner), column_of(value, tuples)) for name, value in outcome.names]
+        times = batch["time_us"][tuples.origin].tolist()
+        error = window.error([outcome.node])
+        for row, time_us in enumerate(times):
+            yield _result(running, window, columns, row, at_us=time_us, error=error)
+
+    def _close(self, keys: list[tuple[int, int]]) -> list[Output]:
+        outputs: list[Output] = []
+        for key in sorted(keys, key=lambda key: ((key[1] + 1) * key[0], key[0])):
+            window = self._windows.pop(key)
+            self._closed[key[0]] = max(key[1], self._closed.get(key[0], -1))
+            for running in self._queries.values():
+                if running.window_us == key[0] and isinstance(running.outcome, Table):
+                    outputs += _final(running, running.outcome, window)
+        return outputs
+
+
+def _final(running: _Running, outcome: Table, window: _Window) -> Iterator[Output]:
+    relation = window.relation(outcome)
+    columns = [(name, running.kinds[name], column) for name, column in sorted(relation.columns.items())]
+    error = window.error(running.nodes())
+    end = window.start_us + window.length_us
+    for row in range(relation.size):
+        yield _result(running, window, columns, row, at_us=end, error=error)
+
+
+def _result(
+    running: _Running,
+    window: _Window,
+    columns: list[tuple[str, Kind, tuple[np.ndarray, ...]]],
+    row: int,
+    *,
+    at_us: int,
+    error: str,
+) -> Result:
+    return Result(
+        query=running.name,
+        window_us=window.start_us,
+        length_us=window.length_us,
+        at_us=at_us,
+        fields={name: plain_value(kind, column, row) for name, kind, column in columns},
+        exact=not error,
+        partial=running.since_us is not None and running.since_us > window.start_us,
+        error=error,
+    )
+
+
+def _captured(running: _Running, outcome: Stream, memo: dict[Node, Rows | Update]) -> Iterator[Output]:
+    packets = memo[outcome.node]
+    assert isinstance(packets, Packets)  # noqa: S101 - a stream's node is a packet source
+    if not len(packets):
+        return
+    batch = packets.batch
+    last_us = int(batch["time_us"][-1])
+    if outcome.names is not None:
+        made = {"time_us": batch["time_us"]}
+        for name, value in outcome.names:
+            column = column_of(value, packets)
+            kind = kind_of(value, PACKET_KINDS)
+            made |= dict(
+                zip((f"{name}_hi", f"{name}_lo") if kind == "address" else (name,), column, strict=True)
+            )
+        batch = RecordBatch(made)
+    yield Captured(query=running.name, batch=batch, last_us=last_us)

@@ -1,0 +1,182 @@
+"""DUE keys → queries, and the keys that results are written under.
+
+    network.traffic_query.sonata.<query>:window=3s,threshold=40,dst=10.0.0.0/8     results
+    network.traffic_capture.sonata.<protocol>:flag=syn,dst=…,dport=80               packets
+    network.handshake.sonata.tcp                                                     completed handshakes
+
+A parameter that is missing means its default.  Items carry all parameters, spelled as the interest
+spelled those that it gave (`window=3000ms` stays that), so that whoever asked receives them.
+"""
+
+from collections.abc import Mapping
+from typing import Final, Literal
+
+import msgspec
+
+from apps.sonata_adapter.catalogue import Template
+from apps.sonata_adapter.errors import InvalidRequest
+from apps.sonata_adapter.expressions import ACK, FIN, RST, Flags, Term
+from apps.sonata_adapter.parameters import ANY_PREFIX, Parameter, Value, prefix
+from apps.sonata_adapter.query import Query, field, ip, tcp, udp
+from due import Key
+
+QUERY_PREFIX: Final = "network.traffic_query.sonata"
+CAPTURE_PREFIX: Final = "network.traffic_capture.sonata"
+HANDSHAKE: Final = "network.handshake.sonata.tcp"
+
+Kind = Literal["query", "capture", "handshake"]
+
+_FLAGS: Final[dict[str, Flags]] = {
+    "syn": Flags("syn", 0x02, 0x12),  # SYN set, ACK clear
+    "syn+ack": Flags("syn+ack", 0x12, 0x12),
+    "ack": ACK,
+    "fin": FIN,
+    "rst": RST,
+}
+_PREFIXES: Final = (prefix("src", "source address"), prefix("dst", "destination address"))
+_ANY: Final = "any"
+
+
+class Protocol(msgspec.Struct, frozen=True):
+    """What a raw stream's protocol selects."""
+
+    meaning: str
+    conditions: tuple[Term, ...]
+    ports: tuple[Term, Term] | None = None
+    flags: bool = False
+
+
+_DNS: Final = (udp.sport == 53) | (udp.dport == 53)
+PROTOCOLS: Final[dict[str, Protocol]] = {
+    "tcp": Protocol("TCP segments", (ip.proto == 6,), (tcp.sport, tcp.dport), flags=True),
+    "udp": Protocol("UDP datagrams", (ip.proto == 17,), (udp.sport, udp.dport)),
+    "icmp": Protocol("ICMP and ICMPv6", ((ip.proto == 1) | (ip.proto == 58),)),
+    "arp": Protocol("ARP", (field("arp.op") >= 0,)),
+    "dns": Protocol("DNS over UDP", (_DNS,), (udp.sport, udp.dport)),
+    "ip": Protocol("IPv4 and IPv6", (ip.version != 0,)),
+}
+
+
+class Request(msgspec.Struct, frozen=True):
+    """What a key asks for."""
+
+    key: str
+    """The interest's key, canonical for DUE."""
+    kind: Kind
+    name: str
+    identity: str
+    """Equal for keys that ask for the same: the key with all parameters in one spelling."""
+    output: str
+    """Where results go: all parameters, spelled as the interest spelled them."""
+    query: Query
+    values: tuple[tuple[str, Value], ...] = ()
+
+
+def request_of(key: str, templates: Mapping[str, Template]) -> Request | None:
+    """What an interest asks for; None for a key that asks for nothing of its own.
+
+    A wildcard (`window=*`, `sonata.*`) follows what others ask for.  Raises `InvalidRequest` for an
+    unknown query or parameter and for a value out of bounds: the text says what would do.
+    """
+    parsed = Key.parse(key)
+    if not parsed.concrete:
+        return None
+    path = ".".join(parsed.segments[:3])
+    name = parsed.segments[-1]
+    given = {name: parsed.spec(name) for name in parsed.specs}
+    if parsed.path == HANDSHAKE:
+        return Request(parsed.text, "handshake", "tcp", HANDSHAKE, HANDSHAKE, Query("handshakes", 1000))
+    if len(parsed.segments) == 4 and path == QUERY_PREFIX:
+        return _query_request(parsed, name, given, templates)
+    if len(parsed.segments) == 4 and path == CAPTURE_PREFIX:
+        return _capture_request(parsed, name, given)
+    raise InvalidRequest(
+        f"{key}: not a key of the Sonata adapter; write {QUERY_PREFIX}.<query> or {CAPTURE_PREFIX}.<protocol>"
+    )
+
+
+def canonical_key(template: Template, values: Mapping[str, Value] | None = None) -> str:
+    """The key of a query with all parameters written out."""
+    chosen = {each.name: each.default for each in template.parameters} | dict(values or {})
+    specs = {each.name: each.text(chosen[each.name]) for each in template.parameters}
+    return Key(f"{QUERY_PREFIX}.{template.name}").with_specs(**specs).text
+
+
+def _query_request(
+    key: Key, name: str, given: Mapping[str, str], templates: Mapping[str, Template]
+) -> Request:
+    template = templates.get(name)
+    if template is None:
+        raise InvalidRequest(f"{key}: there is no query {name}; there are {', '.join(templates)}")
+    values = _values(key, {each.name: each for each in template.parameters}, given)
+    identity = canonical_key(template, values)
+    texts = {each.name: given.get(each.name, each.text(values[each.name])) for each in template.parameters}
+    output = Key(f"{QUERY_PREFIX}.{name}").with_specs(**texts).text
+    query = msgspec.structs.replace(template.query(values), name=identity)
+    return Request(key.text, "query", name, identity, output, query, tuple(sorted(values.items())))
+
+
+def _values(key: Key, parameters: Mapping[str, Parameter], given: Mapping[str, str]) -> dict[str, Value]:
+    for name in given:
+        if name not in parameters:
+            raise InvalidRequest(f"{key}: no parameter {name}; there are {', '.join(parameters)}")
+    try:
+        return {
+            name: each.parse(given[name]) if name in given else each.default
+            for name, each in parameters.items()
+        }
+    except InvalidRequest as error:
+        raise InvalidRequest(f"{key}: {error}") from None
+
+
+def capture_parameters(protocol: Protocol) -> dict[str, str]:
+    """Specs of a raw stream and what they mean."""
+    found = {each.name: each.meaning for each in _PREFIXES}
+    if protocol.ports is not None:
+        found |= {"sport": "source port", "dport": "destination port"}
+    if protocol.flags:
+        found["flag"] = f"one of {', '.join(_FLAGS)}"
+    return found
+
+
+def _capture_request(key: Key, name: str, given: Mapping[str, str]) -> Request:
+    protocol = PROTOCOLS.get(name)
+    if protocol is None:
+        raise InvalidRequest(f"{key}: there is no raw stream {name}; there are {', '.join(PROTOCOLS)}")
+    known = capture_parameters(protocol)
+    for spec in given:
+        if spec not in known:
+            raise InvalidRequest(f"{key}: no parameter {spec}; there are {', '.join(known)}")
+    query = Query(name)
+    for always in protocol.conditions:
+        query = query.filter(always)
+    texts: dict[str, str] = {}
+    try:
+        for spec, text in sorted(given.items()):
+            condition, texts[spec] = _capture_condition(protocol, spec, text)
+            if condition is not None:
+                query = query.filter(condition)
+    except InvalidRequest as error:
+        raise InvalidRequest(f"{key}: {error}") from None
+    identity = Key(f"{CAPTURE_PREFIX}.{name}").with_specs(**texts).text
+    return Request(
+        key.text, "capture", name, identity, key.text, msgspec.structs.replace(query, name=identity)
+    )
+
+
+def _capture_condition(protocol: Protocol, spec: str, text: str) -> tuple[Term | None, str]:
+    """The condition of one spec, and its one spelling."""
+    if spec == "flag":
+        pattern = _FLAGS.get(text.lower())
+        if pattern is None:
+            raise InvalidRequest(f"flag={text} is unknown; give one of {', '.join(_FLAGS)}")
+        return tcp.flags == pattern, text.lower()
+    if spec in ("sport", "dport"):
+        assert protocol.ports is not None  # noqa: S101 - else the spec is not known
+        if not text.isdecimal() or int(text) > 65_535:
+            raise InvalidRequest(f"{spec}={text} is no port; give 0 to 65535")
+        return protocol.ports[spec == "dport"] == int(text), str(int(text))
+    parameter = _PREFIXES[spec == "dst"]
+    value = str(parameter.parse(text))
+    address = ip.dst if spec == "dst" else ip.src
+    return (None if value == ANY_PREFIX else address.within(value)), value

@@ -1,0 +1,54 @@
+"""os-ken's event API as a peer: one app sends events, another's handler counts them, in one process."""
+
+import importlib
+import importlib.util
+import time
+from typing import Any
+
+
+def available() -> bool:
+    """Whether os-ken is installed."""
+    return importlib.util.find_spec("os_ken") is not None
+
+
+def events_per_second(size: int, count: int = 50_000) -> float:
+    """Events a second from `send_event` to the handler."""
+    times = _run(size, count, gap=0.0)
+    return count / (times[-1][1] - times[0][0])
+
+
+def latency_us(size: int, count: int = 1000) -> list[float]:
+    """One-way times of events sent one by one, µs."""
+    return [(arrived - sent) * 1e6 for sent, arrived in _run(size, count, gap=0.001)]
+
+
+def _run(size: int, count: int, gap: float) -> list[tuple[float, float]]:
+    app_manager: Any = importlib.import_module("os_ken.base.app_manager")
+    event: Any = importlib.import_module("os_ken.controller.event")
+    handler: Any = importlib.import_module("os_ken.controller.handler")
+    hub: Any = importlib.import_module("os_ken.lib.hub")
+
+    class Message(event.EventBase):  # type: ignore[misc]
+        def __init__(self, payload: bytes) -> None:
+            super().__init__()
+            self.payload = payload
+            self.sent = time.monotonic()
+
+    times: list[tuple[float, float]] = []
+
+    class Receiver(app_manager.OSKenApp):  # type: ignore[misc]
+        @handler.set_ev_handler(Message)  # type: ignore[untyped-decorator]
+        def on_message(self, message: Any) -> None:
+            times.append((message.sent, time.monotonic()))
+
+    receiver = Receiver()
+    receiver.register_handler(Message, receiver.on_message)
+    receiver.start()
+    payload = bytes(size)
+    for _ in range(count):
+        receiver._send_event(Message(payload), None)
+        hub.sleep(gap) if gap else None
+    while len(times) < count:
+        hub.sleep(0.001)
+    receiver.stop()
+    return times

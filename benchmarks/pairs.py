@@ -1,0 +1,198 @@
+"""A producer here and a consumer in another process, for DUE and for its peers.
+
+Each `run_*` sends `count` messages and returns messages per second, from the first write until the
+last callback in the other process.
+"""
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
+
+import msgspec
+import redis
+
+from due import CONSUMER, PRODUCER, PUB_ONLY, Engine, Item, Options, RecordBatch
+
+KEY = "bench.pairs.app.message"
+CHANNEL = "bench"
+_spawn = multiprocessing.get_context("spawn")
+
+Runner = Callable[[str, int, int], float]
+
+
+def engine(url: str, app: str, role: Any, **options: Any) -> Engine:
+    """An engine without a Coordinator."""
+    made = Engine(Options(coordinated=False, **options))
+    made.set_pubsub(url)
+    made.init(app, role)
+    return made
+
+
+def raw_client(url: str) -> redis.Redis:
+    """redis-py as fast as it goes: RESP2 and hiredis."""
+    return redis.Redis.from_url(url, protocol=2, socket_timeout=None)
+
+
+@contextmanager
+def other_process(target: Callable[..., None], *arguments: Any) -> Iterator[Connection]:
+    """Runs `target(pipe, ...)` in another process; it sends "ready" first."""
+    here, there = _spawn.Pipe()
+    process = _spawn.Process(target=target, args=(there, *arguments), daemon=True)
+    process.start()
+    try:
+        assert here.recv() == "ready"
+        yield here
+    finally:
+        process.join(5)
+        if process.is_alive():
+            process.terminate()
+            process.join()
+        here.close()
+
+
+def run_due(url: str, size: int, count: int) -> float:
+    """DUE with its defaults, one callback per message."""
+    with other_process(_due_consumer, url, count) as pipe:
+        producer = engine(url, "producer", PRODUCER)
+        payload, write = bytes(size), producer.write
+        flags = [PUB_ONLY]
+        start = time.monotonic()
+        for _ in range(count):
+            write(KEY, payload, flags)
+        producer.flush()
+        rate = count / (_finished(pipe) - start)
+        producer.close()
+    return rate
+
+
+def run_records(url: str, rows: int, count: int) -> float:
+    """DUE with record batches of `rows` packet headers; records per second."""
+    import numpy as np
+
+    batch = RecordBatch(
+        {
+            "time_us": np.arange(rows, dtype="i8"),
+            "source": np.arange(rows, dtype="u4"),
+            "destination": np.arange(rows, dtype="u4"),
+            "source_port": np.zeros(rows, "u2"),
+            "destination_port": np.zeros(rows, "u2"),
+            "length": np.zeros(rows, "u2"),
+            "protocol": np.zeros(rows, "u1"),
+            "flags": np.zeros(rows, "u1"),
+        }
+    )
+    with other_process(_due_consumer, url, count) as pipe:
+        producer = engine(url, "producer", PRODUCER)
+        start = time.monotonic()
+        for _ in range(count):
+            producer.write(KEY, batch, [PUB_ONLY])
+        rate = rows * count / (_finished(pipe) - start)
+        producer.close()
+    return rate
+
+
+def run_one_by_one(url: str, size: int, count: int) -> float:
+    """redis-py: one PUBLISH per message."""
+    with other_process(_raw_consumer, url, count) as pipe:
+        client = raw_client(url)
+        payload = bytes(size)
+        start = time.monotonic()
+        for _ in range(count):
+            client.publish(CHANNEL, payload)
+        rate = count / (_finished(pipe) - start)
+        client.close()
+    return rate
+
+
+def run_pipeline100(url: str, size: int, count: int) -> float:
+    """redis-py: pipelines of 100 PUBLISHes."""
+    with other_process(_raw_consumer, url, count) as pipe:
+        client = raw_client(url)
+        payload = bytes(size)
+        start = time.monotonic()
+        for _ in range(count // 100):
+            pipeline = client.pipeline(transaction=False)
+            for _ in range(100):
+                pipeline.publish(CHANNEL, payload)
+            pipeline.execute()
+        rate = count / (_finished(pipe) - start)
+        client.close()
+    return rate
+
+
+def run_raw_frames(url: str, size: int, count: int) -> float:
+    """redis-py: frames of 100 messages, decoded to a list, without callbacks: the bound for any framing."""
+    with other_process(_frame_consumer, url, count // 100) as pipe:
+        client = raw_client(url)
+        payload = bytes(size)
+        encoder = msgspec.msgpack.Encoder()
+        start = time.monotonic()
+        for _ in range(count // 100):
+            client.publish(CHANNEL, encoder.encode([payload] * 100))
+        rate = count / (_finished(pipe) - start)
+        client.close()
+    return rate
+
+
+def _finished(pipe: Connection) -> float:
+    if not pipe.poll(120):
+        raise RuntimeError("the consumer did not receive everything within 120 s")
+    return float(pipe.recv())
+
+
+def _due_consumer(pipe: Connection, url: str, count: int) -> None:
+    consumer = engine(url, "consumer", CONSUMER)
+    left = [count]
+
+    def callback(_item: Item) -> None:
+        left[0] -= 1
+        if not left[0]:
+            pipe.send(time.monotonic())
+
+    consumer.observe(KEY).subscribe(callback)
+    pipe.send("ready")
+    while left[0] > 0:
+        time.sleep(0.02)
+    consumer.close()
+
+
+def _raw_consumer(pipe: Connection, url: str, count: int) -> None:
+    left = [count]
+
+    def callback(_data: bytes) -> None:
+        left[0] -= 1
+        if not left[0]:
+            pipe.send(time.monotonic())
+
+    _listen(pipe, url, count, callback)
+
+
+def _frame_consumer(pipe: Connection, url: str, frames: int) -> None:
+    left = [frames]
+    decoder = msgspec.msgpack.Decoder(list[Any])
+
+    def callback(data: bytes) -> None:
+        decoder.decode(data)
+        left[0] -= 1
+        if not left[0]:
+            pipe.send(time.monotonic())
+
+    _listen(pipe, url, frames, callback)
+
+
+def _listen(pipe: Connection, url: str, messages: int, callback: Callable[[bytes], None]) -> None:
+    client: Any = raw_client(url)
+    subscriber = client.pubsub(ignore_subscribe_messages=False)
+    subscriber.subscribe(CHANNEL)
+    subscriber.get_message(timeout=5)
+    pipe.send("ready")
+    while messages:
+        message = subscriber.get_message(timeout=5)
+        if message is not None and message["type"] == "message":
+            callback(message["data"])
+            messages -= 1
+    subscriber.close()
+    client.close()

@@ -1,0 +1,210 @@
+"""How many pairs fit on one machine, how fairly, and what 100 apps cost the Coordinator.
+
+`python -m benchmarks.scale --json FILE`.  Each pair is two processes with a reliable key of its own, writing
+as fast as the consumer takes it.  The Coordinator hears 100 apps beating at 10 Hz.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from benchmarks.measure import arguments, bars, machine, table, write_json
+from benchmarks.pairs import _spawn
+from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Interest, Item, Options
+from due.codec import Frame, decode_frame, encode_frame, freeze
+from due.drivers.embedded_redis import EmbeddedServer
+from due.drivers.redis import RedisUpdates
+from due.membership import Assignments, Heartbeat, Member, Registration
+
+PAIRS = (1, 2, 5, 10, 20, 30)
+SECONDS = 4.0
+SIZE = 100
+APPS, BEAT = 100, 0.1
+_WINDOW = 1 << 20
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print, write."""
+    options = arguments("scale", __doc__, rounds=1).parse_args(argv)
+    seconds = max(1.0, SECONDS * options.scale)
+    aggregate: dict[str, float] = {}
+    fairness: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder, EmbeddedServer(folder) as server:
+        for pairs in PAIRS:
+            rounds = sorted(_run(server.url, pairs, seconds) for _ in range(options.rounds))
+            rates = rounds[len(rounds) // 2]
+            aggregate[str(pairs)] = sum(rates)
+            fairness[str(pairs)] = min(rates) / max(rates)
+        share = coordinator_share(server.url, folder, 2 * seconds)
+    table(
+        ["pairs", "messages/s", "share of the best", "min / max"],
+        [[p, aggregate[p], aggregate[p] / max(aggregate.values()), fairness[p]] for p in aggregate],
+    )
+    bars("messages/s of all pairs together", aggregate)
+    print(f"Coordinator with {APPS} apps at {1 / BEAT:.0f} Hz: {share:.1%} of a core")
+    figures = {"aggregate_by_pairs": aggregate, "fairness_by_pairs": fairness}
+    write_json(options.json, {"machine": machine(), **figures, "coordinator_cpu_share": share})
+    return 0
+
+
+def _run(url: str, pairs: int, seconds: float) -> list[float]:
+    """Messages a second of each pair, counted by the consumers in one common span of time."""
+    pipes: list[Connection] = []
+    processes = []
+    for number in range(pairs):
+        for target in (_consumer, _producer):
+            here, there = _spawn.Pipe()
+            processes.append(_spawn.Process(target=target, args=(there, url, number, seconds), daemon=True))
+            processes[-1].start()
+            pipes.append(here)
+    for pipe in pipes:
+        _answer(pipe)
+    start = time.time() + 0.5
+    for pipe in pipes:
+        pipe.send(start)
+    rates = [float(_answer(pipe)) for pipe in pipes[::2]]
+    for process in processes:
+        process.join()
+    return rates
+
+
+def _answer(pipe: Connection) -> float:
+    if not pipe.poll(120):
+        raise RuntimeError("a process did not answer within 120 s")
+    return float(pipe.recv())
+
+
+def _options() -> Options:
+    return Options(coordinated=False, window_bytes=_WINDOW, retain_bytes=_WINDOW)
+
+
+def _producer(pipe: Connection, url: str, number: int, seconds: float) -> None:
+    key = f"bench.scale.p{number}.x"
+    engine = Engine(_options())
+    engine.set_pubsub(url)
+    engine.init(f"producer{number}", PRODUCER, capabilities=[Capability(key, delivery="reliable")])
+    payload = bytes(SIZE)
+    pipe.send(0)
+    start = pipe.recv()
+    time.sleep(max(0.0, start - time.time() - 0.3))
+    end = start + seconds + 0.3
+    while time.time() < end:
+        for _ in range(500):
+            engine.write(key, payload, [PUB_ONLY])
+    os._exit(0)
+
+
+def _consumer(pipe: Connection, url: str, number: int, seconds: float) -> None:
+    engine = Engine(_options())
+    engine.set_pubsub(url)
+    engine.init(f"consumer{number}", CONSUMER)
+    count = [0]
+
+    def callback(_item: Item) -> None:
+        count[0] += 1
+
+    engine.observe(f"bench.scale.p{number}.x").subscribe(callback)
+    pipe.send(0)
+    start = pipe.recv()
+    time.sleep(max(0.0, start - time.time()))
+    began, before = time.time(), count[0]
+    time.sleep(max(0.1, start + seconds - time.time()))
+    pipe.send((count[0] - before) / (time.time() - began))
+    os._exit(0)
+
+
+def coordinator_share(url: str, folder: str, seconds: float) -> float:
+    """CPU share of a real Coordinator that hears `APPS` apps."""
+    archive = f"sqlite://{Path(folder) / 'coordinator.db'}"
+    command = [
+        sys.executable,
+        "-m",
+        "coordinator.service",
+        "--updates",
+        url,
+        "--archive",
+        archive,
+        "--log",
+        "warning",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        json.loads(process.stdout.readline())
+        crowd = _Crowd(url, [_member(number) for number in range(APPS)])
+        crowd.beat(2.0)
+        before, began = _cpu_seconds(process.pid), time.monotonic()
+        crowd.beat(seconds)
+        share = (_cpu_seconds(process.pid) - before) / (time.monotonic() - began)
+        crowd.close()
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+    return share
+
+
+def _member(number: int) -> Member:
+    registration = Registration(
+        app_id=f"app{number}",
+        instance_id=f"instance{number}",
+        revision=1,
+        capabilities=(Capability(f"bench.made.app{number}.x"),),
+        interests=(Interest(f"bench.made.app{(number + 1) % APPS}.*"),),
+        heartbeat=BEAT,
+        started=time.time_ns(),
+    )
+    return Member(registration, now=time.monotonic(), handshake_timeout=1.0)
+
+
+class _Crowd:
+    """The members' side of the conversation with the Coordinator, over one connection."""
+
+    def __init__(self, url: str, members: list[Member]) -> None:
+        driver = RedisUpdates(url)
+        self._publisher = driver.publisher()
+        self._receiver = driver.receiver("crowd", "crowd")
+        self._receiver.subscribe("due.assignment.*")
+        self._members = {member.registration.app_id: member for member in members}
+        self._sent: Counter[str] = Counter()
+
+    def beat(self, seconds: float) -> None:
+        """Register, beat and listen for so long."""
+        end = time.monotonic() + seconds
+        while (now := time.monotonic()) < end:
+            for member in self._members.values():
+                for message in member.tick(now):
+                    self._send(message)
+            for delivery in self._receiver.receive(0.01):
+                said = Assignments.from_value(decode_frame(delivery.payload).values[0])
+                if said.app_id in self._members:
+                    self._members[said.app_id].assigned(said, time.monotonic())
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._publisher.close()
+        self._receiver.close()
+
+    def _send(self, message: Registration | Heartbeat) -> None:
+        kind = "registration" if isinstance(message, Registration) else "heartbeat"
+        path = f"due.{kind}.{message.app_id}"
+        count = self._sent[path]
+        self._sent[path] += 1
+        now, value = [time.time_ns()], [freeze(message.to_value())]
+        frame = Frame(path, message.app_id, message.instance_id, 0, count + 1, count, now, None, value)
+        self._publisher.publish(path, encode_frame(frame))
+
+
+def _cpu_seconds(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,219 @@
+"""The compiled switch program alone, without ports and gRPC: `python -m benchmarks.switch_pipeline --json FILE`.
+
+pipeline_pps: frames per second of the full program with 11 queries active and mixed traffic, batches of
+1,024 frames from Python to Python, median of the rounds.  block_10k_ratio: the rate with 10,000 block_src
+and 1,000 ternary block entries over that with 10, runs alternating.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from benchmarks import measure
+from dataplane.program import load
+from dataplane.switch import Backend, Replica, Switch
+from dataplane.tables import Exact, Lpm, Range, TableEntry, Ternary
+from dataplane.tree import Program
+
+_PROGRAM = Path(__file__).resolve().parent.parent / "p4" / "sdnator.json"
+_BATCH = 1024
+_SECONDS = 3.0
+_QUERIES = 11
+_START_US = 60_000_000
+_ALL = (1 << 256) - 1
+_HOSTS = 1000
+_ANY = Ternary(0, 0)
+_SYN, _SYN_ACK, _DATA = 0x02, 0x12, 0x18
+_FAMILIES = ((1, 2), (1, 5))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run, print, write."""
+    chosen = measure.arguments("switch_pipeline", __doc__, rounds=5).parse_args(argv)
+    figures = {"machine": measure.machine(), **figures_of(_SECONDS * chosen.scale, chosen.rounds)}
+    for name, value in figures.items():
+        print(f"{name:24} {value}")
+    measure.write_json(chosen.json, figures)
+    return 0
+
+
+def figures_of(seconds: float, rounds: int) -> dict[str, Any]:
+    """All figures; `seconds` of traffic for each round."""
+    program = load(_PROGRAM.read_bytes())
+    started = time.perf_counter()
+    few = prepared(program, "auto", blocks=10, ternary=10)
+    compiled = time.perf_counter() - started
+    many = prepared(program, "auto", blocks=10_000, ternary=1000)
+    plain = prepared(program, "python", blocks=10, ternary=10)
+    frames = traffic(20 * _BATCH)
+    rates: dict[str, list[float]] = {"few": [], "many": [], "python": []}
+    for _ in range(rounds):
+        rates["few"].append(rate(few, frames, seconds))
+        rates["many"].append(rate(many, frames, seconds))
+        rates["python"].append(rate(plain, frames[: 2 * _BATCH], seconds / 3))
+    ratios = [m / f for m, f in zip(rates["many"], rates["few"], strict=True)]
+    return {
+        "backend": few.backend,
+        "pipeline_pps": round(statistics.median(rates["few"])),
+        "block_10k_ratio": round(statistics.median(ratios), 3),
+        "pipeline_python_pps": round(statistics.median(rates["python"])),
+        "pipeline_load_s": round(compiled, 2),
+        **shares(few, frames),
+    }
+
+
+def shares(switch: Switch, frames: Sequence[bytes]) -> dict[str, float]:
+    """How many of the frames were copied to the controller, and made a digest."""
+    result = switch.process_many(1, frames, range(_START_US, _START_US + len(frames)))
+    return {
+        "copied_share": round(len(result.packet_ins) / len(frames), 3),
+        "digest_share": round(len(result.digests) / len(frames), 3),
+    }
+
+
+def rate(switch: Switch, frames: Sequence[bytes], seconds: float) -> float:
+    """Frames per second over about `seconds`, the clock of the frames running at 1 µs a frame."""
+    sent = 0
+    started = time.perf_counter()
+    while True:
+        for first in range(0, len(frames), _BATCH):
+            batch = frames[first : first + _BATCH]
+            switch.process_many(1, batch, range(_START_US + sent, _START_US + sent + len(batch)))
+            sent += len(batch)
+        passed = time.perf_counter() - started
+        if passed >= seconds:
+            return sent / passed
+
+
+def prepared(program: Program, backend: Backend, *, blocks: int, ternary: int) -> Switch:
+    """The program with 11 queries, wires, a protected service and so many block entries."""
+    switch = Switch(program, backend=backend)
+    switch.set_clone_session(1, [Replica(510, 1)])
+    switch.tables["ingress.forward_port"].insert(TableEntry((Exact(1),), "ingress.to_port", (2,)))
+    for n in range(blocks):
+        # addresses that send nothing: every frame is looked up, none is stopped
+        key = (Exact(1), Exact(0xC0000000 + n))
+        switch.tables["ingress.block_src"].insert(TableEntry(key, "ingress.drop_src"))
+    random = Random(1)
+    for n in range(ternary):
+        switch.tables["ingress.block"].insert(_block(random, n))
+    _queries(switch)
+    return switch
+
+
+def _block(random: Random, n: int) -> TableEntry:
+    """Blocks as an operator writes them: ten shapes of masks, varying prefixes."""
+    key = [_ANY] * 12
+    key[5] = Ternary(1, 1)
+    length = random.choice([16, 20, 24, 28, 32])
+    mask = ((1 << length) - 1) << (32 - length) | ((1 << 96) - 1) << 32
+    key[6 + n % 2] = Ternary((0xC0000000 + n * 7919 * 256) & mask, mask)
+    if n % 3 == 0:
+        key[8] = Ternary(6, 0xFF)
+    if n % 5 == 0:
+        key[10] = Ternary(1 + n % 1000, 0xFFFF)
+    return TableEntry(tuple(key), "ingress.drop_frame", (), 1 + n)
+
+
+def _queries(switch: Switch) -> None:
+    """Eleven queries, eight of them counted in the switch, two of them sending copies."""
+    tables = switch.tables
+    everything = (1 << _QUERIES) - 1
+    for name in ("link", "src", "dst", "sport"):
+        tables[f"ingress.telemetry_{name}"].set_default(f"ingress.match_{name}", (everything,))
+    for n, prefix in enumerate((0x0A000000, 0x0A010000, 0x0A020000)):
+        entry = TableEntry((Exact(1), Lpm(prefix, 112)), "ingress.match_src", (everything & ~(1 << n),))
+        tables["ingress.telemetry_src"].insert(entry)
+    l4 = tables["ingress.telemetry_l4"]
+    syn, ack, udp, other = 0b00000011111, 0b00001100000, 0b11100000000, 0b00010000000
+    shapes = ((6, _SYN, 0x17, syn), (6, _SYN_ACK, 0x17, ack), (6, 0, 0, other), (17, 0, 0, udp))
+    for n, (protocol, flags, mask, queries) in enumerate(shapes):
+        key = (Ternary(protocol, 0xFF), Ternary(flags, mask), Ternary(1, 1), _ANY)
+        l4.insert(TableEntry(key, "ingress.match_l4", (queries | other,), 100 - n))
+    ports = tables["ingress.telemetry_dport"]
+    ports.set_default("ingress.match_dport", (everything & ~(0b10000000001),))
+    ports.insert(TableEntry((Range(22, 23),), "ingress.match_dport", (everything,), 1))
+    ports.insert(TableEntry((Range(53, 53),), "ingress.match_dport", (everything,), 1))
+    tables["ingress.telemetry_active"].set_default(
+        "ingress.set_active", (everything, 0b10000000000, 0b00001000000)
+    )
+    for stage in range(8):
+        table = tables[f"ingress.count_{stage}.queries"]
+        for query in (stage, stage + 8)[: 2 if stage + 8 < _QUERIES else 1]:
+            bit = 1 << query
+            reciprocal = (1 << 64) // 3_000_000
+            params = (query, bit, 0, _ALL >> 128, 0, 0, 40, 0, reciprocal, 0, 32768, 0)
+            entry = TableEntry((Ternary(bit, bit),), f"ingress.count_{stage}.count", params, 1 + query)
+            table.insert(entry)
+
+
+def traffic(count: int) -> list[bytes]:
+    """Mixed frames of 1,000 hosts: TCP data and SYNs, UDP, ICMP errors that quote, ARP, IPv6."""
+    random = Random(2)
+    makers: list[tuple[float, Callable[[Random], bytes]]] = [
+        (0.55, lambda r: _ipv4(r, 6, _tcp(r, _DATA), r.choice([0, 40, 400]))),
+        (0.70, lambda r: _ipv4(r, 6, _tcp(r, r.choice([_SYN, _SYN_ACK])), 0)),
+        (0.88, lambda r: _ipv4(r, 17, _udp(r), 60)),
+        (0.93, lambda r: _ipv4(r, 1, b"\3\3" + bytes(6) + _ipv4(r, 17, _udp(r), 0)[14:], 0)),
+        (0.96, _arp),
+        (1.00, _ipv6),
+    ]
+    frames = []
+    for _ in range(count):
+        chance = random.random()
+        frames.append(next(make for limit, make in makers if chance < limit)(random))
+    return frames
+
+
+def _ends(random: Random) -> bytes:
+    return (
+        b"\2\0\0\0"
+        + random.randrange(_HOSTS).to_bytes(2, "big")
+        + b"\2\0\0\0"
+        + random.randrange(_HOSTS).to_bytes(2, "big")
+    )
+
+
+def _address(random: Random) -> bytes:
+    number = random.randrange(_HOSTS)
+    return bytes([10, number % 4, number // 250, 1 + number % 250])
+
+
+def _tcp(random: Random, flags: int) -> bytes:
+    ports = random.randint(1024, 60000).to_bytes(2, "big") + random.choice([80, 443, 22, 23, 8080]).to_bytes(
+        2, "big"
+    )
+    return ports + random.randbytes(8) + bytes([0x50, flags]) + b"\x20\0\0\0\0\0"
+
+
+def _udp(random: Random) -> bytes:
+    return (
+        random.randint(1024, 60000).to_bytes(2, "big")
+        + random.choice([53, 123, 10240]).to_bytes(2, "big")
+        + b"\0\x44\0\0"
+    )
+
+
+def _ipv4(random: Random, protocol: int, body: bytes, payload: int) -> bytes:
+    total = (20 + len(body) + payload).to_bytes(2, "big")
+    head = (
+        b"\x45\0" + total + b"\0\1\x40\0" + bytes([64, protocol, 0, 0]) + _address(random) + _address(random)
+    )
+    return _ends(random) + b"\x08\0" + head + body + bytes(payload)
+
+
+def _arp(random: Random) -> bytes:
+    ends = _ends(random)
+    return ends + b"\x08\x06\0\1\x08\0\6\4\0\1" + ends[6:] + _address(random) + bytes(6) + _address(random)
+
+
+def _ipv6(random: Random) -> bytes:
+    addresses = b"\xfe\x80" + bytes(10) + _address(random) + b"\xfe\x80" + bytes(10) + _address(random)
+    return _ends(random) + b"\x86\xdd\x60\0\0\0\0\x14\6\x40" + addresses + _tcp(random, _DATA)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,112 @@
+"""Two veth pairs and a switch between them: what it forwards, copies and digests, embedded and BMv2 alike.
+
+The sender raises its rate step by step; the figure is the highest rate that came through.  A step that
+loses more than a tenth is the last.
+"""
+
+import os
+import shutil
+import socket
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from benchmarks.switch_control import writes
+from benchmarks.switch_stage import Count, Switch, every_packet, frame, primary, process, program
+from benchmarks.switch_streams import count_stream, digest_entry
+from dataplane.bmv2 import PROGRAM, Bmv2
+from sdnator.wire import VethPair
+from tests.dataplane.controller import Controller, Names, insert
+
+RATES = (2_000, 5_000, 8_000, 12_000, 16_000, 20_000, 30_000, 40_000, 60_000, 80_000, 120_000)
+_TICK_S = 0.002
+_LOST = 0.1
+_SETTLE_S = 0.4
+
+
+def possible() -> bool:
+    """Veth pairs need root."""
+    return os.geteuid() == 0 and shutil.which("ip") is not None
+
+
+def bmv2_installed() -> bool:
+    return shutil.which(PROGRAM) is not None
+
+
+def send_process(pipe: Any, interface: str) -> None:
+    """Sends (rate, seconds) as told; answers with the number of frames."""
+    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)
+    raw.bind((interface, 0))
+    sent_frame = frame()
+    pipe.send("ready")
+    while order := pipe.recv():
+        rate, seconds = order
+        started, sent = time.monotonic(), 0
+        while (passed := time.monotonic() - started) < seconds:
+            due = int(rate * passed) - sent
+            for _ in range(due):
+                raw.send(sent_frame)
+            sent += max(due, 0)
+            time.sleep(_TICK_S)
+        pipe.send(sent)
+    raw.close()
+
+
+def wire(kind: str, folder: Path, seconds: float) -> dict[str, float]:
+    """forward_pps, packet_in_pps, digest_pps and entries_per_s of `kind`: embedded or bmv2."""
+    figures: dict[str, float] = {}
+    for what in ("forward_pps", "packet_in_pps", "digest_pps"):
+        with ExitStack() as stack:
+            entry, leave = VethPair.make(stack, "bi"), VethPair.make(stack, "bo")
+            controller = _switch(kind, folder / what, entry.far, leave.near, stack)
+            names = Names(program().p4info)
+            seen = _prepare(what, controller, names, leave.far)
+            pipe = stack.enter_context(process(send_process, entry.near))
+            figures[what] = _highest(pipe, seen, seconds)
+            if what == "digest_pps":
+                figures |= writes(controller, 10_000, 500, 3)
+    return figures
+
+
+def _switch(kind: str, folder: Path, one: str, two: str, stack: ExitStack) -> Controller:
+    if kind == "bmv2":
+        address = stack.enter_context(Bmv2({1: one, 2: two})).address
+    else:
+        switch = Switch(folder, (f"1=veth:{one}", f"2=veth:{two}"))
+        stack.callback(switch.close)
+        address = switch.address
+    controller = primary(address)
+    stack.callback(controller.close)
+    return controller
+
+
+def _prepare(what: str, controller: Controller, names: Names, out: str) -> Callable[[], int]:
+    """Set the switch up; a counter of what has come through."""
+    if what == "forward_pps":
+        action = names.tables["ingress.forward_port"].action_refs[0].id
+        name = next(a.preamble.name for a in names.info.actions if a.preamble.id == action)
+        controller.write(insert(names.entry("ingress.forward_port", {"ingress_port": 1}, name, [2])))
+        statistics = Path(f"/sys/class/net/{out}/statistics/rx_packets")
+        return lambda: int(statistics.read_text())
+    every_packet(controller, names, copies=what == "packet_in_pps", digests=what == "digest_pps")
+    if what == "digest_pps":
+        controller.write(insert(digest_entry(names)))
+    seen = Count()
+    count_stream(controller, seen)
+    return lambda: seen.total
+
+
+def _highest(pipe: Any, seen: Callable[[], int], seconds: float) -> float:
+    best = 0.0
+    for rate in RATES:
+        before = seen()
+        pipe.send((rate, seconds))
+        sent = int(pipe.recv())
+        time.sleep(_SETTLE_S)
+        came = seen() - before
+        best = max(best, min(came, sent) / seconds)
+        if came < sent * (1 - _LOST):
+            break
+    return best

@@ -1,0 +1,97 @@
+"""How many messages a second reach callbacks in another process: DUE, raw redis-py, os-ken.
+
+`python -m benchmarks.updates --json FILE`.  All peers use one embedded server over a Unix socket and take
+turns.  os-ken's event API hands objects from app to app inside one process, so it is the bound that a
+controller without distribution sets; it is measured where `os_ken` can be imported.
+"""
+
+import sys
+import tempfile
+from collections.abc import Sequence
+
+from benchmarks import osken
+from benchmarks.measure import arguments, bars, interleaved, machine, table, write_json
+from benchmarks.pairs import run_due, run_one_by_one, run_pipeline100, run_raw_frames, run_records
+from due.drivers.embedded_redis import EmbeddedServer
+
+SIZES = (100, 1000, 10_000)
+COUNTS = {
+    "due": {100: 600_000, 1000: 300_000, 10_000: 30_000},
+    "pipeline100": {100: 100_000, 1000: 80_000, 10_000: 20_000},
+    "one_by_one": {100: 10_000, 1000: 10_000, 10_000: 6_000},
+    "raw_frames": {100: 600_000, 1000: 300_000, 10_000: 30_000},
+}
+RUNNERS = {
+    "due": run_due,
+    "pipeline100": run_pipeline100,
+    "one_by_one": run_one_by_one,
+    "raw_frames": run_raw_frames,
+}
+ROWS, BATCHES = 10_000, 1500
+WHY_NOT_RAW = (
+    "the rest against raw frames: DUE numbers and stamps each message, and calls back for each with an Item"
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print, write."""
+    options = arguments("updates", __doc__, rounds=3).parse_args(argv)
+    figures: dict[str, object] = {"machine": machine(), "rounds": options.rounds}
+    rates: dict[str, dict[str, float]] = {name: {} for name in RUNNERS}
+    with tempfile.TemporaryDirectory() as folder, EmbeddedServer(folder) as server:
+        for size in SIZES:
+            peers = {
+                name: lambda name=name, size=size: RUNNERS[name](
+                    server.url, size, _hundreds(COUNTS[name][size] * options.scale)
+                )
+                for name in RUNNERS
+            }
+            for name, rate in interleaved(peers, options.rounds).items():
+                rates[name][str(size)] = rate
+        records = interleaved(
+            {"records": lambda: run_records(server.url, ROWS, max(10, int(BATCHES * options.scale)))},
+            options.rounds,
+        )["records"]
+    os_ken = {str(size): osken.events_per_second(size) for size in SIZES} if osken.available() else None
+    for name in RUNNERS:
+        figures[f"{name}_msgs_per_s"] = rates[name]
+    figures["osken_events_per_s"] = os_ken
+    figures["ratio_vs_pipeline100"] = {s: rates["due"][s] / rates["pipeline100"][s] for s in rates["due"]}
+    figures["ratio_vs_raw_frames"] = {s: rates["due"][s] / rates["raw_frames"][s] for s in rates["due"]}
+    figures["records_per_s"] = records
+    figures["records_vs_pipeline100"] = records / rates["pipeline100"]["100"]
+    _show(rates, os_ken, figures)
+    write_json(options.json, figures)
+    return 0
+
+
+def _hundreds(count: float) -> int:
+    return max(100, int(count) // 100 * 100)
+
+
+def _show(
+    rates: dict[str, dict[str, float]], os_ken: dict[str, float] | None, figures: dict[str, object]
+) -> None:
+    ratio, frames = figures["ratio_vs_pipeline100"], figures["ratio_vs_raw_frames"]
+    assert isinstance(ratio, dict)
+    assert isinstance(frames, dict)
+    table(
+        ["bytes", *RUNNERS, "os-ken", "DUE / pipeline", "DUE / raw frames"],
+        [
+            [
+                size,
+                *(rates[name][size] for name in RUNNERS),
+                os_ken[size] if os_ken else "-",
+                ratio[size],
+                frames[size],
+            ]
+            for size in rates["due"]
+        ],
+    )
+    print(f"\n{WHY_NOT_RAW}")
+    bars("messages/s of 100 bytes", {name: rates[name]["100"] for name in RUNNERS})
+    bars("records/s", {"record batches": float(str(figures["records_per_s"]))})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,63 @@
+"""Keeping the archive within an age and a size: the leading Coordinator prunes it now and then."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from due.drivers.base import ArchiveDriver
+from due.errors import DueError
+
+log = logging.getLogger("coordinator.retention")
+
+
+class Retention:
+    """Prunes in a thread of its own, since a large archive takes a while.  0 means no limit."""
+
+    def __init__(
+        self,
+        open_archive: Callable[[], ArchiveDriver],
+        allowed: Callable[[], bool],
+        *,
+        age_s: float,
+        max_bytes: int,
+        every_s: float,
+    ) -> None:
+        self._open_archive = open_archive
+        self._allowed = allowed
+        self._age_s = age_s
+        self._max_bytes = max_bytes
+        self._every_s = every_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="coordinator-retention", daemon=True)
+        self.deleted = 0
+        """Items so far."""
+
+    def start(self) -> None:
+        """Begin, where there is a limit."""
+        if self._age_s > 0 or self._max_bytes > 0:
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End; a prune on its way is finished first."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        archive = self._open_archive()
+        while not self._stop.wait(self._every_s):
+            if self._allowed():
+                self._prune(archive)
+        archive.close()
+
+    def _prune(self, archive: ArchiveDriver) -> None:
+        before = time.time_ns() - int(self._age_s * 1e9) if self._age_s > 0 else None
+        try:
+            deleted = archive.prune(before=before, max_bytes=self._max_bytes or None)
+        except DueError as error:
+            log.warning("the archive could not be pruned: %s; trying again in %g s", error, self._every_s)
+            return
+        self.deleted += deleted
+        if deleted:
+            log.info("%d items were beyond the archive's age or size and are deleted", deleted)

@@ -1,0 +1,15 @@
+"""A stand-alone analyser beside the loop: which senders does Kitsune find worst?  Run it; stop it; nothing else changes."""
+
+# [analyser]
+from collections import Counter
+
+from sdnator_due import *
+
+worst: Counter[str] = Counter()
+due.init("WorstSenders", CONSUMER)
+due.observe("network.anomaly.kitsune.alert").subscribe(
+    lambda alert: worst.update([alert.value["sender"]["ip"]])
+)
+input("Enter to see the result\n")
+print(worst.most_common(10))
+# [/analyser]

@@ -1,0 +1,125 @@
+"""The app as a process: batches in, one score item each and the published scores out, an orderly end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from apps.kitsune.service import ALERT, CAPABILITIES, INTERESTS, PACKETS, SCORE
+from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest
+from due.drivers.embedded_redis import EmbeddedServer
+from tests.apps.kitsune.test_afterimage import require_reference_arithmetic
+from tests.apps.kitsune.traffic import blank, part, real
+from tests.requirements import shared_data
+
+KEY = "network.packets.p4runtime_ctrl.s1.all"
+DEADLINE_S = 60.0
+
+
+def wait_for(condition):
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def server(tmp_path):
+    with EmbeddedServer(tmp_path / "server") as running:
+        yield running
+
+
+def start(server, tmp_path, **settings):
+    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    command = [sys.executable, "-m", "apps.kitsune.service", "--updates", server.url]
+    command += [
+        "--archive",
+        f"sqlite:///{tmp_path}/archive.db",
+        "--settings",
+        str(tmp_path / "settings.json"),
+    ]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+    )
+
+
+@pytest.fixture
+def controller(server, tmp_path):
+    engine = Engine()
+    engine.set_pubsub(server.url)
+    engine.set_db(f"sqlite:///{tmp_path}/archive.db")
+    engine.init(
+        "p4runtime_ctrl",
+        PRODUCER | CONSUMER,
+        interests=(Interest(SCORE), Interest(ALERT)),
+        capabilities=(Capability(KEY, delivery="reliable"),),
+    )
+    yield engine
+    engine.close()
+
+
+def test_scores_and_alerts_of_a_stream(server, controller, tmp_path):
+    require_reference_arithmetic()
+    batch, extra = real(3_000), 40
+    wanted = np.load(shared_data("kitsune/scores.npz"))["first3000_fm500_ad1500_m10"]
+    process = start(
+        server,
+        tmp_path,
+        fm_grace=500,
+        ad_grace=1500,
+        mode="reference",
+        threshold=1e-9,
+        save_model=str(tmp_path / "model.npz"),
+    )
+    try:
+        assert json.loads(process.stdout.readline())["app"] == "kitsune"
+        scores, alerts = [], []
+        controller.observe(SCORE).subscribe(lambda item: scores.append(item.value))
+        controller.observe(ALERT).subscribe(lambda item: alerts.append(item.value))
+        wait_for(lambda: controller.wanted(KEY))
+        for at in range(0, 3_000, 250):
+            controller.write(KEY, part(batch, at, at + 250), [NO_WAIT])
+        controller.write(KEY, blank(extra, time_us=batch["time_us"][-1:].repeat(extra)), [NO_WAIT])
+        wait_for(lambda: sum(item["count"] for item in scores) == 3_000 + extra)
+        assert [item["count"] for item in scores] == [250] * 12 + [extra]
+        assert [item["trained"] for item in scores][-1] == 2_001
+        assert {item["switch"] for item in scores} == {"s1"}
+        found = np.concatenate([item["score"] for item in scores])[:3_000]
+        state = np.concatenate([item["state"] for item in scores])[:3_000]
+        assert np.array_equal(np.flatnonzero(state), np.arange(2_001, 3_000))
+        assert np.allclose(found[2_001:], wanted[2_001:], rtol=1e-12, atol=0)
+        before = len(alerts)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(DEADLINE_S) == 0
+        wait_for(lambda: len(alerts) > before)  # the open second, closed at the stop
+        archived = controller.get(ALERT)
+        assert [item.value["id"] for item in archived] == [alert["id"] for alert in alerts]
+        assert len(controller.get(SCORE)) == 13
+        assert (tmp_path / "model.npz").exists()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [({"no_such_option": 1}, "no_such_option"), ({"load_model": "/nowhere/model.npz"}, "no such model")],
+)
+def test_wrong_settings_end_with_a_sentence(server, tmp_path, settings, text):
+    process = start(server, tmp_path, **settings)
+    out, errors = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode != 0
+    assert out == ""
+    assert text in errors
+    assert "Traceback" not in errors
+
+
+def test_declares_what_it_does():
+    assert Interest(PACKETS) in INTERESTS
+    assert {capability.key for capability in CAPABILITIES} == {SCORE, ALERT}
+    assert all(c.delivery == "reliable" and c.archive == "always" for c in CAPABILITIES)

@@ -1,0 +1,280 @@
+"""The embedded switch against the real simple_switch_grpc: the same entries, frames and packet-outs go to
+both, and all that comes out is compared.  Left out: clocks, meters, and programs that multiply for ever.
+
+SDNATOR_SAMENESS_FRAMES sets the frames per program and seed (default 120).
+"""
+
+import itertools
+import os
+import queue
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dataplane.bmv2 import PROGRAM
+from dataplane.schema import Schema, bind
+from dataplane.switch import Replica, Result, Switch
+from dataplane.table_codec import TableCodec
+from dataplane.tables import TableEntry, TableError
+from dataplane.tree import MatchKind, Program
+from p4rt import p4runtime
+from tests.contract.targets import Bmv2Target
+from tests.dataplane.controller import Controller, delete, insert, modify, program_config
+from tests.dataplane.loading import features, sdnator, shared
+from tests.dataplane.traffic import Chooser, Maker, feature_frame, network_frame
+from tests.requirements import optional_program, shared_data
+
+_HERE = Path(__file__).resolve().parent
+_FRAMES = int(os.environ.get("SDNATOR_SAMENESS_FRAMES", "120"))
+_BURST = 12  # BMv2 drops where 64 frames wait for one port
+_UPDATES = 40
+_WAIT_S = 10.0
+_PORTS = (1, 2, 3)
+_ids = itertools.count(10)
+_SESSIONS = {1: [Replica(510, 1)], 5: [Replica(4, 7), Replica(510, 1)], 6: [Replica(4, 7), Replica(510, 1)]}
+_SESSIONS |= {98: [Replica(510, 1)], 99: [Replica(510, 1)]}
+_GROUPS = {1: [Replica(1, 1), Replica(2, 2), Replica(3, 3)], 2: [Replica(1, 1)]}
+
+
+def _no_clock(data: bytes) -> bytes:
+    """packet_in of sketch and sdnator: bits 16 to 63 are a time."""
+    return data[:2] + bytes(6) + data[8:]
+
+
+def _endless_or_timed(data: bytes) -> bool:
+    """features.p4: 15 shows the clock; 18 goes round as often as the next byte says, flooding each time."""
+    return data[12:14] == b"\x88\xb5" and (
+        data[14:15] == b"\x0f" or (data[14:15] == b"\x12" and data[15:16] > b"\2")
+    )
+
+
+class Case:
+    """One program: where it is and what of it cannot be compared."""
+
+    def __init__(
+        self,
+        path: Callable[[], Path],
+        program: Callable[[], Program],
+        maker: Maker,
+        *,
+        mask: Callable[[bytes], bytes] = bytes,
+        skip: Callable[[bytes], bool] = lambda _: False,
+    ) -> None:
+        self.path, self.program, self.maker, self.mask, self.skip = path, program, maker, mask, skip
+
+
+CASES = {
+    "features": Case(
+        lambda: _HERE / "programs" / "features", features, feature_frame, skip=_endless_or_timed
+    ),
+    "small": Case(lambda: shared_data("p4/small.json"), lambda: shared("small"), network_frame),
+    "sketch": Case(
+        lambda: shared_data("p4/sketch.json"), lambda: shared("sketch"), network_frame, mask=_no_clock
+    ),
+    "sdnator": Case(lambda: _HERE.parents[1] / "p4" / "sdnator", sdnator, network_frame, mask=_no_clock),
+}
+
+
+@pytest.fixture(scope="module")
+def bmv2():
+    optional_program(PROGRAM)
+    target = Bmv2Target()
+    yield target
+    target.close()
+
+
+class Pair:
+    """Both switches with the same program, entries, sessions and groups."""
+
+    def __init__(self, target: Bmv2Target, case: Case, seed: int) -> None:
+        self.target, self.case = target, case
+        self.chooser = Chooser(seed)
+        self.controller = Controller(target.address, election_id=next(_ids))
+        self.controller.arbitrate()
+        config = program_config(case.path())
+        self._forget_replicas()
+        self.controller.set_pipeline(config)
+        program = case.program()
+        self.schema: Schema = bind(config.p4info, program)
+        self.switch = Switch(program, backend="c" if seed % 2 else "python")
+        updates = [*self._tables(), *self._replicas(), *self._digests(config)]
+        for first in range(0, len(updates), _UPDATES):
+            self.controller.write(*updates[first : first + _UPDATES])
+        self.digests: set[tuple[int, ...]] = set()
+        for port in (*_PORTS, 4):
+            self.exchange(port, [b"\0"])  # BMv2 knows a port once something came from it
+
+    def _forget_replicas(self) -> None:
+        """BMv2 keeps sessions and groups when a pipeline is set; before the first there are none."""
+        asked = [p4runtime.Entity(), p4runtime.Entity()]
+        asked[0].packet_replication_engine_entry.clone_session_entry.SetInParent()
+        asked[1].packet_replication_engine_entry.multicast_group_entry.SetInParent()
+        for entity in asked:
+            try:
+                found = self.controller.read(entity)
+            except Exception as error:  # noqa: BLE001 - a switch without a pipeline
+                assert "No forwarding pipeline" in str(error)  # noqa: PT017
+                continue
+            for entry in found:
+                self.controller.write(delete(entry))
+
+    def _tables(self) -> Iterable[Any]:
+        for name, table in self.switch.tables.items():
+            bound = self.schema.table_of(name)
+            codec = TableCodec(bound)
+            if table.spec.keys and not table.spec.is_const:
+                yield from self._entries(bound, codec)
+            actions = [a.spec for a in bound.actions if a.as_default]
+            if not bound.const_default and actions and self.chooser.random.random() < 0.4:
+                action = self.chooser.random.choice(actions)
+                params = self.chooser.params(action)
+                table.set_default(action.name, params)
+                entity = p4runtime.Entity()
+                entity.table_entry.table_id = bound.id
+                entity.table_entry.is_default_action = True
+                codec.write_action(action.name, params, entity.table_entry)
+                yield modify(entity)
+
+    def _entries(self, bound: Any, codec: TableCodec) -> Iterable[Any]:
+        actions = [a.spec for a in bound.actions if a.in_entries]
+        for number in range(self.chooser.random.choice([0, 1, 3, 10, 25])):
+            entry = self.chooser.entry(bound.spec, number, actions)
+            match = tuple(
+                self.chooser.match(key, optional=True) if kind is MatchKind.OPTIONAL else value
+                for key, kind, value in zip(bound.spec.keys, bound.kinds, entry.match, strict=True)
+            )
+            entry = TableEntry(match, entry.action, entry.params, entry.priority)
+            try:
+                self.switch.tables[bound.spec.name].insert(entry)
+            except TableError:
+                continue
+            entity = p4runtime.Entity()
+            codec.write(entry, entity.table_entry)
+            yield insert(entity)
+
+    def _replicas(self) -> Iterable[Any]:
+        for number, replicas in _SESSIONS.items():
+            self.switch.set_clone_session(number, replicas)
+            entity = p4runtime.Entity()
+            session = entity.packet_replication_engine_entry.clone_session_entry
+            session.session_id = number
+            _add(session, replicas)
+            yield insert(entity)
+        for number, replicas in _GROUPS.items():
+            self.switch.set_multicast_group(number, replicas)
+            entity = p4runtime.Entity()
+            group = entity.packet_replication_engine_entry.multicast_group_entry
+            group.multicast_group_id = number
+            _add(group, replicas)
+            yield insert(entity)
+
+    @staticmethod
+    def _digests(config: Any) -> Iterable[Any]:
+        for digest in config.p4info.digests:
+            entity = p4runtime.Entity()
+            entity.digest_entry.digest_id = digest.preamble.id
+            entity.digest_entry.config.max_list_size = 1
+            yield insert(entity)
+
+    # -- traffic --------------------------------------------------------------------------------------
+
+    def exchange(self, port: int, frames: list[bytes]) -> None:
+        """Frames into `port` of both; what leaves must be the same, as a set for each port."""
+        result = self.switch.process_many(port, frames, [1_000_000] * len(frames))
+        self.target.inject(port, *frames)
+        self._compare(result, frames)
+
+    def packet_out(self, header: list[int], payload: bytes) -> None:
+        bits = 0
+        for field, value in zip(self.schema.packet_out, header, strict=True):
+            bits = bits << field.width | value
+        size = sum(f.width for f in self.schema.packet_out) // 8
+        result = self.switch.packet_out(bits.to_bytes(size, "big") + payload, 1_000_000)
+        metadata = {
+            field.id: value.to_bytes(max(1, (value.bit_length() + 7) // 8), "big")
+            for field, value in zip(self.schema.packet_out, header, strict=True)
+        }
+        self.controller.packet_out(payload, metadata)
+        self._compare(result, [payload])
+
+    def _compare(self, result: Result, frames: list[bytes]) -> None:
+        shown = [f.hex() for f in frames]
+        expected: dict[int, list[bytes]] = {}
+        for port, data in result.outputs:
+            expected.setdefault(port, []).append(data)
+        for port, ours in expected.items():
+            assert sorted(self.target.sent(port, len(ours))) == sorted(ours), (port, shown)
+        theirs = sorted(self.case.mask(p) for p in self._packet_ins(len(result.packet_ins)))
+        assert theirs == sorted(self.case.mask(p) for p in result.packet_ins), shown
+        self.digests |= {d.values for d in result.digests}
+
+    def _packet_ins(self, count: int) -> list[bytes]:
+        found = []
+        size = sum(f.width for f in self.schema.packet_in) // 8
+        for _ in range(count):
+            try:
+                packet = self.controller.packets.get(timeout=_WAIT_S)
+            except queue.Empty:
+                break
+            values = {m.metadata_id: int.from_bytes(m.value, "big") for m in packet.metadata}
+            bits = 0
+            for field in self.schema.packet_in:
+                bits = bits << field.width | values.get(field.id, 0)
+            found.append(bits.to_bytes(size, "big") + packet.payload)
+        return found
+
+    def finish(self) -> None:
+        """Nothing more came, digests and direct counters are equal."""
+        time.sleep(0.2)
+        assert self.controller.packets.empty()
+        assert all(q.empty() for q in self.target._frames.values())
+        theirs: set[tuple[int, ...]] = set()
+        while not self.controller.digests.empty():
+            for sample in self.controller.digests.get().data:
+                theirs.add(tuple(int.from_bytes(m.bitstring, "big") for m in sample.struct.members))
+        assert theirs == self.digests
+        for name, table in self.switch.tables.items():
+            if table.spec.has_counter and table.spec.keys:
+                self._compare_counters(name)
+        self.controller.close()
+        self.switch.close()
+
+    def _compare_counters(self, name: str) -> None:
+        bound = self.schema.table_of(name)
+        codec = TableCodec(bound)
+        entity = p4runtime.Entity()
+        entity.table_entry.table_id = bound.id
+        entity.table_entry.counter_data.SetInParent()
+        for found in self.controller.read(entity):
+            entry = found.table_entry
+            if not entry.is_default_action:
+                ours = self.switch.tables[name].counter(codec.match(entry.match), entry.priority)
+                data = entry.counter_data
+                assert (data.packet_count, data.byte_count) == (ours.packets, ours.bytes), (name, entry)
+
+
+def _add(message: Any, replicas: Iterable[Replica]) -> None:
+    for replica in replicas:
+        message.replicas.add(egress_port=replica.port, instance=replica.instance)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("name", CASES)
+def test_embedded_switch_does_what_bmv2_does(bmv2, name, seed):
+    case = CASES[name]
+    pair = Pair(bmv2, case, seed)
+    chooser = pair.chooser
+    for _ in range(0, _FRAMES, _BURST):
+        frames = []
+        while len(frames) < _BURST:
+            data = chooser.spoil(case.maker(chooser.random))
+            if data and not case.skip(data):
+                frames.append(data)
+        pair.exchange(chooser.random.choice(_PORTS), frames)
+        if pair.schema.packet_out:
+            header = [chooser.value(f.width) for f in pair.schema.packet_out]
+            pair.packet_out(header, frames[0])
+    pair.finish()

@@ -1,0 +1,138 @@
+"""Packets on their way to controllers: back-pressure where nothing may be lost, counted loss elsewhere."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from dataplane.ports import MemoryPort
+from tests.dataplane.controller import Controller, Names, insert, program_config
+from tests.dataplane.embedded import Embedded
+
+PUNT = 15
+PROGRAM = Path(__file__).parent / "programs" / "features"
+
+
+def frame(number=0):
+    return bytes(12) + b"\x88\xb5" + bytes([PUNT, 0, 0]) + bytes(16) + number.to_bytes(4, "big") + bytes(30)
+
+
+def number_of(packet):
+    return int.from_bytes(packet.payload[33:37], "big")
+
+
+def until(condition):
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def lossless():
+    port = MemoryPort(lossless=True)
+    with Embedded(ports={1: port, 2: MemoryPort()}, driven=True, queue=100) as switch:
+        yield switch, port
+
+
+def primary(switch, election_id=1, **options):
+    controller = Controller(switch.address, election_id=election_id, **options)
+    controller.arbitrate()
+    return controller
+
+
+def test_frames_of_a_capture_wait_for_a_primary_and_then_come_all(lossless):
+    switch, port = lossless
+    with primary(switch) as controller:
+        controller.set_pipeline(program_config(PROGRAM))
+    until(lambda: not switch.device.room())
+    port.inject(*map(frame, range(1000)), time_us=1)
+    time.sleep(0.05)
+    assert port.counters.received == 0
+    with primary(switch, 2) as controller:
+        assert [number_of(controller.packets.get(timeout=10)) for _ in range(1000)] == list(range(1000))
+    assert port.verdicts == bytes([1]) * 1000
+    assert switch.device.counts["packet_in_dropped"] == 0
+
+
+def test_a_new_primary_gets_what_the_old_one_was_not_sent(lossless):
+    switch, port = lossless
+    with primary(switch) as controller:
+        controller.set_pipeline(program_config(PROGRAM))
+        port.inject(*map(frame, range(200)), time_us=1)
+        first = [number_of(controller.packets.get(timeout=10)) for _ in range(200)]
+    port.inject(*map(frame, range(200, 3000)), time_us=1)
+    with primary(switch, 2) as controller:
+        second = [number_of(controller.packets.get(timeout=10)) for _ in range(2800)]
+    assert first + second == list(range(3000))
+
+
+def test_elsewhere_packet_ins_without_a_primary_are_counted():
+    with Embedded() as switch:
+        with primary(switch) as controller:
+            controller.set_pipeline(program_config(PROGRAM))
+        until(lambda: switch.device._arbitration.primary() is None)
+        switch.memory[1].inject(*[frame()] * 50)
+        until(lambda: switch.device.counts["packet_in_dropped"] == 50)
+        assert switch.device.counts["packet_in"] == 50
+
+
+def test_frames_before_the_first_pipeline_are_counted():
+    with Embedded() as switch:
+        switch.memory[1].inject(*[frame()] * 50)
+        until(lambda: switch.loop.counts["without_pipeline"] == 50)
+
+
+def test_each_role_s_primary_gets_the_packets():
+    with Embedded() as switch, primary(switch) as one, primary(switch, 1, role="guard") as two:
+        one.set_pipeline(program_config(PROGRAM))
+        switch.memory[1].inject(frame(5))
+        assert [number_of(c.packets.get(timeout=10)) for c in (one, two)] == [5, 5]
+
+
+def test_a_role_writes_with_its_own_election_id():
+    with Embedded() as switch, primary(switch, 4) as one, primary(switch, 9, role="guard") as two:
+        config = program_config(PROGRAM)
+        one.set_pipeline(config)
+        names = Names(config.p4info)
+        two.write(insert(names.entry("I.ports", {"sm.ingress_port": 1}, "I.forward", [2])))
+
+
+def test_setting_a_pipeline_drops_and_counts_what_the_old_one_left(lossless):
+    switch, port = lossless
+    with primary(switch) as controller:
+        controller.set_pipeline(program_config(PROGRAM))
+    until(lambda: not switch.device.room())
+    port.inject(*[frame()] * 3, time_us=1)
+    with primary(switch, 2) as controller:
+        for _ in range(3):
+            controller.packets.get(timeout=10)
+        controller.set_pipeline(program_config(PROGRAM))
+    assert switch.device.counts["packet_in"] == 3
+
+
+def test_streams_are_limited():
+    with Embedded() as switch:
+        controllers = [primary(switch, n + 1) for n in range(16)]
+        late = Controller(switch.address, election_id=99)
+        assert late.ended.wait(10)
+        assert late.error.code().name == "RESOURCE_EXHAUSTED"
+        for controller in (*controllers, late):
+            controller.close()
+
+
+def test_time_comes_with_the_frames(lossless):
+    switch, port = lossless
+    with primary(switch) as controller:
+        config = program_config(PROGRAM)
+        controller.set_pipeline(config)
+        names = Names(config.p4info)
+        controller.write(
+            insert(names.entry("I.route", {"h.ip.dst": (1, 32)}, "I.drop", idle_timeout_ns=60 * 10**9))
+        )
+        port.inject(frame(), time_us=59_000_000)
+        controller.packets.get(timeout=10)
+        assert controller.others.empty()
+        port.inject(frame(), time_us=60_000_001)
+        told = controller.others.get(timeout=10)
+        assert told.table_entry[0].idle_timeout_ns == 60 * 10**9

@@ -1,0 +1,80 @@
+"""Streams send what is posted first, then their role's queue, and lose nothing when they end."""
+
+import threading
+
+from dataplane.status import InvalidArgument
+from dataplane.streams import PacketQueue, Stream
+
+
+def connected(capacity=1000):
+    rooms = []
+    queue = PacketQueue(capacity, lambda: rooms.append(len(queue)))
+    stream = Stream(1)
+    stream.queue, queue.reader = queue, stream
+    return stream, queue, rooms
+
+
+def test_messages_come_in_order_and_posted_ones_first():
+    stream, queue, _ = connected()
+    queue.put([b"%d" % n for n in range(200)])
+    stream.post(b"hello")
+    messages = stream.messages()
+    assert next(messages) == b"hello"
+    assert [next(messages) for _ in range(200)] == [b"%d" % n for n in range(200)]
+
+
+def test_what_a_stream_took_and_did_not_send_goes_to_the_next_one():
+    stream, queue, _ = connected()
+    queue.put([b"%d" % n for n in range(100)])
+    messages = stream.messages()
+    assert [next(messages) for _ in range(10)] == [b"%d" % n for n in range(10)]
+    messages.close()
+    assert queue.take()[0] == b"10"
+    assert len(queue) == 90 - 64
+
+
+def test_a_waiting_stream_is_woken():
+    stream, queue, _ = connected()
+    got = []
+    reader = threading.Thread(target=lambda: got.extend(stream.messages()))
+    reader.start()
+    for n in range(50):
+        queue.put([b"%d" % n])
+        stream.post(b"c")
+    stream.end()
+    reader.join(10)
+    assert not reader.is_alive()
+    assert got.count(b"c") == 50
+
+
+def test_an_error_ends_a_stream_once():
+    stream, _, _ = connected()
+    stream.end(InvalidArgument("first"))
+    stream.end(InvalidArgument("second"))
+    assert list(stream.messages()) == []
+    assert str(stream.error) == "first"
+
+
+def test_room_is_announced_when_a_full_queue_is_half_empty():
+    stream, queue, rooms = connected(capacity=100)
+    queue.put([b"x"] * 100)
+    assert queue.room() == 0
+    messages = stream.messages()
+    for _ in range(65):
+        next(messages)
+    assert rooms == [36]
+    assert queue.room() == 100 - len(queue)
+
+
+def test_clearing_counts_what_is_dropped():
+    _, queue, _ = connected()
+    queue.put([b"x"] * 7)
+    assert queue.clear() == 7
+    assert len(queue) == 0
+
+
+def test_posted_messages_are_bounded():
+    stream, _, _ = connected()
+    for _ in range(5000):
+        stream.post(b"x")
+    assert stream.dropped == 5000 - 4096

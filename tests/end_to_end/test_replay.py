@@ -1,0 +1,137 @@
+"""The main job, whole: capture, switch, controller, Kitsune, firewall, as separate processes."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from sdnator.datasets.mirai_like import Options, make
+from sdnator.datasets.rebuild import rebuild
+from tests.end_to_end.command import figures, sdnator
+from tests.requirements import optional_program, require_netns, shared_data
+
+REAL_PACKETS = 38_363
+CAMERA = "34:c3:d2:e0:fc:c9"
+INTRUDER = "00:0c:29:5e:71:b4"
+
+
+@pytest.fixture(scope="module")
+def real_capture(tmp_path_factory):
+    """The first 38,363 packets of the real Mirai capture, as frames."""
+    path = tmp_path_factory.mktemp("real") / "mirai38k.pcap"
+    rebuild(shared_data("kitsune/mirai_38k.tsv.gz"), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def attacked_capture(real_capture):
+    """The real harmless packets with a generated attack behind them, and its labels."""
+    attack = real_capture.with_name("attack.pcap")
+    done = sdnator("dataset", "make", "mirai-like", attack, "--no-background", "--seed", "5", "--attack-seconds", "240")
+    assert done.returncode == 0, done.stderr
+    spliced = real_capture.with_name("attacked.pcap")
+    done = sdnator("dataset", "splice", real_capture, attack, spliced)
+    assert done.returncode == 0, done.stderr
+    return spliced, spliced.with_name("attacked.labels.csv")
+
+
+def scores_csv(folder):
+    with (folder / "scores.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    score = np.array([float(row["score"] or "nan") for row in rows])
+    return score, [row["state"] for row in rows]
+
+
+def test_scores_of_the_real_packets_are_the_published_detectors(real_capture, tmp_path):
+    """Through switch, gRPC, Redis and back, every score is that of Kitsune-py, and nothing is lost."""
+    report = tmp_path / "report"
+    training = ("--fm-grace", "2000", "--ad-grace", "10000")
+    found = figures("replay", real_capture, *training, "--no-mitigate", "--report", report)
+    assert (found["packets_in"], found["packets_lost"], found["packets_dropped"]) == (REAL_PACKETS, 0, 0)
+    assert found["training_packets"] == 12_001
+    score, state = scores_csv(report)
+    reference = np.load(shared_data("kitsune/scores.npz"))["fm2000_ad10000_m10"]
+    scored = np.array([each == "scored" for each in state])
+    assert int(scored.sum()) == REAL_PACKETS - 12_001
+    np.testing.assert_allclose(score[scored], reference[scored], rtol=1e-6)
+
+
+def test_nobody_is_blocked_in_the_real_harmless_traffic(real_capture):
+    """33 packets of the gateway score over the line; they raise alerts, and nobody is cut off."""
+    found = figures("replay", real_capture, "--fm-grace", "2000", "--ad-grace", "10000")
+    assert (found["blocks"], found["packets_dropped"], found["packets_lost"]) == ([], 0, 0)
+    assert found["alerts"] == 3
+
+
+def test_attackers_are_blocked_and_nobody_else(attacked_capture, tmp_path):
+    """The infected camera is stopped, with the report to prove it, and no harmless device loses a packet."""
+    capture, labels = attacked_capture
+    report = tmp_path / "report"
+    training = ("--fm-grace", "2000", "--ad-grace", "10000")
+    found = figures("replay", capture, "--labels", labels, *training, "--report", report)
+    assert found["packets_lost"] == 0
+    assert found["packets_in"] == (
+        found["packets_scored"] + found["packets_dropped"] + found["packets_not_copied"]
+    )
+    blocked = {block["address"] for block in found["blocks"]}
+    assert CAMERA in blocked
+    assert blocked <= {CAMERA, INTRUDER}
+    assert found["benign_dropped"] == 0
+    assert found["attack_dropped"] >= 0.95 * found["attack_after_first_block"] > 0
+    assert found["first_attack_packet"] <= found["first_alert_packet"] < found["first_block_packet"] or (
+        found["first_alert_packet"] < REAL_PACKETS  # the gateway's own alerts come before the attack
+    )
+    assert 0.9 < found["auc"] < 1.0
+    for name in ("index.html", "scores.png", "scores.csv", "decisions.csv", "eve.json"):
+        assert (report / name).stat().st_size > 0
+    events = [json.loads(line) for line in (report / "eve.json").read_text().splitlines()]
+    assert {"alert", "drop"} <= {event["event_type"] for event in events}
+
+
+def test_flood_answered_by_its_victim_blocks_the_flooder_only(tmp_path):
+    """SYN-ACKs and RSTs of a victim are charged to whoever began; bursts of SSDP block nobody."""
+    capture = tmp_path / "answered.pcap"
+    options = ("--answer-all", "--benign-seconds", "900", "--attack-seconds", "240", "--seed", "3")
+    done = sdnator("dataset", "make", "mirai-like", capture, *options)
+    assert done.returncode == 0, done.stderr
+    labels = tmp_path / "answered.labels.csv"
+    found = figures("replay", capture, "--labels", labels, "--train", "15000")
+    assert found["benign_dropped"] == 0
+    assert CAMERA in {block["address"] for block in found["blocks"]}
+    assert found["packets_lost"] == 0
+
+
+def test_everything_decided_is_in_the_archive(tmp_path):
+    """Alerts, score summaries, decisions and confirmations are found again after the run."""
+    from due import Engine  # the reader of the archive is any app
+
+    capture = tmp_path / "short.pcap"
+    make(Options(seed=4, benign_seconds=600, attack_seconds=120), capture)
+    keep = tmp_path / "keep"
+    labels = tmp_path / "short.labels.csv"
+    found = figures("replay", capture, "--labels", labels, "--train", "9000", "--keep", keep)
+    archive = keep / "with-blocking" / "archive.db"
+    engine = Engine()
+    engine.set_db(f"sqlite:///{archive}")
+    try:
+        assert len(engine.get("network.anomaly.kitsune.alert")) == found["alerts"]
+        scored = sum(item.value["count"] for item in engine.get("network.anomaly.kitsune.score"))
+        assert scored == found["packets_scored"]
+        decided = {item.value["id"] for item in engine.get("network.block.firewall.*")}
+        assert {block["id"] for block in found["blocks"]} <= decided
+        installed = [item.value["state"] for item in engine.get("network.confirmation.p4runtime_ctrl.*")]
+        assert installed.count("installed") == len(found["blocks"])
+    finally:
+        engine.close()
+
+
+def test_same_loop_on_bmv2(attacked_capture):
+    """The pipeline runs unchanged on BMv2: real packets on veth pairs, nothing lost, the camera blocked."""
+    optional_program("simple_switch_grpc")
+    require_netns()
+    capture, labels = attacked_capture
+    training = ("--fm-grace", "2000", "--ad-grace", "10000")
+    found = figures("replay", capture, "--labels", labels, *training, "--switch", "bmv2", "--no-mitigate")
+    assert (found["packets_lost"], found["packets_dropped"]) == (0, 0)
+    assert found["packets_scored"] == found["packets_in"]
