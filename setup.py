@@ -16,9 +16,6 @@ class BuildKernel(build_ext):
     def get_ext_filename(self, fullname: str) -> str:
         return str(Path(*fullname.split(".")).with_suffix(".so"))
 
-    def get_export_symbols(self, _ext: Extension) -> list[str]:
-        return []
-
 
 setup(
     ext_modules=[

@@ -22,7 +22,7 @@ def _update(names: Names, number: int) -> Any:
     return names.entry("ingress.block_src", match, _drop_action(names))
 
 
-def _drop_action(names: Names) -> str:
+def _drop_action(names: Names) -> Any:
     actions = {action.preamble.id: action for action in names.info.actions}
     table = names.tables["ingress.block_src"]
     default = table.initial_default_action.action_id or table.const_default_action_id

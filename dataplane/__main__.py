@@ -47,21 +47,20 @@ def options() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run until a signal comes; 0, or 2 where an option cannot be met."""
+    """Run until a signal comes; 0, 2 where an option cannot be met, 1 after a fault of our own."""
     arguments = options().parse_args(argv)
     _end_with_parent()
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     try:
-        _run(arguments, stop)
+        return _run(arguments, stop)
     except DataplaneError as error:
         print(f"dataplane: {error}", file=sys.stderr)
         return 2
-    return 0
 
 
-def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
+def _run(arguments: argparse.Namespace, stop: threading.Event) -> int:
     clock = PacketClock(driven=captures(arguments.port))
     credentials = _credentials(arguments)
     ports = open_ports(arguments.port, arguments.cpu_port, clock.now)
@@ -79,15 +78,18 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
         for port in ports.values():
             port.close()
         raise
-    loop = PacketLoop(device, ports, clock)
+    loop = PacketLoop(device, ports, clock, on_end=stop.set)
     loop.start()
     server.start()
     print(json.dumps({"ready": True, "grpc": server.address, "pid": os.getpid()}), flush=True)
     stop.wait()
+    failed = loop.failed()
     server.stop()
     loop.stop()
     if arguments.state_json:
         _write(arguments.state_json, state(device, loop, ports))
+    device.close()
+    return 1 if failed else 0
 
 
 def state(device: Device, loop: PacketLoop, ports: Mapping[int, Port]) -> dict[str, Any]:

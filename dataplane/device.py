@@ -186,6 +186,14 @@ class Device:
             old.close()
         self._room()
 
+    def close(self) -> None:
+        """Free the pipelines; no packets may come any more."""
+        with self.control, self.running:
+            for pipeline in (self.pipeline, self._saved):
+                if pipeline is not None:
+                    pipeline.close()
+            self.pipeline = self._saved = None
+
     def get_pipeline(self, request: Any) -> Any:
         """The response to a GetForwardingPipelineConfigRequest.  Raises Missing."""
         self.check_id(request.device_id)
@@ -224,13 +232,19 @@ class Device:
         """Queue the packet-ins and digests of processed frames; what has no taker is counted."""
         ready: list[bytes] = []
         if result.packet_ins:
-            encode = pipeline.packet_in.encode
-            ready = [encode(frame) for frame in result.packet_ins]
+            ready = self._encoded(pipeline, result.packet_ins)
             self.counts["packet_in"] += len(ready)
         if result.digests:
             ready += pipeline.digests.add(result.digests, time.monotonic_ns())
         if ready:
             self._put(ready, lossless=lossless)
+
+    def _encoded(self, pipeline: Pipeline, frames: list[bytes]) -> list[bytes]:
+        encode, shortest = pipeline.packet_in.encode, pipeline.packet_in.header_bytes
+        whole = [frame for frame in frames if len(frame) >= shortest]
+        # a program can send anything to the CPU port, also less than its own header
+        self.counts["packet_in_malformed"] += len(frames) - len(whole)
+        return [encode(frame) for frame in whole]
 
     def _put(self, ready: list[bytes], *, lossless: bool) -> None:
         queues = [queue for queue in list(self._queues.values()) if queue.reader is not None]
@@ -240,9 +254,7 @@ class Device:
         if not queues:
             self.counts["packet_in_dropped"] += len(ready)
         for queue in queues:
-            room = len(ready) if lossless else queue.room()
-            queue.put(ready[:room])
-            self.counts["packet_in_dropped"] += len(ready[room:])
+            self.counts["packet_in_dropped"] += queue.put(ready, lossless=lossless)
 
     def tick(self, pipeline: Pipeline, now_us: int) -> None:
         """Send digest lists that are due, and look for idle entries every 0.1 s of the packets' clock."""

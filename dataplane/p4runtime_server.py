@@ -25,6 +25,15 @@ _OPTIONS = (
     ("grpc.max_metadata_size", 64 << 20),
     ("grpc.absolute_max_metadata_size", 64 << 20),
     ("grpc.so_reuseport", 0),
+    # a controller behind a cut connection stops being primary after some seconds
+    ("grpc.keepalive_time_ms", 5_000),
+    ("grpc.keepalive_timeout_ms", 3_000),
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.max_pings_without_data", 0),
+    # and controllers may ask as often themselves
+    ("grpc.http2.min_ping_interval_without_data_ms", 1_000),
+    ("grpc.http2.min_recv_ping_interval_without_data_ms", 1_000),
+    ("grpc.http2.max_ping_strikes", 0),
 )
 
 

@@ -9,7 +9,7 @@ import select
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from dataplane.device import Device
 from dataplane.pipeline import Pipeline
@@ -19,6 +19,10 @@ from dataplane.switch import Result
 _CHUNK = 256
 _IDLE_MS = 100
 _PACKET_OUTS = 4096
+
+
+def _nothing() -> None:
+    return
 
 
 class PacketClock:
@@ -43,9 +47,16 @@ class PacketLoop:
 
     ports: by port number
     clock: the same as the device's
+    on_end: called when the thread has ended, also by a fault
     """
 
-    def __init__(self, device: Device, ports: Mapping[int, Port], clock: PacketClock) -> None:
+    def __init__(
+        self,
+        device: Device,
+        ports: Mapping[int, Port],
+        clock: PacketClock,
+        on_end: Callable[[], None] = _nothing,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self._device = device
         self._ports = dict(ports)
@@ -54,6 +65,7 @@ class PacketLoop:
         self._packet_outs: deque[bytes] = deque()
         self._space = threading.Condition()
         self._stopping = False
+        self._on_end = on_end
         self._thread = threading.Thread(target=self._run, name="packets", daemon=True)
         device.on_room = self._wakeup.set
         device.on_packet_out = self._put_packet_out
@@ -81,6 +93,16 @@ class PacketLoop:
         self._wakeup.set()
 
     def _run(self) -> None:
+        try:
+            self._move()
+        finally:
+            self._on_end()
+
+    def failed(self) -> bool:
+        """The thread has ended without having been stopped."""
+        return not self._stopping and not self._thread.is_alive()
+
+    def _move(self) -> None:
         while not self._stopping:
             ready = self._wait()
             with self._device.running:

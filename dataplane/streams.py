@@ -10,18 +10,20 @@ next one.  Messages are protobuf bytes, ready to send.
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from dataplane.status import Refused
 
 _TAKE = 64
+_UNIT = 2048
+_BEYOND = 4
 _MAX_CONTROL = 4096
 
 
 class PacketQueue:
     """Packet-ins and digest lists of one role, bounded by what `room` says.
 
-    capacity: messages
+    capacity: packet-ins; a long digest list counts for as many as it has `_UNIT` bytes
     on_room: called (from a stream's thread) when a queue that was full has room again
     """
 
@@ -29,6 +31,8 @@ class PacketQueue:
         self._capacity = capacity
         self._on_room = on_room
         self._items: deque[bytes] = deque()
+        self._weight = 0
+        self._lock = threading.Lock()
         self._stalled = False
         self.reader: Stream | None = None
 
@@ -36,41 +40,63 @@ class PacketQueue:
         return len(self._items)
 
     def room(self) -> int:
-        """Messages that can be put; 0 asks for `on_room` later."""
-        room = self._capacity - len(self._items)
-        if room > 0:
-            return room
-        self._stalled = True
-        # the reader may have emptied it before it could see the flag
-        return max(0, self._capacity - len(self._items))
+        """Packet-ins that can be put; 0 asks for `on_room` later."""
+        with self._lock:
+            room = self._capacity - self._weight
+            self._stalled = room <= 0
+            return max(0, room)
 
-    def put(self, messages: Iterable[bytes]) -> None:
-        """Append; the caller has looked at `room`."""
-        self._items.extend(messages)
+    def put(self, messages: Sequence[bytes], *, lossless: bool = False) -> int:
+        """Append what there is room for; the number of messages that were refused.
+
+        lossless: the caller has looked at `room`, and may go beyond it for the frames in its hands
+        """
+        with self._lock:
+            limit = self._capacity * (_BEYOND if lossless else 1)
+            taken = 0
+            for message in messages:
+                if self._weight >= limit:
+                    break
+                self._weight += _weight(message)
+                taken += 1
+            self._items.extend(messages[:taken])
         reader = self.reader
         if reader is not None:
             reader.wake()
+        return len(messages) - taken
 
     def take(self) -> list[bytes]:
         """Some messages from the front."""
-        items = self._items
-        taken = [items.popleft() for _ in range(min(_TAKE, len(items)))]
-        if self._stalled and len(items) <= self._capacity // 2:
-            self._stalled = False
+        with self._lock:
+            items = self._items
+            taken = [items.popleft() for _ in range(min(_TAKE, len(items)))]
+            self._weight -= sum(map(_weight, taken))
+            announce = self._stalled and self._weight <= self._capacity // 2
+            if announce:
+                self._stalled = False
+        if announce:
             self._on_room()
         return taken
 
     def give_back(self, messages: list[bytes]) -> None:
         """Messages that were taken and not sent go to the front again."""
-        self._items.extendleft(reversed(messages))
+        with self._lock:
+            self._items.extendleft(reversed(messages))
+            self._weight += sum(map(_weight, messages))
 
     def clear(self) -> int:
         """Drop everything; the number of messages dropped."""
-        dropped = len(self._items)
-        self._items.clear()
-        self._stalled = False
+        with self._lock:
+            dropped = len(self._items)
+            self._items.clear()
+            self._weight = 0
+            self._stalled = False
         self._on_room()
         return dropped
+
+
+def _weight(message: bytes) -> int:
+    return 1 + len(message) // _UNIT
 
 
 class Stream:

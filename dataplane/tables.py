@@ -115,6 +115,7 @@ class Table:
         self._clock = clock
         self._actions = {a.name: (actions[a.name], a) for a in spec.actions}
         self._keys = tuple(zip(spec.keys, store.place.shifts, strict=True))
+        self._needs_priority = spec.needs_priority
         self._only_lpm = not spec.needs_priority and any(k.kind is MatchKind.LPM for k in spec.keys)
         self._slots: dict[tuple[Match, int], int] = {}
         self._entries: dict[tuple[Match, int], TableEntry] = {}
@@ -334,9 +335,9 @@ class Table:
         return value, mask, tuple(ranges), rank
 
     def _check_priority(self, priority: int) -> None:
-        if self.spec.needs_priority and priority < 1:
+        if self._needs_priority and priority < 1:
             raise InvalidEntry(f"table {self.name} needs a priority of at least 1, got {priority}")
-        if not self.spec.needs_priority and priority:
+        if not self._needs_priority and priority:
             raise InvalidEntry(f"table {self.name} takes no priority, got {priority}")
         if priority >= 1 << 31:
             raise InvalidEntry(f"table {self.name}: priority {priority} does not fit 31 bits")

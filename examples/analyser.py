@@ -1,4 +1,5 @@
-"""A stand-alone analyser beside the loop: which senders does Kitsune find worst?  Run it; stop it; nothing else changes."""
+"""A stand-alone analyser beside the loop: which senders does Kitsune find worst?"""
+# ruff: noqa: F403, F405 - the way of importing that the paper shows
 
 # [analyser]
 from collections import Counter

@@ -1,20 +1,17 @@
-"""A detector that knows nothing of SDNator, wrapped as an app: it scores every packet batch and publishes the scores."""
+"""A detector that knows nothing of SDNator, wrapped as an app: it scores every packet and publishes the scores."""
+# ruff: noqa: F403, F405 - the paper's way of importing
 
 from detector import Detector  # any class with proc_next_packet(); here examples/detector.py
 
 # [wrapper]
 from sdnator_due import *
 
+SCORE = "network.anomaly.foreign.score"
 detector = Detector()
-due.init(
-    "foreign",
-    PRODUCER | CONSUMER,
-    capabilities=[Capability("network.anomaly.foreign.score", archive="always")],
-)
-due.observe("network.packets.*.*.all").subscribe(
-    lambda item: due.write(
-        "network.anomaly.foreign.score", [detector.proc_next_packet(p) for p in item.value["length"].tolist()]
-    )
+due.init("foreign", PRODUCER | CONSUMER, capabilities=[Capability(SCORE, archive="always")])
+packets = due.observe("network.packets.*.*.all")
+packets.subscribe(
+    lambda item: due.write(SCORE, [detector.proc_next_packet(x) for x in item.value["length"].tolist()])
 )
 # [/wrapper]
 input("Enter to stop\n")

@@ -13,6 +13,7 @@ import typer
 
 from sdnator import __version__
 from sdnator.dataset_commands import dataset
+from sdnator.detect_command import detect_command
 from sdnator.errors import SdnatorError
 
 app = typer.Typer(
@@ -23,6 +24,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(dataset, name="dataset")
+app.command("detect")(detect_command)
 
 
 def _show_version(wanted: bool) -> None:

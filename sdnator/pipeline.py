@@ -6,6 +6,7 @@
 """
 
 import json
+import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -32,7 +33,7 @@ class PipelinePlan:
     """What to start."""
 
     folder: Path
-    """Empty folder for sockets, the archive, settings and logs."""
+    """Empty folder for the archive, settings and logs."""
     switch: str = "embedded"
     """embedded, bmv2, or HOST:PORT of a P4Runtime switch that runs already."""
     inject: str | None = None
@@ -67,7 +68,9 @@ class Pipeline:
         """URL of Data Updates."""
         self.archive = f"sqlite:///{plan.folder / 'archive.db'}"
         """URL of Data Archives."""
-        self._capture_socket = str(plan.folder / "capture.sock")
+        # Sockets live in a folder of their own: their paths must be short, the plan's may be long.
+        self._run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-run-")))
+        self._capture_socket = str(self._run / "capture.sock")
         self._switch = _StartedSwitch("", None, self._plan.base_us)
 
     def __enter__(self) -> Self:
@@ -85,7 +88,7 @@ class Pipeline:
 
     def _start(self) -> None:
         self._logs.mkdir(parents=True, exist_ok=True)
-        self.updates = self._stack.enter_context(EmbeddedServer(self._plan.folder / "updates")).url
+        self.updates = self._stack.enter_context(EmbeddedServer(self._run / "updates")).url
         coordinator = self._app("coordinator", "coordinator.service", {})
         self._switch = self._start_switch()
         coordinator.wait_ready()
@@ -112,6 +115,7 @@ class Pipeline:
             "--device-id", str(self._plan.device_id),
             "--port", f"{INGRESS_PORT}=capture:{self._capture_socket}",
             "--port", f"{EGRESS_PORT}=null",
+            "--state-json", str(self._plan.folder / "switch.json"),
         )  # fmt: skip
         return _StartedSwitch(str(switch.wait_ready()["grpc"]), None, self._plan.base_us)
 

@@ -35,6 +35,8 @@ STALL_SECONDS = 30.0
 """The loop has failed when nothing comes back for so long."""
 SETTLE_SECONDS = 0.5
 """On a switch that gives no verdicts: silence for so long means that what is in flight was dropped."""
+WIRE_WINDOW = 16
+"""Most packets in flight into a real interface: BMv2's capture ring has 32 slots, the kernel drops the rest."""
 POLL_SECONDS = 0.002
 LOOK_SECONDS = 0.1
 PACKETS = "packets"
@@ -65,6 +67,11 @@ class ReplayOptions:
     """Packets in flight, at most."""
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
+
+    @property
+    def in_flight_limit(self) -> int:
+        """Packets in flight, at most, on the chosen switch."""
+        return self.window if self.switch == "embedded" else min(self.window, WIRE_WINDOW)
 
     @property
     def training_packets(self) -> int:
@@ -297,8 +304,8 @@ class ReplayPass:
                 progress(self._result.flight, self._observer.blocks)
 
     def _wait_for_room(self, pipeline: Pipeline, feed: Feed, progress: Progress | None) -> int:
-        self._await(pipeline, feed, progress, lambda flight: flight.in_flight < self._options.window)
-        return self._options.window - self._result.flight.in_flight
+        self._await(pipeline, feed, progress, lambda flight: flight.in_flight < self._options.in_flight_limit)
+        return self._options.in_flight_limit - self._result.flight.in_flight
 
     def _drain(self, pipeline: Pipeline, feed: Feed, progress: Progress | None) -> None:
         self._await(pipeline, feed, progress, lambda flight: flight.in_flight == 0)
@@ -330,6 +337,7 @@ class ReplayPass:
                 raise PipelineError(
                     f"the loop stands still: {flight.in_flight} of {flight.sent} packets sent are neither scored "
                     f"nor dropped after {STALL_SECONDS:.0f} s"
+                    + ("" if pipeline.gives_verdicts else "; frames were lost on the wire: try a smaller --window")
                 )
 
 

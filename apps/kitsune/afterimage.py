@@ -6,7 +6,11 @@
     columns  65- 99  packets from socket to socket           as from host to host
 
 Each group holds five time scales: the damping factors 5, 3, 1, 0.1 and 0.01 per second, in this
-order.  The numbers equal those of the published implementation bit for bit (x86-64, glibc with FMA).
+order.  Reference mode equals the published implementation bit for bit (x86-64, glibc with FMA).
+
+Bounded mode, measured against it: on the 38,363 real packets 9 cells of 3.8 million differ and no score
+by more than 2e-11; on three generated infections the AUC agrees to six digits and all alerts are the
+same.  Where dozens of hosts all talk to each other, covariances differ visibly, the rest in rounding.
 """
 
 from typing import Final, Literal, Protocol

@@ -82,7 +82,7 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
     ffi = cffi.FFI()
     ffi.cdef(_DECLARATIONS)
     try:
-        lib = ffi.dlopen(str(path))
+        lib: Any = ffi.dlopen(str(path))
         if lib.kitsune_kernel_version() == VERSION:
             return Kernel(ffi, lib)
         problem = f"{path} belongs to another version"

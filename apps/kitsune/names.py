@@ -1,7 +1,7 @@
-"""Addresses as text, as tshark writes them."""
+"""Addresses as text, as tshark and inet_ntop write them."""
 
 import functools
-import socket
+from itertools import groupby
 
 _TEXTS = 65_536
 
@@ -16,7 +16,31 @@ def mac_text(mac: int) -> str:
 def ip_text(version: int, hi: int, lo: int) -> str:
     """IPv4 dotted, IPv6 compressed, empty for no address."""
     if version == 4:
-        return socket.inet_ntop(socket.AF_INET, lo.to_bytes(4, "big"))
-    if version == 6:
-        return socket.inet_ntop(socket.AF_INET6, hi.to_bytes(8, "big") + lo.to_bytes(8, "big"))
-    return ""
+        return _dotted(lo)
+    return _compressed(hi << 64 | lo) if version == 6 else ""
+
+
+def _dotted(address: int) -> str:
+    return ".".join(map(str, address.to_bytes(4, "big")))
+
+
+def _compressed(address: int) -> str:
+    """The first of the longest runs of zero words becomes `::`; IPv4 inside IPv6 stays dotted."""
+    words = [address >> shift & 0xFFFF for shift in range(112, -16, -16)]
+    start, length = _longest_zeros(words)
+    if start == 0 and (length == 6 or (length == 5 and words[5] == 0xFFFF)):
+        return f"::{'ffff:' if length == 5 else ''}{_dotted(address & 0xFFFFFFFF)}"
+    texts = [f"{word:x}" for word in words]
+    if length < 2:
+        return ":".join(texts)
+    return ":".join(texts[:start]) + "::" + ":".join(texts[start + length :])
+
+
+def _longest_zeros(words: list[int]) -> tuple[int, int]:
+    best, at = (0, 0), 0
+    for is_zero, run in groupby(words, key=lambda word: word == 0):
+        length = len(list(run))
+        if is_zero and length > best[1]:
+            best = (at, length)
+        at += length
+    return best

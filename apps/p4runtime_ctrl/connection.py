@@ -90,6 +90,11 @@ class Connection:
             if thread.is_alive() and thread is not threading.current_thread():
                 thread.join(timeout=5)
 
+    @property
+    def works(self) -> bool:
+        """Whether its threads are there; one that met an error of ours has ended, and the log has it."""
+        return self._closing.is_set() or all(thread.is_alive() for thread in self._threads)
+
     def stand(self, *, chief: bool) -> None:
         """Become chief or deputy of the controllers of this switch."""
         if chief != self._chief:

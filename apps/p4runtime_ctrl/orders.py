@@ -22,6 +22,12 @@ class Owner:
     id: str
     action: str
     target: Target | None = None
+    event_time: int = 0
+    """Of the decision, capture time in ns."""
+
+
+def owner_of(decision: Decision) -> Owner:
+    return Owner(decision.id, decision.action, decision.target, decision.event_time)
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class OrderBook:
 
     def of_decision(self, decision: Decision) -> Order:
         """Raises `EntryError` or `ProgramError` for what cannot be carried out."""
-        owner = Owner(decision.id, decision.action, decision.target)
+        owner = owner_of(decision)
         if decision.action in ("block", "unblock"):
             return Order(owner, (self._change(table_update(decision, self._program)),))
         service = guard.service_of(decision.target)

@@ -46,6 +46,7 @@ CAPABILITIES = (
     Capability("network.switch.p4runtime_ctrl.*", archive="always"),
 )
 
+_OFFERS: Final = "network.telemetry.*.*"
 _DATA: Final = tuple(key_of(kind, "*", "*") for kind in KINDS)
 _LOG = logging.getLogger(__name__)
 _JOBS: Final = 10_000
@@ -145,8 +146,8 @@ class Agent:
 
     def tick(self) -> None:
         """Wall-clock duties: is the switch alive, are counters due, has the state changed."""
-        if not self._worker.is_alive():
-            raise ControllerError(f"{self.name}: the worker has ended; the log has the reason")
+        if not self._worker.is_alive() or not self._connection.works:
+            raise ControllerError(f"{self.name}: a thread has ended with an error; the log has the reason")
         now = time.monotonic()
         if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
             self._alive_at = now
@@ -324,7 +325,8 @@ class Agent:
         waiting = list(confirmations)
         for place, confirmation in enumerate(waiting, start=1):
             flags = [NO_WAIT] if place == len(waiting) else []
-            self._engine.write(key, confirmation.to_value(), flags, event_time=confirmation.event_time)
+            at = confirmation.event_time or None
+            self._engine.write(key, confirmation.to_value(), flags, event_time=at)
 
     def _say(self, change: str) -> None:
         self._change = change
@@ -381,6 +383,7 @@ class P4RuntimeCtrlService:
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
+        self._settings = settings
         pipeline = load_pipeline(settings)
         names = [each.name for each in settings.switches]
         if len(set(names)) != len(names):
@@ -399,12 +402,15 @@ class P4RuntimeCtrlService:
         while self._engine.health()["phase"] == "waiting":
             time.sleep(0.01)
         self._chief = bool(self._engine.health()["active"])
+        for item in self._engine.get(_OFFERS) if self._settings.restore else ():
+            if item.timestamp > self._settings.restore_since:
+                self._take_offer(item)
         for agent in self._agents.values():
             agent.start(chief=self._chief)
         for key in DECISIONS:
             self._engine.observe(key).subscribe(self._on_decision)
         self._engine.observe("network.p4_command.*.*").subscribe(self._on_command)
-        self._engine.observe("network.telemetry.*.*").subscribe(self._on_offer)
+        self._engine.observe(_OFFERS).subscribe(self._on_offer)
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
@@ -453,12 +459,14 @@ class P4RuntimeCtrlService:
             agent.command(command)
 
     def _on_offer(self, item: Item) -> None:
-        offer = read(Offer, item)
-        if offer is None:
-            return
-        with self._demand:
-            self._offers[offer.name] = offer
+        self._take_offer(item)
         self._demand_changed()
+
+    def _take_offer(self, item: Item) -> None:
+        offer = read(Offer, item)
+        if offer is not None:
+            with self._demand:
+                self._offers[offer.name] = offer
 
     def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
         with self._demand:

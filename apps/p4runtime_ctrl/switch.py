@@ -25,7 +25,7 @@ from apps.p4runtime_ctrl.desired_state import (
 )
 from apps.p4runtime_ctrl.errors import EntryError, ProgramError, SwitchError
 from apps.p4runtime_ctrl.guard import SECRET_WORDS, GuardSettings, secrets_entry
-from apps.p4runtime_ctrl.orders import Order, OrderBook, Owner
+from apps.p4runtime_ctrl.orders import Order, OrderBook, Owner, owner_of
 from apps.p4runtime_ctrl.p4info import Program
 from apps.p4runtime_ctrl.telemetry import Classifier, Request
 
@@ -176,8 +176,7 @@ class Switch:
             try:
                 orders.append(self._book.of_decision(decision))
             except (EntryError, ProgramError) as error:
-                owner = Owner(decision.id, decision.action, decision.target)
-                answers.append(self._confirmation(owner, "failed", cause=str(error)))
+                answers.append(self._confirmation(owner_of(decision), "failed", cause=str(error)))
         return answers + self._carry_out(orders, transport)
 
     def command(self, command: TableCommand, transport: Transport | None) -> list[Confirmation]:
@@ -377,7 +376,7 @@ class Switch:
             target=owner.target,
             handle=handle,
             cause=cause,
-            event_time=event_time,
+            event_time=event_time or owner.event_time,
             arrival=arrival,
         )
 

@@ -57,8 +57,8 @@ class _Station:
     def __init__(self, limit: int, lateness_us: int) -> None:
         self.host = HostEngine(limit=limit, lateness_us=lateness_us)
         self.merger = Merger()
+        self.handshakes = Handshakes()
         self.reports: dict[str, Reports] = {}
-        self.base_us = 0
         self.now_us: int | None = None
 
 
@@ -128,13 +128,17 @@ class Control:
     def switch(self, name: str, base_us: int) -> bool:
         """A switch is there; returns whether it is new."""
         new = name not in self._stations
-        self._station(name).base_us = base_us
+        self._station(name).host.base_us = base_us
         return new
 
     def packets(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
         """Copied packets of one of the sources, at `now` (seconds of any clock)."""
         station = self._station(switch)
         return self._processed(station, station.merger.put(name, batch, now))
+
+    def busy(self, switch: str, now: float) -> None:
+        """Until `now` no packets of a switch could be taken: silence before means nothing."""
+        self._station(switch).merger.busy(now)
 
     def digests(self, switch: str, name: str, batch: RecordBatch) -> list[Written]:
         """Reports of counting stages."""
@@ -145,7 +149,7 @@ class Control:
             station.now_us = max(int(batch["time_us"].max()), station.now_us or 0)
         for found in self.plan.queries:
             if any(entry.bit == bit for entry in found.entries) and found.identity in station.reports:
-                written += self._addressed(station.reports[found.identity].take(bit, batch))
+                written += self._addressed(station, station.reports[found.identity].take(bit, batch))
         return written
 
     def tick(self, now: float) -> list[Written]:
@@ -159,14 +163,14 @@ class Control:
         """Capture time of a switch has come to `now_us`, though no packet may have come here."""
         station = self._station(switch)
         station.now_us = max(now_us, station.now_us or 0)
-        return self._addressed(station.host.advance(now_us))
+        return self._addressed(station, station.host.advance(now_us))
 
     def finish(self) -> list[Written]:
         """No more packets will come."""
         written: list[Written] = []
         for station in self._stations.values():
             written += self._processed(station, station.merger.flush())
-            written += self._addressed(station.host.finish())
+            written += self._addressed(station, station.host.finish())
         return written
 
     def health(self) -> dict[str, Any]:
@@ -215,7 +219,7 @@ class Control:
             station.host.remove(identity)
         for identity in sorted(host - station.host.names):
             station.host.add(self._requests[identity].query)
-        station.merger.expect({_name(copy.bit) for copy in self.plan.copies}, 0.0)
+        station.merger.expect({_name(copy.bit) for copy in self.plan.copies})
         reports = {}
         for one in self.plan.queries:
             if one.in_switch:
@@ -225,20 +229,23 @@ class Control:
 
     def _new_reports(self, one: QueryPlan, station: _Station) -> Reports:
         query = self._requests[one.identity].query
-        return Reports(query, one, base_us=station.base_us, since_us=station.now_us)
+        return Reports(query, one, base_us=station.host.base_us, since_us=station.now_us)
 
     def _processed(self, station: _Station, batch: RecordBatch | None) -> list[Written]:
-        return [] if batch is None else self._addressed(station.host.process(batch))
+        return [] if batch is None else self._addressed(station, station.host.process(batch))
 
-    def _addressed(self, outputs: Sequence[Output]) -> list[Written]:
-        return [
-            Written(self._outputs[output.query], output)
-            for output in outputs
-            if output.query in self._outputs
-        ]
+    def _addressed(self, station: _Station, outputs: Sequence[Result | Captured]) -> list[Written]:
+        written: list[Written] = []
+        for output in outputs:
+            keys = self._outputs.get(output.query, ())
+            if output.query == HANDSHAKE and isinstance(output, Captured):
+                written += [Written(keys, found) for found in station.handshakes.process(output.batch)]
+            else:
+                written.append(Written(keys, output))
+        return written
 
     def _withdrawn(self, before: Plan) -> tuple[dict[str, Any], ...]:
-        now = {**{bit: True for bit in self.plan.entries}, **{copy.bit: True for copy in self.plan.copies}}
+        now = {**dict.fromkeys(self.plan.entries, True), **{copy.bit: True for copy in self.plan.copies}}
         gone = [bit for bit in (*before.entries, *(copy.bit for copy in before.copies)) if bit not in now]
         return tuple({"name": _name(bit), "bit": bit, "active": False} for bit in gone)
 

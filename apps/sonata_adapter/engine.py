@@ -38,7 +38,7 @@ from apps.sonata_adapter.operators import (
 )
 from apps.sonata_adapter.query import PACKET_KINDS, Query
 from apps.sonata_adapter.relations import Relation
-from apps.sonata_adapter.results import Captured, Output, Result
+from apps.sonata_adapter.results import Captured, Result
 from due import RecordBatch
 
 DEFAULT_LIMIT: Final = 1 << 20
@@ -131,10 +131,14 @@ class _Window:
 class HostEngine:
     """Runs queries over batches; pure: time comes with the packets.
 
-    `limit` is the number of keys that one operator keeps exactly in one window.
+    `limit` is the number of keys that one operator keeps exactly in one window; windows are multiples
+    of their length from `base_us`, the absolute time of the switch's clock zero.
     """
 
-    def __init__(self, *, limit: int = DEFAULT_LIMIT, lateness_us: int = DEFAULT_LATENESS_US) -> None:
+    def __init__(
+        self, *, limit: int = DEFAULT_LIMIT, lateness_us: int = DEFAULT_LATENESS_US, base_us: int = 0
+    ) -> None:
+        self.base_us = base_us
         self._limit = limit
         self._lateness_us = lateness_us
         self._queries: dict[str, _Running] = {}
@@ -161,7 +165,7 @@ class HostEngine:
         lengths = {running.window_us for running in self._queries.values()}
         self._windows = {key: window for key, window in self._windows.items() if key[0] in lengths}
 
-    def process(self, batch: RecordBatch) -> list[Output]:
+    def process(self, batch: RecordBatch) -> list[Result | Captured]:
         """What the packets bring about, in order."""
         if not len(batch) or not self._queries:
             return []
@@ -169,26 +173,26 @@ class HostEngine:
         times = batch["time_us"]
         first, last = int(times.min()), int(times.max())
         whole = Packets(batch)
-        outputs: list[Output] = []
+        outputs: list[Result | Captured] = []
         for length, queries in self._by_length().items():
-            for index, packets in self._windows_of(whole, length, first, last):
+            for index, packets in self._windows_of(whole, length, first - self.base_us, last - self.base_us):
                 outputs += self._feed(length, index, packets, queries, batch)
         self.without_payload += whole.without_payload
         outputs += self.advance(last)
         self.results += len(outputs)
         return outputs
 
-    def advance(self, now_us: int) -> list[Output]:
+    def advance(self, now_us: int) -> list[Result | Captured]:
         """Capture time has come to `now_us`: close what is over."""
         self.watermark_us = max(now_us, self.watermark_us or now_us)
         over = [
             key
             for key in self._windows
-            if (key[1] + 1) * key[0] + min(self._lateness_us, key[0]) <= self.watermark_us
+            if self.base_us + (key[1] + 1) * key[0] + min(self._lateness_us, key[0]) <= self.watermark_us
         ]
         return self._close(over)
 
-    def finish(self) -> list[Output]:
+    def finish(self) -> list[Result | Captured]:
         """No more packets will come: close all windows."""
         return self._close(list(self._windows))
 
@@ -201,27 +205,29 @@ class HostEngine:
     def _windows_of(
         self, whole: Packets, length: int, first: int, last: int
     ) -> Iterator[tuple[int, Packets]]:
-        closed = self._closed.get(length, -1)
+        closed = self._closed.get(length)
         if first // length == last // length:
-            if first // length > closed:
+            if closed is None or first // length > closed:
                 yield first // length, whole
             else:
                 self.late += len(whole)
             return
-        indices = whole.batch["time_us"] // length
+        indices = (whole.batch["time_us"] - self.base_us) // length
         for index in np.unique(indices).tolist():
             rows = np.flatnonzero(indices == index)
-            if index > closed:
+            if closed is None or index > closed:
                 yield index, Packets(whole.batch, rows)
             else:
                 self.late += len(rows)
 
     def _feed(
         self, length: int, index: int, packets: Packets, queries: list[_Running], batch: RecordBatch
-    ) -> Iterator[Output]:
+    ) -> Iterator[Result | Captured]:
         window = self._windows.get((length, index))
         if window is None:
-            window = self._windows[length, index] = _Window(index * length, length, self._limit)
+            window = self._windows[length, index] = _Window(
+                self.base_us + index * length, length, self._limit
+            )
         memo: dict[Node, Rows | Update] = {}
         for running in queries:
             for node in running.nodes():
@@ -241,7 +247,7 @@ class HostEngine:
         window: _Window,
         memo: dict[Node, Rows | Update],
         batch: RecordBatch,
-    ) -> Iterator[Output]:
+    ) -> Iterator[Result | Captured]:
         found = memo[outcome.node]
         if isinstance(found, Update):
             crossed = found.crossed(outcome.threshold, window.reported(running.name))
@@ -258,18 +264,18 @@ class HostEngine:
         for row, time_us in enumerate(times):
             yield _result(running, window, columns, row, at_us=time_us, error=error)
 
-    def _close(self, keys: list[tuple[int, int]]) -> list[Output]:
-        outputs: list[Output] = []
+    def _close(self, keys: list[tuple[int, int]]) -> list[Result | Captured]:
+        outputs: list[Result | Captured] = []
         for key in sorted(keys, key=lambda key: ((key[1] + 1) * key[0], key[0])):
             window = self._windows.pop(key)
-            self._closed[key[0]] = max(key[1], self._closed.get(key[0], -1))
+            self._closed[key[0]] = max(key[1], self._closed.get(key[0], key[1]))
             for running in self._queries.values():
                 if running.window_us == key[0] and isinstance(running.outcome, Table):
                     outputs += _final(running, running.outcome, window)
         return outputs
 
 
-def _final(running: _Running, outcome: Table, window: _Window) -> Iterator[Output]:
+def _final(running: _Running, outcome: Table, window: _Window) -> Iterator[Result | Captured]:
     relation = window.relation(outcome)
     columns = [(name, running.kinds[name], column) for name, column in sorted(relation.columns.items())]
     error = window.error(running.nodes())
@@ -299,7 +305,9 @@ def _result(
     )
 
 
-def _captured(running: _Running, outcome: Stream, memo: dict[Node, Rows | Update]) -> Iterator[Output]:
+def _captured(
+    running: _Running, outcome: Stream, memo: dict[Node, Rows | Update]
+) -> Iterator[Result | Captured]:
     packets = memo[outcome.node]
     assert isinstance(packets, Packets)  # noqa: S101 - a stream's node is a packet source
     if not len(packets):

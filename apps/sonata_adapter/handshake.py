@@ -2,18 +2,18 @@
 
 A handshake counts when the client's ACK acknowledges the server's sequence number + 1: a spoofer, who
 never sees the SYN-ACK, cannot write himself into the history.  Where only one direction passes the
-switch nothing can be known; `one_way` counts it.
+switch nothing can be known.
 """
 
 from collections import OrderedDict
-from typing import Any, Final
+from typing import Final
 
-import msgspec
 import numpy as np
 
 from apps.sonata_adapter.columns import Packets, evaluate
 from apps.sonata_adapter.expressions import ACK, SYN_ACK, address_text
 from apps.sonata_adapter.query import tcp
+from apps.sonata_adapter.results import Handshake
 from due import RecordBatch
 
 DEFAULT_OPEN: Final = 65_536
@@ -22,19 +22,6 @@ _MASK: Final = 0xFFFF_FFFF
 
 _Connection = tuple[int, int, int, int, int, int]
 """Client (high, low), server (high, low), client's port, server's port."""
-
-
-class Handshake(msgspec.Struct, frozen=True, kw_only=True):
-    """A client proved to a service that it can be reached under its address."""
-
-    source: str
-    service: str
-    port: int
-    at_us: int
-
-    def to_value(self) -> dict[str, Any]:
-        """As a DUE value; time in ns."""
-        return {"source": self.source, "service": self.service, "port": self.port, "at": self.at_us * 1000}
 
 
 class Handshakes:
@@ -50,8 +37,8 @@ class Handshakes:
         self._open: OrderedDict[_Connection, tuple[int, int]] = OrderedDict()
         self.completed = 0
         self.forgotten = 0
-        self.one_way = 0
-        """Wrong or missing acknowledgements: ACKs for connections that are not half open are no news."""
+        self.wrong = 0
+        """ACKs towards half-open connections that do not acknowledge the server's number."""
 
     def process(self, batch: RecordBatch) -> list[Handshake]:
         """Handshakes that the batch completes, in order."""
@@ -75,9 +62,8 @@ class Handshakes:
                 continue
             connection = (src_hi, src_lo, dst_hi, dst_lo, sport, dport)
             if self._acknowledged(connection, ack, at):
-                source, service = (
-                    address_text(version, h << 64 | l) for h, l in ((src_hi, src_lo), (dst_hi, dst_lo))
-                )
+                source = address_text(version, src_hi << 64 | src_lo)
+                service = address_text(version, dst_hi << 64 | dst_lo)
                 found.append(Handshake(source=source, service=service, port=dport, at_us=at))
         return found
 
@@ -94,7 +80,7 @@ class Handshakes:
             return False
         sequence, since = half
         if (sequence + 1) & _MASK != acknowledged:
-            self.one_way += 1
+            self.wrong += 1
             return False
         del self._open[connection]
         if at - since > self._age_us:

@@ -15,7 +15,7 @@ import msgspec
 
 from apps.sonata_adapter.catalogue import Template
 from apps.sonata_adapter.errors import InvalidRequest
-from apps.sonata_adapter.expressions import ACK, FIN, RST, Flags, Term
+from apps.sonata_adapter.expressions import ACK, FIN, RST, SYN_ACK, Flags, Term
 from apps.sonata_adapter.parameters import ANY_PREFIX, Parameter, Value, prefix
 from apps.sonata_adapter.query import Query, field, ip, tcp, udp
 from due import Key
@@ -46,6 +46,7 @@ class Protocol(msgspec.Struct, frozen=True):
     flags: bool = False
 
 
+_HANDSHAKES: Final = Query(HANDSHAKE).filter((tcp.flags == SYN_ACK) | (tcp.flags == ACK))
 _DNS: Final = (udp.sport == 53) | (udp.dport == 53)
 PROTOCOLS: Final[dict[str, Protocol]] = {
     "tcp": Protocol("TCP segments", (ip.proto == 6,), (tcp.sport, tcp.dport), flags=True),
@@ -85,7 +86,7 @@ def request_of(key: str, templates: Mapping[str, Template]) -> Request | None:
     name = parsed.segments[-1]
     given = {name: parsed.spec(name) for name in parsed.specs}
     if parsed.path == HANDSHAKE:
-        return Request(parsed.text, "handshake", "tcp", HANDSHAKE, HANDSHAKE, Query("handshakes", 1000))
+        return Request(parsed.text, "handshake", "tcp", HANDSHAKE, HANDSHAKE, _HANDSHAKES)
     if len(parsed.segments) == 4 and path == QUERY_PREFIX:
         return _query_request(parsed, name, given, templates)
     if len(parsed.segments) == 4 and path == CAPTURE_PREFIX:

@@ -11,13 +11,14 @@ from typing import Final
 
 import numpy as np
 
-from apps.sonata_adapter.columns import Column, Packets, column_of, plain_value
+from apps.sonata_adapter.columns import Packets, column_of, plain_value
 from apps.sonata_adapter.dataflow import Crossing, ReduceNode, compile_query, kinds_of
 from apps.sonata_adapter.engine import HostEngine
 from apps.sonata_adapter.expressions import Field, Kind, kind_of
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import PACKET_KINDS, Query
-from apps.sonata_adapter.results import Output, Result
+from apps.sonata_adapter.results import Result
+from apps.sonata_adapter.tables import Column
 from due import RecordBatch
 
 _KEPT: Final = 4
@@ -47,10 +48,10 @@ class Reports:
         ]
         self.tuples = 0
 
-    def take(self, bit: int, batch: RecordBatch) -> list[Output]:
+    def take(self, bit: int, batch: RecordBatch) -> list[Result]:
         """Results of the reports of one of the query's bits."""
         self.tuples += len(batch)
-        outputs: list[Output] = []
+        outputs: list[Result] = []
         over = np.flatnonzero(batch["overflow"])
         if len(over):
             outputs += self._overflowed(batch.take(over))
@@ -59,7 +60,7 @@ class Reports:
             outputs += self._crossed(batch.take(crossed))
         return outputs
 
-    def _crossed(self, batch: RecordBatch) -> Iterator[Output]:
+    def _crossed(self, batch: RecordBatch) -> Iterator[Result]:
         packets = Packets(batch)
         columns: list[tuple[str, Kind, Column | None]] = []
         for (name, value), (_, kind) in zip(self._outcome.names, self._columns, strict=True):
@@ -72,9 +73,9 @@ class Reports:
             }
             yield from self._once(self._window(time_us), fields, time_us)
 
-    def _overflowed(self, batch: RecordBatch) -> Iterator[Output]:
+    def _overflowed(self, batch: RecordBatch) -> Iterator[Result]:
         if self._host is None:
-            self._host = HostEngine(lateness_us=0)
+            self._host = HostEngine(lateness_us=0, base_us=self._base_us)
             self._host.add(self._query)
         for number in np.unique((batch["time_us"] - self._base_us) // self._query.window_us).tolist():
             window = self._base_us + number * self._query.window_us
@@ -87,7 +88,7 @@ class Reports:
         length = self._query.window_us
         return (time_us - self._base_us) // length * length + self._base_us
 
-    def _once(self, window: int, fields: dict[str, int | str], at_us: int) -> Iterator[Output]:
+    def _once(self, window: int, fields: dict[str, int | str], at_us: int) -> Iterator[Result]:
         key = tuple(value for name, value in sorted(fields.items()))
         seen = self._seen.setdefault(window, set())
         if key in seen:

@@ -47,4 +47,17 @@ class Captured(msgspec.Struct, frozen=True, kw_only=True):
     last_us: int
 
 
-Output = Result | Captured
+class Handshake(msgspec.Struct, frozen=True, kw_only=True):
+    """A client proved to a service that it can be reached under its address."""
+
+    source: str
+    service: str
+    port: int
+    at_us: int
+
+    def to_value(self) -> dict[str, Any]:
+        """As a DUE value; time in ns."""
+        return {"source": self.source, "service": self.service, "port": self.port, "at": self.at_us * 1000}
+
+
+Output = Result | Captured | Handshake

@@ -1,7 +1,7 @@
 """The generated-C back end: c_code's unit behind the interface of machine.Machine."""
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any
 
@@ -23,12 +23,12 @@ void dp_statistics(void *h, uint64_t *to);
 void dp_ports(void *h, const char *exists);
 void dp_session(void *h, uint32_t number, uint32_t count, const uint32_t *pairs, uint32_t length);
 void dp_group(void *h, uint32_t number, uint32_t count, const uint32_t *pairs);
-void dp_insert(void *h, uint32_t t, uint32_t slot, const uint64_t *value, const uint64_t *mask,
+void dp_insert(void *h, uint32_t t, uint32_t slot, const char *value, const char *mask,
                uint32_t ranges, const uint64_t *range, uint32_t rank, int64_t action,
-               const uint64_t *params, uint64_t now);
-void dp_replace(void *h, uint32_t t, uint32_t slot, int64_t action, const uint64_t *params);
+               const char *params, uint64_t now);
+void dp_replace(void *h, uint32_t t, uint32_t slot, int64_t action, const char *params);
 void dp_remove(void *h, uint32_t t, uint32_t slot);
-void dp_default(void *h, uint32_t t, int64_t action, const uint64_t *params);
+void dp_default(void *h, uint32_t t, int64_t action, const char *params);
 void dp_entry(void *h, uint32_t t, uint32_t slot, uint64_t *to);
 void dp_set_entry(void *h, uint32_t t, uint32_t slot, uint32_t which, uint64_t a, uint64_t b);
 void dp_entry_meter(void *h, uint32_t t, uint32_t slot, const uint64_t *rates);
@@ -66,21 +66,16 @@ class CTable:
         self._words, places = key_places(spec) if spec.keys else (0, ())
         self.place = KeyPlace(places)
         self._stride = stride
-        widths = {a.name: tuple(words(p.width) for p in a.params) for a in spec.actions}
-        self._narrow = all(w == 1 for counts in widths.values() for w in counts)
-        self._counts: dict[int, tuple[int, ...]] = {}
+        self._sizes: dict[int, tuple[int, ...]] = {-1: ()}
 
     def know_action(self, number: int, counts: tuple[int, ...]) -> None:
         """Words of each parameter of an action."""
-        self._counts[number] = counts
+        self._sizes[number] = tuple(8 * count for count in counts)
 
-    def _params(self, action: int, params: Sequence[int]) -> Any:
-        if not self._narrow and action >= 0:
-            params = list(_split(params, self._counts[action]))
-        return self._ffi.new("uint64_t[]", [*params, *[0] * (self._stride - len(params) + 1)])
-
-    def _key(self, value: int) -> Any:
-        return self._ffi.new("uint64_t[]", [(value >> 64 * i) & _WORD for i in range(self._words)] or [0])
+    def _params(self, action: int, params: Sequence[int]) -> bytes:
+        sizes = self._sizes[action]
+        data = b"".join([v.to_bytes(size, "little") for v, size in zip(params, sizes, strict=True)])
+        return data.ljust(8 * self._stride, b"\0")
 
     def insert(self, slot: int, row: Row, now_us: int) -> None:
         parts = self._ffi.NULL
@@ -93,8 +88,8 @@ class CTable:
             self._handle,
             self._number,
             slot,
-            self._key(row.value),
-            self._key(row.mask),
+            row.value.to_bytes(8 * self._words, "little"),
+            row.mask.to_bytes(8 * self._words, "little"),
             len(row.ranges),
             parts,
             row.rank,
@@ -131,12 +126,6 @@ class CTable:
 
     def touch(self, slot: int, now_us: int) -> None:
         self._lib.dp_set_entry(self._handle, self._number, slot, 1, now_us, 0)
-
-
-def _split(values: Sequence[int], counts: Sequence[int]) -> Iterable[int]:
-    for value, count in zip(values, counts, strict=True):
-        for i in range(count):
-            yield (value >> 64 * i) & _WORD
 
 
 class CCounters:

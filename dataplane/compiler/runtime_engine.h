@@ -300,20 +300,24 @@ void dp_group(void *h, u32 number, u32 count, const u32 *pairs) {
 }
 
 /* ranges: five numbers each: word, shift, mask, low, high */
-void dp_insert(void *h, u32 t, u32 slot, const u64 *value, const u64 *mask, u32 ranges, const u64 *range,
-               u32 rank, i64 action, const u64 *params, u64 now) {
+void dp_insert(void *h, u32 t, u32 slot, const char *value, const char *mask, u32 ranges, const u64 *range,
+               u32 rank, i64 action, const char *params, u64 now) {
     range_part parts[64];
+    u64 key[2 * KEY_WORDS + 2];
+    table *x = &((machine *)h)->t[t];
+    memcpy(key, value, x->words * 8);
+    memcpy(key + x->words, mask, x->words * 8);
     for (u32 i = 0; i < ranges && i < 64; i++, range += 5)
         parts[i] = (range_part){(u32)range[0], (u32)range[1], range[2], range[3], range[4]};
-    table_insert(&((machine *)h)->t[t], slot, value, mask, ranges, parts, rank, action, params, now);
+    table_insert(x, slot, key, key + x->words, ranges, parts, rank, action, params, now);
 }
-void dp_replace(void *h, u32 t, u32 slot, i64 action, const u64 *params) {
+void dp_replace(void *h, u32 t, u32 slot, i64 action, const char *params) {
     table *x = &((machine *)h)->t[t];
     x->entries[slot].action = action;
     memcpy(x->params + (u64)slot * x->stride, params, x->stride * 8);
 }
 void dp_remove(void *h, u32 t, u32 slot) { table_remove(&((machine *)h)->t[t], slot); }
-void dp_default(void *h, u32 t, i64 action, const u64 *params) {
+void dp_default(void *h, u32 t, i64 action, const char *params) {
     table *x = &((machine *)h)->t[t];
     x->default_action = action;
     memcpy(x->default_params, params, x->stride * 8);

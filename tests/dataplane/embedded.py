@@ -37,6 +37,7 @@ class Embedded:
     def close(self) -> None:
         self.server.stop()
         self.loop.stop()
+        self.device.close()
 
     def __enter__(self) -> Self:
         return self

@@ -4,11 +4,12 @@ from functools import cache
 from pathlib import Path
 
 from dataplane.program import load
+from dataplane.switch import Backend
 from dataplane.tree import Program
 from tests.requirements import shared_data
 
 _HERE = Path(__file__).resolve().parent
-BACKENDS = ("python", "c")
+BACKENDS: tuple[Backend, ...] = ("python", "c")
 
 
 @cache
@@ -32,7 +33,7 @@ def ethernet(etype: int, payload: bytes) -> bytes:
     return bytes.fromhex("020000000002 020000000001") + etype.to_bytes(2, "big") + payload
 
 
-def frame(
+def frame(  # noqa: PLR0917 - the header's own order
     what: int, a: int = 0, b: int = 0, c: int = 0, d: int = 0, e: int = 0, *, rest: bytes = b""
 ) -> bytes:
     """A frame of features.p4's own type; the header is 20 bytes behind Ethernet."""

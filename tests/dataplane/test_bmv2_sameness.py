@@ -268,7 +268,7 @@ def test_embedded_switch_does_what_bmv2_does(bmv2, name, seed):
     pair = Pair(bmv2, case, seed)
     chooser = pair.chooser
     for _ in range(0, _FRAMES, _BURST):
-        frames = []
+        frames: list[bytes] = []
         while len(frames) < _BURST:
             data = chooser.spoil(case.maker(chooser.random))
             if data and not case.skip(data):

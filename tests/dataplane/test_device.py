@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from dataplane.ports import MemoryPort
+from dataplane.switch import Result
 from tests.dataplane.controller import Controller, Names, insert, program_config
 from tests.dataplane.embedded import Embedded
 
@@ -81,6 +82,27 @@ def test_frames_before_the_first_pipeline_are_counted():
     with Embedded() as switch:
         switch.memory[1].inject(*[frame()] * 50)
         until(lambda: switch.loop.counts["without_pipeline"] == 50)
+
+
+def test_a_slow_primary_loses_packets_of_live_ports_and_they_are_counted():
+    with Embedded(queue=10) as switch, primary(switch) as controller:
+        controller.set_pipeline(program_config(PROGRAM))
+        with switch.device.control:
+            # the stream's thread finds nothing to do: as slow as can be
+            stream = next(iter(switch.device._streams.values()))
+            stream.queue = None
+        switch.memory[1].inject(*[frame()] * 100)
+        until(lambda: switch.device.counts["packet_in"] == 100)
+        assert switch.device.counts["packet_in_dropped"] == 90
+
+
+def test_what_is_shorter_than_the_packet_in_header_is_counted():
+    with Embedded() as switch, primary(switch) as controller:
+        controller.set_pipeline(program_config(PROGRAM))
+        result = Result(packet_ins=[b"", b"x", bytes(20)])
+        switch.device.deliver(switch.device.pipeline, result, lossless=False)
+        assert switch.device.counts["packet_in_malformed"] == 2
+        assert len(controller.packets.get(timeout=10).payload) == 18
 
 
 def test_each_role_s_primary_gets_the_packets():

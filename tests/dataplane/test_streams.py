@@ -66,6 +66,21 @@ def test_room_is_announced_when_a_full_queue_is_half_empty():
     assert queue.room() == 100 - len(queue)
 
 
+def test_what_does_not_fit_is_refused_and_a_lossless_caller_may_go_beyond():
+    _, queue, _ = connected(capacity=10)
+    assert queue.put([b"x"] * 15) == 5
+    assert queue.put([b"x"] * 100, lossless=True) == 70
+    assert len(queue) == 40
+
+
+def test_long_messages_weigh_more():
+    _, queue, _ = connected(capacity=10)
+    assert queue.put([bytes(9000)] * 5) == 3
+    assert queue.room() == 0
+    queue.take()
+    assert queue.room() == 10
+
+
 def test_clearing_counts_what_is_dropped():
     _, queue, _ = connected()
     queue.put([b"x"] * 7)

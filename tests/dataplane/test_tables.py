@@ -12,6 +12,7 @@ from dataplane.tables import (
     Exact,
     InvalidEntry,
     Lpm,
+    Match,
     NotFound,
     Optional,
     Range,
@@ -30,7 +31,7 @@ def switch(request):
     made.close()
 
 
-def flow(low: int, high: int, value: int, mask: int, a: int) -> tuple:
+def flow(low: int, high: int, value: int, mask: int, a: int) -> Match:
     return (Range(low, high), Ternary(value, mask), Exact(a))
 
 
@@ -176,7 +177,7 @@ def test_lookup_equals_a_list_read_from_the_top(backend, entries, removed, asked
     switch = Switch(features(), backend=backend)
     switch.tables["I.ports"].set_default("I.forward", (2,))
     table, naive = switch.tables["I.flows"], Naive()
-    known: list[tuple] = []
+    known: list[tuple[Match, int]] = []
     for n, (match, priority) in enumerate(entries):
         entry = TableEntry(match, "I.metered", (n,), priority)
         if (match, priority) not in known:
@@ -216,5 +217,5 @@ def test_optional_values():
     naive = Naive()
     naive.insert(TableEntry((Optional(None),), "any", (), 1))
     naive.insert(TableEntry((Optional(5),), "five", (), 2))
-    assert naive.find((5,)).action == "five"
-    assert naive.find((6,)).action == "any"
+    found = [naive.find((5,)), naive.find((6,))]
+    assert [entry.action for entry in found if entry] == ["five", "any"]

@@ -1,5 +1,6 @@
 """Generated C against generated Python: random entries and frames, no difference in anything seen."""
 
+from collections.abc import Callable
 from random import Random
 
 import pytest
@@ -12,7 +13,7 @@ from tests.dataplane.loading import BACKENDS, features, sdnator, shared
 from tests.dataplane.traffic import Chooser, Maker, feature_frame, network_frame
 
 _FRAMES = 600
-_CASES = {
+_CASES: dict[str, tuple[Callable[[], Program], Maker]] = {
     "features": (features, feature_frame),
     "small": (lambda: shared("small"), network_frame),
     "sketch": (lambda: shared("sketch"), network_frame),
@@ -92,7 +93,7 @@ def run(program: Program, maker: Maker, seed: int) -> None:
         one, two = (switch.process_many(port, frames, times) for switch in switches)
         assert one == two
         sent += count
-    compare_state(*switches, now)
+    compare_state(switches[0], switches[1], now)
     for switch in switches:
         switch.close()
 

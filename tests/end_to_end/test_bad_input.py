@@ -6,12 +6,15 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
 
 import pytest
 
 from sdnator.datasets.mirai_like import Options, make
 from tests.end_to_end.command import figures, sdnator
+
+MARK = "SDNATOR_TEST_RUN"
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +97,12 @@ def test_labels_of_another_capture_are_refused(capture, tmp_path):
     assert "2 labels" in told(done)
 
 
-def processes_naming(word: str) -> list[int]:
+def processes_of(run: str) -> list[int]:
+    """All processes that inherited the mark of a test run."""
     found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+    for entry in Path("/proc").glob("[0-9]*/environ"):
         try:
-            if word.encode() in entry.read_bytes():
+            if f"{MARK}={run}".encode() in entry.read_bytes():
                 found.append(int(entry.parent.name))
         except OSError:
             continue
@@ -114,14 +118,17 @@ def running(capture, tmp_path):
         sys.executable, "-m", "sdnator.cli", "replay", str(capture),
         "--train", "1000", "--pace", "1x", "--report", str(report), "--keep", str(keep), "--json",
     ]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = uuid.uuid4().hex
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {MARK: run}
+    )
     log = keep / "kitsune-alone" / "logs" / "p4runtime_ctrl.log"
     deadline = time.monotonic() + 60
     while not (log.exists() and "primary" in log.read_text()):
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.1)
-    yield process, keep, report
+    yield process, run, report
     if process.poll() is None:
         process.kill()
     process.communicate()
@@ -129,7 +136,7 @@ def running(capture, tmp_path):
 
 def test_ctrl_c_leaves_nothing_behind(running):
     """Exit code 130, one line, no process, no half-written report."""
-    process, keep, report = running
+    process, run, report = running
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -137,27 +144,27 @@ def test_ctrl_c_leaves_nothing_behind(running):
     assert error.rstrip().endswith("sdnator: interrupted; nothing was left running")
     assert out == ""
     assert not report.exists()
-    assert processes_naming(str(keep)) == []
+    assert processes_of(run) == []
 
 
 def test_killed_replay_takes_its_pipeline_along(running):
     """Even kill -9 leaves no switch, server or app running."""
-    process, keep, _ = running
+    process, run, _ = running
     process.kill()
     process.communicate(timeout=60)
     deadline = time.monotonic() + 30
-    while processes_naming(str(keep)) and time.monotonic() < deadline:
+    while processes_of(run) and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert processes_naming(str(keep)) == []
+    assert processes_of(run) == []
 
 
 @pytest.mark.parametrize("part", ["apps.kitsune.service", "dataplane", "apps.firewall.service"])
 def test_death_of_a_part_is_told(running, part):
     """Which part died, and how; exit code 1."""
-    process, keep, _ = running
+    process, run, _ = running
     (pid,) = (
         pid
-        for pid in processes_naming(str(keep))
+        for pid in processes_of(run)
         if f"\0{part}\0".encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
     )
     os.kill(pid, signal.SIGKILL)

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from due.drivers.sqlite import SqliteArchive
 from sdnator.datasets.mirai_like import Options, make
 from sdnator.datasets.rebuild import rebuild
 from tests.end_to_end.command import figures, sdnator
@@ -104,26 +105,22 @@ def test_flood_answered_by_its_victim_blocks_the_flooder_only(tmp_path):
 
 def test_everything_decided_is_in_the_archive(tmp_path):
     """Alerts, score summaries, decisions and confirmations are found again after the run."""
-    from due import Engine  # the reader of the archive is any app
-
     capture = tmp_path / "short.pcap"
     make(Options(seed=4, benign_seconds=600, attack_seconds=120), capture)
     keep = tmp_path / "keep"
     labels = tmp_path / "short.labels.csv"
     found = figures("replay", capture, "--labels", labels, "--train", "9000", "--keep", keep)
-    archive = keep / "with-blocking" / "archive.db"
-    engine = Engine()
-    engine.set_db(f"sqlite:///{archive}")
+    archive = SqliteArchive(f"sqlite:///{keep / 'with-blocking' / 'archive.db'}")
     try:
-        assert len(engine.get("network.anomaly.kitsune.alert")) == found["alerts"]
-        scored = sum(item.value["count"] for item in engine.get("network.anomaly.kitsune.score"))
-        assert scored == found["packets_scored"]
-        decided = {item.value["id"] for item in engine.get("network.block.firewall.*")}
+        assert len(archive.find({"dataKey": "network.anomaly.kitsune.alert"})) == found["alerts"]
+        scores = archive.find({"dataKey": "network.anomaly.kitsune.score"})
+        assert sum(item.value["count"] for item in scores) == found["packets_scored"]
+        decided = {item.value["id"] for item in archive.find({"dataKey": "network.block.firewall.*"})}
         assert {block["id"] for block in found["blocks"]} <= decided
-        installed = [item.value["state"] for item in engine.get("network.confirmation.p4runtime_ctrl.*")]
-        assert installed.count("installed") == len(found["blocks"])
+        answers = archive.find({"dataKey": "network.confirmation.p4runtime_ctrl.*"})
+        assert [item.value["state"] for item in answers].count("installed") == len(found["blocks"])
     finally:
-        engine.close()
+        archive.close()
 
 
 def test_same_loop_on_bmv2(attacked_capture):

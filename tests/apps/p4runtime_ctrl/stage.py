@@ -28,11 +28,14 @@ PACKETS = "network.packets.p4runtime_ctrl.s1.all"
 class Stage:
     """`with Stage(folder) as stage:`; what it starts ends with it."""
 
-    def __init__(self, folder: Path, *, kind: str = "embedded", **switch_options: object) -> None:
+    def __init__(
+        self, folder: Path, *, kind: str = "embedded", veth: str = "", **switch_options: object
+    ) -> None:
         self.folder = folder
         self.archive = f"sqlite://{folder / 'archive.db'}"
         self._sockets = folder / "in.sock"
-        self.target = Target(kind, folder, ports=(f"1=capture:{self._sockets}", "2=null"))
+        entry = f"veth:{veth}" if veth else f"capture:{self._sockets}"
+        self.target = Target(kind, folder, ports=(f"1={entry}", "2=null"))
         self._switch_options = switch_options
         self._processes: list[subprocess.Popen[str]] = []
         self._engines: list[Engine] = []

@@ -36,8 +36,10 @@ class Target:
             ports = [part for port in self._ports for part in ("--port", port)]
             return [self._program, "-m", "dataplane", "--grpc", self.address, "--device-id", "1",
                     "--cpu-port", "510", *ports]  # fmt: skip
+        veths = [port.replace("=veth:", "@") for port in self._ports if "=veth:" in port]
+        ports = [part for veth in veths for part in ("-i", veth)]
         return [self._program, "--no-p4", "--device-id", "1", "--thrift-port", str(free_port()), "-L", "off",
-                "--", "--grpc-server-addr", self.address, "--cpu-port", "510"]  # fmt: skip
+                *ports, "--", "--grpc-server-addr", self.address, "--cpu-port", "510"]  # fmt: skip
 
     def start(self) -> None:
         self._process = subprocess.Popen(

@@ -1,5 +1,6 @@
 """Programs that do nothing but compute: fields in, expressions, fields out."""
 
+from collections.abc import Sequence
 from random import Random
 
 from dataplane import tree
@@ -7,7 +8,26 @@ from dataplane.tree import Binary, Conditional, Const, Expression, FieldRef, Fie
 
 WIDTHS = (1, 3, 8, 9, 16, 31, 32, 48, 63, 64, 65, 100, 127, 128, 129, 200, 256, 300, 448, 512)
 SIGNED = (8, 16, 33, 64, 100, 128)
-_OPS = ("+", "-", "*", "&", "|", "^", "<<", ">>", "==", "<", ">=", "?", "~", "mask", "cast", "and", "not", "%")
+_OPS = (
+    "+",
+    "-",
+    "*",
+    "&",
+    "|",
+    "^",
+    "<<",
+    ">>",
+    "==",
+    "<",
+    ">=",
+    "?",
+    "~",
+    "mask",
+    "cast",
+    "and",
+    "not",
+    "%",
+)
 
 
 def layout(sizes: list[tuple[int, bool, bool]], prefix: str) -> tuple[FieldType, ...]:
@@ -39,19 +59,10 @@ def random_expression(random: Random, depth: int) -> Expression:
         return random_field(random) if random.random() < 0.8 else random_constant(random)
     op = random.choice(_OPS)
     left = random_expression(random, depth - 1)
-    if op == "~":
-        return Unary("~", left)
-    if op == "not":
-        return Unary("b2d", Unary("not", Unary("d2b", left)))
-    if op == "mask":
-        return Binary("&", left, Const((1 << random.choice(WIDTHS)) - 1))
-    if op == "cast":
-        name = random.choice(["two_comp_mod", "usat_cast", "sat_cast"])
-        return Binary(name, left, Const(random.choice([2, 8, 16, 32, 64, 100])))
-    if op in ("<<", ">>") and random.random() < 0.7:
-        return Binary(op, left, Const(random.choice([0, 1, 7, 8, 31, 32, 63, 64, 65, 127, 128, 200])))
     if op in ("<<", ">>"):
-        return Binary(op, left, FieldRef("given", INPUTS[random.randrange(4)]))
+        return Binary(op, left, random_distance(random))
+    if op in ("~", "not", "mask", "cast"):
+        return one_operand(random, op, left)
     if op == "%":
         divisor = FieldRef("given", random.choice(INPUTS[:13]))
         return Binary(random.choice("/%"), Binary("&", left, Const((1 << 100) - 1)), divisor)
@@ -60,12 +71,28 @@ def random_expression(random: Random, depth: int) -> Expression:
         joined = Binary(random.choice(["and", "or"]), Unary("d2b", left), Unary("d2b", right))
         return Unary("b2d", joined)
     if op == "?":
-        third = random_expression(random, depth - 1)
-        return Conditional(Unary("d2b", left), right, third)
+        return Conditional(Unary("d2b", left), right, random_expression(random, depth - 1))
     return Binary(op, left, right)
 
 
-def program(targets: list[tuple[FieldType, Expression]]) -> tree.Program:
+def random_distance(random: Random) -> Expression:
+    if random.random() < 0.7:
+        return Const(random.choice([0, 1, 7, 8, 31, 32, 63, 64, 65, 127, 128, 200]))
+    return FieldRef("given", INPUTS[random.randrange(4)])
+
+
+def one_operand(random: Random, op: str, operand: Expression) -> Expression:
+    if op == "~":
+        return Unary("~", operand)
+    if op == "not":
+        return Unary("b2d", Unary("not", Unary("d2b", operand)))
+    if op == "mask":
+        return Binary("&", operand, Const((1 << random.choice(WIDTHS)) - 1))
+    name = random.choice(["two_comp_mod", "usat_cast", "sat_cast"])
+    return Binary(name, operand, Const(random.choice([2, 8, 16, 32, 64, 100])))
+
+
+def program(targets: Sequence[tuple[FieldType, Expression | None]]) -> tree.Program:
     """Extracts `given`, computes every target into `result`, sends the frame to port 1."""
     standard = (("ingress_port", 9), ("egress_spec", 9), ("egress_port", 9), ("instance_type", 32))
     meta = layout([(w, False, False) for _, w in standard] + [(32, False, False)], "m")

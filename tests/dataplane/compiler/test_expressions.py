@@ -9,7 +9,7 @@ from dataplane.compiler.layout import make
 from dataplane.compiler.simplify import bounds, simplify
 from dataplane.errors import Unsupported
 from dataplane.switch import Switch
-from dataplane.tree import Binary, Const, Expression, FieldRef, FieldType, Unary
+from dataplane.tree import Binary, Const, Expression, FieldRef, Unary
 from tests.dataplane.compiler.expressions import (
     INPUTS,
     SIGNED,

@@ -1,0 +1,232 @@
+"""The Sonata adapter as a DUE app: keys become queries in the switch, results come back.
+
+    network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata_adapter.*, network.p4_command.sonata_adapter.*
+    network.packets|frames|digests.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
+
+Nothing is observed and nothing is offered while nobody wants a result: with no interest the switch
+has no entry and sends nothing.
+"""
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+import due.service
+from apps.messages import TableCommand
+from apps.packets import read_frames
+from apps.sonata_adapter.catalogue import CATALOGUE, Template
+from apps.sonata_adapter.control import Changes, Control, Source, Written
+from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
+from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
+from apps.sonata_adapter.planner import SwitchLimits
+from apps.sonata_adapter.results import Captured
+from apps.sonata_adapter.text import parse_queries
+from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
+
+SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
+TELEMETRY: Final = "network.telemetry.sonata_adapter"
+COMMAND: Final = "network.p4_command.sonata_adapter"
+INCOMPATIBLE: Final = "network.incompatible.sonata_adapter"
+_OWN_PARAMETERS: Final = sorted(
+    {each.name for template in CATALOGUE.values() for each in template.parameters}
+)
+
+
+def _offering(path: str, names: Iterable[str]) -> str:
+    return f"{path}:{','.join(f'{name}=*' for name in sorted(names))}"
+
+
+INTERESTS = (Interest(SWITCHES),)
+CAPABILITIES = (
+    *(
+        Capability(
+            _offering(f"{QUERY_PREFIX}.{template.name}", (each.name for each in template.parameters)),
+            delivery="reliable",
+        )
+        for template in CATALOGUE.values()
+    ),
+    # queries that people add; and wrong parameters, which are answered with what would do
+    Capability(_offering(f"{QUERY_PREFIX}.*", _OWN_PARAMETERS), delivery="reliable"),
+    *(
+        Capability(_offering(f"{CAPTURE_PREFIX}.{name}", capture_parameters(protocol)), delivery="reliable")
+        for name, protocol in PROTOCOLS.items()
+    ),
+    Capability(HANDSHAKE, delivery="reliable", archive="always"),
+    Capability(f"{TELEMETRY}.*", delivery="reliable"),
+    Capability(f"{COMMAND}.*", delivery="reliable"),
+    Capability(f"{INCOMPATIBLE}.*", archive="always"),
+)
+
+_LOG = logging.getLogger(__name__)
+_WIDTH: Final = 256
+_MY_KEYS: Final = (QUERY_PREFIX, CAPTURE_PREFIX, HANDSHAKE)
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the Sonata adapter."""
+
+    limits: SwitchLimits = SwitchLimits()
+    """What queries may take of the switch."""
+    keys: int = DEFAULT_LIMIT
+    """Keys that one operator keeps exactly in a window; beyond, results are estimates and say so."""
+    lateness_us: int = DEFAULT_LATENESS_US
+    """How long after its end a window waits for late packets, capture time; a window at most."""
+    files: tuple[str, ...] = ()
+    """Files with queries in text form."""
+
+
+class SonataAdapterService:
+    """Turns interests into queries.  Raises `QueryTextError` and OSError for files of queries."""
+
+    def __init__(self, engine: Engine, settings: Settings) -> None:
+        self._engine = engine
+        self._control = Control(
+            load_templates(settings.files),
+            limits=settings.limits,
+            keys_limit=settings.keys,
+            lateness_us=settings.lateness_us,
+        )
+        self._lock = threading.RLock()
+        self._observed: dict[Source, Any] = {}
+        self._switches: dict[str, Any] = {}
+        self._wanted: frozenset[str] = frozenset()
+        self._heard: frozenset[str] = frozenset()
+        self._commands = count(1)
+        self._written = 0
+
+    def start(self) -> None:
+        """Subscribe to what is wanted and to which switches there are."""
+        for item in self._engine.get(SWITCHES):
+            self._on_switch(item)
+        self._engine.observe(SWITCHES).subscribe(self._on_switch)
+        self._engine.on_assignments(self._on_assignments)
+
+    def tick(self) -> None:
+        """Packets that waited for other streams go on."""
+        with self._lock:
+            self._write(self._control.tick(time.monotonic()))
+
+    def stop(self) -> None:
+        """Report what is open, and take everything out of the switch."""
+        with self._lock:
+            self._write(self._control.finish())
+            self._apply(self._control.want(()))
+
+    def health(self) -> dict[str, Any]:
+        """Counters for people."""
+        with self._lock:
+            return {**self._control.health(), "results": self._written, "switches": sorted(self._switches)}
+
+    def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
+        wanted = frozenset(each.key for each in assignments if each.key.startswith(_MY_KEYS))
+        heard = frozenset(each.key for each in assignments) - wanted
+        with self._lock:
+            if wanted != self._wanted:
+                self._wanted = wanted
+                self._apply(self._control.want(wanted))
+            if heard - self._heard:
+                # a controller has come that knows nothing of what was said before
+                self._apply(self._control.everything())
+            self._heard = heard
+
+    def _on_switch(self, item: Item) -> None:
+        name = item.key.rpartition(".")[2]
+        value = item.value
+        with self._lock:
+            base_us = int(value.get("base_us", 0))
+            fresh = self._control.switch(name, base_us) or name not in self._switches
+            primary = bool(value.get("primary"))
+            again = primary and not self._switches.get(name, False)
+            self._switches[name] = primary
+            if fresh or again:
+                self._apply(self._control.everything(), only=name)
+            if value.get("event_time"):
+                self._write(self._control.advance(name, int(value["event_time"]) // 1000))
+
+    def _apply(self, changes: Changes, only: str = "") -> None:
+        """Tell the controller: what ends first, then counting entries, then classifier bits."""
+        for offer in changes.withdraw:
+            self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
+        if changes.updates:
+            for switch in [only] if only else sorted(self._switches):
+                command = TableCommand(
+                    id=f"sonata-{time.time_ns()}-{next(self._commands)}", updates=changes.updates
+                )
+                self._engine.write(f"{COMMAND}.{switch}", command.to_value(), [NO_WAIT])
+        for offer in changes.offer:
+            self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
+        for key, reason in changes.refused:
+            _LOG.warning("%s", reason)
+            name = key.split(":")[0].rpartition(".")[2]
+            self._engine.write(f"{INCOMPATIBLE}.{name}", {"key": key, "reason": reason}, [NO_WAIT])
+        self._observe(self._control.sources)
+
+    def _observe(self, sources: set[Source]) -> None:
+        for source in self._observed.keys() - sources:
+            self._observed.pop(source).dispose()
+        for source in sorted(sources - self._observed.keys()):
+            key = f"network.{source.kind}.p4runtime_ctrl.*.{source.name}"
+            self._observed[source] = self._engine.observe(key).subscribe(self._on_data)
+
+    def _on_data(self, item: Item) -> None:
+        _, kind, _, switch, name = item.key.split(".")
+        batch = with_frames(item.value) if kind == "frames" else item.value
+        with self._lock:
+            if kind == "digests":
+                self._write(self._control.digests(switch, name, batch))
+            else:
+                self._write(self._control.packets(switch, name, batch, time.monotonic()))
+                self._control.busy(switch, time.monotonic())
+
+    def _write(self, written: Iterable[Written]) -> None:
+        for one in written:
+            output = one.output
+            value: Any = output.batch if isinstance(output, Captured) else output.to_value()
+            at_us = output.last_us if isinstance(output, Captured) else output.at_us
+            for key in one.keys:
+                self._written += 1
+                self._engine.write(key, value, [NO_WAIT], event_time=at_us * 1000)
+
+
+def with_frames(value: dict[str, Any]) -> RecordBatch:
+    """The controller's frames as a batch: header columns, the bytes, and how many of them there are."""
+    frames = [bytes(frame) for frame in value["frames"]]
+    batch = read_frames(
+        frames,
+        lengths=value["lengths"],
+        times_us=value["times_us"],
+        ports=value["ports"],
+        sequence=value["sequence"],
+        arrival=value["arrival"],
+    )
+    cut = [frame[:_WIDTH] for frame in frames]
+    captured = np.array([len(frame) for frame in cut], dtype=np.uint16)
+    return RecordBatch({**batch, "frame": np.array(cut, dtype=f"V{_WIDTH}"), "captured": captured})
+
+
+def load_templates(files: Iterable[str]) -> dict[str, Template]:
+    """The catalogue and the queries of these files; raises `QueryTextError`, OSError."""
+    templates = dict(CATALOGUE)
+    for name in files:
+        for template in parse_queries(Path(name).read_text(encoding="utf-8"), name):
+            templates[template.name] = template
+    return templates
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the adapter until it is told to stop."""
+    return int(
+        due.service.run("sonata_adapter", SonataAdapterService, Settings, INTERESTS, CAPABILITIES, argv)
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

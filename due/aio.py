@@ -1,0 +1,41 @@
+"""DUE from asyncio: `async for item in items(engine, key)`.
+
+    dispatcher thread ──call_soon_threadsafe──► bounded queue ──► the coroutine
+
+A full queue makes the dispatcher wait, so a slow coroutine holds back reliable producers like a slow
+callback does.  Calls that wait (`flush`, `get`, `close`) belong into `asyncio.to_thread`.
+"""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator
+
+from due.engine import Engine
+from due.messages import Item
+
+_PATIENCE = 0.1
+
+
+async def items(engine: Engine, key: str, *, most: int = 10_000) -> AsyncIterator[Item]:
+    """The items under `key`, for ever; at most `most` wait.  Leaving the loop withdraws the interest."""
+    loop = asyncio.get_running_loop()
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    room = threading.Semaphore(most)
+    left = threading.Event()
+
+    def arrived(item: Item) -> None:
+        while not room.acquire(timeout=_PATIENCE):
+            if left.is_set():
+                return
+        if not left.is_set():
+            loop.call_soon_threadsafe(queue.put_nowait, item)
+
+    subscription = await asyncio.to_thread(engine.observe(key).subscribe, arrived)
+    try:
+        while True:
+            item = await queue.get()
+            room.release()
+            yield item
+    finally:
+        left.set()
+        subscription.dispose()

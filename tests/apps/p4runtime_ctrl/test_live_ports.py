@@ -1,0 +1,63 @@
+"""Frames that come in through a real interface reach DUE whole and in order, from either kind of switch."""
+
+import os
+import socket
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from apps.packets import PACKET_COLUMNS, read_frames
+from tests.apps.p4runtime_ctrl.stage import PACKETS, Heard, Stage, frame, wait_for
+from tests.apps.p4runtime_ctrl.targets import KINDS
+from tests.requirements import optional_program, require_netns
+
+COUNT = 500
+
+
+@pytest.fixture
+def veth():
+    """Two ends of a cable; nobody else talks on it."""
+    require_netns()
+    near, far = f"sdn{os.getpid() % 100_000}a", f"sdn{os.getpid() % 100_000}b"
+    subprocess.run(["ip", "link", "add", near, "type", "veth", "peer", "name", far], check=True)
+    try:
+        for end in (near, far):
+            subprocess.run(["sysctl", "-qw", f"net.ipv6.conf.{end}.disable_ipv6=1"], check=False)
+            subprocess.run(["ip", "link", "set", end, "up"], check=True)
+        yield near, far
+    finally:
+        subprocess.run(["ip", "link", "delete", near], check=True)
+
+
+@pytest.mark.parametrize("telemetry", ["packet-in", "digest"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_of_an_interface(kind, telemetry, veth, tmp_path):
+    if kind == "bmv2":
+        optional_program("simple_switch_grpc")
+    near, far = veth
+    with Stage(tmp_path, kind=kind, veth=far, forward={}) as stage:
+        stage.controller(telemetry=telemetry)
+        heard = Heard(stage.engine("listener"), PACKETS, "network.switch.p4runtime_ctrl.s1")
+        wait_for(lambda: any(v["telemetry"] == ["packets"] for v in heard.values("switch")), why=stage.log)
+        with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as wire:
+            wire.bind((near, 0))
+            for number in range(COUNT):
+                wire.send(frame(1 + number % 200))
+                if number % 10 == 0:
+                    time.sleep(0.005)
+        wait_for(lambda: len(heard.arrivals()) == COUNT, why=lambda: (len(heard.arrivals()), heard.values("switch")[-1], np.diff(heard.arrivals().astype(int)).max(), heard.arrivals()[-1]))
+        batches = [item.value for item in heard.items if item.key == PACKETS]
+        got = {name: np.concatenate([batch[name] for batch in batches]) for name in PACKET_COLUMNS}
+        assert got["sequence"].tolist() == list(range(1, COUNT + 1))
+        assert (np.diff(got["time_us"]) >= 0).all()
+        want = read_frames(
+            [frame(1 + number % 200) for number in range(COUNT)],
+            lengths=np.full(COUNT, 60),
+            times_us=got["time_us"],
+            ports=np.ones(COUNT),
+            sequence=got["sequence"],
+            arrival=np.arange(COUNT),
+        )
+        assert not [name for name in PACKET_COLUMNS if (got[name] != want[name]).any()]

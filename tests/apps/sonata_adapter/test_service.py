@@ -1,0 +1,105 @@
+"""The adapter among real processes: a key is declared, a query runs in the switch, and leaves with the key."""
+
+import pytest
+
+from apps.sonata_adapter.catalogue import CATALOGUE
+from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, end, wait_for
+from tests.apps.sonata_adapter.test_catalogue import expect
+from tests.apps.sonata_adapter.traffic import BASE_US as TRAFFIC_US
+from tests.apps.sonata_adapter.traffic import Frame, mixed
+
+PREFIX = "network.traffic_query.sonata"
+
+
+@pytest.fixture
+def stage(tmp_path):
+    with Stage(tmp_path) as stage:
+        yield stage
+
+
+def telemetry(states):
+    """What the newest state of the switch says that it sends."""
+    found = states.values("network.switch")
+    return found[-1]["telemetry"] if found else []
+
+
+def test_keys_become_queries_and_leave_with_them(stage):
+    """Eleven keys: results equal the naive evaluator's; without interest the switch has no request."""
+    adapter = stage.run("apps.sonata_adapter.service", {})
+    stage.controller()
+    engine = stage.engine("observer")
+    states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    wait_for(lambda: states.values("network.switch"))
+    assert telemetry(states) == []
+    keys = {name: f"{PREFIX}.{name}:window=2s" for name in CATALOGUE}
+    results = Heard(engine, *keys.values())
+    wait_for(lambda: len(telemetry(states)) >= 19, why=lambda: (telemetry(states), stage.log()[-3000:]))
+    frames = mixed(CATALOGUE, seconds=16)
+    feed = stage.feed()
+    for begin in range(0, len(frames), 256):
+        part = frames[begin : begin + 256]
+        feed.send([f.time_us - TRAFFIC_US for f in part], [f.length for f in part], [f.data for f in part])
+    verdicts = b""
+
+    def processed():
+        nonlocal verdicts
+        verdicts += feed.verdicts()
+        return len(verdicts) >= len(frames)
+
+    wait_for(processed)
+    feed.close()
+    health = Heard(engine, "due.health.sonata_adapter")
+    wait_for(lambda: quiet(health))
+    end(adapter)
+    shifted = [Frame(f.time_us - TRAFFIC_US + BASE_US, f.length, f.data) for f in frames]
+    for name in CATALOGUE:
+        truth = {(f.window, f.fields) for f in expect(name, shifted, {"window": 2000})}
+        wait_for(
+            lambda name=name, truth=truth: found(results, name) >= truth,
+            5,
+            lambda name=name, truth=truth: (name, truth, found(results, name)),
+        )
+        assert found(results, name) == truth
+    results.stop()
+
+
+def quiet(health):
+    """Nothing has reached the adapter between its last three reports of health."""
+    counts = [(v["app"]["host_packets"], v["app"]["reports"]) for v in health.values("health")[-3:]]
+    return len(counts) == 3 and len(set(counts)) == 1 and min(counts[0]) > 0
+
+
+def found(results, name):
+    rows = set()
+    for item in results.items:
+        if item.key.startswith(f"{PREFIX}.{name}:"):
+            value = dict(item.value)
+            start, _, _ = value.pop("window_start"), value.pop("window_end"), value.pop("at")
+            for extra in ("exact", "partial", "error"):
+                value.pop(extra, None)
+            rows.add((start // 2_000_000_000, tuple(sorted(value.items()))))
+    return rows
+
+
+def test_two_consumers_share_and_the_last_one_removes(stage):
+    """One entry for two consumers of a key; gone in two seconds when the last one leaves."""
+    stage.run("apps.sonata_adapter.service", {})
+    stage.controller()
+    engine, other = stage.engine("observer"), stage.engine("other")
+    states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    first = Heard(engine, f"{PREFIX}.new_tcp:threshold=5")
+    second = Heard(other, f"{PREFIX}.new_tcp:threshold=5")
+    wait_for(lambda: telemetry(states) == ["q0"], why=stage.log)
+    first.stop()
+    second.stop()
+    wait_for(lambda: telemetry(states) == [], 10, stage.log)
+
+
+def test_wrong_parameter_is_answered(stage):
+    """A value out of bounds is answered with what would do."""
+    stage.run("apps.sonata_adapter.service", {})
+    engine = stage.engine("observer")
+    answers = Heard(engine, "network.incompatible.sonata_adapter.*")
+    Heard(engine, f"{PREFIX}.new_tcp:window=1ms")
+    wait_for(lambda: answers.items)
+    assert "100ms to 1h" in answers.items[0].value["reason"]

@@ -1,0 +1,132 @@
+"""What is put reaches the archive: at once, after it was away, through the spool, or is counted as lost."""
+
+import threading
+
+import pytest
+
+from due.archiver import Archiver
+from due.codec import pack, unpack
+from due.drivers.spool import DiskSpool
+from due.errors import ArchiveUnavailable, BackendError
+from due.messages import Item
+from tests.due.conftest import wait_for
+
+
+class Shelf:
+    """An archive in memory that can be away or refuse."""
+
+    def __init__(self) -> None:
+        self.items = {}
+        self.problem = None
+        self.calls = 0
+        self.open = threading.Event()
+        self.open.set()
+
+    def insert_frames(self, frames):
+        self.open.wait()
+        self.calls += 1
+        if self.problem is not None:
+            raise self.problem
+        for frame in frames:
+            for item in unpack(frame):
+                self.items[item.sequence] = item
+
+    def insert(self, items): ...
+    def find(self, query): ...
+    def prune(self, *, before=None, max_bytes=None): ...
+    def close(self): ...
+
+
+def _frame(first: int, count: int = 10):
+    return pack([Item("a.b", bytes(100), n, n, "app", "inst", n) for n in range(first, first + count)])
+
+
+@pytest.fixture
+def shelf():
+    return Shelf()
+
+
+def test_flush_means_archived(shelf):
+    archiver = Archiver(shelf, linger=30.0, batch=10**6)
+    for first in range(0, 100, 10):
+        archiver.put(_frame(first))
+    archiver.flush(20)
+    assert sorted(shelf.items) == list(range(100))
+    assert archiver.statistics()["archived"] == 100
+    archiver.close()
+
+
+def test_batches_hold_at_least_so_many_items_under_load(shelf):
+    shelf.open.clear()
+    archiver = Archiver(shelf, batch=50, linger=0.0)
+    for first in range(0, 1000, 10):
+        archiver.put(_frame(first))
+    shelf.open.set()
+    archiver.flush(20)
+    assert shelf.calls <= 22
+    archiver.close()
+
+
+def test_frames_go_to_the_spool_while_the_archive_is_away_and_come_back(shelf, tmp_path):
+    shelf.problem = ArchiveUnavailable("away")
+    archiver = Archiver(shelf, DiskSpool(tmp_path, 1 << 20))
+    for first in range(0, 200, 10):
+        archiver.put(_frame(first))
+    archiver.flush(20)
+    assert archiver.statistics()["spooled"] == 200
+    assert archiver.statistics()["backlog"] == 20
+    shelf.problem = None
+    wait_for(lambda: len(shelf.items) == 200)
+    wait_for(lambda: archiver.backlog() == 0)
+    archiver.close()
+
+
+def test_the_spool_outlives_the_process(shelf, tmp_path):
+    shelf.problem = ArchiveUnavailable("away")
+    archiver = Archiver(shelf, DiskSpool(tmp_path, 1 << 20))
+    archiver.put(_frame(0))
+    archiver.close()
+    shelf.problem = None
+    again = Archiver(shelf, DiskSpool(tmp_path, 1 << 20))
+    wait_for(lambda: len(shelf.items) == 10)
+    again.close()
+
+
+def test_what_does_not_fit_into_the_spool_is_counted(shelf, tmp_path):
+    shelf.problem = ArchiveUnavailable("away")
+    archiver = Archiver(shelf, DiskSpool(tmp_path, 4000))
+    for first in range(0, 100, 10):
+        archiver.put(_frame(first))
+    archiver.flush(20)
+    counts = archiver.statistics()
+    assert counts["lost"] > 0
+    assert counts["lost"] + counts["spooled"] == 100
+    archiver.close()
+
+
+def test_what_the_archive_refuses_is_counted_and_does_not_stop_the_rest(shelf, caplog):
+    shelf.problem = BackendError("never")
+    archiver = Archiver(shelf)
+    archiver.put(_frame(0))
+    archiver.flush(20)
+    shelf.problem = None
+    archiver.put(_frame(10))
+    archiver.flush(20)
+    assert sorted(shelf.items) == list(range(10, 20))
+    assert archiver.statistics()["refused"] == 10
+    assert "refused 10 items of a.b" in caplog.text
+    archiver.close()
+
+
+def test_a_full_queue_makes_the_writer_wait(shelf):
+    shelf.open.clear()
+    archiver = Archiver(shelf, queue_bytes=3000)
+    writer = threading.Thread(target=lambda: [archiver.put(_frame(n)) for n in range(0, 100, 10)])
+    writer.start()
+    wait_for(lambda: archiver.statistics()["held_back"] > 0)
+    assert writer.is_alive()
+    shelf.open.set()
+    writer.join(20)
+    archiver.flush(20)
+    assert sorted(shelf.items) == list(range(100))
+    archiver.close()

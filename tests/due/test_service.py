@@ -1,0 +1,123 @@
+"""A service says when it is ready, reports its health, stops on a signal, and names wrong options in one line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from tests.due.conftest import wait_for
+
+ROOT = Path(__file__).parents[2]
+APP = """
+import sys
+import msgspec
+from due import Capability, Interest
+from due import service
+
+INTERESTS = (Interest("svc.in"),)
+CAPABILITIES = (Capability("svc.out", delivery="reliable"),)
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    factor: int = 2
+
+class Doubler:
+    def __init__(self, engine, settings):
+        self.engine, self.settings, self.ticks = engine, settings, 0
+    def start(self):
+        self.engine.observe("svc.in").subscribe(lambda i: self.engine.write("svc.out", i.value * self.settings.factor))
+    def tick(self):
+        self.ticks += 1
+    def stop(self):
+        self.engine.write("svc.out", "stopped")
+    def health(self):
+        return {"ticks": self.ticks}
+
+sys.exit(service.run("doubler", Doubler, Settings, INTERESTS, CAPABILITIES))
+"""
+
+
+@pytest.fixture
+def start(tmp_path, server):
+    program = tmp_path / "app.py"
+    program.write_text(textwrap.dedent(APP))
+    started = []
+
+    def run(*arguments):
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "DUE_DIRECTORY": str(tmp_path)}
+        command = [sys.executable, str(program), "--updates", server.url, *arguments]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        started.append(subprocess.Popen(command, env=environment, text=True, **pipes))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def test_a_service_works_from_ready_to_sigterm(start, tmp_path, make_engine):
+    settings = tmp_path / "settings.json"
+    settings.write_text('{"factor": 3}')
+    engine = make_engine("outside")
+    out, health = [], []
+    engine.observe("svc.out").subscribe(lambda item: out.append(item.value))
+    engine.observe("due.health.doubler").subscribe(lambda item: health.append(item.value))
+    process = start("--settings", str(settings), "--archive", f"sqlite://{tmp_path / 'a.db'}")
+    ready = json.loads(process.stdout.readline())
+    assert ready == {"ready": True, "app": "doubler", "pid": process.pid}
+    engine.write("svc.in", 7)
+    wait_for(lambda: out == [21])
+    wait_for(lambda: health)
+    assert health[0]["app"]["ticks"] > 0
+    assert health[0]["engine"]["app"] == "doubler"
+    process.send_signal(signal.SIGTERM)
+    stdout, _ = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert stdout == ""
+    wait_for(lambda: out == [21, "stopped"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--settings", "/nowhere.json"], "/nowhere.json"),
+        (["--settings", "{folder}/wrong.json"], "factr"),
+        (["--archive", "ftp://x"], "ftp://x"),
+        (["--updates", "http://x"], "http://x"),
+        (["--updates", "redis://127.0.0.1:1/0"], "127.0.0.1:1"),
+    ],
+)
+def test_a_wrong_option_is_one_clear_line(start, tmp_path, arguments, text):
+    (tmp_path / "wrong.json").write_text('{"factr": 3}')
+    process = start(*(a.format(folder=tmp_path) for a in arguments))
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode in (1, 2)
+    assert text in stderr
+    assert "Traceback" not in stderr
+
+
+def test_a_service_ends_with_its_parent(tmp_path, server):
+    program = tmp_path / "app.py"
+    program.write_text(textwrap.dedent(APP))
+    code = (
+        "import subprocess, sys, time\n"
+        f"child = subprocess.Popen([sys.executable, {str(program)!r}, '--updates', {server.url!r}], stdout=subprocess.PIPE)\n"
+        "child.stdout.readline()\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment
+    ) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+    wait_for(
+        lambda: not Path(f"/proc/{child}").exists() or "Z" in Path(f"/proc/{child}/stat").read_text().split()
+    )
