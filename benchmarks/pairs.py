@@ -7,7 +7,7 @@ last callback in the other process.
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -66,6 +66,25 @@ def run_due(url: str, size: int, count: int) -> float:
         rate = count / (_finished(pipe) - start)
         producer.close()
     return rate
+
+
+def producer_cost(url: str, size: int, count: int, consumers: int) -> float:
+    """CPU seconds of the producer per million messages with so many consumers of one stream."""
+    with ExitStack() as stack:
+        pipes = [
+            stack.enter_context(other_process(_due_consumer, url, count, f"c{n}")) for n in range(consumers)
+        ]
+        producer = engine(url, "producer", PRODUCER)
+        payload, write = bytes(size), producer.write
+        before = time.process_time()
+        for _ in range(count):
+            write(KEY, payload, [PUB_ONLY])
+        producer.flush()
+        cost = (time.process_time() - before) / count * 1e6
+        for pipe in pipes:
+            _finished(pipe)
+        producer.close()
+    return cost
 
 
 def run_records(url: str, rows: int, count: int) -> float:
@@ -143,8 +162,8 @@ def _finished(pipe: Connection) -> float:
     return float(pipe.recv())
 
 
-def _due_consumer(pipe: Connection, url: str, count: int) -> None:
-    consumer = engine(url, "consumer", CONSUMER)
+def _due_consumer(pipe: Connection, url: str, count: int, app: str = "consumer") -> None:
+    consumer = engine(url, app, CONSUMER)
     left = [count]
 
     def callback(_item: Item) -> None:

@@ -85,7 +85,10 @@ def block_latency(folder: Path, rounds: int) -> dict[str, float]:
         subscription.dispose()
     finally:
         stage.close()
-    return {"block_latency_ms_p50": statistics.median(found), "block_latency_ms_p99": max(found)}
+    return {
+        "block_latency_ms_p50": statistics.median(found),
+        "block_latency_ms_p99": statistics.quantiles(found, n=100)[98],
+    }
 
 
 def _one_block(firewall: Any, probe: "_Probe", number: int) -> float:

@@ -20,7 +20,21 @@ from dataplane.bmv2 import PROGRAM, Bmv2
 from sdnator.wire import VethPair
 from tests.dataplane.controller import Controller, Names, insert
 
-RATES = (2_000, 5_000, 8_000, 12_000, 16_000, 20_000, 30_000, 40_000, 60_000, 80_000, 120_000)
+RATES = (
+    2_000,
+    5_000,
+    8_000,
+    12_000,
+    16_000,
+    20_000,
+    30_000,
+    40_000,
+    60_000,
+    80_000,
+    120_000,
+    160_000,
+    240_000,
+)
 _TICK_S = 0.002
 _LOST = 0.1
 _SETTLE_S = 0.4

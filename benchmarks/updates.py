@@ -8,10 +8,18 @@ controller without distribution sets; it is measured where `os_ken` can be impor
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 
 from benchmarks import osken
 from benchmarks.measure import arguments, bars, interleaved, machine, table, write_json
-from benchmarks.pairs import run_due, run_one_by_one, run_pipeline100, run_raw_frames, run_records
+from benchmarks.pairs import (
+    producer_cost,
+    run_due,
+    run_one_by_one,
+    run_pipeline100,
+    run_raw_frames,
+    run_records,
+)
 from due.drivers.embedded_redis import EmbeddedServer
 
 SIZES = (100, 1000, 10_000)
@@ -52,6 +60,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             {"records": lambda: run_records(server.url, ROWS, max(10, int(BATCHES * options.scale)))},
             options.rounds,
         )["records"]
+        costs = interleaved(
+            {
+                str(n): partial(producer_cost, server.url, 1000, int(200_000 * options.scale), n)
+                for n in (1, 3)
+            },
+            options.rounds,
+        )
     os_ken = {str(size): osken.events_per_second(size) for size in SIZES} if osken.available() else None
     for name in RUNNERS:
         figures[f"{name}_msgs_per_s"] = rates[name]
@@ -60,6 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures["ratio_vs_raw_frames"] = {s: rates["due"][s] / rates["raw_frames"][s] for s in rates["due"]}
     figures["records_per_s"] = records
     figures["records_vs_pipeline100"] = records / rates["pipeline100"]["100"]
+    figures["producer_cpu_s_per_million_by_consumers"] = costs
+    figures["producer_cost_of_three_consumers"] = costs["3"] / costs["1"] - 1
     _show(rates, os_ken, figures)
     write_json(options.json, figures)
     return 0
@@ -90,6 +107,7 @@ def _show(
     )
     print(f"\n{WHY_NOT_RAW}")
     bars("messages/s of 100 bytes", {name: rates[name]["100"] for name in RUNNERS})
+    print(f"three consumers cost the producer {figures['producer_cost_of_three_consumers']:+.1%} CPU")
     bars("records/s", {"record batches": float(str(figures["records_per_s"]))})
 
 

@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> int:
     server.start()
     print(json.dumps({"ready": True, "grpc": server.address, "pid": os.getpid()}), flush=True)
     stop.wait()
-    failed = loop.failed()
+    failed = loop.failed
     server.stop()
     loop.stop()
     if arguments.state_json:

@@ -4,12 +4,11 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from dataplane import bytestrings
-from dataplane.externs import CounterValue
 from dataplane.meters import meter_config, write_meter_config
 from dataplane.schema import BoundArray, Schema
 from dataplane.status import InvalidArgument, OutOfRange, Unimplemented
 from dataplane.switch import Switch
-from dataplane.table_entities import MODIFY, Undo, write_counter
+from dataplane.table_entities import MODIFY, Undo, counter_value, write_counter
 from p4rt import p4runtime
 
 V = TypeVar("V")
@@ -28,7 +27,7 @@ class ArrayEntities:
         cells = self._switch.counters[array.name]
         if not message.HasField("data"):
             return _nothing
-        value = CounterValue(message.data.packet_count, message.data.byte_count)
+        value = counter_value(message.data, array.name)
         return _write_all(_indices(message, array), cells.read, cells.write, value)
 
     def write_meter(self, kind: int, message: Any) -> Undo:

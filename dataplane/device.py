@@ -174,7 +174,6 @@ class Device:
     def _make(self, verified: Verified) -> Pipeline:
         pipeline = Pipeline(verified, cpu_port=self._cpu_port, backend=self._backend, clock=self._clock)
         pipeline.switch.set_ports(self._ports)
-        pipeline.advance(self._clock())
         return pipeline
 
     def _replace(self, pipeline: Pipeline | None) -> None:
@@ -258,7 +257,6 @@ class Device:
 
     def tick(self, pipeline: Pipeline, now_us: int) -> None:
         """Send digest lists that are due, and look for idle entries every 0.1 s of the packets' clock."""
-        pipeline.advance(now_us)
         due = pipeline.digests.due(time.monotonic_ns())
         if due:
             self._put(due, lossless=True)

@@ -65,6 +65,8 @@ class PacketLoop:
         self._packet_outs: deque[bytes] = deque()
         self._space = threading.Condition()
         self._stopping = False
+        self.failed = False
+        """The thread has ended without having been stopped."""
         self._on_end = on_end
         self._thread = threading.Thread(target=self._run, name="packets", daemon=True)
         device.on_room = self._wakeup.set
@@ -96,11 +98,8 @@ class PacketLoop:
         try:
             self._move()
         finally:
+            self.failed = not self._stopping
             self._on_end()
-
-    def failed(self) -> bool:
-        """The thread has ended without having been stopped."""
-        return not self._stopping and not self._thread.is_alive()
 
     def _move(self) -> None:
         while not self._stopping:

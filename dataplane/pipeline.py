@@ -71,12 +71,6 @@ class Pipeline:
         self.packet_in = PacketInEncoder(self.schema.packet_in)
         self.packet_out = PacketOutDecoder(self.schema.packet_out)
 
-    def advance(self, now_us: int) -> None:
-        """The packets' clock has come so far, with or without a frame."""
-        advance: Callable[[int], None] | None = getattr(self.switch, "advance", None)
-        if advance is not None:
-            advance(now_us)
-
     def close(self) -> None:
         """Free the switch."""
         self.switch.close()

@@ -18,12 +18,14 @@ def open_ports(options: Iterable[str], cpu_port: int, clock: Callable[[], int]) 
 
     Raises PortError; ports opened before are closed again.
     """
+    wanted = [(*parse(option, cpu_port), option) for option in options]
+    numbers = [number for number, *_ in wanted]
+    twice = {number for number in numbers if numbers.count(number) > 1}
+    if twice:
+        raise PortError(f"port {min(twice)} is given twice")
     ports: dict[int, Port] = {}
     try:
-        for option in options:
-            number, kind, argument = parse(option, cpu_port)
-            if number in ports:
-                raise PortError(f"port {number} is given twice")
+        for number, kind, argument, option in wanted:
             ports[number] = _open(kind, argument, option, clock)
     except PortError:
         for port in ports.values():

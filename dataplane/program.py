@@ -105,7 +105,6 @@ class _Reader:
         for name in _REFUSED:
             if self.doc.get(name):
                 self.refuse(f"{name.removesuffix('s').replace('_', ' ')} {self.doc[name][0].get('name', '')}")
-        self.aliases = {a: (t[0], t[1]) for a, t in self.doc.get("field_aliases", [])}
         self.read_headers()
         digests = {d["id"]: self.digest(d) for d in self.doc.get("learn_lists", [])}
         field_lists = {f["id"]: self.field_list(f) for f in self.doc.get("field_lists", [])}
@@ -146,6 +145,7 @@ class _Reader:
     # -- headers ------------------------------------------------------------------------------------
 
     def read_headers(self) -> None:
+        self.aliases = {a: (t[0], t[1]) for a, t in self.doc.get("field_aliases", [])}
         types = {t["name"]: self.header_type(t) for t in self.doc["header_types"]}
         for header in self.doc["headers"]:
             name = header["name"]

@@ -117,6 +117,11 @@ class Switch:
         """The packets' clock: the time of the latest frame."""
         return self._now
 
+    def advance(self, now_us: int) -> None:
+        """The packets' clock stands at `now_us`, though no frame came: what is written now is that young."""
+        with self.lock:
+            self._now = now_us
+
     def process(self, port: int, frame: bytes, now_us: int) -> Result:
         """One frame that arrived on `port` at `now_us` (µs of the packets' clock, 48 bits)."""
         return self.process_many(port, (frame,), (now_us,))
@@ -205,7 +210,7 @@ class Switch:
             return self._machine.statistics()
 
     def close(self) -> None:
-        """Free what the back end holds; the switch must not be used afterwards."""
+        """Free what the back end holds; the C back end raises DataplaneError when used afterwards."""
         with self.lock:
             self._machine.close()
 

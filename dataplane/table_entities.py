@@ -17,6 +17,7 @@ from p4rt import p4runtime
 
 INSERT, MODIFY, DELETE = p4runtime.Update.INSERT, p4runtime.Update.MODIFY, p4runtime.Update.DELETE
 Undo = Callable[[], None]
+_Direct = tuple[MeterConfig | None, CounterValue | None]
 
 
 class TableEntities:
@@ -72,11 +73,12 @@ class TableEntities:
     def _insert(self, message: Any, codec: TableCodec, table: Table) -> Undo:
         entry = codec.entry(message)
         if entry.idle_timeout_ns:
-            self.has_idle_timeouts = True
+            self._begin_to_age()
         if message.HasField("meter_config") or message.HasField("counter_data"):
+            values = self._direct_values(message, codec)
             with self._switch.lock:
                 table.insert(entry)
-                self._write_direct(message, codec, table, entry)
+                self._write_direct(values, table, entry)
         else:
             table.insert(entry)
         return lambda: table.delete(entry.match, entry.priority)
@@ -86,14 +88,15 @@ class TableEntities:
         old = _snapshot(table, match, priority)
         if old is None:
             raise Missing(f"table {codec.name} has no such entry")
+        values = self._direct_values(message, codec)
         with self._switch.lock:
             entry = old[0]
             if message.HasField("action"):
                 entry = codec.entry(message)
+                if entry.idle_timeout_ns:
+                    self._begin_to_age()
                 table.modify(entry)
-            if entry.idle_timeout_ns:
-                self.has_idle_timeouts = True
-            self._write_direct(message, codec, table, entry)
+            self._write_direct(values, table, entry)
 
         def undo() -> None:
             if message.HasField("action"):
@@ -102,17 +105,27 @@ class TableEntities:
 
         return undo
 
-    def _write_direct(self, message: Any, codec: TableCodec, table: Table, entry: TableEntry) -> None:
-        if table.spec.has_meter:
-            config = None
-            if message.HasField("meter_config"):
-                config = meter_config(
-                    message.meter_config, self._meter_types.get(codec.table.id, 0), codec.name
-                )
-            table.set_meter(entry.match, entry.priority, config)
+    def _begin_to_age(self) -> None:
+        """The switch's clock stands at its latest frame, which may be long ago."""
+        self._switch.advance(self._clock())
+        self.has_idle_timeouts = True
+
+    def _direct_values(self, message: Any, codec: TableCodec) -> _Direct:
+        """Checked before the entry is touched: an update is done whole or not at all."""
+        meter, counter = None, None
+        if message.HasField("meter_config"):
+            meter = meter_config(message.meter_config, self._meter_types.get(codec.table.id, 0), codec.name)
         if message.HasField("counter_data"):
-            data = message.counter_data
-            table.set_counter(entry.match, entry.priority, CounterValue(data.packet_count, data.byte_count))
+            counter = counter_value(message.counter_data, codec.name)
+        return meter, counter
+
+    @staticmethod
+    def _write_direct(values: _Direct, table: Table, entry: TableEntry) -> None:
+        meter, counter = values
+        if table.spec.has_meter:
+            table.set_meter(entry.match, entry.priority, meter)
+        if counter is not None:
+            table.set_counter(entry.match, entry.priority, counter)
 
     def _write_default(self, kind: int, message: Any, codec: TableCodec, table: Table) -> Undo:
         if kind != MODIFY:
@@ -195,8 +208,7 @@ class TableEntities:
         _, table, match, priority = self._direct(kind, message, "counter")
         old = table.counter(match, priority)
         if message.HasField("data"):
-            new = CounterValue(message.data.packet_count, message.data.byte_count)
-            table.set_counter(match, priority, new)
+            table.set_counter(match, priority, counter_value(message.data, table.name))
         return lambda: table.set_counter(match, priority, old)
 
     def write_meter(self, kind: int, message: Any) -> Undo:
@@ -304,6 +316,13 @@ def _read_default(codec: TableCodec, table: Table) -> Iterator[Any]:
         entity.table_entry.is_default_action = True
         codec.write_action(*default, entity.table_entry)
         yield entity
+
+
+def counter_value(message: Any, what: str) -> CounterValue:
+    """A CounterData message.  Raises InvalidArgument for negative counts."""
+    if message.packet_count < 0 or message.byte_count < 0:
+        raise InvalidArgument(f"counter of {what}: counts cannot be negative")
+    return CounterValue(message.packet_count, message.byte_count)
 
 
 def write_counter(value: CounterValue, message: Any) -> None:

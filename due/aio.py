@@ -8,7 +8,7 @@ callback does.  Calls that wait (`flush`, `get`, `close`) belong into `asyncio.t
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 from due.engine import Engine
 from due.messages import Item
@@ -16,7 +16,7 @@ from due.messages import Item
 _PATIENCE = 0.1
 
 
-async def items(engine: Engine, key: str, *, most: int = 10_000) -> AsyncIterator[Item]:
+async def items(engine: Engine, key: str, *, most: int = 10_000) -> AsyncGenerator[Item, None]:
     """The items under `key`, for ever; at most `most` wait.  Leaving the loop withdraws the interest."""
     loop = asyncio.get_running_loop()
     queue: asyncio.Queue[Item] = asyncio.Queue()

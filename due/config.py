@@ -18,6 +18,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     directory: str = ""
     """Where the embedded defaults and the spool live; empty: $DUE_DIRECTORY, else ~/.local/state/due."""
 
+    connect_timeout: float = 5.0
+    """How long `init` waits for Data Updates, seconds; afterwards a lost server is waited for without end."""
+
     frame_bytes: int = 96 << 10
     """A batch is sent when it holds this many bytes ..."""
     linger: float = 0.002

@@ -65,11 +65,11 @@ class Dispatcher:
         with self._lock:
             self._observations = tuple(o for o in self._observations if o is not observation)
             self._routes = {}
-            paths = {o.key.path for o in self._observations}
+            rest = self._observations
         self.receiver.unsubscribe(observation.key.path)
-        if observation.key.path not in paths:
+        if observation.key.path not in {o.key.path for o in rest}:
             self.receiver.unfollow(observation.key.path)
-        self.post(lambda: self.tracker.forget(lambda key: bool(self._route(key))))
+        self.post(lambda: self.tracker.forget(lambda key: any(o.key.matches(Key(key)) for o in rest)))
 
     def activate(self, active: bool, *, reading: bool, take_over: bool) -> None:
         """A standby instance that is not active receives nothing."""

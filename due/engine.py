@@ -24,7 +24,7 @@ from uuid import uuid4
 from due.backends import default_archive, default_updates
 from due.codec import freeze, unpack
 from due.config import Options
-from due.errors import InvalidKey, InvalidOption, NotAllowed, NotInitialised
+from due.errors import BackendError, InvalidKey, InvalidOption, NotAllowed, NotInitialised
 from due.keys import Key
 from due.membership import Registration
 from due.messages import (
@@ -178,7 +178,7 @@ class Engine:
         if isinstance(query, str):
             query = {"dataKey": Key.parse(query).text}
         session.flush_archive(_FLUSH_SECONDS)
-        return session.archive().find(query)
+        return session.archive.find(query)
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back, in the dispatcher thread, when what is wanted of this app changes, and once now."""
@@ -234,7 +234,11 @@ class Engine:
             self.options, registration, updates_url=self._updates_url, archive_url=self._archive_url
         )
         self._registration = registration
-        self._session.start()
+        try:
+            self._session.start()
+        except BackendError:
+            self._session = self._registration = None
+            raise
 
     def _require(self) -> Session:
         session = self._session

@@ -20,7 +20,7 @@ class Sender:
         self._service = service
         self._dirty: deque[Outlet] = deque()
         self._kick = threading.Event()
-        self._closed = False
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="due-sender", daemon=True)
 
     def start(self) -> None:
@@ -35,15 +35,15 @@ class Sender:
 
     def close(self) -> None:
         """Stop; what waits stays."""
-        self._closed = True
+        self._stopping.set()
         self._kick.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(5)
 
     def _run(self) -> None:
-        while not self._closed:
+        while not self._stopping.is_set():
             self._kick.wait()
-            time.sleep(self._linger)
+            self._stopping.wait(self._linger)
             self._kick.clear()
             for outlet in {
                 id(o): o for o in (self._dirty.popleft() for _ in range(len(self._dirty)))

@@ -34,7 +34,6 @@ class Session:
         self, options: Options, registration: Registration, *, updates_url: str, archive_url: str
     ) -> None:
         self._options = options
-        self._archive_url = archive_url
         self._server: EmbeddedServer | None = None
         if not updates_url:
             updates_url, self._server = shared_server(options.folder())
@@ -65,14 +64,22 @@ class Session:
         self._observed: list[Observation] = []
         self._declared = registration.interests
         self._archiver: Archiver | None = None
-        self._archive: ArchiveDriver | None = None
+        self._archive: ArchiveDriver = open_archive(archive_url)
         self._lock = threading.RLock()
         self._unpublished = 0
         self._told: tuple[Assignment, ...] | None = None
         self._callback: AssignmentCallback | None = None
 
     def start(self) -> None:
-        """Start the threads and register."""
+        """Start the threads and register; raises `UpdatesUnavailable`."""
+        try:
+            self.publisher.settle(self._options.connect_timeout)
+        except Timeout:
+            self.publisher.close()
+            raise UpdatesUnavailable(
+                f"Data Updates at {self._driver.url} could not be reached within "
+                f"{self._options.connect_timeout:g} s: start the server, or give another URL"
+            ) from None
         self.sender.start()
         self.keeper.start()
         self.dispatcher.start()
@@ -111,12 +118,10 @@ class Session:
         if self._archiver is not None:
             self._archiver.flush(timeout)
 
+    @property
     def archive(self) -> ArchiveDriver:
-        """Data Archives, opened when first needed."""
-        with self._lock:
-            if self._archive is None:
-                self._archive = open_archive(self._archive_url)
-            return self._archive
+        """Data Archives."""
+        return self._archive
 
     def opened(self, observation: Observation) -> None:
         """An observation got its first subscriber."""
@@ -169,8 +174,7 @@ class Session:
         self.publisher.close()
         if self._archiver is not None:
             self._archiver.close()
-        if self._archive is not None:
-            self._archive.close()
+        self._archive.close()
         self._driver.close()
         if self._server is not None:
             self._server.stop()
@@ -210,7 +214,7 @@ class Session:
                 registration = self.keeper.member.registration
                 spool = open_spool(o.folder() / "spool" / registration.app_id, o)
                 self._archiver = Archiver(
-                    self.archive(),
+                    self._archive,
                     spool,
                     queue_bytes=o.archive_queue_bytes,
                     batch=o.archive_batch,

@@ -1,7 +1,7 @@
 """A detector that knows nothing of SDNator, wrapped as an app: it scores every packet and publishes the scores."""
 # ruff: noqa: F403, F405 - the paper's way of importing
 
-from detector import Detector  # any class with proc_next_packet(); here examples/detector.py
+from detector import Detector  # type: ignore[import-not-found] # any class with proc_next_packet(); here examples/detector.py
 
 # [wrapper]
 from sdnator_due import *

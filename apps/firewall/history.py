@@ -1,6 +1,6 @@
 """What the archive says of a sender: pure reading of archived items."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from apps.messages import Decision, Target
@@ -13,6 +13,15 @@ def offences_query(target: Target) -> dict[str, Any]:
         "dataKey": "network.block.firewall.*",
         "value.action": "block",
         "value.target.address": target.address,
+    }
+
+
+def offences_of_many(addresses: Sequence[str]) -> dict[str, Any]:
+    """The archive query for earlier blocks of any of the addresses."""
+    return {
+        "dataKey": "network.block.firewall.*",
+        "value.action": "block",
+        "value.target.address": {"$in": list(addresses)},
     }
 
 

@@ -57,7 +57,7 @@ class Ledger:
         """The block in force that already stops this sender."""
         for block in self.blocks.values():
             target = block.decision.target
-            if block.decision.switch != sender.switch:
+            if block.decision.switch not in (sender.switch, "*"):
                 continue
             if target.kind == "mac" and (target.address, target.port) == (sender.mac, sender.port):
                 return block
@@ -86,12 +86,35 @@ class Ledger:
         self, alert: Alert, target: Target, reason: str, evidence: Iterable[Evidence], offences: int
     ) -> Decision:
         """Open a block; `offences` is the number of earlier ones in the archive."""
+        return self.open(
+            alert.sender.switch,
+            target,
+            reason,
+            evidence,
+            alert.event_time,
+            offences=offences,
+            first_packet=alert.first_packet,
+            training_rate=alert.training_rate,
+        )
+
+    def open(
+        self,
+        switch: str,
+        target: Target,
+        reason: str,
+        evidence: Iterable[Evidence],
+        now: int,
+        *,
+        offences: int = 0,
+        first_packet: int = 0,
+        training_rate: float = 0.0,
+    ) -> Decision:
+        """Open a block on a switch, or on all with `*`; a step longer for each earlier offence."""
         level = min(offences, len(self.rules.durations_s) - 1)
-        now = alert.event_time
         decision = Decision(
-            id=decision_id(alert.sender.switch, target, now),
+            id=decision_id(switch, target, now),
             action="block",
-            switch=alert.sender.switch,
+            switch=switch,
             target=target,
             reason=reason,
             evidence=tuple(evidence),
@@ -99,11 +122,25 @@ class Ledger:
             expires=now + self.rules.durations_s[level] * SECOND,
             level=level,
             dry_run=self.rules.dry_run,
-            first_packet=alert.first_packet,
+            first_packet=first_packet,
         )
-        self.blocks[decision.id] = Block(decision, alert.training_rate, deque([(now, 0)]))
+        self.blocks[decision.id] = Block(decision, training_rate, deque([(now, 0)]))
         self._recent.append(now)
         return decision
+
+    def blocks_address(self, address: str) -> bool:
+        """Whether a block of this address is in force."""
+        return any(
+            block.decision.target.kind == "ip" and block.decision.target.address == address
+            for block in self.blocks.values()
+        )
+
+    def lift(self, decision_id: str, now: int, reason: str) -> Decision | None:
+        """End a block before its time, without probation; None where there is none."""
+        block = self.blocks.pop(decision_id, None)
+        if block is None:
+            return None
+        return _changed(block.decision, now, action="unblock", reason=reason)
 
     def confirm(self, confirmation: Confirmation) -> None:
         """Note what the switch said; a block that failed is not in force."""
@@ -125,7 +162,9 @@ class Ledger:
 
     def due(self, now: int) -> list[Decision]:
         """Decisions that time alone brings: extended blocks and lifted ones."""
-        return [self._end(block, now) for block in list(self.blocks.values()) if 0 < block.decision.expires <= now]
+        return [
+            self._end(block, now) for block in list(self.blocks.values()) if 0 < block.decision.expires <= now
+        ]
 
     def _end(self, block: Block, now: int) -> Decision:
         old = block.decision

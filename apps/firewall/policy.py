@@ -64,9 +64,11 @@ class AllowList:
         """True if a block of this sender would touch an allowed one."""
         if sender.mac in self.macs:
             return True
-        if not sender.ip:
-            return False
-        address = ipaddress.ip_address(sender.ip)
+        return bool(sender.ip) and self.covers_address(sender.ip)
+
+    def covers_address(self, text: str) -> bool:
+        """True if the address is an allowed one."""
+        address = ipaddress.ip_address(text)
         return any(address in network for network in self.networks)
 
 
@@ -97,7 +99,8 @@ def judge(alert: Alert, rules: Rules, allow_list: AllowList, *, on_probation: bo
     target = target_of(alert)
     if target is None:
         return Verdict(
-            None, f"{alert.mac_addresses} addresses stand behind {alert.sender.mac}, and the frames carry none"
+            None,
+            f"{alert.mac_addresses} addresses stand behind {alert.sender.mac}, and the frames carry none",
         )
     return Verdict(target, f"{why}: {alert.reason}")
 

@@ -1,33 +1,55 @@
-"""The firewall as a DUE app: alerts in, decisions out."""
+"""The firewall as a DUE app: alerts, floods and handshakes in, decisions out.
+
+All callbacks run in DUE's dispatcher thread, ticks in the main thread; one lock keeps them apart.
+"""
 
 import logging
 import sys
+import threading
+import time
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
+from uuid import uuid4
 
 import msgspec
 
 import due.service
-from apps.firewall.history import count_offences, offences_query
+from apps.firewall.history import count_offences, offences_of_many, offences_query
+from apps.firewall.known_sources import HANDSHAKES, KnownSources, in_batches, learn_archived
 from apps.firewall.ledger import Ledger
 from apps.firewall.policy import AllowList, Rules, judge
-from apps.messages import Alert, Confirmation, Decision, Evidence, Sender
-from due import Capability, Engine, Interest, Item
+from apps.firewall.services import Service
+from apps.firewall.syn_defence import SynDefence, syns_of
+from apps.firewall.syn_policy import SynRules
+from apps.messages import Alert, Confirmation, Decision, Evidence, Sender, TableCommand, TableUpdate, Target
+from due import Capability, Engine, Interest, Item, Key
+from due.errors import DueError
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
 )
+SYN_INTERESTS = (
+    Interest(HANDSHAKES),
+    Interest("network.traffic_query.sonata.syn_flood"),
+    Interest("network.traffic_capture.sonata.tcp"),
+)
+"""Registered by observing, with parameters of the settings; the last only while a flood is suspected."""
 CAPABILITIES = (
     Capability("network.block.firewall.ipv4", delivery="reliable", archive="always"),
     Capability("network.block.firewall.ipv6", delivery="reliable", archive="always"),
     Capability("network.block.firewall.mac", delivery="reliable", archive="always"),
+    Capability("network.protect.firewall.ipv4", delivery="reliable", archive="always"),
+    Capability("network.protect.firewall.ipv6", delivery="reliable", archive="always"),
+    Capability("network.p4_command.firewall.*", delivery="reliable"),
 )
 
 EVIDENCE_KEPT = 10
 SENDERS_KEPT = 10_000
+WATCH_SECONDS = 2.0
+"""A suspected flood of which no SYN comes is given up."""
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +58,17 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Settings of the firewall."""
 
     rules: Rules = Rules()
+    syn: SynRules = SynRules()
+    guard: tuple[str, ...] = ()
+    """Services guarded from the start: ADDRESS:PORT, IPv6 addresses in brackets."""
+    detect: bool = True
+    """Ask the switch for SYN floods (needs the Sonata adapter)."""
+    learn: bool = True
+    """Learn known sources from completed handshakes (needs the Sonata adapter, and both directions)."""
+    known_limit: int = 4000
+    """Known sources in the switch, the most recent ones."""
+    known_days: int = 30
+    """A handshake counts for so long."""
 
 
 class FirewallService:
@@ -46,17 +79,46 @@ class FirewallService:
         self._rules = settings.rules
         self._allow_list = AllowList.parse(settings.rules.allow)
         self._ledger = Ledger(settings.rules)
-        self._evidence: defaultdict[Sender, deque[Evidence]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
+        self._evidence: defaultdict[Sender, deque[Evidence]] = defaultdict(
+            lambda: deque(maxlen=EVIDENCE_KEPT)
+        )
         self._alerts = 0
+        self._settings = settings
+        services = tuple(Service.parse(text) for text in settings.guard)
+        self._known = KnownSources(settings.known_limit)
+        self._syn = SynDefence(settings.syn, services, self._ledger, self._allow_list, self._known)
+        self._switches: dict[str, bool] = {}
+        self._samples: dict[str, Any] = {}
+        self._sampling_until: dict[str, float] = {}
+        self._lock = threading.RLock()
+        self._archive_away = 0
 
     def start(self) -> None:
-        """Subscribe."""
-        self._engine.observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
-        self._engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
-        self._engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
+        """Take up history, then subscribe."""
+        observe = self._engine.observe
+        if self._settings.learn:
+            learn_archived(self._known, self._archived(HANDSHAKES), self._settings.known_days)
+            self._known.changes()
+            log.info("%d known sources in the archive", len(self._known))
+            observe(HANDSHAKES).subscribe(self._on_handshake)
+        observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
+        observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
+        observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
+        if self._settings.detect:
+            rules = self._settings.syn
+            specs = {"window": f"{rules.window_ms}ms", "threshold": str(rules.threshold)}
+            key = Key("network.traffic_query.sonata.syn_flood").with_specs(**specs).text
+            observe(key).subscribe(self._on_flood)
 
     def tick(self) -> None:
-        """Nothing runs on wall time here."""
+        """What a wall clock drives: ends of samples, and batches of known sources."""
+        with self._lock:
+            now = time.monotonic()
+            for host in [host for host, until in self._sampling_until.items() if until <= now]:
+                self._conclude(host)
+            updates = self._known.changes()
+            for switch in self._switches if updates else ():
+                self._command(switch, updates)
 
     def stop(self) -> None:
         """Nothing to wind down: blocks stay in force, as the archive says."""
@@ -66,11 +128,94 @@ class FirewallService:
         return {
             "alerts": self._alerts,
             "blocks": len(self._ledger.blocks),
-            "refused_by_cap": self._ledger.refused,
+            "guarded": [str(service) for service in self._syn.guarded],
+            "known_sources": len(self._known),
+            "refused_by_cap": self._ledger.refused + self._syn.refused,
+            "archive_away": self._archive_away,
         }
 
+    def _archived(self, query: Any) -> list[Item]:
+        """What the archive has; nothing, and a note, while it is away."""
+        try:
+            return self._engine.get(query)
+        except DueError as error:
+            self._archive_away += 1
+            log.warning("Data Archives do not answer, deciding without history: %s", error)
+            return []
+
+    def _on_handshake(self, item: Item) -> None:
+        value = item.value
+        with self._lock:
+            service = Service(str(value["service"]), int(value["port"]))
+            self._syn.handshake(str(value["source"]), service, int(value["at"]))
+
+    def _on_flood(self, item: Item) -> None:
+        host = str(item.value["dst"])
+        summary = f"{item.value['count']} half-open connections came up towards {host} within a window"
+        evidence = Evidence(key=item.key, timestamp=item.timestamp, summary=summary)
+        with self._lock:
+            if not self._syn.suspect(host, evidence, item.event_time):
+                return
+            log.warning("SYN flood suspected: %s", summary)
+            key = Key("network.traffic_capture.sonata.tcp").with_specs(dst=host, flag="syn").text
+            self._sampling_until[host] = time.monotonic() + WATCH_SECONDS
+            self._samples[host] = self._engine.observe(key)
+            self._samples[host].subscribe(lambda got: self._on_syns(host, got))
+
+    def _on_syns(self, host: str, item: Item) -> None:
+        with self._lock:
+            watch = self._syn.watches.get(host)
+            if watch is None:
+                return
+            if not watch.total:
+                limit = time.monotonic() + self._settings.syn.sample_ms / 1000
+                self._sampling_until[host] = min(limit, self._sampling_until[host])
+            for port, source in syns_of(item.value):
+                watch.add(port, source)
+            if watch.total >= self._settings.syn.sample:
+                self._conclude(host)
+
+    def _conclude(self, host: str) -> None:
+        watch = self._syn.watches.get(host)
+        if watch is not None:
+            often = [
+                source for (_, source), count in watch.syns.items() if count >= self._settings.syn.repeats
+            ]
+            limit = self._settings.syn.sources
+            earlier = self._archived(offences_of_many(often)) if 0 < len(often) <= limit else []
+            targets = {source: Target(kind="ip", address=source) for source in often[:limit]}
+            offences = {
+                source: count_offences(earlier, target, watch.now) for source, target in targets.items()
+            }
+            for decision in self._syn.conclude(host, offences):
+                self._publish(decision)
+        # disposing within a callback of the same subject is left to the next tick
+        if self._sampling_until.get(host, 0.0) <= time.monotonic():
+            self._sampling_until.pop(host, None)
+            self._samples.pop(host).dispose()
+        else:
+            self._sampling_until[host] = 0.0
+
+    def _command(self, switch: str, updates: Iterable[TableUpdate]) -> None:
+        for batch in in_batches(updates):
+            command = TableCommand(id=f"firewall-{uuid4().hex[:12]}", updates=batch)
+            self._engine.write(f"network.p4_command.firewall.{switch}", command.to_value(), [due.NO_WAIT])
+
+    def _arm(self, item: Item) -> None:
+        """A switch has come under control, for the first time or again: its guards and known sources."""
+        switch, ready = str(item.value["switch"]), bool(item.value.get("primary"))
+        before, self._switches[switch] = self._switches.get(switch, False), ready
+        if not ready or before:
+            return
+        for decision in self._syn.arm(switch, int(item.value.get("event_time", 0)) or item.event_time):
+            self._publish(decision)
+        self._command(switch, self._known.everything())
+
     def _on_alert(self, item: Item) -> None:
-        alert = Alert.from_value(item.value)
+        with self._lock:
+            self._judge(item, Alert.from_value(item.value))
+
+    def _judge(self, item: Item, alert: Alert) -> None:
         self._alerts += 1
         self._lapse(alert.event_time)
         evidence = self._remember(item, alert)
@@ -86,7 +231,7 @@ class FirewallService:
             self._ledger.refused += 1
             log.error("BLOCKING STOPPED, %s: %s stays unblocked", cap, alert.sender)
             return
-        earlier = self._engine.get(offences_query(verdict.target))
+        earlier = self._archived(offences_query(verdict.target))
         offences = count_offences(earlier, verdict.target, alert.event_time)
         self._publish(self._ledger.block(alert, verdict.target, verdict.reason, evidence, offences))
 
@@ -99,29 +244,30 @@ class FirewallService:
 
     def _on_confirmation(self, item: Item) -> None:
         confirmation = Confirmation.from_value(item.value)
-        self._ledger.confirm(confirmation)
+        with self._lock:
+            self._ledger.confirm(confirmation)
         if confirmation.state == "failed":
             log.error("switch %s refused %s: %s", confirmation.switch, confirmation.id, confirmation.cause)
 
     def _on_switch(self, item: Item) -> None:
         now = int(item.value.get("event_time", 0))
-        for reading in item.value.get("blocks", ()):
-            self._ledger.count_drops(str(reading["id"]), int(reading["packets"]), now)
-        self._lapse(now)
+        with self._lock:
+            for reading in item.value.get("blocks", ()):
+                self._ledger.count_drops(str(reading["id"]), int(reading["packets"]), now)
+            self._arm(item)
+            self._lapse(now)
 
     def _lapse(self, now: int) -> None:
-        for decision in self._ledger.due(now):
+        for decision in [*self._ledger.due(now), *self._syn.due(now)]:
             self._publish(decision)
 
     def _publish(self, decision: Decision) -> None:
         kind = decision.target.kind
-        if kind == "ip":
-            kind_segment = "ipv6" if ":" in decision.target.address else "ipv4"
-        else:
-            kind_segment = "mac"
+        kind_segment = ("ipv6" if ":" in decision.target.address else "ipv4") if kind == "ip" else "mac"
         log.warning("%s %s: %s", decision.action, decision.target.address, decision.reason)
+        family = "protect" if decision.action in ("protect", "unprotect") else "block"
         self._engine.write(
-            f"network.block.firewall.{kind_segment}",
+            f"network.{family}.firewall.{kind_segment}",
             decision.to_value(),
             [due.NO_WAIT],
             event_time=decision.event_time,

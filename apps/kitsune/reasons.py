@@ -44,7 +44,7 @@ def feature_words(feature: int) -> str:
     start, per_scale, group = max(entry for entry in _GROUPS if entry[0] <= feature)
     scale, statistic = divmod(feature - start, per_scale)
     names = _GAP_STATISTICS if start == 50 else _STATISTICS
-    return f"{names[statistic]} of {group} over {1 / LAMBDAS[scale]:.2g} s"
+    return f"{names[statistic]} of {group} over {round(1 / LAMBDAS[scale], 1):g} s"
 
 
 def reason(hot: HotSecond, model: KitNet, line: float) -> str:

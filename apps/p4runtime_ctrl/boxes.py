@@ -31,6 +31,18 @@ class Bits:
     def narrowness(self) -> int:
         return self.mask.bit_count()
 
+    @property
+    def shape(self) -> int:
+        return self.mask
+
+    @property
+    def place(self) -> int | None:
+        return self.value
+
+    def seen_through(self, mask: int) -> int | None:
+        """The place of the set of this mask that covers this one; None where none can."""
+        return self.value & mask if self.mask & mask == mask else None
+
 
 @dataclass(frozen=True)
 class Span:
@@ -49,6 +61,18 @@ class Span:
 
     def narrowness(self) -> int:
         return (1 << self.width) - 1 - (self.high - self.low)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.low, self.high
+
+    @property
+    def place(self) -> bool:
+        return True
+
+    def seen_through(self, ends: tuple[int, int]) -> bool:
+        """Whether the span with these ends covers this one."""
+        return ends[0] <= self.low and self.high <= ends[1]
 
 
 @dataclass(frozen=True)
@@ -136,19 +160,53 @@ def _add_family(table: Table, given: dict[str, Any]) -> None:
             return
 
 
-def closure(boxes: Iterable[Box], *, limit: int, where: str) -> list[Box]:
-    """The boxes and all their intersections; raises `TelemetryError` where they are over `limit`."""
-    found: dict[Box, None] = {}
-    waiting = list(dict.fromkeys(boxes))
-    while waiting:
-        box = waiting.pop()
-        if box in found:
-            continue
-        waiting.extend(met for other in found if (met := box.meet(other)) is not None and met not in found)
-        found[box] = None
-        if len(found) > limit:
-            raise TelemetryError(
-                f"{where} has room for {limit} conditions and their overlaps, and more are asked for;"
-                " use fewer or simpler packet requests"
+class Closure:
+    """The boxes of one table and all their intersections; remembers the last answer, and adds to it."""
+
+    def __init__(self, *, limit: int, where: str) -> None:
+        self._limit = limit
+        self._where = where
+        self._asked: set[Box] = set()
+        self._found: dict[Box, None] = {}
+
+    def of(self, boxes: Iterable[Box]) -> list[Box]:
+        """Raises `TelemetryError` where they are more than the table's size."""
+        asked = set(boxes)
+        if not asked >= self._asked:
+            self._asked, self._found = set(), {}
+        found = dict(self._found)
+        waiting = [box for box in asked if box not in found]
+        while waiting:
+            box = waiting.pop()
+            if box in found:
+                continue
+            waiting.extend(
+                met for other in found if (met := box.meet(other)) is not None and met not in found
             )
-    return list(found)
+            found[box] = None
+            if len(found) > self._limit:
+                raise TelemetryError(
+                    f"{self._where} has room for {self._limit} conditions and their overlaps, and more are"
+                    " asked for; use fewer or simpler packet requests"
+                )
+        self._asked, self._found = asked, found
+        return list(found)
+
+
+class Covering:
+    """Finds what covers a box among many: one look-up for each combination of masks that occurs."""
+
+    def __init__(self, boxes: Mapping[Box, int]) -> None:
+        self._groups: dict[tuple[Any, ...], dict[tuple[Any, ...], int]] = {}
+        for box, bits in boxes.items():
+            group = self._groups.setdefault(tuple(side.shape for side in box.sides), {})
+            key = tuple(side.place for side in box.sides)
+            group[key] = group.get(key, 0) | bits
+
+    def bits(self, box: Box) -> int:
+        """The bits of all boxes that cover this one, or-ed."""
+        found = 0
+        for shapes, group in self._groups.items():
+            key = tuple(side.seen_through(shape) for side, shape in zip(box.sides, shapes, strict=True))
+            found |= group.get(key, 0)
+        return found

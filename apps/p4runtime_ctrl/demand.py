@@ -49,7 +49,8 @@ class Offer(Message, frozen=True, kw_only=True):
     conditions: dict[str, Any] = {}  # noqa: RUF012 - msgspec copies empty defaults
     """As in `telemetry.Request`."""
     copy: bool = True
-    """Packet-ins of the matching packets; else they only reach the counting stages."""
+    """Packet-ins of the matching packets; else they only reach the counting stages, and their reports
+    come under `network.digests`."""
     digest: bool = False
     """A digest of every matching packet."""
     active: bool = True
@@ -88,7 +89,6 @@ def demand_for(
     mine = {name: offer for name, offer in offers.items() if offer.active and offer.switch in ("", switch)}
     known |= {name: mine[name].request() for name in named if name in mine}
 
-    requests = {name: offer.request() for name, offer in mine.items() if not offer.copy and not offer.digest}
     routes: dict[Kind, dict[str, int]] = {}
     for kind in KINDS:
         routes[kind] = {
@@ -96,7 +96,7 @@ def demand_for(
         }
     if by_digest:
         known = {which: _by_digest(request, routes, which) for which, request in known.items()}
-    requests |= {which: known[which] for kind in KINDS for which in routes[kind]}
+    requests = {which: known[which] for kind in KINDS for which in routes[kind]}
     return Demand(tuple(sorted(requests.values(), key=lambda request: -request.bit)), routes)
 
 

@@ -82,17 +82,12 @@ class Agent:
         self._switch = Switch(
             mine.name, self._program, self._now, forward=forward, fail=mine.fail, guard=settings.guard
         )
-        address = Address(
-            mine.address,
-            mine.device_id,
-            settings.rank,
-            copies_session=settings.copy_session,
-            cpu_port=settings.cpu_port,
-            timeout_s=settings.timeout_s,
-            credentials=credentials(settings.tls_ca, settings.tls_certificate, settings.tls_key),
-        )
         self._connection = Connection(
-            address, pipeline, self, batch=settings.batch, linger_s=settings.linger_ms / 1000
+            _address(settings, mine),
+            pipeline,
+            self,
+            batch=settings.batch,
+            linger_s=settings.linger_ms / 1000,
         )
         self._jobs: queue.Queue[_Job] = queue.Queue(_JOBS)
         self._closing = threading.Event()
@@ -350,6 +345,7 @@ class Agent:
             "primary": self._session is not None,
             "target": self._mine.target or self._mine.address,
             "program": self._program_name,
+            "base_us": self._mine.base_us,
             "fail": self._mine.fail,
             "telemetry": [request.name for request in self._switch.requests or ()],
             "packet_in": self._progress.received,
@@ -376,6 +372,18 @@ class Agent:
         commands = commands_of(self._engine.get(f"network.p4_command.*.{self.name}"), since)
         for problem in self._switch.restore(decisions, commands):
             _LOG.warning("%s: not restored: %s", self.name, problem)
+
+
+def _address(settings: Settings, mine: SwitchSettings) -> Address:
+    return Address(
+        mine.address,
+        mine.device_id,
+        settings.rank,
+        copies_session=settings.copy_session,
+        cpu_port=settings.cpu_port,
+        timeout_s=settings.timeout_s,
+        credentials=credentials(settings.tls_ca, settings.tls_certificate, settings.tls_key),
+    )
 
 
 class P4RuntimeCtrlService:

@@ -19,6 +19,7 @@ from apps.p4runtime_ctrl.desired_state import (
     EntrySet,
     deletion,
     difference,
+    entry_body,
     entry_key,
     is_standing,
     table_id,
@@ -200,7 +201,7 @@ class Switch:
         self.requests = wanted
         if transport is None:
             return []
-        changes = self._classifier.transition(self._telemetry, wanted, kept)
+        changes = self._classifier.transition(self._telemetry, desired, kept)
         outcomes = transport.write(changes) if changes else []
         self._telemetry = desired
         return [
@@ -271,7 +272,7 @@ class Switch:
         others = [change for change in plain if entry_key(change.entry) not in wires]
         packets: list[Change] = []
         if self.requests is not None:
-            packets = self._classifier.transition(telemetry, self.requests, kept=())
+            packets = self._classifier.transition(telemetry, self._classifier.entries(self.requests), kept=())
         return forward + others + packets if self.fail == "open" else others + packets + forward
 
     def _note(self, report: BringUp, change: Change, outcome: Outcome) -> None:
@@ -355,11 +356,20 @@ class Switch:
             self._remember(order)
             return self._confirmation(order.owner, "removed", main.entry, cause=said.message)
         if said.code == _EXISTS:
-            if main.entry not in self._desired:
-                self._remember(order)
-            return self._confirmation(order.owner, "exists", main.entry, cause=said.message)
+            return self._confirmation(
+                order.owner, "exists", main.entry, cause=self._kept(order, said.message)
+            )
         self._remember(order)
         return self._confirmation(order.owner, "installed", main.entry)
+
+    def _kept(self, order: Order, said: str) -> str:
+        """The entry that was there stays; what to say about it."""
+        held = self._desired.get(order.main.entry)
+        if held is None:
+            self._remember(order)
+        elif entry_body(held) != entry_body(order.main.entry):
+            return "it exists with another action or other parameters; use modify to change it"
+        return said
 
     def _confirmation(
         self, owner: Owner, state: State, entry: Any | None = None, *, cause: str = ""

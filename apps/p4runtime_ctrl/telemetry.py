@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from apps.messages import TableUpdate
-from apps.p4runtime_ctrl.boxes import Box, Shape, closure
+from apps.p4runtime_ctrl.boxes import Box, Closure, Covering, Shape
 from apps.p4runtime_ctrl.desired_state import DELETE, INSERT, MODIFY, Change, EntrySet, difference, entry_body
 from apps.p4runtime_ctrl.errors import EntryError, ProgramError, TelemetryError
 from apps.p4runtime_ctrl.p4info import Program, Table
@@ -62,6 +62,8 @@ class Classifier:
         taken = [param.name for param in self._active.default_actions[0].params]
         if sorted(taken) != sorted(_MAPS):
             raise ProgramError(f"{_ACTIVE}: its action takes {', '.join(taken)}, not {', '.join(_MAPS)}")
+        self._shapes = {table.id: Shape(table) for table in self._tables}
+        self._closures = {table.id: Closure(limit=table.size, where=table.name) for table in self._tables}
         self.table_ids = frozenset(table.id for table in (*self._tables, self._active))
 
     def entries(self, requests: Sequence[Request]) -> EntrySet:
@@ -78,16 +80,13 @@ class Classifier:
             self._fill(found, table, list(zip(requests, boxes, strict=True)))
         return found
 
-    def transition(
-        self, present: EntrySet, requests: Sequence[Request], kept: Sequence[Request]
-    ) -> list[Change]:
-        """Steps from what the switch holds to `requests`, to be written in this order.
+    def transition(self, present: EntrySet, desired: EntrySet, kept: Sequence[Request]) -> list[Change]:
+        """Steps from what the switch holds to the `entries` of some requests, to be written in this order.
 
         `kept` are the requests that go on unchanged and must not miss a packet.
         """
-        desired = self.entries(requests)
         fields = difference(self._without_active(desired), self._without_active(present), rank=_outside_in)
-        goal = self._active_entry(requests)
+        goal = desired.get(self._active_entry(()))
         pause = self._active_entry(kept) if fields else goal
         changes = list(fields)
         held = present.get(goal)
@@ -122,8 +121,7 @@ class Classifier:
                     f"request {request.name}: no condition {name!r}; there are {', '.join(known)}"
                 )
             given.setdefault(table.id, {})[name] = value
-        shapes = {table.id: Shape(table) for table in self._tables}
-        return {table_id: shapes[table_id].box(match) for table_id, match in given.items()}
+        return {table_id: self._shapes[table_id].box(match) for table_id, match in given.items()}
 
     def _fill(self, found: EntrySet, table: Table, wanted: list[tuple[Request, Box | None]]) -> None:
         action = table.actions[0]
@@ -144,12 +142,17 @@ class Classifier:
             )
 
         found.put(self._program.entry(update({}, _map(everywhere), default=True)))
-        shape = Shape(table)
-        boxes = closure((box for _, box in wanted if box is not None), limit=table.size, where=table.name)
-        for box in boxes:
-            covering = [request for request, other in wanted if other is None or other.covers(box)]
+        shape = self._shapes[table.id]
+        everywhere_bits = _map(everywhere)
+        bits: dict[Box, int] = {}
+        for request, box in wanted:
+            if box is not None:
+                bits[box] = bits.get(box, 0) | 1 << request.bit
+        covering = Covering(bits)
+        for box in self._closures[table.id].of(bits):
             priority = shape.priority(box) if table.has_priority else 0
-            found.put(self._program.entry(update(shape.match(box), _map(covering), priority)))
+            entry = update(shape.match(box), everywhere_bits | covering.bits(box), priority)
+            found.put(self._program.entry(entry))
 
 
 def _find(program: Program, name: str) -> Table:

@@ -51,15 +51,32 @@ class Written(msgspec.Struct, frozen=True):
     output: Output
 
 
-class _Station:
-    """What is kept for one switch."""
+class _Lane:
+    """Host operators and the stream that they see; queries on bytes have a lane of their own."""
 
     def __init__(self, limit: int, lateness_us: int) -> None:
         self.host = HostEngine(limit=limit, lateness_us=lateness_us)
         self.merger = Merger()
+        self.names: set[str] = set()
+        """Streams that bring its packets."""
+        self.brought: dict[str, int] = {}
+        """Packets by stream."""
+
+
+class _Station:
+    """What is kept for one switch."""
+
+    def __init__(self, limit: int, lateness_us: int) -> None:
+        self.headers = _Lane(limit, lateness_us)
+        self.frames = _Lane(limit, lateness_us)
         self.handshakes = Handshakes()
         self.reports: dict[str, Reports] = {}
+        self.base_us = 0
         self.now_us: int | None = None
+
+    @property
+    def lanes(self) -> tuple[_Lane, _Lane]:
+        return self.headers, self.frames
 
 
 class Control:
@@ -102,6 +119,10 @@ class Control:
         }
         return found
 
+    def know(self, templates: Mapping[str, Template]) -> None:
+        """These queries there are from now on; what runs goes on as it is."""
+        self._templates = templates
+
     def want(self, keys: Iterable[str]) -> Changes:
         """These keys are wanted from now on, and no others."""
         requests, outputs, refused = self._read(keys)
@@ -128,17 +149,26 @@ class Control:
     def switch(self, name: str, base_us: int) -> bool:
         """A switch is there; returns whether it is new."""
         new = name not in self._stations
-        self._station(name).host.base_us = base_us
+        station = self._station(name)
+        station.base_us = base_us
+        for lane in station.lanes:
+            lane.host.base_us = base_us
         return new
 
     def packets(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
         """Copied packets of one of the sources, at `now` (seconds of any clock)."""
         station = self._station(switch)
-        return self._processed(station, station.merger.put(name, batch, now))
+        written: list[Written] = []
+        for lane in station.lanes:
+            if name in lane.names:
+                lane.brought[name] = lane.brought.get(name, 0) + len(batch)
+                written += self._processed(station, lane, lane.merger.put(name, batch, now))
+        return written
 
     def busy(self, switch: str, now: float) -> None:
         """Until `now` no packets of a switch could be taken: silence before means nothing."""
-        self._station(switch).merger.busy(now)
+        for lane in self._station(switch).lanes:
+            lane.merger.busy(now)
 
     def digests(self, switch: str, name: str, batch: RecordBatch) -> list[Written]:
         """Reports of counting stages."""
@@ -156,39 +186,56 @@ class Control:
         """Let go what has waited long enough."""
         written: list[Written] = []
         for station in self._stations.values():
-            written += self._processed(station, station.merger.release(now))
+            for lane in station.lanes:
+                written += self._processed(station, lane, lane.merger.release(now))
         return written
 
     def advance(self, switch: str, now_us: int) -> list[Written]:
         """Capture time of a switch has come to `now_us`, though no packet may have come here."""
         station = self._station(switch)
         station.now_us = max(now_us, station.now_us or 0)
-        return self._addressed(station, station.host.advance(now_us))
+        written: list[Written] = []
+        for lane in station.lanes:
+            written += self._addressed(station, lane.host.advance(now_us))
+        return written
 
     def finish(self) -> list[Written]:
         """No more packets will come."""
         written: list[Written] = []
         for station in self._stations.values():
-            written += self._processed(station, station.merger.flush())
-            written += self._addressed(station, station.host.finish())
+            for lane in station.lanes:
+                written += self._processed(station, lane, lane.merger.flush())
+                written += self._addressed(station, lane.host.finish())
         return written
 
     def health(self) -> dict[str, Any]:
         """Counters for people."""
         stations = self._stations.values()
+        lanes = [lane for station in stations for lane in station.lanes]
         return {
             "queries": {
                 one.identity: "switch" if one.in_switch else f"host: {one.reason}"
                 for one in self.plan.queries
             },
+            "tuples": {one.identity: self._tuples(one) for one in self.plan.queries},
             "bits": len(self.plan.entries) + len(self.plan.copies),
-            "host_packets": sum(station.host.packets for station in stations),
-            "late": sum(station.host.late for station in stations),
-            "disordered": sum(station.merger.disordered for station in stations),
-            "without_payload": sum(station.host.without_payload for station in stations),
+            "host_packets": sum(lane.host.packets for lane in lanes),
+            "late": sum(lane.host.late for lane in lanes),
+            "disordered": sum(lane.merger.disordered for lane in lanes),
+            "without_payload": sum(lane.host.without_payload for lane in lanes),
             "reports": sum(report.tuples for station in stations for report in station.reports.values()),
             "refused": len(self._refused),
         }
+
+    def _tuples(self, one: QueryPlan) -> int:
+        """What reached the host for a query, of all switches."""
+        found = 0
+        for station in self._stations.values():
+            lane = station.frames if one.payload else station.headers
+            found += sum(lane.brought.get(_name(copy.bit), 0) for copy in one.copies)
+            if one.identity in station.reports:
+                found += station.reports[one.identity].tuples
+        return found
 
     def _read(self, keys: Iterable[str]) -> tuple[dict[str, Request], dict[str, set[str]], dict[str, str]]:
         requests: dict[str, Request] = {}
@@ -214,12 +261,19 @@ class Control:
 
     def _refit(self, station: _Station, old: Mapping[str, Request]) -> None:
         """Make a switch's operators those of the plan."""
-        host = {one.identity for one in self.plan.queries if not one.in_switch}
-        for identity in old.keys() - host:
-            station.host.remove(identity)
-        for identity in sorted(host - station.host.names):
-            station.host.add(self._requests[identity].query)
-        station.merger.expect({_name(copy.bit) for copy in self.plan.copies})
+        for lane in station.lanes:
+            mine = [
+                one
+                for one in self.plan.queries
+                if not one.in_switch and one.payload == (lane is station.frames)
+            ]
+            host = {one.identity for one in mine}
+            for identity in old.keys() - host:
+                lane.host.remove(identity)
+            for identity in sorted(host - lane.host.names):
+                lane.host.add(self._requests[identity].query)
+            lane.names = {_name(copy.bit) for one in mine for copy in one.copies}
+            lane.merger.expect(lane.names)
         reports = {}
         for one in self.plan.queries:
             if one.in_switch:
@@ -229,10 +283,10 @@ class Control:
 
     def _new_reports(self, one: QueryPlan, station: _Station) -> Reports:
         query = self._requests[one.identity].query
-        return Reports(query, one, base_us=station.host.base_us, since_us=station.now_us)
+        return Reports(query, one, base_us=station.base_us, since_us=station.now_us)
 
-    def _processed(self, station: _Station, batch: RecordBatch | None) -> list[Written]:
-        return [] if batch is None else self._addressed(station, station.host.process(batch))
+    def _processed(self, station: _Station, lane: _Lane, batch: RecordBatch | None) -> list[Written]:
+        return [] if batch is None else self._addressed(station, lane.host.process(batch))
 
     def _addressed(self, station: _Station, outputs: Sequence[Result | Captured]) -> list[Written]:
         written: list[Written] = []

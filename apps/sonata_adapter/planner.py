@@ -110,6 +110,8 @@ class QueryPlan(msgspec.Struct, frozen=True, kw_only=True):
     identity: str
     entries: tuple[Entry, ...] = ()
     copies: tuple[Copy, ...] = ()
+    payload: bool = False
+    """On the host, and some of its copies must hold the frames' bytes."""
     reason: str = ""
     """Why it does not run in the switch; empty: it does."""
     tuples_per_second: float = 0.0
@@ -165,6 +167,8 @@ def plan(
     space = _Space(limits)
     kept: dict[str, QueryPlan] = {}
     wanted = {request.identity: request for request in requests}
+    held = before.copies if before is not None else ()
+    space.take_bits(copy.bit for copy in held)
     for old in before.queries if before is not None else ():
         if old.identity in wanted and old.in_switch:
             kept[old.identity] = old
@@ -174,16 +178,18 @@ def plan(
     found = dict(kept)
     for request in ordered:
         found[request.identity] = _counted(request, space)
-    held = before.copies if before is not None else ()
     copies = _copies([wanted[one.identity] for one in found.values() if not one.in_switch], held, space)
     plans = []
     for identity in sorted(found):
         one = found[identity]
         if not one.in_switch:
-            needed = _needed(wanted[identity])
-            mine = tuple(copy for copy in copies if any(copy.match == match for match, _ in needed))
-            rate = packets_per_second(copy.match for copy in mine)
-            one = msgspec.structs.replace(one, copies=mine, tuples_per_second=rate)
+            mine = _serving(wanted[identity], copies)
+            one = msgspec.structs.replace(
+                one,
+                copies=mine,
+                payload=any(bytes_too for _, bytes_too in _needed(wanted[identity])),
+                tuples_per_second=packets_per_second(copy.match for copy in mine),
+            )
         plans.append(one)
     return Plan(tuple(plans), tuple(copies))
 
@@ -311,19 +317,44 @@ def _masks(keys: Iterable[Expression]) -> tuple[tuple[str, int], ...]:
     return tuple(sorted(masks.items()))
 
 
-def _copies(requests: Sequence[Request], held: Iterable[Copy], space: "_Space") -> list[Copy]:
-    """One copy for each condition; those of the plan before keep their bits."""
+def _serving(request: Request, copies: Sequence[Copy]) -> tuple[Copy, ...]:
+    """The copies that bring what a query needs."""
+    every = [copy for copy in copies if not copy.match]
+    found: dict[int, Copy] = {}
+    for match, _ in _needed(request):
+        for copy in [copy for copy in copies if copy.match == match] or every:
+            found[copy.bit] = copy
+    return tuple(found.values())
+
+
+def _copies(requests: Sequence[Request], held: Sequence[Copy], space: "_Space") -> list[Copy]:
+    """One copy for each condition; those of the plan before keep their bits.
+
+    Where bits run out, the last one copies every packet for all that is left.
+    """
     wanted: list[tuple[Match, bool]] = []
     for request in requests:
-        for match, payload in _needed(request):
+        for match, payload in _overlapping_too(_needed(request)):
             _want(wanted, match, payload)
-    found = []
-    old = {copy.bit: copy for copy in held if any(copy.match == match for match, _ in wanted)}
-    space.take_bits(old)
+    old = {copy.bit: copy.match for copy in held}
+    found: list[Copy] = []
     for match, payload in wanted:
-        bit = next((copy.bit for copy in old.values() if copy.match == match), None)
-        found.append(Copy(bit=space.bit() if bit is None else bit, match=match, payload=payload))
+        bit = next((bit for bit, other in old.items() if other == match), None)
+        if bit is None:
+            bit = space.bit_for_copy()
+        if bit is None:
+            rest = any(bytes_too for other, bytes_too in wanted if all(other != copy.match for copy in found))
+            return [*found, Copy(bit=space.last_bit, match={}, payload=rest)]
+        found.append(Copy(bit=bit, match=match, payload=payload))
     return found
+
+
+def _overlapping_too(needed: Sequence[tuple[Match, bool]]) -> list[tuple[Match, bool]]:
+    """Where one of a query's copies holds bytes, those that may hold the same packets must, too."""
+    return [
+        (match, payload or any(bytes_too and not disjoint(match, other) for other, bytes_too in needed))
+        for match, payload in needed
+    ]
 
 
 class _Space:
@@ -351,10 +382,21 @@ class _Space:
 
     def bit(self) -> int:
         """A free bit; raises `NotPlaced`."""
-        free = next((bit for bit in range(self._limits.bits) if bit not in self._bits), None)
+        free = self.bit_for_copy()
         if free is None:
             raise NotPlaced(f"all {self._limits.bits} bits of the classifier are taken")
-        self._bits.add(free)
+        return free
+
+    @property
+    def last_bit(self) -> int:
+        """Kept for copies of every packet."""
+        return self._limits.bits - 1
+
+    def bit_for_copy(self) -> int | None:
+        """A free bit, None if there is none."""
+        free = next((bit for bit in range(self.last_bit) if bit not in self._bits), None)
+        if free is not None:
+            self._bits.add(free)
         return free
 
     def distinct(self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int) -> Entry:

@@ -25,10 +25,11 @@ from apps.packets import read_frames
 from apps.sonata_adapter.catalogue import CATALOGUE, Template
 from apps.sonata_adapter.control import Changes, Control, Source, Written
 from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
+from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
 from apps.sonata_adapter.planner import SwitchLimits
 from apps.sonata_adapter.results import Captured
-from apps.sonata_adapter.text import parse_queries
+from apps.sonata_adapter.templates import QueryFolder, own_queries
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
@@ -79,17 +80,21 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Keys that one operator keeps exactly in a window; beyond, results are estimates and say so."""
     lateness_us: int = DEFAULT_LATENESS_US
     """How long after its end a window waits for late packets, capture time; a window at most."""
-    files: tuple[str, ...] = ()
-    """Files with queries in text form."""
+    base_us: dict[str, int] = {}
+    """Absolute time of a switch's clock zero, where the controller does not say it: switch to us."""
+    queries: str = ""
+    """Folder of people's own queries; empty: `$SDNATOR_QUERIES`, or one in the home folder."""
 
 
 class SonataAdapterService:
-    """Turns interests into queries.  Raises `QueryTextError` and OSError for files of queries."""
+    """Turns interests into queries."""
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
+        self._bases = settings.base_us
+        self._folder = QueryFolder(Path(settings.queries) if settings.queries else own_queries())
         self._control = Control(
-            load_templates(settings.files),
+            self._templates(),
             limits=settings.limits,
             keys_limit=settings.keys,
             lateness_us=settings.lateness_us,
@@ -125,12 +130,20 @@ class SonataAdapterService:
         with self._lock:
             return {**self._control.health(), "results": self._written, "switches": sorted(self._switches)}
 
+    def _templates(self) -> dict[str, Template]:
+        try:
+            return self._folder.templates()
+        except (SonataError, OSError) as error:
+            _LOG.error("own queries are left out: %s", error)
+            return dict(CATALOGUE)
+
     def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
         wanted = frozenset(each.key for each in assignments if each.key.startswith(_MY_KEYS))
         heard = frozenset(each.key for each in assignments) - wanted
         with self._lock:
             if wanted != self._wanted:
                 self._wanted = wanted
+                self._control.know(self._templates())
                 self._apply(self._control.want(wanted))
             if heard - self._heard:
                 # a controller has come that knows nothing of what was said before
@@ -141,7 +154,7 @@ class SonataAdapterService:
         name = item.key.rpartition(".")[2]
         value = item.value
         with self._lock:
-            base_us = int(value.get("base_us", 0))
+            base_us = int(value.get("base_us", self._bases.get(name, 0)))
             fresh = self._control.switch(name, base_us) or name not in self._switches
             primary = bool(value.get("primary"))
             again = primary and not self._switches.get(name, False)
@@ -210,15 +223,6 @@ def with_frames(value: dict[str, Any]) -> RecordBatch:
     cut = [frame[:_WIDTH] for frame in frames]
     captured = np.array([len(frame) for frame in cut], dtype=np.uint16)
     return RecordBatch({**batch, "frame": np.array(cut, dtype=f"V{_WIDTH}"), "captured": captured})
-
-
-def load_templates(files: Iterable[str]) -> dict[str, Template]:
-    """The catalogue and the queries of these files; raises `QueryTextError`, OSError."""
-    templates = dict(CATALOGUE)
-    for name in files:
-        for template in parse_queries(Path(name).read_text(encoding="utf-8"), name):
-            templates[template.name] = template
-    return templates
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -221,18 +221,41 @@ class CGenerator(CStatements):
 
 def _structures(g: CGenerator) -> list[str]:
     program, layout = g.program, g.layout
+    deparsed = [program.headers[h].type for h in program.deparser]
+    widest = max((program.headers[h].type.width // 8 for h in layout.packet_headers), default=0)
     lines = [
         f"#define N_TABLES {len(program.tables)}",
         f"#define N_COUNTERS {len(program.counters)}",
         f"#define N_METERS {len(program.meters)}",
         f"#define N_REGISTERS {len(program.registers)}",
+        f"#define DEPARSED_MOST {sum(t.max_bytes or t.width // 8 for t in deparsed)}",
+        f"static const u8 zeros[{widest + 8}];",
+        *_packet(g),
+        "typedef struct job job;",
+        "typedef struct { u32 port, instance; } replica;",
+        "typedef struct { u32 count, length; replica to[]; } replicas;",
+        "typedef struct {",
+        "table t[N_TABLES + 1]; u64 *c[N_COUNTERS + 1]; meter *mt[N_METERS + 1];",
+        "u64 *reg[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;",
+        "u64 stats[6], out_used, out_room, seed; u8 *out; u8 verdict; int budget; job *head, **tail;",
+        "} machine;",
+        "static u8 *arena(machine *m, u64 more);",
+        "static void record(machine *m, u32 kind, u32 id, u64 length);",
+        "#define STD(p, name) (p)->STD_##name",
     ]
-    most = sum(
-        program.headers[h].type.max_bytes or program.headers[h].type.width // 8 for h in program.deparser
-    )
-    widest = max((program.headers[h].type.width // 8 for h in layout.packet_headers), default=0)
-    lines += [f"#define DEPARSED_MOST {most}", f"static const u8 zeros[{widest + 8}];", "typedef struct {"]
-    lines += ["const u8 *pkt; u64 now;", "u32 size, offset, length, arrived, truncate;"]
+    for f in layout.fields.get(STANDARD, ()):
+        lines += [f"#define HAS_{f.name} 1", f"#define STD_{f.name} {g.names[STANDARD, f.name]}"]
+    for n in sorted({key_places(s)[0] for s in program.tables.values() if s.keys}):
+        lines.append(
+            f"PLAIN entry *find{n}(const table *t, const u64 *k) {{ return table_find(t, k, {n}); }}"
+        )
+    return lines
+
+
+def _packet(g: CGenerator) -> list[str]:
+    """The type of one packet's state; metadata stand together so that they can be zeroed."""
+    layout = g.layout
+    lines = ["typedef struct {", "const u8 *pkt; u64 now;", "u32 size, offset, length, arrived, truncate;"]
     lines += ["u32 clone, clone_list, digest, resubmit, recirculate, exit;", "struct {"]
     for header in layout.metadata:
         for f in layout.fields[header]:
@@ -242,26 +265,7 @@ def _structures(g: CGenerator) -> list[str]:
         number = g.numbers[header]
         lines.append(f"const u8 *r{number}; u32 l{number}; u8 v{number};")
         lines += [f"{storage(f)} {g.names[header, f.name]};" for f in layout.fields[header]]
-    lines += [f"u32 n{i};" for i in g.index["s"].values()]
-    lines += ["} phv;", "typedef struct job job;", "typedef struct { u32 port, instance; } replica;"]
-    lines += ["typedef struct { u32 count, length; replica to[]; } replicas;", "typedef struct {"]
-    lines += ["table t[N_TABLES + 1]; u64 *c[N_COUNTERS + 1]; meter *mt[N_METERS + 1];"]
-    lines += ["u64 *reg[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;"]
-    lines += ["u64 stats[6], out_used, out_room, seed; u8 *out; u8 verdict; int budget; job *head, **tail;"]
-    lines += ["} machine;"]
-    lines += ["static u8 *arena(machine *m, u64 more);"]
-    lines += ["static void record(machine *m, u32 kind, u32 id, u64 length);"]
-    for f in layout.fields.get(STANDARD, ()):
-        lines.append(f"#define HAS_{f.name} 1")
-    lines.append("#define STD(p, name) (p)->STD_##name")
-    for f in layout.fields.get(STANDARD, ()):
-        lines.append(f"#define STD_{f.name} {g.names[STANDARD, f.name]}")
-    sizes = sorted({key_places(s)[0] for s in program.tables.values() if s.keys})
-    for n in sizes:
-        lines.append(
-            f"PLAIN entry *find{n}(const table *t, const u64 *k) {{ return table_find(t, k, {n}); }}"
-        )
-    return lines
+    return [*lines, *[f"u32 n{i};" for i in g.index["s"].values()], "} phv;"]
 
 
 def _start(g: CGenerator) -> None:

@@ -1,6 +1,7 @@
 """The generated-C back end: c_code's unit behind the interface of machine.Machine."""
 
 import struct
+import weakref
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any
@@ -11,6 +12,7 @@ from dataplane.compiler.c_build import library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
 from dataplane.compiler.machine import Batch, KeyPlace, Replicas, Row
+from dataplane.errors import DataplaneError
 from dataplane.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
 _DECLARATIONS = """
@@ -44,13 +46,26 @@ _Rates = tuple[int, int, int, int]
 
 
 class _Native:
-    """The library's handle, shared by the parts of one machine."""
+    """The library's handle, shared by the parts of one machine; freed by close() or with the last of them."""
 
     def __init__(self, text: str, cpu_port: int) -> None:
         self.ffi, self.lib = library(text, _DECLARATIONS)
-        self.handle = self.lib.dp_new(cpu_port)
-        if self.handle == self.ffi.NULL:
+        handle = self.lib.dp_new(cpu_port)
+        if handle == self.ffi.NULL:
             raise MemoryError("no memory for the switch's state")
+        self._handle: Any = handle
+        self._free = weakref.finalize(self, self.lib.dp_free, handle)
+
+    @property
+    def handle(self) -> Any:
+        """Raises DataplaneError once closed: the state behind it is gone."""
+        if self._handle is None:
+            raise DataplaneError("the switch is closed")
+        return self._handle
+
+    def close(self) -> None:
+        self._handle = None
+        self._free()
 
     def rates(self, rates: _Rates | None) -> Any:
         return self.ffi.NULL if rates is None else self.ffi.new("uint64_t[4]", rates)
@@ -60,8 +75,7 @@ class CTable:
     """See machine.TableStore."""
 
     def __init__(self, native: _Native, number: int, spec: TableSpec, stride: int) -> None:
-        self._ffi, self._lib, self._handle = native.ffi, native.lib, native.handle
-        self._native = native
+        self._ffi, self._lib, self._native = native.ffi, native.lib, native
         self._number = number
         self._words, places = key_places(spec) if spec.keys else (0, ())
         self.place = KeyPlace(places)
@@ -85,7 +99,7 @@ class CTable:
             )
             parts = self._ffi.new("uint64_t[]", list(flat))
         self._lib.dp_insert(
-            self._handle,
+            self._native.handle,
             self._number,
             slot,
             row.value.to_bytes(8 * self._words, "little"),
@@ -99,33 +113,33 @@ class CTable:
         )
 
     def replace(self, slot: int, action: int, params: Sequence[int]) -> None:
-        self._lib.dp_replace(self._handle, self._number, slot, action, self._params(action, params))
+        self._lib.dp_replace(self._native.handle, self._number, slot, action, self._params(action, params))
 
     def remove(self, slot: int) -> None:
-        self._lib.dp_remove(self._handle, self._number, slot)
+        self._lib.dp_remove(self._native.handle, self._number, slot)
 
     def set_default(self, action: int, params: Sequence[int]) -> None:
-        self._lib.dp_default(self._handle, self._number, action, self._params(action, params))
+        self._lib.dp_default(self._native.handle, self._number, action, self._params(action, params))
 
     def _entry(self, slot: int) -> tuple[int, int, int]:
         state = self._ffi.new("uint64_t[3]")
-        self._lib.dp_entry(self._handle, self._number, slot, state)
+        self._lib.dp_entry(self._native.handle, self._number, slot, state)
         return state[0], state[1], state[2]
 
     def counter(self, slot: int) -> tuple[int, int]:
         return self._entry(slot)[:2]
 
     def set_counter(self, slot: int, packets: int, octets: int) -> None:
-        self._lib.dp_set_entry(self._handle, self._number, slot, 0, packets & _WORD, octets & _WORD)
+        self._lib.dp_set_entry(self._native.handle, self._number, slot, 0, packets & _WORD, octets & _WORD)
 
     def set_meter(self, slot: int, rates: _Rates | None) -> None:
-        self._lib.dp_entry_meter(self._handle, self._number, slot, self._native.rates(rates))
+        self._lib.dp_entry_meter(self._native.handle, self._number, slot, self._native.rates(rates))
 
     def hit_us(self, slot: int) -> int:
         return self._entry(slot)[2]
 
     def touch(self, slot: int, now_us: int) -> None:
-        self._lib.dp_set_entry(self._handle, self._number, slot, 1, now_us, 0)
+        self._lib.dp_set_entry(self._native.handle, self._number, slot, 1, now_us, 0)
 
 
 class CCounters:
@@ -273,6 +287,4 @@ class CMachine:
         return dict(zip(m.STATISTICS, counts, strict=True))
 
     def close(self) -> None:
-        if self._native.handle != self._native.ffi.NULL:
-            self._native.lib.dp_free(self._native.handle)
-            self._native.handle = self._native.ffi.NULL
+        self._native.close()

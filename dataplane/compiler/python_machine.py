@@ -282,7 +282,7 @@ class PythonMachine:
         return dict(self._counts)
 
     def close(self) -> None:
-        self.tables.clear()
+        """Nothing to free."""
 
 
 class _Places:

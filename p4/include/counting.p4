@@ -9,7 +9,7 @@ const bit<32> CELLS = 65536;              // of a stage, both banks together
 struct cell_key_t { bit<8> query; address_t source; address_t destination; bit<32> extra; }
 
 control CountStage(in headers_t hdr, inout metadata_t meta) {
-    // epoch 32 | query 8 | source 128 | destination 128 | extra 32 | count 32
+    // epoch (window number + 1) 32 | query 8 | source 128 | destination 128 | extra 32 | count 32
     @name("cells") register<bit<360>>(CELLS) cells;
     direct_counter(CounterType.packets) stage_counter;
 
@@ -25,7 +25,7 @@ control CountStage(in headers_t hdr, inout metadata_t meta) {
         address_t destination = meta.destination & destination_mask;
         bit<32> extra = (meta.destination_port & port_mask) ++ ((bit<16>)meta.length & length_mask);
         bit<112> product = (bit<112>)meta.timestamp * (bit<112>)reciprocal;
-        bit<32> epoch = (bit<32>)(product >> 64);
+        bit<32> epoch = (bit<32>)(product >> 64) + 1; // a cell of zeros belongs to no window
         bit<32> slot;
         hash(slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
         slot = slot + (epoch[0:0] == 1 ? CELLS / 2 : 32w0);
@@ -39,7 +39,7 @@ control CountStage(in headers_t hdr, inout metadata_t meta) {
         bit<32> after = before |+| step;
         bool writes = (is_empty || is_mine) && meta.reading == 0;
         cells.write(slot, writes ? epoch ++ query ++ source ++ destination ++ extra ++ after : cell);
-        meta.cell_epoch = epoch;
+        meta.cell_epoch = epoch - 1;
         meta.cell_count = before;
         meta.crossed = meta.crossed | ((is_empty || is_mine) && threshold != 0 && before < threshold && after >= threshold ? bit_of_query : 256w0);
         meta.overflow = meta.overflow | (is_empty || is_mine ? 256w0 : bit_of_query);

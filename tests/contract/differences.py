@@ -15,6 +15,8 @@ DIFFERENCES = {
     "metadata-limit": "BMv2 loses the details of batches with more than about 80 failures, because its "
     "metadata limit is not raised; the embedded switch's is 64 MiB.",
     "table-full": "BMv2 reports a full table as UNKNOWN; the embedded switch as RESOURCE_EXHAUSTED.",
+    "meter-check": "BMv2 takes a meter whose peak rate is below its committed rate; the embedded switch refuses "
+    "the whole update.",
     "constant-table": "BMv2 reports an insert into a constant table as UNKNOWN; the embedded switch as "
     "PERMISSION_DENIED.",
     "read-by-priority": "BMv2 ignores the priority of a read without match; the embedded switch selects by it.",
@@ -41,3 +43,13 @@ def differs(target: Any, name: str) -> bool:
     """Whether the target is BMv2, in a matter that is listed above."""
     assert name in DIFFERENCES
     return bool(target.name == "bmv2")
+
+
+def markdown() -> str:
+    """The list as a table for the documentation."""
+    rows = [f"| {name} | {text} |" for name, text in DIFFERENCES.items()]
+    return "\n".join(("| matter | what differs |", "|---|---|", *rows))
+
+
+if __name__ == "__main__":
+    print(markdown())

@@ -4,13 +4,13 @@ Where BMv2 departs from the P4Runtime specification, the embedded switch follows
 such matter has a name in differences.py.
 """
 
-import struct
 import time
 
 import grpc
 import pytest
 
 from p4rt import p4runtime
+from tests.contract.asking import codes, entries, flow, forward, frame, ip_frame, route, status_of
 from tests.contract.differences import differs
 from tests.dataplane.controller import (
     TIMEOUT_S,
@@ -20,54 +20,12 @@ from tests.dataplane.controller import (
     modify,
     program_config,
     text,
-    update_errors,
 )
 from tests.requirements import shared_data
 
 UNKNOWN, INVALID, NOT_FOUND, EXISTS, DENIED, EXHAUSTED = 2, 3, 5, 6, 7, 8
 ABORTED, RANGE, UNIMPLEMENTED = 10, 11, 12
 CPU = 510
-
-
-def frame(what=0, *, a=0, b=0, c=0, d=0, e=0):
-    """A frame of the feature program's test type."""
-    return bytes(range(12)) + b"\x88\xb5" + struct.pack(">BBBHIQH", what, a, b, c, d, e, 0) + bytes(40)
-
-
-def ip_frame(destination):
-    header = struct.pack(">BBHHHBBHII", 0x45, 0, 20, 1, 0, 64, 17, 0, 0x0A000001, destination)
-    return bytes(12) + b"\x08\x00" + header + bytes(30)
-
-
-def codes(call):
-    """Canonical codes of the updates of a batch that fails."""
-    with pytest.raises(grpc.RpcError) as caught:
-        call()
-    assert caught.value.code() == grpc.StatusCode.UNKNOWN
-    return [error.canonical_code for error in update_errors(caught.value)]
-
-
-def status_of(call):
-    with pytest.raises(grpc.RpcError) as caught:
-        call()
-    return caught.value.code().value[0]
-
-
-def route(names, address, prefix, port=2, **fields):
-    return names.entry("I.route", {"h.ip.dst": (address, prefix)}, "I.counted", [port], **fields)
-
-
-def flow(names, **fields):
-    match = {"h.test.c": (1, 9), "h.test.d": (0x100, 0xF00), "h.test.a": 4}
-    return names.entry("I.flows", match, "I.metered", [2], **{"priority": 3, **fields})
-
-
-def forward(names, controller, port_in=1, port_out=2):
-    controller.write(insert(names.entry("I.ports", {"sm.ingress_port": port_in}, "I.forward", [port_out])))
-
-
-def entries(names, table, **fields):
-    return names.entry(table, {}, **fields)
 
 
 # -- arbitration --------------------------------------------------------------------------------------
@@ -291,6 +249,19 @@ def test_malformed_entries_are_invalid(target, controller, names, what):
     WRONG[what](entity.table_entry)
     assert codes(lambda: controller.write(insert(entity))) == [INVALID]
     assert controller.read(entries(names, "I.flows")) == []
+
+
+def test_an_entry_with_a_wrong_meter_is_not_inserted(target, controller, names):
+    if differs(target, "meter-check"):
+        return
+    wrong = flow(names)
+    wrong.table_entry.meter_config.cir, wrong.table_entry.meter_config.pir = 9, 3
+    assert codes(lambda: controller.write(insert(wrong))) == [INVALID]
+    assert controller.read(entries(names, "I.flows")) == []
+    controller.write(insert(flow(names)))
+    wrong.table_entry.action.action.params[0].value = b"\x03"
+    assert codes(lambda: controller.write(modify(wrong))) == [INVALID]
+    assert controller.read(entries(names, "I.flows")) == [flow(names)]
 
 
 def test_a_full_table_is_exhausted(target, controller, names):

@@ -9,6 +9,7 @@ from dataplane.ports import MemoryPort
 from dataplane.switch import Result
 from tests.dataplane.controller import Controller, Names, insert, program_config
 from tests.dataplane.embedded import Embedded
+from tests.requirements import require_program
 
 PUNT = 15
 PROGRAM = Path(__file__).parent / "programs" / "features"
@@ -158,3 +159,26 @@ def test_time_comes_with_the_frames(lossless):
         port.inject(frame(), time_us=60_000_001)
         told = controller.others.get(timeout=10)
         assert told.table_entry[0].idle_timeout_ns == 60 * 10**9
+
+
+@pytest.mark.parametrize("backend", ["python", "c"])
+def test_an_entry_s_age_begins_when_it_is_written(backend):
+    """Also on a pipeline that has not seen a frame yet, in the middle of a capture."""
+    port = MemoryPort(lossless=True)
+    if backend == "c":
+        require_program("gcc")
+    with Embedded(ports={1: port}, driven=True, backend=backend) as switch, primary(switch) as controller:
+        config = program_config(PROGRAM)
+        controller.set_pipeline(config)
+        port.inject(frame(), time_us=500_000_000)
+        controller.packets.get(timeout=10)
+        controller.set_pipeline(config)
+        entry = Names(config.p4info).entry(
+            "I.route", {"h.ip.dst": (1, 32)}, "I.drop", idle_timeout_ns=60 * 10**9
+        )
+        controller.write(insert(entry))
+        port.inject(frame(), time_us=559_000_000)
+        controller.packets.get(timeout=10)
+        assert controller.others.empty()
+        port.inject(frame(), time_us=560_000_001)
+        assert len(controller.others.get(timeout=10).table_entry) == 1

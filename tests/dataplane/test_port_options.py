@@ -38,9 +38,14 @@ def test_what_is_no_port_is_refused(option):
         open_ports([option], 510, lambda: 0)
 
 
-def test_a_number_given_twice_is_refused_and_the_first_port_closed(tmp_path):
+def test_a_number_given_twice_is_refused():
     with pytest.raises(PortError, match="twice"):
-        open_ports([f"1=capture:{tmp_path}/s", "1=null"], 510, lambda: 0)
+        open_ports(["1=null", "1=null"], 510, lambda: 0)
+
+
+def test_ports_opened_before_one_that_fails_are_closed(tmp_path):
+    with pytest.raises(PortError, match="cannot read"):
+        open_ports([f"1=capture:{tmp_path}/s", f"2=pcap:{tmp_path}/none"], 510, lambda: 0)
     assert not (tmp_path / "s").exists()
 
 

@@ -1,6 +1,7 @@
 """Coroutines receive in order, and a slow one holds the dispatcher back instead of piling items up."""
 
 import asyncio
+from typing import Any
 
 from due import NO_WAIT, PUB_ONLY
 from due.aio import items
@@ -11,7 +12,7 @@ def test_a_coroutine_receives_items_in_order(make_engine):
     engine = make_engine("async")
 
     async def main():
-        got = []
+        got: list[Any] = []
         stream = items(engine, "t.aio", most=10)
         first = asyncio.ensure_future(anext(stream))
         while not first.done():

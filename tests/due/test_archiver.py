@@ -16,7 +16,7 @@ class Shelf:
     """An archive in memory that can be away or refuse."""
 
     def __init__(self) -> None:
-        self.items = {}
+        self.items: dict[int, Item] = {}
         self.problem = None
         self.calls = 0
         self.open = threading.Event()
@@ -121,7 +121,12 @@ def test_what_the_archive_refuses_is_counted_and_does_not_stop_the_rest(shelf, c
 def test_a_full_queue_makes_the_writer_wait(shelf):
     shelf.open.clear()
     archiver = Archiver(shelf, queue_bytes=3000)
-    writer = threading.Thread(target=lambda: [archiver.put(_frame(n)) for n in range(0, 100, 10)])
+
+    def write():
+        for first in range(0, 100, 10):
+            archiver.put(_frame(first))
+
+    writer = threading.Thread(target=write)
     writer.start()
     wait_for(lambda: archiver.statistics()["held_back"] > 0)
     assert writer.is_alive()

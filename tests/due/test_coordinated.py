@@ -4,6 +4,7 @@ The Coordinator here is a scripted one that says what the test wants; the real o
 """
 
 import time
+from typing import Any
 
 import pytest
 
@@ -21,8 +22,8 @@ class Script:
     def __init__(self, engine) -> None:
         self.engine = engine
         self.registrations: dict[str, Registration] = {}
-        self.heartbeats = []
-        self.say: dict[str, dict] = {}
+        self.heartbeats: list[Any] = []
+        self.say: dict[str, dict[str, Any]] = {}
         self.version = 0
         self.sent: dict[str, int] = {}
         engine.observe("due.registration.*").subscribe(self._registered)
@@ -61,7 +62,7 @@ def _wants(key, frequency=None, epoch=1):
 
 def test_items_written_before_the_handshake_are_kept_in_order(make_engine, script):
     consumer = make_engine("early_reader")
-    got = []
+    got: list[Any] = []
     consumer.observe("t.early.**").subscribe(lambda item: got.append(item.value))
     engine = make_engine(
         "early", init={"capabilities": [Capability("t.early.**", delivery="reliable")]}, **FAST
@@ -80,7 +81,7 @@ def test_without_an_answer_items_go_out_as_if_wanted(make_engine):
     engine = make_engine(
         "alone", init={"capabilities": [Capability("t.alone")]}, coordinated=True, handshake_timeout=0.2
     )
-    got = []
+    got: list[Any] = []
     engine.observe("t.alone").subscribe(lambda item: got.append(item.value))
     assert engine.write("t.alone", 1)
     wait_for(lambda: got == [1])
@@ -122,7 +123,7 @@ def test_interests_are_registered_and_withdrawn(make_engine, script):
 
 def test_writes_keep_the_assigned_pace(make_engine, script):
     reader = make_engine("paced_reader")
-    got = []
+    got: list[Any] = []
     reader.observe("t.pace.*").subscribe(got.append)
     capabilities = [Capability("t.pace.latest"), Capability("t.pace.queue", pacing="queue")]
     engine = make_engine("paced", init={"capabilities": capabilities}, **FAST)
@@ -175,7 +176,7 @@ def test_frames_of_an_older_epoch_are_dropped_and_counted(make_engine):
     from due.codec import Frame, encode_frame
 
     engine = make_engine("fence")
-    got = []
+    got: list[Any] = []
     engine.observe("t.fence").subscribe(lambda item: got.append(item.value))
     publisher = engine._session.publisher
     sent = ((4, "old", 0), (5, "new", 0), (4, "old", 1), (5, "new", 1))

@@ -3,11 +3,12 @@
 import os
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import pytest
 
-from due import CONSUMER, DB_ONLY, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, RecordBatch
+from due import CONSUMER, DB_ONLY, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Item, RecordBatch
 from due.errors import InvalidKey, InvalidOption, NotAllowed, NotInitialised, UnsupportedValue
 from tests.due.conftest import wait_for
 
@@ -17,7 +18,7 @@ RELIABLE = {"capabilities": [Capability("t.**", delivery="reliable")]}
 @pytest.mark.parametrize("init", [{}, RELIABLE], ids=["best_effort", "reliable"])
 def test_items_arrive_in_order_with_types_and_times(make_engine, init):
     producer, consumer = make_engine("producer", init=init), make_engine("consumer")
-    got = []
+    got: list[Any] = []
     consumer.observe("t.order.producer").subscribe(got.append)
     values = [None, 7, 1.5, "text", b"bytes", {"a": [1, np.arange(3)]}, b"x" * 10_000]
     for number in range(300):
@@ -36,7 +37,7 @@ def test_items_arrive_in_order_with_types_and_times(make_engine, init):
 @pytest.mark.parametrize("init", [{}, RELIABLE], ids=["best_effort", "reliable"])
 def test_a_record_batch_travels_whole(make_engine, init):
     producer, consumer = make_engine("batcher", init=init), make_engine("batch_reader")
-    got = []
+    got: list[Any] = []
     consumer.observe("t.batch.**").subscribe(got.append)
     batch = RecordBatch({"time_us": np.arange(10_000), "mac": np.full(10_000, b"abcdef")})
     producer.write("t.batch.batcher", batch, [PUB_ONLY])
@@ -47,7 +48,9 @@ def test_a_record_batch_travels_whole(make_engine, init):
 @pytest.mark.parametrize("init", [{}, RELIABLE], ids=["best_effort", "reliable"])
 def test_wildcards_and_specs_select_and_no_item_comes_twice(make_engine, init):
     producer, consumer = make_engine("selected", init=init), make_engine("selector")
-    got = {key: [] for key in ("t.w.*.a", "t.w.**", "t.w.x.a:flag=syn", "t.*.x.a:flag=*", "t.w.x.b")}
+    got: dict[str, list[Any]] = {
+        key: [] for key in ("t.w.*.a", "t.w.**", "t.w.x.a:flag=syn", "t.*.x.a:flag=*", "t.w.x.b")
+    }
     for key, items in got.items():
         consumer.observe(key).subscribe(lambda item, items=items: items.append(item.key))
     written = ["t.w.x.a:flag=syn,dst=1", "t.w.x.a:flag=ack", "t.w.x.a", "t.w.y.a", "t.w.x.b.c"]
@@ -65,7 +68,7 @@ def test_wildcards_and_specs_select_and_no_item_comes_twice(make_engine, init):
 
 def test_flags_choose_the_backend(make_engine):
     engine = make_engine("flags")
-    got = []
+    got: list[Any] = []
     engine.observe("t.flags.**").subscribe(got.append)
     engine.write("t.flags.both", 1)
     engine.write("t.flags.pub", 2, [PUB_ONLY])
@@ -95,7 +98,7 @@ def test_get_finds_what_was_just_written(make_engine):
 
 def test_a_no_wait_item_carries_what_waited_before_it(make_engine):
     engine = make_engine("hasty", linger=30.0)
-    got = []
+    got: list[Any] = []
     engine.observe("t.hasty").subscribe(lambda item: got.append(item.value))
     engine.write("t.hasty", 1, [PUB_ONLY])
     engine.write("t.hasty", 2, [PUB_ONLY, NO_WAIT])
@@ -105,7 +108,7 @@ def test_a_no_wait_item_carries_what_waited_before_it(make_engine):
 
 def test_a_failing_callback_does_not_stop_the_others(make_engine, caplog):
     engine = make_engine("careless")
-    got = []
+    got: list[Any] = []
     engine.observe("t.fail").subscribe(lambda item: 1 / item.value)
     engine.observe("t.fail").subscribe(lambda item: got.append(item.value))
     for value in (0, 1, 0, 2):
@@ -141,7 +144,7 @@ def test_reliable_items_are_tried_again_and_then_set_aside(make_engine):
 
 def test_observers_may_come_and_go(make_engine):
     producer, consumer = make_engine("constant"), make_engine("visitor")
-    got = []
+    got: list[Any] = []
     subject = consumer.observe("t.visit")
     first, second = subject.subscribe(got.append), subject.subscribe(got.append)
     producer.write("t.visit", 1, [NO_WAIT, PUB_ONLY])
@@ -157,14 +160,22 @@ def test_observers_may_come_and_go(make_engine):
     assert consumer.health()["receiving"]["gaps"] == 0
 
 
+def _value(item: Item) -> int:
+    return int(item.value)
+
+
+def _even(value: int) -> bool:
+    return value % 2 == 0
+
+
 def test_reactive_operators_work(make_engine):
     import reactivex.operators as ops
 
     engine = make_engine("reactive")
-    got = []
-    engine.observe("t.rx").pipe(
-        ops.map(lambda item: item.value), ops.filter(lambda v: v % 2 == 0), ops.buffer_with_count(2)
-    ).subscribe(got.append)
+    got: list[Any] = []
+    engine.observe("t.rx").pipe(ops.map(_value), ops.filter(_even), ops.buffer_with_count(2)).subscribe(
+        got.append
+    )
     for value in range(8):
         engine.write("t.rx", value, [PUB_ONLY])
     wait_for(lambda: len(got) == 2)
@@ -173,7 +184,7 @@ def test_reactive_operators_work(make_engine):
 
 def test_many_threads_may_write(make_engine):
     engine = make_engine("threads", init=RELIABLE)
-    got = []
+    got: list[Any] = []
     engine.observe("t.threads").subscribe(got.append)
 
     def work(name):
@@ -194,7 +205,7 @@ def test_many_threads_may_write(make_engine):
 
 def test_a_callback_may_write_get_and_observe(make_engine):
     engine = make_engine("nested")
-    got = []
+    got: list[Any] = []
 
     def echo(item):
         if item.value == 1:
@@ -229,7 +240,7 @@ def test_what_goes_wrong_is_said_at_once(make_engine):
 
 def test_a_forked_child_speaks_for_itself(make_engine):
     engine = make_engine("parent")
-    got = []
+    got: list[Any] = []
     engine.observe("t.fork").subscribe(got.append)
     engine.write("t.fork", "before", [PUB_ONLY, NO_WAIT])
     child = os.fork()
@@ -248,7 +259,7 @@ def test_a_forked_child_speaks_for_itself(make_engine):
 
 def test_close_sends_what_waits_and_may_be_repeated(make_engine):
     writer, reader = make_engine("leaver", linger=30.0), make_engine("stayer")
-    got = []
+    got: list[Any] = []
     reader.observe("t.close").subscribe(got.append)
     writer.write("t.close", 1)
     writer.close()

@@ -34,7 +34,7 @@ def test_the_node_client_has_at_most_150_lines():
     assert len((EXAMPLES / "client.mjs").read_text().splitlines()) <= 150
 
 
-def _start(name: str, server, folder: Path) -> subprocess.Popen:
+def _start(name: str, server, folder: Path) -> subprocess.Popen[str]:
     environment = {
         "DUE_UPDATES": server.url,
         "DUE_ARCHIVE": f"sqlite://{folder / 'a.db'}",

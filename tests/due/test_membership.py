@@ -49,6 +49,7 @@ def test_it_registers_and_beats_at_its_rate():
     member.declare(0.6, interests=(Interest("a.b"),))
     assert member.next_tick() == 0.6
     (registration,) = member.tick(0.6)
+    assert isinstance(registration, Registration)
     assert (registration.revision, registration.interests) == (2, (Interest("a.b"),))
 
 

@@ -18,10 +18,13 @@ KINDS = ("embedded", "bmv2")
 class Target:
     """A switch process that can be killed and started again on the same address."""
 
-    def __init__(self, kind: str, folder: Path, *, ports: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, kind: str, folder: Path, *, ports: tuple[str, ...] = (), more: tuple[str, ...] = ()
+    ) -> None:
         self.kind = kind
         self.folder = folder
         self._ports = ports
+        self._more = more
         self._program = sys.executable if kind == "embedded" else optional_program("simple_switch_grpc")
         self._port = free_port()
         self._process: subprocess.Popen[str] | None = None
@@ -35,7 +38,7 @@ class Target:
         if self.kind == "embedded":
             ports = [part for port in self._ports for part in ("--port", port)]
             return [self._program, "-m", "dataplane", "--grpc", self.address, "--device-id", "1",
-                    "--cpu-port", "510", *ports]  # fmt: skip
+                    "--cpu-port", "510", *ports, *self._more]  # fmt: skip
         veths = [port.replace("=veth:", "@") for port in self._ports if "=veth:" in port]
         ports = [part for veth in veths for part in ("-i", veth)]
         return [self._program, "--no-p4", "--device-id", "1", "--thrift-port", str(free_port()), "-L", "off",

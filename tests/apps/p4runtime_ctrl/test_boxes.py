@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.p4runtime_ctrl.boxes import Bits, Box, Shape, Span, closure
+from apps.p4runtime_ctrl.boxes import Bits, Box, Closure, Covering, Shape, Span
 from apps.p4runtime_ctrl.errors import EntryError, TelemetryError
 from tests.apps.p4runtime_ctrl.programs import program
 
@@ -38,18 +38,30 @@ def test_a_box_inside_another_is_narrower(one, other):
         assert sum(s.narrowness() for s in one.sides) > sum(s.narrowness() for s in other.sides)
 
 
-@given(st.lists(boxes, max_size=5))
-def test_the_closure_holds_every_intersection(some):
-    found = closure(some, limit=10_000, where="here")
+@given(st.lists(boxes, max_size=5), st.integers(0, 5))
+def test_the_closure_holds_every_intersection_however_it_came_about(some, first):
+    growing = Closure(limit=10_000, where="here")
+    growing.of(some[:first])
+    found = growing.of(some)
+    assert set(Closure(limit=10_000, where="here").of(some)) == set(found)
+    assert growing.of(some[first:]) is not None
+    assert set(growing.of(some)) == set(found)
     sets = {frozenset(inside(box)) for box in found}
     assert all(not (a & b) or a & b in sets for a in sets for b in sets)
     assert all(frozenset(inside(box)) in sets for box in some)
     assert len(found) == len(set(found))
 
 
+@given(st.lists(boxes, max_size=8, unique=True), boxes)
+def test_covering_finds_the_same_as_looking_at_each(some, box):
+    bits = {each: 1 << place for place, each in enumerate(some)}
+    naive = sum(bit for each, bit in bits.items() if each.covers(box))
+    assert Covering(bits).bits(box) == naive
+
+
 def test_a_table_that_is_too_small_is_named():
     with pytest.raises(TelemetryError, match="here has room for 2 conditions"):
-        closure([Box((Bits(0, 1 << n),)) for n in range(3)], limit=2, where="here")
+        Closure(limit=2, where="here").of([Box((Bits(0, 1 << n),)) for n in range(3)])
 
 
 def test_shapes_speak_the_notation_of_table_updates():

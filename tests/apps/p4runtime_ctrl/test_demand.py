@@ -46,13 +46,12 @@ def test_ports_have_requests_of_their_own():
 def test_offers_are_sent_only_while_observed():
     offers = {
         "scan": Offer(name="scan", bit=4, conditions={"dport": 23}),
-        "count": Offer(name="count", bit=5, copy=False),
         "gone": Offer(name="gone", bit=6, active=False),
         "elsewhere": Offer(name="elsewhere", bit=7, switch="s2", copy=False),
         "report": Offer(name="report", bit=8, copy=False, digest=True),
     }
-    assert names(demand_for("s1", [f"{KEY}.**"], offers)) == [("packets", 255), ("count", 5)]
+    assert names(demand_for("s1", [f"{KEY}.**"], offers)) == [("packets", 255)]
     demand = demand_for("s1", [f"{KEY}.s1.scan", f"{KEY}.s1.gone", key_of("digests", "*", "report")], offers)
-    assert names(demand) == [("report", 8), ("count", 5), ("scan", 4)]
+    assert names(demand) == [("report", 8), ("scan", 4)]
     assert demand.to("packets") == {"scan": 4}
     assert demand.to("digests") == {"report": 8}

@@ -3,7 +3,6 @@
 import os
 import socket
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -14,6 +13,8 @@ from tests.apps.p4runtime_ctrl.targets import KINDS
 from tests.requirements import optional_program, require_netns
 
 COUNT = 500
+WINDOW = 25
+"""Frames in flight: few enough for BMv2 on a busy machine."""
 
 
 @pytest.fixture
@@ -45,9 +46,9 @@ def test_frames_of_an_interface(kind, telemetry, veth, tmp_path):
             wire.bind((near, 0))
             for number in range(COUNT):
                 wire.send(frame(1 + number % 200))
-                if number % 10 == 0:
-                    time.sleep(0.005)
-        wait_for(lambda: len(heard.arrivals()) == COUNT, why=lambda: (len(heard.arrivals()), heard.values("switch")[-1], np.diff(heard.arrivals().astype(int)).max(), heard.arrivals()[-1]))
+                if number % WINDOW == WINDOW - 1:
+                    sent = number + 1
+                    wait_for(lambda: len(heard.arrivals()) == sent, why=stage.log)  # noqa: B023 - run at once
         batches = [item.value for item in heard.items if item.key == PACKETS]
         got = {name: np.concatenate([batch[name] for batch in batches]) for name in PACKET_COLUMNS}
         assert got["sequence"].tolist() == list(range(1, COUNT + 1))

@@ -1,7 +1,7 @@
 """A switch is brought to its desired state whatever happened to it, and every decision is confirmed."""
 
 from apps.messages import Decision, TableCommand, TableUpdate, Target
-from apps.p4runtime_ctrl.desired_state import DELETE, INSERT, EntrySet, is_standing
+from apps.p4runtime_ctrl.desired_state import DELETE, INSERT, MODIFY, EntrySet, is_standing
 from apps.p4runtime_ctrl.errors import Unreachable
 from apps.p4runtime_ctrl.switch import Outcome, Switch
 from apps.p4runtime_ctrl.telemetry import Request
@@ -55,6 +55,8 @@ class Held:
         elif change.kind == INSERT:
             if change.entry in self.entries:
                 return Outcome(6, "it exists")
+            self.entries.put(change.entry)
+        elif change.kind == MODIFY:
             self.entries.put(change.entry)
         elif change.kind == DELETE and not self.entries.discard(change.entry):
             return Outcome(5, "there is no such entry")
@@ -213,6 +215,29 @@ def test_commands_are_confirmed_update_by_update():
     answers = switch.command(TableCommand(id="c2", updates=(good, gone)), held)
     assert said(answers) == [("c2", "installed"), ("c2", "removed")]
     assert held.names() == {"ingress.allow[src=10.0.0.7]@3"}
+
+
+def test_an_insert_never_changes_what_is_there():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+
+    def wire(kind, port):
+        update = TableUpdate(
+            kind=kind,
+            table="forward_port",
+            match={"ingress_port": 5},
+            action="to_port",
+            params={"port": port},
+        )
+        (answer,) = switch.command(TableCommand(id="c", updates=(update,)), held)
+        return answer.state, answer.cause
+
+    assert wire("insert", 6) == ("installed", "")
+    assert wire("insert", 6) == ("exists", "it exists")
+    state, cause = wire("insert", 7)
+    assert (state, "use modify" in cause) == ("exists", True)
+    assert str(switch.bring_up(held)) == "nothing to change"
+    assert wire("modify", 7) == ("installed", "")
 
 
 def test_a_command_may_not_touch_the_classifier():

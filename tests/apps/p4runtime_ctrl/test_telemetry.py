@@ -119,7 +119,7 @@ def test_every_packet_meets_exactly_its_requests(requests, some):
 def test_no_packet_sees_half_a_request_during_a_change(before, after, some):
     kept = [request for request in after if request in before]
     state = EntrySet(CLASSIFIER.entries(before))
-    changes = CLASSIFIER.transition(state, after, kept)
+    changes = CLASSIFIER.transition(state, CLASSIFIER.entries(after), kept)
     for place, change in enumerate(changes, start=1):
         if change.kind == DELETE:
             assert state.discard(change.entry)
@@ -145,9 +145,9 @@ def test_a_request_comes_in_with_active_last_and_leaves_with_active_first():
     nothing = CLASSIFIER.entries([])
     request = Request(name="packets", bit=255)
     active = program().table("telemetry_active").id
-    coming = CLASSIFIER.transition(nothing, [request], kept=[])
+    coming = CLASSIFIER.transition(nothing, CLASSIFIER.entries([request]), kept=[])
     assert [change.entry.table_id == active for change in coming] == [False] * (len(coming) - 1) + [True]
-    going = CLASSIFIER.transition(CLASSIFIER.entries([request]), [], kept=[])
+    going = CLASSIFIER.transition(CLASSIFIER.entries([request]), nothing, kept=[])
     assert [change.entry.table_id == active for change in going] == [True] + [False] * (len(going) - 1)
 
 

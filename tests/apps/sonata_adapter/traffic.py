@@ -85,8 +85,8 @@ def connection(
         yield Frame(start + place * 1500, max(60, len(data)), data)
 
 
-def office(seconds: float, rng: random.Random, start: int = BASE_US) -> list[Frame]:
-    """Ten clients, two servers, DNS, IPv6, ARP and broken frames."""
+def office(seconds: float, rng: random.Random, start: int = BASE_US, *, long: bool = False) -> list[Frame]:
+    """Ten clients, two servers, DNS, IPv6, ARP and broken frames; `long`: connections as long as real ones."""
     frames: list[Frame] = []
     end = start + int(seconds * 1e6)
     now = start
@@ -95,10 +95,10 @@ def office(seconds: float, rng: random.Random, start: int = BASE_US) -> list[Fra
         client, server = f"10.0.0.{rng.randrange(10, 20)}", f"192.0.2.{rng.randrange(1, 3)}"
         kind = rng.random()
         if kind < 0.4:
-            sizes = [rng.randrange(40, 1200) for _ in range(rng.randrange(2, 6))]
-            frames += connection(
-                now, client, server, rng.randrange(20_000, 60_000), rng.choice((80, 443, 22)), sizes
-            )
+            turns = int(min(400.0, 4 * rng.paretovariate(0.9))) if long else rng.randrange(2, 6)
+            sizes = [rng.randrange(40, 1200) for _ in range(turns)]
+            service = rng.choices((443, 80, 22), (70, 28, 2))[0] if long else rng.choice((80, 443, 22))
+            frames += connection(now, client, server, rng.randrange(20_000, 60_000), service, sizes)
         elif kind < 0.6:
             name = f"{rng.choice(('www', 'mail', 'api'))}.example{rng.randrange(4)}.org"
             port = rng.randrange(20_000, 60_000)

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -51,7 +51,7 @@ class Program:
 
 
 @pytest.fixture
-def programs(tmp_path) -> Iterator:
+def programs(tmp_path) -> Iterator[Callable[..., Program]]:
     started = []
 
     def start(*arguments, **options):

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Callable
 
 from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Options
 
@@ -19,7 +20,11 @@ def _engine(url: str, app: str, role=PRODUCER | CONSUMER, **init) -> Engine:
 
 def produce(url: str, delivery: str, count: str, size: str) -> None:
     """Write numbered payloads and say where we are; the last line says that all is flushed."""
-    engine = _engine(url, "maker", capabilities=[Capability(KEY, delivery=delivery)])
+    engine = _engine(
+        url,
+        "maker",
+        capabilities=[Capability(KEY, delivery="reliable" if delivery == "reliable" else "best_effort")],
+    )
     padding = b"." * int(size)
     for number in range(int(count)):
         engine.write(KEY, [number, padding], [PUB_ONLY])
@@ -85,4 +90,10 @@ def listen(url: str) -> None:
 
 
 if __name__ == "__main__":
-    {"produce": produce, "consume": consume, "speak": speak, "listen": listen}[sys.argv[1]](*sys.argv[2:])
+    programs: dict[str, Callable[..., None]] = {
+        "produce": produce,
+        "consume": consume,
+        "speak": speak,
+        "listen": listen,
+    }
+    programs[sys.argv[1]](*sys.argv[2:])

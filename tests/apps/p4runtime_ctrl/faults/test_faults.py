@@ -181,3 +181,19 @@ def test_what_happens_to_traffic_without_a_controller_is_configured(tmp_path, fa
         stage.controller()
         assert verdicts(feed, [4]) == [FORWARDED]
         feed.close()
+
+
+def test_the_switch_falls_silent_and_comes_to(stage):
+    stage.controller(timeout_s=1.0)
+    firewall = Firewall(stage)
+    wait_for(lambda: firewall.state().get("telemetry") == ["packets"], why=stage.log)
+    firewall.decide(1)
+    stage.target.pause()
+    wait_for(lambda: firewall.state()["connected"] is False, why=stage.log)
+    late = firewall.decide(2, wait="failed")
+    stage.target.resume()
+    wait_for(lambda: {(late, "installed"), (late, "exists")} & set(firewall.said()), why=stage.log)
+    feed = stage.feed()
+    wait_for(lambda: verdicts(feed, [1, 2, 3]) == [BLOCKED, BLOCKED, FREE], why=stage.log)
+    assert "program loaded" not in firewall.state()["change"]
+    feed.close()

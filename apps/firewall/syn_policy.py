@@ -1,0 +1,87 @@
+"""A SYN flood towards a service: block its senders, or protect the service?  Pure rules.
+
+Blocking helps where few addresses send nearly everything and each of them again and again.  Spoofed
+floods have almost one address per SYN: there only the SYN guard helps.  An address that has completed
+handshakes before, or is on the allow-list, is never blocked, since anybody can write it into a SYN.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+
+from apps.firewall.policy import AllowList
+from apps.firewall.services import Service
+
+
+class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the operator can set about SYN floods."""
+
+    threshold: int = 100
+    """Half-open connections that come up within a window towards one host: a flood is suspected."""
+    window_ms: int = 200
+    """Length of that window."""
+    sample: int = 600
+    """SYNs looked at before it is decided."""
+    sample_ms: int = 150
+    """... but no longer than this, wall time."""
+    repeats: int = 4
+    """A source repeats when it sent this many unanswered SYNs of the sample."""
+    share: float = 0.9
+    """Repeating sources are blocked if this share of the sample is theirs."""
+    sources: int = 200
+    """... and they are no more than this."""
+    protect_s: int = 3600
+    """A service is protected for this long after a flood; services of the settings always."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """SYNs towards a service that no handshake has followed, by source."""
+
+    service: Service
+    syns: Mapping[str, int]
+
+    @property
+    def total(self) -> int:
+        return sum(self.syns.values())
+
+
+@dataclass(frozen=True)
+class SynVerdict:
+    """What to do; `block` names the sources, `protect` is the service's guard."""
+
+    kind: Literal["nothing", "block", "protect", "block and protect"]
+    block: tuple[str, ...]
+    reason: str
+
+    @property
+    def protects(self) -> bool:
+        return self.kind in ("protect", "block and protect")
+
+
+def judge_syns(sample: Sample, rules: SynRules, allow: AllowList, known: Collection[str]) -> SynVerdict:
+    """Which defence follows from the number and repetition of sources."""
+    total = sample.total
+    if total < rules.repeats:
+        return SynVerdict("nothing", (), f"{total} unfinished SYNs towards {sample.service} are no flood")
+    repeating = {source: count for source, count in sample.syns.items() if count >= rules.repeats}
+    theirs = sum(repeating.values())
+    what = f"{total:,} unfinished SYNs from {len(sample.syns):,} sources towards {sample.service}"
+    share = f"{len(repeating):,} of the sources repeat and sent {theirs / total:.0%}"
+    if theirs < rules.share * total:
+        return SynVerdict(
+            "protect", (), f"{what}; {share}: spoofed or too many to block, so the service is guarded"
+        )
+    if len(repeating) > rules.sources:
+        return SynVerdict("protect", (), f"{what}; {share}: too many to block, so the service is guarded")
+    spared = sorted(source for source in repeating if source in known or allow.covers_address(source))
+    block = tuple(sorted(repeating.keys() - set(spared)))
+    if not spared:
+        return SynVerdict("block", block, f"{what}; {share}: these are blocked")
+    names = ", ".join(spared[:3])
+    excuse = f"{names} may be forged (known or allowed), so the service is guarded"
+    if not block:
+        return SynVerdict("protect", (), f"{what}; {share}: {excuse}")
+    return SynVerdict("block and protect", block, f"{what}; {share}: blocked but for {len(spared)}; {excuse}")

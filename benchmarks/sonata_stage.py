@@ -1,0 +1,180 @@
+"""The adapter among real processes, for benchmarks: declare keys, play frames, collect results."""
+
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any
+
+from apps.sonata_adapter.catalogue import CATALOGUE
+from due import Item
+from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, end, wait_for
+from tests.apps.sonata_adapter.traffic import Frame
+from tests.naive import sonata
+
+PREFIX = "network.traffic_query.sonata"
+QUERIES = {name: f"{PREFIX}.{name}" for name in CATALOGUE}
+_BLOCK = 512
+_IN_FLIGHT = 20_000
+_PACE_S = 0.002
+
+
+class SonataStage(Stage):
+    """Switch, controller, Coordinator and adapter; `with SonataStage(folder) as stage`."""
+
+    base_us = BASE_US
+
+    def __enter__(self) -> "SonataStage":
+        super().__enter__()
+        self._adapter = self.run("apps.sonata_adapter.service", {"base_us": {"s1": BASE_US}})
+        self.controller()
+        self._observer = self.engine("observer")
+        self._states = Heard(self._observer, "network.switch.p4runtime_ctrl.s1")
+        self._health = Heard(self._observer, "due.health.sonata_adapter")
+        self._results: list[Item] = []
+        self._feed = self.feed()
+        self.tuples: dict[str, int] = {}
+        wait_for(lambda: self._states.values("network.switch"))
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self._feed.close()
+        super().__exit__(*details)
+
+    @property
+    def _telemetry(self) -> list[str]:
+        states = self._states.values("network.switch")
+        return list(states[-1]["telemetry"]) if states else []  # type: ignore[call-overload]
+
+    def declare(self, keys: Iterable[str]) -> None:
+        """Observe keys; returns when the switch has all that they need."""
+        for key in keys:
+            self._observer.observe(key).subscribe(self._results.append)
+        wait_for(self._settled, 60, self.log)
+
+    def _settled(self) -> bool:
+        """The adapter's bits are those that the switch has."""
+        health = self._health.values("health")
+        bits = health[-1]["app"]["bits"] if health else 0  # type: ignore[index]
+        return bool(bits) and len(self._telemetry) == bits
+
+    def play(self, frames: Iterable[Frame]) -> int:
+        """Send all frames, times from the first one's second; returns their number."""
+        rest = iter(frames)
+        zero: int | None = None
+        sent = done = 0
+        while part := list(islice(rest, _BLOCK)):
+            zero = part[0].time_us // 10**6 * 10**6 if zero is None else zero
+            self._feed.send(
+                [f.time_us - zero for f in part], [f.length for f in part], [f.data for f in part]
+            )
+            sent += len(part)
+            done += len(self._feed.verdicts())
+            while sent - done > _IN_FLIGHT:
+                time.sleep(0.001)
+                done += len(self._feed.verdicts())
+        while done < sent:
+            time.sleep(0.01)
+            done += len(self._feed.verdicts())
+        return sent
+
+    def finish(self) -> dict[str, list[dict[str, Any]]]:
+        """Wait until all is quiet, end the adapter, and give the results by query."""
+        self._health.items.clear()
+        wait_for(self._quiet, 120)
+        last: Any = self._health.values("health")[-1]
+        found = {key.partition(":")[0].rpartition(".")[2]: n for key, n in last["app"]["tuples"].items()}
+        self.tuples = {name: found.get(name, 0) for name in CATALOGUE}
+        written = last["app"]["results"]
+        end(self._adapter)
+        wait_for(lambda: len(self._results) >= written)
+        time.sleep(1)
+        results: dict[str, list[dict[str, Any]]] = {name: [] for name in CATALOGUE}
+        for item in list(self._results):
+            results[item.key.partition(":")[0].rpartition(".")[2]].append(dict(item.value))
+        return results
+
+    def _quiet(self) -> bool:
+        values: Any = self._health.values("health")[-3:]
+        counts = [(v["app"]["host_packets"], v["app"]["reports"], v["app"]["results"]) for v in values]
+        return len(counts) == 3 and len(set(counts)) == 1
+
+    @contextmanager
+    def traffic(self, frames: Iterator[bytes]) -> Iterator[None]:
+        """Frames on the wall clock, without end."""
+        stop = threading.Event()
+        self._sent = self._done = 0
+        self._forwarded = 0
+
+        def run() -> None:
+            begin = time.monotonic()
+            while not stop.wait(_PACE_S):
+                part = list(islice(frames, 10))
+                now = int((time.monotonic() - begin) * 1e6)
+                self._feed.send([now] * len(part), [60] * len(part), part)
+                self._sent += len(part)
+                self._count()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+    def _count(self) -> None:
+        verdicts = self._feed.verdicts()
+        self._done += len(verdicts)
+        self._forwarded += sum(verdict >> 1 & 1 for verdict in verdicts)
+
+    def first_result(self, query: str) -> float:
+        """Seconds from declaring a key to its first result."""
+        found = threading.Event()
+        begin = time.monotonic()
+        subscription = self._observer.observe(f"{PREFIX}.{query}").subscribe(lambda _item: found.set())
+        assert found.wait(30), self.log()
+        took = time.monotonic() - begin
+        subscription.dispose()
+        wait_for(lambda: not self._telemetry, 30, self.log)
+        return took
+
+    def lost_while_changing(self, queries: Iterable[str]) -> int:
+        """Frames that were not forwarded while queries were added, one by one, and removed."""
+        before = self._sent, self._forwarded
+        subscriptions = []
+        for query in queries:
+            subscriptions.append(self._observer.observe(f"{PREFIX}.{query}").subscribe(lambda _item: None))
+            time.sleep(0.01)
+        wait_for(self._settled, 60, self.log)
+        for subscription in subscriptions:
+            subscription.dispose()
+            time.sleep(0.005)
+        wait_for(lambda: not self._telemetry, 60, self.log)
+        sent = self._sent
+        wait_for(lambda: self._done >= sent, 60)
+        return max(0, sent - before[0] - (self._forwarded - before[1]))
+
+
+def equal_to_naive(
+    frames: Sequence[Frame], results: dict[str, list[dict[str, Any]]], base_us: int
+) -> list[str]:
+    """Queries whose results differ from the naive evaluator's."""
+    zero = frames[0].time_us // 10**6 * 10**6
+    packets = [sonata.read(frame.time_us - zero, frame.length, frame.data) for frame in frames]
+    wrong = []
+    for name, template in CATALOGUE.items():
+        parameters = {each.name: each.default for each in template.parameters}
+        truth = {(found.window, found.fields) for found in sonata.evaluate(name, packets, parameters)}
+        length_ns = int(parameters["window"]) * 10**6
+        mine = [_row(value, length_ns, base_us) for value in results[name]]
+        if len(mine) != len(set(mine)) or set(mine) != truth:
+            wrong.append(name)
+    return wrong
+
+
+def _row(value: dict[str, Any], length_ns: int, base_us: int) -> tuple[int, tuple[tuple[str, Any], ...]]:
+    known = ("window_start", "window_end", "at", "exact", "partial", "error")
+    fields = {name: found for name, found in value.items() if name not in known}
+    return (value["window_start"] - base_us * 1000) // length_ns, tuple(sorted(fields.items()))

@@ -1,0 +1,149 @@
+"""Which pipeline runs on this machine: the run file of `sdnator up`, and the folders of the product.
+
+    $XDG_STATE_HOME/sdnator   run.json, run.lock, logs, settings of the parts, spools
+    $XDG_DATA_HOME/sdnator    archive.db
+
+Who holds `run.lock` runs; the kernel lets it go even after kill -9, so a run file left behind deceives nobody.
+"""
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sdnator.errors import BadInput, PipelineError
+
+SCHEMA = 1
+"""Of the run file; grows when a reader of the old one would misunderstand it."""
+_CLAIM_SECONDS = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Running:
+    """A pipeline that runs, as its run file tells."""
+
+    pid: int
+    """Of `sdnator up`; SIGTERM ends it in order."""
+    started: int
+    """UTC, ns."""
+    updates: str
+    archive: str
+    coordinator: str
+    """URL of the HTTP API."""
+    switch: Mapping[str, Any] = field(default_factory=dict)
+    """name, address, device_id, target, ports, forward."""
+    parts: Mapping[str, int] = field(default_factory=dict)
+    """Process ids by name."""
+    logs: str = ""
+    schema: int = SCHEMA
+
+
+def state_folder() -> Path:
+    """For what one run leaves to the next or to other commands."""
+    return _xdg("XDG_STATE_HOME", ".local/state")
+
+
+def data_folder() -> Path:
+    """For what people keep."""
+    return _xdg("XDG_DATA_HOME", ".local/share")
+
+
+def default_archive() -> str:
+    """URL of the embedded archive."""
+    return f"sqlite://{quote(str(data_folder() / 'archive.db'))}"
+
+
+def _xdg(variable: str, default: str) -> Path:
+    named = Path(os.environ.get(variable, ""))
+    # the standard has relative paths ignored
+    return (named if named.is_absolute() else Path.home() / default) / "sdnator"
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Be the one pipeline of a state folder; raises PipelineError where there is one, BadInput for the folder."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(folder / "run.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise BadInput(f"{folder}: {error.strerror}; set XDG_STATE_HOME to a folder of yours") from None
+    try:
+        _lock(descriptor, folder)
+        (folder / "run.json").unlink(missing_ok=True)
+        yield
+        (folder / "run.json").unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    """Tries for a moment: commands that look hold the lock while they look."""
+    deadline = time.monotonic() + _CLAIM_SECONDS
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                raise PipelineError(
+                    f"a pipeline runs already ({folder}): stop it with `sdnator down`"
+                ) from None
+            time.sleep(0.02)
+        else:
+            return
+
+
+def write(folder: Path, running: Running) -> None:
+    """Replace the run file."""
+    new = folder / "run.json.new"
+    new.write_text(json.dumps(asdict(running), indent=2) + "\n", encoding="utf-8")
+    new.chmod(0o600)
+    new.replace(folder / "run.json")
+
+
+def is_claimed(folder: Path) -> bool:
+    """Whether a pipeline of this state folder starts, runs or stops."""
+    try:
+        descriptor = os.open(folder / "run.lock", os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    else:
+        return False
+    finally:
+        os.close(descriptor)
+
+
+def find(folder: Path | None = None) -> Running | None:
+    """The pipeline that runs, None where there is none; raises BadInput for a run file of another version."""
+    folder = folder or state_folder()
+    if not is_claimed(folder):
+        return None
+    path = folder / "run.json"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path} cannot be read ({error}): stop the pipeline and start it again") from None
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        raise BadInput(
+            f"{path} was written by another version of sdnator: stop and start the pipeline with this one"
+        )
+    return Running(**found)
+
+
+def need() -> Running:
+    """The pipeline that runs; raises PipelineError with what to do where there is none."""
+    found = find()
+    if found is None:
+        raise PipelineError("no pipeline is running: start one with `sdnator up`")
+    return found

@@ -1,0 +1,95 @@
+"""The packet thread: no fault of it goes unnoticed, and an atomic batch is never seen half."""
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from dataplane.device import Device
+from dataplane.packet_loop import PacketClock, PacketLoop
+from dataplane.ports import MemoryPort
+from tests.dataplane.controller import Controller, Names, insert, modify, program_config
+from tests.dataplane.embedded import Embedded
+
+PROGRAM = Path(__file__).parent / "programs" / "features"
+
+
+class Broken(MemoryPort):
+    def receive(self, limit):  # noqa: ARG002
+        raise RuntimeError("a fault")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_fault_ends_the_loop_loudly():
+    clock, ended = PacketClock(driven=False), threading.Event()
+    port = Broken()
+    loop = PacketLoop(Device(1, clock=clock.now), {1: port}, clock, on_end=ended.set)
+    loop.start()
+    port.inject(b"x")
+    assert ended.wait(10)
+    assert loop.failed
+    loop.stop()
+
+
+def test_stopping_is_no_fault():
+    clock, ended = PacketClock(driven=False), threading.Event()
+    loop = PacketLoop(Device(1, clock=clock.now), {1: MemoryPort()}, clock, on_end=ended.set)
+    loop.start()
+    loop.stop()
+    assert ended.is_set()
+    assert not loop.failed
+
+
+def test_frames_for_ports_that_do_not_exist_are_counted():
+    with Embedded() as switch, Controller(switch.address) as controller:
+        config = program_config(PROGRAM)
+        controller.arbitrate()
+        controller.set_pipeline(config)
+        names = Names(config.p4info)
+        controller.write(insert(names.entry("I.ports", {"sm.ingress_port": 1}, "I.forward", [99])))
+        controller.write(insert(names.entry("I.ports", {"sm.ingress_port": 2}, "I.forward", [3])))
+        switch.memory[1].inject(bytes(60))
+        switch.memory[2].inject(bytes(60))
+        while not switch.memory[3].outgoing:
+            pass
+        assert switch.device.pipeline.switch.statistics()["no_such_port"] == 1
+
+
+def test_no_frame_sees_half_of_an_atomic_batch():
+    """One of two tables drops every frame, in turns; only a half batch would let a frame through."""
+    with Embedded() as switch, Controller(switch.address) as controller:
+        config = program_config(PROGRAM)
+        controller.arbitrate()
+        controller.set_pipeline(config)
+        names = Names(config.p4info)
+
+        def port(action, params=()):
+            return names.entry("I.ports", {"sm.ingress_port": 1}, action, params)
+
+        def route(action, params=()):
+            return names.entry("I.route", {"h.ip.dst": (0x0A000000, 8)}, action, params)
+
+        port_drops = [port("I.stop"), route("I.counted", [2])]
+        route_drops = [port("I.forward", [2]), route("I.drop")]
+        other = names.entry("I.ports", {"sm.ingress_port": 9}, "I.forward", [1])
+        filler = modify(other)
+        controller.write(*map(insert, [*port_drops, other]))
+        stop, incoming = threading.Event(), switch.memory[1]
+        frame = bytes(12) + b"\x08\x00\x45" + bytes(15) + b"\x0a\x00\x00\x01" + bytes(26)
+
+        def traffic():
+            while not stop.is_set():
+                if len(incoming._incoming) < 50:
+                    incoming.inject(frame)
+
+        sender = threading.Thread(target=traffic)
+        sender.start()
+        for turn in range(40):
+            # going back the other way round: either order has a half that leaks
+            first, last = reversed(port_drops) if turn % 2 else route_drops
+            updates = [modify(first), *[filler] * 1000, modify(last)]
+            controller.write(*updates, atomicity="DATAPLANE_ATOMIC")
+        stop.set()
+        sender.join()
+        assert incoming.counters.received > 100
+        assert not switch.memory[2].outgoing

@@ -1,0 +1,85 @@
+"""Lost connections come back by themselves, and what was lost meanwhile is counted, never silent."""
+
+from typing import Any
+
+from due import PUB_ONLY, Capability
+from due.drivers.embedded_redis import EmbeddedServer
+from due.drivers.redis_wire import Wire
+from tests.due.conftest import wait_for
+
+
+def _kill_all(url: str, kind: str) -> None:
+    wire = Wire(url)
+    wire.call("CLIENT", "KILL", "TYPE", kind, "SKIPME", "yes")
+    wire.close()
+
+
+def test_killed_connections_of_a_reliable_stream_lose_nothing(make_engine, tmp_path):
+    with EmbeddedServer(tmp_path / "u") as server:
+        init = {"capabilities": [Capability("r.kill", delivery="reliable")]}
+        producer = make_engine("producer", url=server.url, init=init)
+        consumer = make_engine("consumer", url=server.url)
+        got: list[Any] = []
+        consumer.observe("r.kill").subscribe(lambda item: got.append(item.value))
+        for round_ in range(5):
+            for number in range(2000):
+                producer.write("r.kill", round_ * 2000 + number, [PUB_ONLY])
+            _kill_all(server.url, "normal")
+        producer.flush()
+        wait_for(lambda: len(got) >= 10_000)
+        assert got == list(range(10_000))
+        assert producer.health()["updates"]["reconnects"] > 0
+        producer.close()
+        consumer.close()
+
+
+def test_gaps_of_a_best_effort_key_are_counted(make_engine, tmp_path):
+    with EmbeddedServer(tmp_path / "u") as server:
+        producer, consumer = make_engine("producer", url=server.url), make_engine("consumer", url=server.url)
+        got: list[Any] = []
+        consumer.observe("b.kill").subscribe(lambda item: got.append(item.value))
+        producer.write("b.kill", 0, [PUB_ONLY])
+        wait_for(lambda: got)
+        reconnects = consumer.health()["receiving"]["reconnects"]
+        _kill_all(server.url, "pubsub")
+        wait_for(lambda: consumer.health()["receiving"]["reconnects"] > reconnects)
+        number = 0
+        while len(got) < 2:
+            number += 1
+            producer.write("b.kill", number, [PUB_ONLY])
+            producer.flush()
+        assert consumer.health()["receiving"]["gaps"] == got[1] - 1
+        producer.close()
+        consumer.close()
+
+
+def test_foreign_and_newer_payloads_are_counted_and_skipped(make_engine, server, caplog):
+    engine = make_engine("tolerant")
+    got: list[Any] = []
+    engine.observe("b.garbage").subscribe(lambda item: got.append(item.value))
+    wire = Wire(server.url)
+    for payload in (b"garbage", b"DUE\x01garbage", b"DUE\x02later", b"", b"DUE\x02later"):
+        wire.call("PUBLISH", "due:b.garbage", payload)
+    wire.close()
+    engine.write("b.garbage", "fine", [PUB_ONLY])
+    wait_for(lambda: got == ["fine"])
+    counts = engine.health()["receiving"]
+    assert (counts["undecodable"], counts["newer_version"]) == (3, 2)
+    assert caplog.text.count("skipped what arrived") == 2
+
+
+def test_instances_of_a_shared_app_divide_a_stream(make_engine):
+    init = {"capabilities": [Capability("r.shared", delivery="reliable")]}
+    producer = make_engine("divider", init=init, frame_bytes=50)
+    got: dict[str, list[Any]] = {name: [] for name in "ab"}
+    for name in "ab":
+        worker = make_engine("worker", init={"instances": "shared"})
+        worker.observe("r.shared").subscribe(lambda item, name=name: got[name].append(item.value))
+    number = 0
+    while not all(got.values()):
+        for _ in range(200):
+            producer.write("r.shared", number, [PUB_ONLY])
+            number += 1
+        producer.flush()
+    wait_for(lambda: sum(map(len, got.values())) == number)
+    assert sorted(got["a"] + got["b"]) == list(range(number))

@@ -1,0 +1,56 @@
+"""The ledger keeps what readers still need, within the window, and knows who is alive."""
+
+from due.drivers.redis_streams import StreamLedger, parse_id
+
+
+def _ledger(**changes):
+    fields = {"window": 5000, "retain": 2000, "group_timeout": 30.0, **changes}
+    return StreamLedger("a.b", **fields)
+
+
+def _add(ledger, count, size=300):
+    for _ in range(count):
+        entry = ledger.add(bytes(size))
+        entry.id = (len(ledger.kept) + len(ledger.retained), 0)
+
+
+def test_the_window_bounds_what_is_kept():
+    ledger = _ledger()
+    while ledger.has_room(300):
+        _add(ledger, 1)
+    assert ledger.kept_bytes <= 5000
+    assert ledger.half_full
+
+
+def test_a_lone_payload_larger_than_the_window_passes():
+    assert _ledger().has_room(10**9)
+
+
+def test_acknowledged_payloads_are_retained_up_to_a_limit_then_trimmed():
+    ledger = _ledger()
+    _add(ledger, 8)
+    ledger.acknowledged((6, 0))
+    assert [e.id for e in ledger.kept] == [(7, 0), (8, 0)]
+    assert ledger.trim_point() == (3, 0)
+    assert [e.id for e in ledger.retained] == [(3, 0), (4, 0), (5, 0), (6, 0)]
+    assert ledger.trim_point() is None
+
+
+def test_what_the_server_has_not_answered_is_never_forgotten():
+    ledger = _ledger()
+    ledger.add(b"")
+    ledger.acknowledged((2**63, 0))
+    assert len(ledger.kept) == 1
+
+
+def test_groups_live_by_their_leases_even_after_the_server_lost_them():
+    ledger = _ledger()
+    assert ledger.live_groups({"kitsune/1": 100.0, "gone/1": 60.0, "left/1": 0.0}, 101.0) == {"kitsune"}
+    assert ledger.live_groups({}, 110.0) == {"kitsune"}
+    assert ledger.live_groups({"kitsune/1": 0.0, "kitsune/2": 110.0}, 111.0) == {"kitsune"}
+    assert ledger.live_groups({"kitsune/2": 0.0}, 112.0) == set()
+
+
+def test_ids_compare_as_numbers():
+    assert parse_id(b"9-10") < parse_id("10-2") < parse_id("10-10")
+    assert parse_id("5") == (5, 0)
