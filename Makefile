@@ -35,7 +35,7 @@ test: venv
 check: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy .
+	$(BIN)/mypy due coordinator apps dataplane sdnator p4rt benchmarks examples sdnator_due.py
 
 p4: venv
 	$(BIN)/python -m sdnator.p4_program compile

@@ -2,6 +2,7 @@
 
     kitsune ──Alert──► firewall ──Decision──► p4runtime_ctrl ──Confirmation──► firewall, reports
     any app ──TableCommand──► p4runtime_ctrl ──Confirmation──► that app
+    people ──Instruction──► firewall ──Answer──► people
 
 Every message travels as the value of a DUE item: `to_value()` makes the map, `from_value()` checks
 one that came from the wire.  Times are capture time, integer nanoseconds since the epoch (UTC).
@@ -123,15 +124,36 @@ class Confirmation(Message, frozen=True, kw_only=True):
     """Arrival number of the newest packet that the controller had seen when the switch answered."""
 
 
+class Instruction(Message, frozen=True, kw_only=True):
+    """`network.instruction.<app>.firewall`: what a person wants of the firewall."""
+
+    id: str
+    verb: Literal["block", "unblock", "allow", "disallow", "panic"]
+    subject: str = ""
+    """An address or MAC to block; a decision's id or an address to unblock; an allow-list entry."""
+    reason: str = ""
+    seconds: int = 600
+    """Length of a block."""
+
+
+class Answer(Message, frozen=True, kw_only=True):
+    """`network.answer.firewall.<app>`: what became of an instruction."""
+
+    id: str
+    """The instruction's."""
+    done: bool
+    text: str
+
+
 class TableUpdate(Message, frozen=True, kw_only=True):
     """One table update by name; checked by the controller against p4info."""
 
     kind: Literal["insert", "modify", "delete"]
     table: str
-    match: dict[str, Any] = {}  # noqa: RUF012 - msgspec copies empty defaults
+    match: dict[str, Any] = {}
     """Field name to value: int, str address, `[value, mask]`, `[value, prefix length]` or `[low, high]`."""
     action: str = ""
-    params: dict[str, Any] = {}  # noqa: RUF012
+    params: dict[str, Any] = {}
     priority: int = 0
     idle_timeout_ns: int = 0
 

@@ -28,11 +28,11 @@ class SonataStage(Stage):
     def __enter__(self) -> "SonataStage":
         super().__enter__()
         self._adapter = self.run("apps.sonata_adapter.service", {"base_us": {"s1": BASE_US}})
-        self.controller()
         self._observer = self.engine("observer")
         self._states = Heard(self._observer, "network.switch.p4runtime_ctrl.s1")
         self._health = Heard(self._observer, "due.health.sonata_adapter")
         self._results: list[Item] = []
+        self.controller()
         self._feed = self.feed()
         self.tuples: dict[str, int] = {}
         wait_for(lambda: self._states.values("network.switch"))

@@ -125,8 +125,9 @@ class Engine:
 
         `flags`: PUB_ONLY, DB_ONLY, NO_WAIT (send at once).  `event_time`: ns.  Returns False if nobody
         wants it (then it is archived only under `archive="always"`) or this instance is not the active
-        one.  Waits only for back-pressure: a reliable stream whose readers are behind.  Raises
-        `InvalidKey`, `UnsupportedValue`, `NotAllowed`.
+        one.  Waits only for back-pressure: a reliable stream whose readers are behind (so a callback must
+        not fill a reliable stream that its own app reads).  A RecordBatch is encoded at once, other
+        mutable values too.  Raises `InvalidKey`, `UnsupportedValue`, `NotAllowed`.
         """
         outlet = self._outlets.get(key) or self._outlet(key)
         now = time.time_ns()

@@ -22,7 +22,11 @@ def _serialized_descriptor(path: str) -> bytes:
     """The `serialized_pb` literal of a generated module, found in its syntax tree."""
     source = Path(str(importlib.metadata.distribution(_WHEEL).locate_file(f"{path}_pb2.py")))
     for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.keyword) and node.arg == "serialized_pb" and isinstance(node.value, ast.Constant):
+        if (
+            isinstance(node, ast.keyword)
+            and node.arg == "serialized_pb"
+            and isinstance(node.value, ast.Constant)
+        ):
             return bytes(node.value.value)
         # protoc >= 3.20 writes AddSerializedFile(b'...') instead
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "AddSerializedFile":

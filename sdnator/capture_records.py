@@ -42,7 +42,7 @@ class CapturedFrame(NamedTuple):
     data: bytes
 
 
-class Damage(Exception):  # noqa: N818 - a finding, turned into a note or an error by the caller
+class Damage(Exception):
     """The record at `offset` (bytes from the start of the unpacked capture) is not whole."""
 
     def __init__(self, offset: int, reason: str) -> None:
@@ -51,7 +51,7 @@ class Damage(Exception):  # noqa: N818 - a finding, turned into a note or an err
         self.reason = reason
 
 
-class WrongLink(Exception):  # noqa: N818 - same
+class WrongLink(Exception):
     """Frames are of another link type than Ethernet."""
 
     def __init__(self, link: int) -> None:

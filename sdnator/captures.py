@@ -58,19 +58,19 @@ class CaptureError(BadInput, ValueError):
     """A capture that cannot be used; the text says what, where and what to do."""
 
 
-class MissingCapture(CaptureError):  # noqa: N818
+class MissingCapture(CaptureError):
     """No such file, a folder, or not readable."""
 
 
-class NotACapture(CaptureError):  # noqa: N818
+class NotACapture(CaptureError):
     """Neither pcap nor pcapng, or damaged before its first packet."""
 
 
-class UnsupportedLink(CaptureError):  # noqa: N818
+class UnsupportedLink(CaptureError):
     """Frames are not Ethernet."""
 
 
-class EmptyCapture(CaptureError):  # noqa: N818
+class EmptyCapture(CaptureError):
     """A sound capture with no packet in it."""
 
 

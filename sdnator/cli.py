@@ -1,6 +1,7 @@
 """The `sdnator` command: options and exit codes here, the work elsewhere, imported on demand.
 
-Exit codes: 0 done, 1 a part of the pipeline failed, 2 bad input or misuse, 130 interrupted.
+Exit codes: 0 done, 1 a part of the pipeline failed, 2 bad input or misuse, 130 interrupted,
+143 terminated.
 """
 
 import os
@@ -36,7 +37,7 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _root(
     *,
-    version: Annotated[  # noqa: ARG001 - the callback does the work
+    version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
@@ -47,12 +48,15 @@ def _root(
 def replay(
     capture: Annotated[Path, typer.Argument(help="pcap or pcapng, plain or gzipped.")],
     *,
-    labels: Annotated[Path | None, typer.Option(help="Labels: index,label,attacker; or lines of 0/1.")] = None,
+    labels: Annotated[
+        Path | None, typer.Option(help="Labels: index,label,attacker; or lines of 0/1.")
+    ] = None,
     switch: Annotated[
         str, typer.Option(help="embedded, bmv2 (where simple_switch_grpc is installed), or HOST:PORT.")
     ] = "embedded",
     inject: Annotated[
-        str | None, typer.Option(help="Interface to send frames into, for --switch HOST:PORT.", metavar="IFACE")
+        str | None,
+        typer.Option(help="Interface to send frames into, for --switch HOST:PORT.", metavar="IFACE"),
     ] = None,
     no_mitigate: Annotated[bool, typer.Option("--no-mitigate", help="Decide, but block nothing.")] = False,
     train: Annotated[
@@ -63,7 +67,9 @@ def replay(
     pace: Annotated[str, typer.Option(help="max, or a multiple of real time: 1x, 10x.")] = "max",
     window: Annotated[int, typer.Option(help="Packets in flight, at most.", min=1, max=65_536)] = 128,
     report: Annotated[Path | None, typer.Option(help="Folder for the report.", metavar="DIR")] = None,
-    keep: Annotated[Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")] = None,
+    keep: Annotated[
+        Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Replay a capture through switch, controller, Kitsune and firewall.
@@ -109,23 +115,28 @@ def demo(
 class _Interrupted(BaseException):
     """Ctrl-C. Not KeyboardInterrupt: the command line library would end the program without a word."""
 
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.exit_code = 128 + number
 
-def _interrupt(*_: object) -> NoReturn:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C does not wait for a clean end
-    raise _Interrupted
+
+def _interrupt(number: int, _: object) -> NoReturn:
+    signal.signal(number, signal.SIG_DFL)  # a second one does not wait for a clean end
+    raise _Interrupted(number)
 
 
 def main() -> None:
     """Entry point: errors become one line and an exit code, Ctrl-C becomes 130."""
     signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         app()
     except SdnatorError as error:
         print(f"sdnator: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except _Interrupted:
+    except _Interrupted as interrupted:
         print("sdnator: interrupted; nothing was left running", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
+        sys.exit(interrupted.exit_code)
     except BrokenPipeError:
         # The reader of our output went away; Python must not complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

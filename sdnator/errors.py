@@ -1,8 +1,8 @@
 """Errors that the command line turns into one line and an exit code.
 
-    SdnatorError
-    ├── BadInput            what the user gave cannot be used: exit code 2
-    └── PipelineError       a part of the pipeline did not start, or died: exit code 1
+SdnatorError
+├── BadInput            what the user gave cannot be used: exit code 2
+└── PipelineError       a part of the pipeline did not start, or died: exit code 1
 """
 
 

@@ -64,7 +64,9 @@ class FlightLog:
         given = np.frombuffer(verdicts, np.uint8)
         states = self.state[self.judged : self.judged + len(given)]
         if len(states) < len(given):
-            raise ValueError(f"{len(given)} verdicts from packet {self.judged} on, only {len(states)} packets left")
+            raise ValueError(
+                f"{len(given)} verdicts from packet {self.judged} on, only {len(states)} packets left"
+            )
         # A score may overtake its verdict: it stands.
         undecided = states == PacketState.IN_FLIGHT
         dropped = undecided & ((given & (COPIED | FORWARDED)) == 0)
@@ -74,7 +76,9 @@ class FlightLog:
         self.judged += len(given)
         self.decided += int(dropped.sum() + not_copied.sum())
 
-    def scored(self, arrival: NDArray[np.uint64], score: NDArray[np.float64], trained: NDArray[np.bool_]) -> None:
+    def scored(
+        self, arrival: NDArray[np.uint64], score: NDArray[np.float64], trained: NDArray[np.bool_]
+    ) -> None:
         """Take scores of packets, by their arrival number at the switch.
 
         The first packet of the capture has arrival number 0 on a switch that gives verdicts; on others

@@ -33,15 +33,15 @@ class LabelsError(BadInput, ValueError):
     """Labels that cannot be used; the text says what, where and what to do."""
 
 
-class MissingLabels(LabelsError):  # noqa: N818
+class MissingLabels(LabelsError):
     """No such file or not readable."""
 
 
-class MalformedLabels(LabelsError):  # noqa: N818
+class MalformedLabels(LabelsError):
     """A line that is none of the three forms."""
 
 
-class LengthMismatch(LabelsError):  # noqa: N818
+class LengthMismatch(LabelsError):
     """Not as many labels as packets."""
 
 

@@ -69,14 +69,18 @@ def check(base: Path) -> None:
     for part in ("sources", "artefacts"):
         changed = sorted(name for name, _ in set(record[part].items()) ^ set(now[part].items()))
         if changed:
-            raise P4ProgramError(f"{', '.join(changed)} changed since p4c ran: run `make p4` and commit all of {base}")
+            raise P4ProgramError(
+                f"{', '.join(changed)} changed since p4c ran: run `make p4` and commit all of {base}"
+            )
 
 
 def compile_program(base: Path) -> None:
     """Run p4c on the source and write the artefacts and their record."""
     p4c = shutil.which("p4c-bm2-ss")
     if p4c is None:
-        raise P4ProgramError("p4c-bm2-ss is not installed: build p4c (github: p4lang/p4c) with its BMv2 back end")
+        raise P4ProgramError(
+            "p4c-bm2-ss is not installed: build p4c (github: p4lang/p4c) with its BMv2 back end"
+        )
     command = [
         p4c, "--arch", "v1model", "--Werror",
         "--p4runtime-files", f"{PROGRAM}.p4info.txtpb", "-o", f"{PROGRAM}.json", f"{PROGRAM}.p4",

@@ -1,8 +1,8 @@
 """The whole pipeline as processes of this machine: started in order, watched, stopped in order.
 
-    Valkey (Data Updates) ─ coordinator ─┬─ switch ◄─ P4Runtime ─ p4runtime_ctrl
-    SQLite (Data Archives)               ├─ kitsune
-                                         └─ firewall
+Valkey (Data Updates) ─ coordinator ─┬─ switch ◄─ P4Runtime ─ p4runtime_ctrl
+SQLite (Data Archives)               ├─ kitsune
+                                     └─ firewall
 """
 
 import json

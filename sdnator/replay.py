@@ -162,7 +162,9 @@ class ReplayPass:
         watch: indices of packets whose time of sending matters.
     """
 
-    def __init__(self, survey: Survey, options: ReplayOptions, *, mitigate: bool, watch: frozenset[int]) -> None:
+    def __init__(
+        self, survey: Survey, options: ReplayOptions, *, mitigate: bool, watch: frozenset[int]
+    ) -> None:
         self._survey = survey
         self._options = options
         self._watch = watch
@@ -337,7 +339,11 @@ class ReplayPass:
                 raise PipelineError(
                     f"the loop stands still: {flight.in_flight} of {flight.sent} packets sent are neither scored "
                     f"nor dropped after {STALL_SECONDS:.0f} s"
-                    + ("" if pipeline.gives_verdicts else "; frames were lost on the wire: try a smaller --window")
+                    + (
+                        ""
+                        if pipeline.gives_verdicts
+                        else "; frames were lost on the wire: try a smaller --window"
+                    )
                 )
 
 

@@ -71,7 +71,9 @@ def check_switch(switch: str, inject: str | None) -> None:
         return
     if switch == "bmv2":
         if shutil.which("simple_switch_grpc") is None:
-            raise BadInput("--switch bmv2: simple_switch_grpc is not installed; install BMv2, or use --switch embedded")
+            raise BadInput(
+                "--switch bmv2: simple_switch_grpc is not installed; install BMv2, or use --switch embedded"
+            )
         if os.geteuid() != 0:
             raise BadInput("--switch bmv2: veth pairs need root; run as root, or use --switch embedded")
         return
@@ -162,21 +164,29 @@ def show(found: dict[str, Any]) -> None:
         table.add_row(label, value)
     out.print(table)
     for block in found["blocks"]:
-        out.print(f"[bold red]blocked[/] {block['address']} at packet {block['packet']:,} ({escape(block['handle'])})")
+        out.print(
+            f"[bold red]blocked[/] {block['address']} at packet {block['packet']:,} ({escape(block['handle'])})"
+        )
         out.print(f"        {escape(block['reason'])}")
     if "report" in found:
         out.print(f"report: {found['report']}")
 
 
 def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    yield "packets in", f"{found['packets_in']:,} in {found['seconds']:.1f} s ({found['packets_per_second']:,.0f}/s)"
+    yield (
+        "packets in",
+        f"{found['packets_in']:,} in {found['seconds']:.1f} s ({found['packets_per_second']:,.0f}/s)",
+    )
     yield "scored", f"{found['packets_scored']:,}, {found['training_packets']:,} of them to train on"
     yield "dropped", f"{found['packets_dropped']:,}"
     yield "not copied", f"{found['packets_not_copied']:,}"
     yield "lost", f"{found['packets_lost']:,}"
     yield "alerts", f"{found['alerts']:,}"
     if found.get("time_to_block_s") and found["time_to_block_s"]["capture"] is not None:
-        yield "time to block", f"{found['time_to_block_s']['capture']:.1f} s of capture time after the first attack packet"
+        yield (
+            "time to block",
+            f"{found['time_to_block_s']['capture']:.1f} s of capture time after the first attack packet",
+        )
     if "attack_dropped" in found:
         yield (
             "attack stopped",

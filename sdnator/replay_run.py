@@ -39,7 +39,10 @@ class ReplayOutcome:
 
 
 def prepare(
-    capture: Path, labels: Path | None, options: ReplayOptions, progress: Callable[[int, int], None] | None = None
+    capture: Path,
+    labels: Path | None,
+    options: ReplayOptions,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Survey, Labels | None]:
     """Read capture and labels once; raises BadInput with one clear line."""
     try:
@@ -105,7 +108,9 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         first_attack = attack["first_attack_packet"]
     capture_seconds = attack.pop("time_to_block_capture_s", None)
     time_to_block = (
-        {"capture": capture_seconds, "wall": wall_seconds_to_block(result, first_attack)} if blocks and attack else None
+        {"capture": capture_seconds, "wall": wall_seconds_to_block(result, first_attack)}
+        if blocks and attack
+        else None
     )
     return {
         "capture": str(outcome.survey.path),

@@ -1,6 +1,6 @@
 """Which pipeline runs on this machine: the run file of `sdnator up`, and the folders of the product.
 
-    $XDG_STATE_HOME/sdnator   run.json, run.lock, logs, settings of the parts, spools
+    $XDG_STATE_HOME/sdnator   run.json, run.lock (with the process id), logs, settings of the parts, spools
     $XDG_DATA_HOME/sdnator    archive.db
 
 Who holds `run.lock` runs; the kernel lets it go even after kill -9, so a run file left behind deceives nobody.
@@ -76,6 +76,8 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         _lock(descriptor, folder)
         (folder / "run.json").unlink(missing_ok=True)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
         yield
         (folder / "run.json").unlink(missing_ok=True)
     finally:
@@ -106,18 +108,19 @@ def write(folder: Path, running: Running) -> None:
     new.replace(folder / "run.json")
 
 
-def is_claimed(folder: Path) -> bool:
-    """Whether a pipeline of this state folder starts, runs or stops."""
+def holder(folder: Path) -> int | None:
+    """Process id of the pipeline of this state folder, also while it starts and stops; None where there is none."""
     try:
         descriptor = os.open(folder / "run.lock", os.O_RDONLY)
     except OSError:
-        return False
+        return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return True
+        written = os.read(descriptor, 32)
+        return int(written) if written.isdigit() else None
     else:
-        return False
+        return None
     finally:
         os.close(descriptor)
 
@@ -125,7 +128,7 @@ def is_claimed(folder: Path) -> bool:
 def find(folder: Path | None = None) -> Running | None:
     """The pipeline that runs, None where there is none; raises BadInput for a run file of another version."""
     folder = folder or state_folder()
-    if not is_claimed(folder):
+    if holder(folder) is None:
         return None
     path = folder / "run.json"
     try:

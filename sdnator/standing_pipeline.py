@@ -10,6 +10,8 @@ again alone.  The switch may not: its clock begins anew, and every timer with it
 """
 
 import json
+import os
+import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -127,12 +129,18 @@ class StandingPipeline:
             if self.updates:
                 Wire(self.updates).close()
             else:
-                self._server = self._stack.enter_context(EmbeddedServer(self._plan.state / "updates"))
+                self._server = self._stack.enter_context(EmbeddedServer(self._fresh_folder()))
                 self.updates = self._server.url
         except InvalidOption as error:
             raise BadInput(f"--updates: {error}") from None
         except DueError as error:
             raise PipelineError(str(error)) from None
+
+    def _fresh_folder(self) -> Path:
+        """Another one for each run: what a killed run left behind, still ending, must not find our server."""
+        for old in self._plan.state.glob("updates-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        return self._plan.state / f"updates-{os.getpid()}"
 
     def _start_switch(self) -> int:
         """Its address is noted; returns the absolute time of its clock's zero, µs."""
@@ -213,6 +221,9 @@ class StandingPipeline:
             raise error
         self._count_death(name, error)
         self._children[name].stop()
+        # it may have taken the server along, and needs one to start
+        self._looked = float("-inf")
+        self._watch_updates()
         self._child(name, *self._commands[name]).wait_ready()
         if name == "coordinator":
             self.coordinator = (self._plan.state / "coordinator.url").read_text(encoding="utf-8")

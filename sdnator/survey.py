@@ -38,7 +38,9 @@ class Survey:
         """What the report should say about the capture."""
         found = [] if self.cut is None else [str(self.cut)]
         if bool((self.time_ns % 1_000 != 0).any()):
-            found.append("the capture has nanosecond times; the switch's clock counts microseconds, the rest is cut off")
+            found.append(
+                "the capture has nanosecond times; the switch's clock counts microseconds, the rest is cut off"
+            )
         backwards = int(np.count_nonzero(np.diff(self.time_ns) < 0))
         if backwards:
             found.append(f"time runs backwards at {backwards:,} packets of the capture")

@@ -26,8 +26,11 @@ BUDGET_S: Final = 3.5
 VOID_FROM: Final = 0.1
 """Without the product the flood must leave fewer than this share of the attempts."""
 _LATE_S: Final = 5.0
-_CLEAR_S: Final = 2.0
+_CLEAR_S: Final = float(HALF_OPEN_S)
+"""After a rule came into force the backlog is full for so long: nothing resets its half-open connections."""
 _KNOWN: Final = 20
+_LATENESS_US: Final = 20_000
+"""One switch's packets come in order: windows need not wait long for late ones."""
 _FIRST_NEW: Final = (4096, 20_480)
 
 
@@ -160,8 +163,12 @@ class _Run:
         self._phase = "with"
         self._lab.flush_metrics()
         options = self._options
-        service = f"[{self._lab.plan.victim}]:{PORT}" if options.version == 6 else f"{self._lab.plan.victim}:{PORT}"
-        self._stage.app("sonata_adapter", "apps.sonata_adapter.service", {}).wait_ready()
+        service = (
+            f"[{self._lab.plan.victim}]:{PORT}" if options.version == 6 else f"{self._lab.plan.victim}:{PORT}"
+        )
+        self._stage.app(
+            "sonata_adapter", "apps.sonata_adapter.service", {"lateness_us": _LATENESS_US}
+        ).wait_ready()
         self._stage.app(
             "firewall", "apps.firewall.service", {"guard": [service] if options.armed else []}
         ).wait_ready()
@@ -180,7 +187,9 @@ class _Run:
         new = [each for each in counted if each.kind == "new"]
         result.known_client_success = _success([each for each in counted if each.kind == "known"])
         result.new_client_success = _success(new)
-        result.new_connect_ms_p50 = statistics.median(each.ms for each in new if each.ok) if _success(new) else None
+        result.new_connect_ms_p50 = (
+            statistics.median(each.ms for each in new if each.ok) if _success(new) else None
+        )
         result.entries_peak = max((line.get("entries", 0) for line in _lines(self._counters)), default=0)
         result.challenged = self._challenged()
         result.decisions = [
@@ -190,12 +199,16 @@ class _Run:
     def _mitigated(self, first: float) -> float | None:
         """When the rule that helps was active: the first challenge, or the first confirmed decision."""
         if self._options.armed:
-            return next((line["at"] for line in _lines(self._counters) if line["at"] > first and _stopped(line)), None)
+            return next(
+                (line["at"] for line in _lines(self._counters) if line["at"] > first and _stopped(line)), None
+            )
         return next(
             (
                 at
                 for at, said in self._stage.confirmed
-                if at > first and said.action in ("block", "protect") and said.state in ("installed", "exists")
+                if at > first
+                and said.action in ("block", "protect")
+                and said.state in ("installed", "exists")
             ),
             None,
         )

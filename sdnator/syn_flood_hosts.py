@@ -26,7 +26,13 @@ from sdnator.syn_flood_frames import FloodPlan, make_frames
 
 _BURST_S = 0.002
 _OUTCOMES = "ingress.guard_outcomes"
-_DYNAMIC = ("ingress.known_sources", "ingress.block_src", "ingress.block_mac", "ingress.block", "ingress.protect")
+_DYNAMIC = (
+    "ingress.known_sources",
+    "ingress.block_src",
+    "ingress.block_mac",
+    "ingress.block",
+    "ingress.protect",
+)
 OUTCOMES = (
     "known",
     "unchallenged",
@@ -100,7 +106,9 @@ async def _attempt(kind: str, source: str, options: dict[str, Any], report: Text
         attempt.bind((source, 0))
         try:
             target = (options["address"], options["port"])
-            await asyncio.wait_for(asyncio.get_running_loop().sock_connect(attempt, target), options["budget"])
+            await asyncio.wait_for(
+                asyncio.get_running_loop().sock_connect(attempt, target), options["budget"]
+            )
             succeeded = True
         except OSError:  # TimeoutError is one
             succeeded = False
@@ -161,12 +169,19 @@ def counters(options: dict[str, Any]) -> None:
             for number in range(sys.maxsize):
                 line: dict[str, Any] = {"at": time.time()}
                 with contextlib.suppress(grpc.RpcError):  # the switch has no program yet
-                    counted = read(p4runtime.Entity(counter_entry=p4runtime.CounterEntry(counter_id=outcomes)))
-                    values = {each.counter_entry.index.index: each.counter_entry.data.packet_count for each in counted}
+                    counted = read(
+                        p4runtime.Entity(counter_entry=p4runtime.CounterEntry(counter_id=outcomes))
+                    )
+                    values = {
+                        each.counter_entry.index.index: each.counter_entry.data.packet_count
+                        for each in counted
+                    }
                     line |= {name: values.get(index, 0) for index, name in enumerate(OUTCOMES)}
                     if number % options["entries_every"] == 0:
                         entries = (p4runtime.TableEntry(table_id=table) for table in tables)
-                        line["entries"] = sum(len(read(p4runtime.Entity(table_entry=each))) for each in entries)
+                        line["entries"] = sum(
+                            len(read(p4runtime.Entity(table_entry=each))) for each in entries
+                        )
                     report.write(json.dumps(line) + "\n")
                 time.sleep(options["every"])
 

@@ -113,7 +113,9 @@ class Lab:
 
     def _connect(self, number: int, host: str) -> None:
         # no segmentation offload to undo, no router solicitations to carry
-        self._sysctl(host, {"net/ipv6/conf/default/accept_dad": 0, "net/ipv6/conf/default/router_solicitations": 0})
+        self._sysctl(
+            host, {"net/ipv6/conf/default/accept_dad": 0, "net/ipv6/conf/default/router_solicitations": 0}
+        )
         _ip(
             *("link", "add", "eth0", "netns", self.namespace(host), "address", mac(host), "type", "veth"),
             *("peer", "name", f"p{number}", "netns", self.namespace("switch")),

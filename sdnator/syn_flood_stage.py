@@ -28,7 +28,11 @@ SWITCH: Final = "s1"
 _DEVICE: Final = 1
 _COMMAND: Final = f"network.p4_command.demo.{SWITCH}"
 _SECONDS: Final = 30.0
-_HEARD: Final = ("network.confirmation.p4runtime_ctrl.*", "network.block.firewall.*", "network.protect.firewall.*")
+_HEARD: Final = (
+    "network.confirmation.p4runtime_ctrl.*",
+    "network.block.firewall.*",
+    "network.protect.firewall.*",
+)
 _HEALTH: Final = "due.health.firewall"
 
 
@@ -93,7 +97,13 @@ class Stage:
 
     def _controller(self, base_us: int) -> dict[str, Any]:
         program = p4_program.find()
-        switch = {"name": SWITCH, "address": self.grpc, "device_id": _DEVICE, "base_us": base_us, "target": self._kind}
+        switch = {
+            "name": SWITCH,
+            "address": self.grpc,
+            "device_id": _DEVICE,
+            "base_us": base_us,
+            "target": self._kind,
+        }
         return {
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
@@ -147,7 +157,9 @@ class Stage:
     def app(self, name: str, module: str, settings: Mapping[str, Any]) -> Child:
         """Start an app of the product."""
         path = self._write(name, settings)
-        return self._child(name, module, "--updates", self._updates, "--archive", self._archive, "--settings", path)
+        return self._child(
+            name, module, "--updates", self._updates, "--archive", self._archive, "--settings", path
+        )
 
     def host(self, host: str, role: str, options: Mapping[str, Any]) -> Child:
         """Start a role of `syn_flood_hosts` in a host's namespace."""

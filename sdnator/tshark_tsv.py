@@ -45,11 +45,11 @@ class TsvError(BadInput, ValueError):
     """A table that cannot be used; the text says what, where and what to do."""
 
 
-class MissingTsv(TsvError):  # noqa: N818
+class MissingTsv(TsvError):
     """No such file or not readable."""
 
 
-class MalformedTsv(TsvError):  # noqa: N818
+class MalformedTsv(TsvError):
     """A line or a column that is not as tshark writes it."""
 
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -156,6 +157,7 @@ def _announce(found: running.Running, *, as_json: bool) -> None:
     }
     for name, where in lines.items():
         print(f"{name:<14}{where}")
+    print(f"apps of yours export DUE_UPDATES={quote(found.updates)} DUE_ARCHIVE={quote(found.archive)}")
     print("The pipeline runs; Ctrl-C or `sdnator down` ends it.", flush=True)
 
 
@@ -171,7 +173,9 @@ def _tell(text: str) -> None:
 @contextmanager
 def _stop_signals() -> Iterator[None]:
     """The first signal raises _Stopped, later ones let the end that it began come to its end."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        numbers.append(signal.SIGHUP)
 
     def stop(*_: object) -> None:
         for number in numbers:
@@ -282,10 +286,13 @@ def status(*, as_json: Json = False) -> None:
     """
     found = running.find()
     if found is None:
+        holder = running.holder(running.state_folder())
         if as_json:
-            print(json.dumps({"running": False}))
-        else:
+            print(json.dumps({"running": False, "pid": holder}))
+        elif holder is None:
             print("no pipeline is running: start one with `sdnator up`")
+        else:
+            print(f"a pipeline is starting or stopping (process {holder})")
         raise typer.Exit(1)
     parts = {name: {"pid": pid, "alive": _alive(pid)} for name, pid in found.parts.items()}
     apps = _states(found.coordinator)
@@ -351,26 +358,27 @@ def down(
 
     Example: sdnator down
     """
-    found = running.find()
-    if found is not None:
-        _end(found, timeout)
+    pid = running.holder(running.state_folder())
+    if pid is not None:
+        _end(pid, timeout)
     if as_json:
-        print(json.dumps({"stopped": found.pid if found is not None else None}))
+        print(json.dumps({"stopped": pid}))
     else:
-        print(f"stopped (process {found.pid})" if found is not None else "no pipeline was running")
+        print(f"stopped (process {pid})" if pid is not None else "no pipeline was running")
 
 
-def _end(found: running.Running, timeout: float) -> None:
+def _end(pid: int, timeout: float) -> None:
     try:
-        os.kill(found.pid, signal.SIGTERM)
+        os.kill(pid, signal.SIGTERM)
     except ProcessLookupError:
         return
     except PermissionError:
-        raise PipelineError(f"process {found.pid} is another user's: stop it as that user") from None
+        raise PipelineError(f"process {pid} is another user's: stop it as that user") from None
     deadline = time.monotonic() + timeout
-    while running.is_claimed(running.state_folder()):
+    while running.holder(running.state_folder()) == pid:
         if time.monotonic() > deadline:
             raise PipelineError(
-                f"process {found.pid} has not ended within {timeout:g} s: see {found.logs}, or kill -9 {found.pid}"
+                f"process {pid} has not ended within {timeout:g} s: see {running.state_folder() / 'logs'}, "
+                f"or kill -9 {pid}"
             )
         time.sleep(0.05)

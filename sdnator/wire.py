@@ -3,7 +3,9 @@
 Linux only, needs root.  Used for switches that have no capture port: BMv2, or one that runs already.
 """
 
+import errno
 import os
+import re
 import socket
 import subprocess
 import time
@@ -51,9 +53,11 @@ class WireFeed:
         except PermissionError:
             raise BadInput(f"--inject {interface}: sending frames needs root; run as root") from None
         except OSError as error:
-            raise BadInput(f"--inject {interface}: {error.strerror}; see `ip link` for the interfaces") from None
+            raise BadInput(
+                f"--inject {interface}: {error.strerror}; see `ip link` for the interfaces"
+            ) from None
 
-    def send(self, times_us: Sequence[int], wire_lengths: Sequence[int], frames: Sequence[bytes]) -> None:
+    def send(self, times_us: Sequence[int], wire_lengths: Sequence[int], frames: Sequence[bytes]) -> None:  # noqa: ARG002 - a wire has its own clock
         """Send frames; times are the wire's own. Raises PipelineError where a frame does not fit."""
         for length, frame in zip(wire_lengths, frames, strict=True):
             padded = frame.ljust(length, b"\0")
@@ -64,7 +68,7 @@ class WireFeed:
                 except BlockingIOError:
                     time.sleep(RETRY_SECONDS)
                 except OSError as error:
-                    if error.errno == 105:  # ENOBUFS: the interface's queue is full
+                    if error.errno == errno.ENOBUFS:  # the interface's queue is full
                         time.sleep(RETRY_SECONDS)
                         continue
                     raise PipelineError(
@@ -88,7 +92,20 @@ class VethPair:
 
     def __init__(self, name: str) -> None:
         self.near, self.far = f"{name}a", f"{name}b"
-        self._ip("link", "add", self.near, "mtu", str(MTU), "type", "veth", "peer", "name", self.far, "mtu", str(MTU))
+        self._ip(
+            "link",
+            "add",
+            self.near,
+            "mtu",
+            str(MTU),
+            "type",
+            "veth",
+            "peer",
+            "name",
+            self.far,
+            "mtu",
+            str(MTU),
+        )
         try:
             for end in (self.near, self.far):
                 Path(f"/proc/sys/net/ipv6/conf/{end}/disable_ipv6").write_text("1", encoding="ascii")
@@ -109,6 +126,18 @@ class VethPair:
     @classmethod
     def make(cls, stack: ExitStack, label: str) -> Self:
         """A pair with a name of this process that is removed with `stack`."""
-        pair = cls(f"sdn{label}{os.getpid() % 100_000}")
+        _remove_orphans()
+        pair = cls(f"sdn{label}{os.getpid()}")
         stack.callback(pair.close)
         return pair
+
+
+_OURS = re.compile(r"sdn[a-z]+(\d+)a")
+
+
+def _remove_orphans() -> None:
+    """Pairs of processes that were killed before they could remove them."""
+    for interface in Path("/sys/class/net").iterdir():
+        found = _OURS.fullmatch(interface.name)
+        if found and not Path(f"/proc/{found[1]}").exists():
+            subprocess.run(["ip", "link", "delete", interface.name], capture_output=True, check=False)

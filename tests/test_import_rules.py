@@ -69,7 +69,8 @@ def test_app_cores_are_pure(app):
         ROOT / (name.replace(".", "/") + ".py")
         for name in (ours(service) if service.exists() else ())
         if name.startswith(f"apps.{app}.")
-        and IO_MODULES & {imported.split(".")[0] for imported in imports(ROOT / (name.replace(".", "/") + ".py"))}
+        and IO_MODULES
+        & {imported.split(".")[0] for imported in imports(ROOT / (name.replace(".", "/") + ".py"))}
     }
     for path in set(sources(f"apps/{app}")) - io_files:
         assert not IO_MODULES & {name.split(".")[0] for name in imports(path)}, path
@@ -81,7 +82,9 @@ def test_p4_folder_is_no_package():
     assert not list((ROOT / "p4").rglob("*.py"))
 
 
-@pytest.mark.parametrize("path", [p for f in OURS - {"sdnator_due"} for p in sources(f)], ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path", [p for f in OURS - {"sdnator_due"} for p in sources(f)], ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_no_file_is_longer_than_600_lines(path):
     """A file should fit a reader's head."""
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 600

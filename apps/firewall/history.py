@@ -1,9 +1,9 @@
 """What the archive says of a sender: pure reading of archived items."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
-from apps.messages import Decision, Target
+from apps.messages import Decision, Instruction, Target
 from due import Item
 
 
@@ -33,3 +33,38 @@ def count_offences(items: Iterable[Item], target: Target, before: int) -> int:
         if decision.target == target and decision.event_time < before and not decision.dry_run:
             ids.add(decision.id)
     return len(ids)
+
+
+DECISIONS: Final = ("network.block.firewall.*", "network.protect.firewall.*")
+INSTRUCTIONS: Final = "network.instruction.*.firewall"
+
+
+def decisions_in(items: Iterable[Item]) -> list[Decision]:
+    """Archived decisions in the order they were written; dry runs change nothing and are left out."""
+    ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
+    return [made for item in ordered if not (made := Decision.from_value(item.value)).dry_run]
+
+
+def in_force(decisions: Iterable[Decision]) -> list[Decision]:
+    """What the decisions come to: the latest for each target on each switch, unless it lifts.
+
+    Expired ones are in: whether they end or go on is for the firewall to say.
+    """
+    latest: dict[tuple[str, Target], Decision] = {}
+    for decision in decisions:
+        key = (decision.switch, decision.target)
+        latest.pop(key, None)
+        if decision.action in ("block", "protect"):
+            latest[key] = decision
+    return list(latest.values())
+
+
+def allowed_by(instructions: Iterable[Instruction], beforehand: Iterable[str] = ()) -> tuple[str, ...]:
+    """The allow-list that follows from the settings and from what people said since."""
+    entries = dict.fromkeys(beforehand)
+    for instruction in instructions:
+        if instruction.verb == "allow":
+            entries[instruction.subject] = None
+        elif instruction.verb == "disallow":
+            entries.pop(instruction.subject, None)
+    return tuple(entries)

@@ -108,8 +108,12 @@ class Ledger:
         offences: int = 0,
         first_packet: int = 0,
         training_rate: float = 0.0,
+        seconds: int | None = None,
     ) -> Decision:
-        """Open a block on a switch, or on all with `*`; a step longer for each earlier offence."""
+        """Open a block on a switch, or on all with `*`; a step longer for each earlier offence.
+
+        `seconds` instead of the steps, where somebody has said how long.
+        """
         level = min(offences, len(self.rules.durations_s) - 1)
         decision = Decision(
             id=decision_id(switch, target, now),
@@ -119,7 +123,7 @@ class Ledger:
             reason=reason,
             evidence=tuple(evidence),
             event_time=now,
-            expires=now + self.rules.durations_s[level] * SECOND,
+            expires=now + (self.rules.durations_s[level] if seconds is None else seconds) * SECOND,
             level=level,
             dry_run=self.rules.dry_run,
             first_packet=first_packet,
@@ -134,6 +138,17 @@ class Ledger:
             block.decision.target.kind == "ip" and block.decision.target.address == address
             for block in self.blocks.values()
         )
+
+    def restore(self, decisions: Iterable[Decision]) -> None:
+        """Take up blocks that are in force from before a restart."""
+        for decision in decisions:
+            if decision.action == "block":
+                self.blocks[decision.id] = Block(decision, 0.0, deque([(decision.event_time, 0)]), "restored")
+
+    def matching(self, subject: str) -> list[Decision]:
+        """Blocks in force with this id or address."""
+        found = (block.decision for block in self.blocks.values())
+        return [each for each in found if subject in (each.id, each.target.address)]
 
     def lift(self, decision_id: str, now: int, reason: str) -> Decision | None:
         """End a block before its time, without probation; None where there is none."""

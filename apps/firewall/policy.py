@@ -49,7 +49,7 @@ class AllowList:
         """Read entries of the operator; raises ValueError that names the wrong one."""
         networks, macs = [], set()
         for entry in entries:
-            if _is_mac(entry):
+            if is_mac(entry):
                 macs.add(entry.lower())
                 continue
             try:
@@ -66,13 +66,20 @@ class AllowList:
             return True
         return bool(sender.ip) and self.covers_address(sender.ip)
 
+    def covers_target(self, target: Target) -> bool:
+        """True if a block of this target would touch an allowed one."""
+        if target.kind == "mac":
+            return target.address.lower() in self.macs
+        return self.covers_address(target.address)
+
     def covers_address(self, text: str) -> bool:
         """True if the address is an allowed one."""
         address = ipaddress.ip_address(text)
         return any(address in network for network in self.networks)
 
 
-def _is_mac(text: str) -> bool:
+def is_mac(text: str) -> bool:
+    """Whether a text is a MAC address with colons."""
     octets = text.split(":")
     return len(octets) == 6 and all(
         len(octet) == 2 and set(octet.lower()) <= set("0123456789abcdef") for octet in octets

@@ -9,20 +9,42 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import msgspec
 
 import due.service
-from apps.firewall.history import count_offences, offences_of_many, offences_query
+from apps.firewall.eve import alert_line, decision_line
+from apps.firewall.history import (
+    DECISIONS,
+    INSTRUCTIONS,
+    count_offences,
+    decisions_in,
+    in_force,
+    offences_of_many,
+    offences_query,
+)
+from apps.firewall.instructions import Desk
 from apps.firewall.known_sources import HANDSHAKES, KnownSources, in_batches, learn_archived
 from apps.firewall.ledger import Ledger
 from apps.firewall.policy import AllowList, Rules, judge
+from apps.firewall.recent_syns import Surges
 from apps.firewall.services import Service
-from apps.firewall.syn_defence import SynDefence, syns_of
+from apps.firewall.syn_defence import Suspicion, SynDefence
 from apps.firewall.syn_policy import SynRules
-from apps.messages import Alert, Confirmation, Decision, Evidence, Sender, TableCommand, TableUpdate, Target
+from apps.messages import (
+    Alert,
+    Confirmation,
+    Decision,
+    Evidence,
+    Instruction,
+    Sender,
+    TableCommand,
+    TableUpdate,
+    Target,
+)
 from due import Capability, Engine, Interest, Item, Key
 from due.errors import DueError
 
@@ -30,13 +52,14 @@ INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
+    Interest(INSTRUCTIONS),
 )
 SYN_INTERESTS = (
     Interest(HANDSHAKES),
     Interest("network.traffic_query.sonata.syn_flood"),
     Interest("network.traffic_capture.sonata.tcp"),
 )
-"""Registered by observing, with parameters of the settings; the last only while a flood is suspected."""
+"""Registered by observing, with parameters of the settings, where the settings want them."""
 CAPABILITIES = (
     Capability("network.block.firewall.ipv4", delivery="reliable", archive="always"),
     Capability("network.block.firewall.ipv6", delivery="reliable", archive="always"),
@@ -44,12 +67,12 @@ CAPABILITIES = (
     Capability("network.protect.firewall.ipv4", delivery="reliable", archive="always"),
     Capability("network.protect.firewall.ipv6", delivery="reliable", archive="always"),
     Capability("network.p4_command.firewall.*", delivery="reliable"),
+    Capability("network.answer.firewall.*", delivery="reliable"),
 )
 
 EVIDENCE_KEPT = 10
 SENDERS_KEPT = 10_000
-WATCH_SECONDS = 2.0
-"""A suspected flood of which no SYN comes is given up."""
+HOSTS_WATCHED = 64
 
 log = logging.getLogger(__name__)
 
@@ -69,6 +92,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Known sources in the switch, the most recent ones."""
     known_days: int = 30
     """A handshake counts for so long."""
+    eve_file: str = ""
+    """Alerts and decisions are appended here as EVE JSON, a line each; empty: nowhere."""
 
 
 class FirewallService:
@@ -77,7 +102,6 @@ class FirewallService:
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
         self._rules = settings.rules
-        self._allow_list = AllowList.parse(settings.rules.allow)
         self._ledger = Ledger(settings.rules)
         self._evidence: defaultdict[Sender, deque[Evidence]] = defaultdict(
             lambda: deque(maxlen=EVIDENCE_KEPT)
@@ -86,16 +110,23 @@ class FirewallService:
         self._settings = settings
         services = tuple(Service.parse(text) for text in settings.guard)
         self._known = KnownSources(settings.known_limit)
-        self._syn = SynDefence(settings.syn, services, self._ledger, self._allow_list, self._known)
+        allow = AllowList.parse(settings.rules.allow)
+        self._syn = SynDefence(settings.syn, services, self._ledger, allow, self._known)
+        self._desk = Desk(self._ledger, self._syn, settings.rules.allow)
         self._switches: dict[str, bool] = {}
-        self._samples: dict[str, Any] = {}
-        self._sampling_until: dict[str, float] = {}
+        self._surges = Surges(settings.syn.threshold, settings.syn.window_ms)
+        self._suspected: dict[str, tuple[float, Suspicion]] = {}
+        """By host: when to look, wall clock, and at what."""
         self._lock = threading.RLock()
         self._archive_away = 0
+        self._eve_failed = 0
+        self._now = 0
+        """Capture time, as the switches last said."""
 
     def start(self) -> None:
         """Take up history, then subscribe."""
         observe = self._engine.observe
+        self._take_up_history()
         if self._settings.learn:
             learn_archived(self._known, self._archived(HANDSHAKES), self._settings.known_days)
             self._known.changes()
@@ -104,18 +135,32 @@ class FirewallService:
         observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
         observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
         observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
+        observe(INSTRUCTIONS).subscribe(self._on_instruction)
         if self._settings.detect:
             rules = self._settings.syn
             specs = {"window": f"{rules.window_ms}ms", "threshold": str(rules.threshold)}
             key = Key("network.traffic_query.sonata.syn_flood").with_specs(**specs).text
             observe(key).subscribe(self._on_flood)
+            observe(Key("network.traffic_capture.sonata.tcp").with_specs(flag="syn").text).subscribe(
+                self._on_syns
+            )
+
+    def _take_up_history(self) -> None:
+        """What was in force before a restart is in force again, in our books as it is in the switch."""
+        instructions = [Instruction.from_value(item.value) for item in self._archived(INSTRUCTIONS)]
+        self._desk.take_up(instructions)
+        standing = in_force(decisions_in(item for key in DECISIONS for item in self._archived(key)))
+        self._ledger.restore(standing)
+        self._syn.restore(standing)
+        if standing:
+            log.info("%d decisions of the archive are in force", len(standing))
 
     def tick(self) -> None:
-        """What a wall clock drives: ends of samples, and batches of known sources."""
+        """Surges of SYNs are judged when their handshakes had time; known sources go out in batches."""
         with self._lock:
             now = time.monotonic()
-            for host in [host for host, until in self._sampling_until.items() if until <= now]:
-                self._conclude(host)
+            for host in [host for host, (due_at, _) in self._suspected.items() if due_at <= now]:
+                self._look(self._suspected.pop(host)[1])
             updates = self._known.changes()
             for switch in self._switches if updates else ():
                 self._command(switch, updates)
@@ -132,6 +177,7 @@ class FirewallService:
             "known_sources": len(self._known),
             "refused_by_cap": self._ledger.refused + self._syn.refused,
             "archive_away": self._archive_away,
+            "events_lost": self._eve_failed,
         }
 
     def _archived(self, query: Any) -> list[Item]:
@@ -142,6 +188,17 @@ class FirewallService:
             self._archive_away += 1
             log.warning("Data Archives do not answer, deciding without history: %s", error)
             return []
+
+    def _on_instruction(self, item: Item) -> None:
+        instruction = Instruction.from_value(item.value)
+        summary = f"{instruction.verb} {instruction.subject}: {instruction.reason}"
+        evidence = Evidence(key=item.key, timestamp=item.timestamp, summary=summary)
+        with self._lock:
+            decisions, answer = self._desk.carry_out(instruction, evidence, self._now or item.event_time)
+            for decision in decisions:
+                self._publish(decision)
+        asked_by = item.key.split(".")[2]
+        self._engine.write(f"network.answer.firewall.{asked_by}", answer.to_value(), [due.NO_WAIT])
 
     def _on_handshake(self, item: Item) -> None:
         value = item.value
@@ -154,47 +211,29 @@ class FirewallService:
         summary = f"{item.value['count']} half-open connections came up towards {host} within a window"
         evidence = Evidence(key=item.key, timestamp=item.timestamp, summary=summary)
         with self._lock:
-            if not self._syn.suspect(host, evidence, item.event_time):
-                return
-            log.warning("SYN flood suspected: %s", summary)
-            key = Key("network.traffic_capture.sonata.tcp").with_specs(dst=host, flag="syn").text
-            self._sampling_until[host] = time.monotonic() + WATCH_SECONDS
-            self._samples[host] = self._engine.observe(key)
-            self._samples[host].subscribe(lambda got: self._on_syns(host, got))
+            self._look(Suspicion(host, evidence, item.event_time, int(item.value["window_start"])))
 
-    def _on_syns(self, host: str, item: Item) -> None:
+    def _on_syns(self, item: Item) -> None:
         with self._lock:
-            watch = self._syn.watches.get(host)
-            if watch is None:
-                return
-            if not watch.total:
-                limit = time.monotonic() + self._settings.syn.sample_ms / 1000
-                self._sampling_until[host] = min(limit, self._sampling_until[host])
-            for port, source in syns_of(item.value):
-                watch.add(port, source)
-            if watch.total >= self._settings.syn.sample:
-                self._conclude(host)
+            self._syn.recent.add(item.value)
+            for host, since in self._surges.add(item.value):
+                rules = self._settings.syn
+                summary = f"{rules.threshold} SYNs went to {host} within {rules.window_ms} ms"
+                evidence = Evidence(key=item.key, timestamp=item.timestamp, summary=summary)
+                due_at = time.monotonic() + rules.grace_ms / 1000
+                if len(self._suspected) < HOSTS_WATCHED:
+                    suspicion = Suspicion(host, evidence, item.event_time, since)
+                    self._suspected.setdefault(host, (due_at, suspicion))
 
-    def _conclude(self, host: str) -> None:
-        watch = self._syn.watches.get(host)
-        if watch is not None:
-            often = [
-                source for (_, source), count in watch.syns.items() if count >= self._settings.syn.repeats
-            ]
-            limit = self._settings.syn.sources
-            earlier = self._archived(offences_of_many(often)) if 0 < len(often) <= limit else []
-            targets = {source: Target(kind="ip", address=source) for source in often[:limit]}
-            offences = {
-                source: count_offences(earlier, target, watch.now) for source, target in targets.items()
-            }
-            for decision in self._syn.conclude(host, offences):
-                self._publish(decision)
-        # disposing within a callback of the same subject is left to the next tick
-        if self._sampling_until.get(host, 0.0) <= time.monotonic():
-            self._sampling_until.pop(host, None)
-            self._samples.pop(host).dispose()
-        else:
-            self._sampling_until[host] = 0.0
+    def _look(self, suspicion: Suspicion) -> None:
+        """Look at the SYNs of a suspected flood, and decide."""
+        watch = self._syn.suspect(suspicion)
+        often = watch.repeating(self._settings.syn.repeats)[: self._settings.syn.sources]
+        earlier = self._archived(offences_of_many(often)) if often else []
+        targets = {source: Target(kind="ip", address=source) for source in often}
+        offences = {source: count_offences(earlier, target, watch.now) for source, target in targets.items()}
+        for decision in self._syn.conclude(watch, offences):
+            self._publish(decision)
 
     def _command(self, switch: str, updates: Iterable[TableUpdate]) -> None:
         for batch in in_batches(updates):
@@ -217,12 +256,13 @@ class FirewallService:
 
     def _judge(self, item: Item, alert: Alert) -> None:
         self._alerts += 1
+        self._log_event(alert_line(alert))
         self._lapse(alert.event_time)
         evidence = self._remember(item, alert)
         if self._ledger.covering(alert.sender) is not None:
             return
         probation = self._ledger.on_probation(alert.sender, alert.event_time)
-        verdict = judge(alert, self._rules, self._allow_list, on_probation=probation)
+        verdict = judge(alert, self._rules, self._desk.allow, on_probation=probation)
         if verdict.target is None:
             log.info("no block of %s: %s", alert.sender, verdict.reason)
             return
@@ -252,6 +292,7 @@ class FirewallService:
     def _on_switch(self, item: Item) -> None:
         now = int(item.value.get("event_time", 0))
         with self._lock:
+            self._now = max(self._now, now)
             for reading in item.value.get("blocks", ()):
                 self._ledger.count_drops(str(reading["id"]), int(reading["packets"]), now)
             self._arm(item)
@@ -261,10 +302,21 @@ class FirewallService:
         for decision in [*self._ledger.due(now), *self._syn.due(now)]:
             self._publish(decision)
 
+    def _log_event(self, line: str) -> None:
+        if not self._settings.eve_file:
+            return
+        try:
+            with Path(self._settings.eve_file).open("a", encoding="utf-8") as events:
+                events.write(line + "\n")
+        except OSError as error:
+            self._eve_failed += 1
+            log.error("%s: %s; the event is lost to it", self._settings.eve_file, error.strerror)  # noqa: TRY400
+
     def _publish(self, decision: Decision) -> None:
         kind = decision.target.kind
         kind_segment = ("ipv6" if ":" in decision.target.address else "ipv4") if kind == "ip" else "mac"
         log.warning("%s %s: %s", decision.action, decision.target.address, decision.reason)
+        self._log_event(decision_line(decision))
         family = "protect" if decision.action in ("protect", "unprotect") else "block"
         self._engine.write(
             f"network.{family}.firewall.{kind_segment}",

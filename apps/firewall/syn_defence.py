@@ -1,34 +1,45 @@
 """Defence against SYN floods: which services are guarded, which floods are looked at, what follows.
 
     switch seen ──► guard of the services that the settings name, and known sources
-    syn_flood result ──► sample of the SYNs towards that host ──► policy ──► block or protect
+    syn_flood result or surge ──► the SYNs that came towards that host ──► policy ──► block or protect
     handshake ──► known source
 
 Pure: decisions are handed out, the caller publishes them; times are capture time in ns.
 """
 
-import ipaddress
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from apps.firewall.known_sources import KnownSources
 from apps.firewall.ledger import SECOND, Ledger, decision_id
 from apps.firewall.policy import AllowList
+from apps.firewall.recent_syns import RecentSyns
 from apps.firewall.services import Service
 from apps.firewall.syn_policy import Sample, SynRules, SynVerdict, judge_syns
 from apps.messages import Decision, Evidence, Target
-from due import RecordBatch
 
 EVERY_SWITCH = "*"
-HOSTS_WATCHED = 64
+SERVICES_LEARNT = 4096
 SOURCES_SAMPLED = 4096
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """A flood towards a host; times are capture time in ns."""
+
+    host: str
+    evidence: Evidence
+    now: int
+    since: int
 
 
 class Watch:
     """A look at the SYNs towards one host."""
 
-    def __init__(self, evidence: Evidence, now: int) -> None:
+    def __init__(self, host: str, evidence: Evidence, now: int) -> None:
+        self.host = host
         self.evidence = evidence
         self.now = now
         self.syns: Counter[tuple[int, str]] = Counter()
@@ -45,7 +56,11 @@ class Watch:
         if self.syns[port, source] > 1:
             self.syns[port, source] -= 1
         else:
-            del self.syns[port, source]
+            del self.syns[port, source]  # a Counter takes this also where there is none
+
+    def repeating(self, often: int) -> list[str]:
+        """Sources with at least so many SYNs."""
+        return [source for (_, source), count in self.syns.items() if count >= often]
 
 
 class SynDefence:
@@ -63,9 +78,12 @@ class SynDefence:
         self.known = known
         self._always = frozenset(services)
         self._ledger = ledger
-        self._allow = allow
+        self.allow = allow
         self._guarded: dict[Service, Decision] = {}
-        self.watches: dict[str, Watch] = {}
+        self.services: dict[Service, None] = {}
+        """Known from handshakes; the latest last."""
+        self.recent = RecentSyns(rules.sample)
+        self._finished: deque[tuple[int, str, Service]] = deque(maxlen=rules.sample)
         self.refused = 0
 
     @property
@@ -83,36 +101,64 @@ class SynDefence:
         ]
         return beforehand + [_on(switch, decision) for decision in self._guarded.values()]
 
-    def suspect(self, host: str, evidence: Evidence, now: int) -> bool:
-        """A flood towards a host is suspected; True if its SYNs are to be looked at."""
+    def suspect(self, suspicion: Suspicion) -> Watch:
+        """Look at the SYNs of a suspected flood."""
+        host, now, since = suspicion.host, suspicion.now, suspicion.since
         for service, decision in self._guarded.items():
             if service.address == host:
                 expires = now + self.rules.protect_s * SECOND
                 self._guarded[service] = _changed(decision, expires=expires)
-        if host in self.watches or len(self.watches) >= HOSTS_WATCHED:
-            return False
-        self.watches[host] = Watch(evidence, now)
-        return True
+        watch = Watch(host, suspicion.evidence, now)
+        for port, source in self.recent.towards(host, since):
+            watch.add(port, source)
+        for at, source, service in self._finished:
+            if at >= since and service.address == host:
+                watch.finished(service.port, source)
+        return watch
+
+    def _guard_known_services(self, watch: Watch) -> list[Decision]:
+        reason = f"{watch.evidence.summary}, whose SYNs were not seen here: its known service is guarded"
+        services = [service for service in self.services if service.address == watch.host]
+        return [guard for service in services for guard in self._guard(service, reason, watch)]
 
     def handshake(self, source: str, service: Service, at: int) -> None:
         """A source has completed a handshake with a service."""
         self.known.learn(source, at)
-        watch = self.watches.get(service.address)
-        if watch is not None:
-            watch.finished(service.port, source)
+        self.services.pop(service, None)
+        self.services[service] = None
+        if len(self.services) > SERVICES_LEARNT:
+            del self.services[next(iter(self.services))]
+        self._finished.append((at, source, service))
 
-    def conclude(self, host: str, offences: Mapping[str, int]) -> list[Decision]:
-        """End a watch and decide; `offences` are earlier blocks by address."""
-        watch = self.watches.pop(host)
+    def conclude(self, watch: Watch, offences: Mapping[str, int]) -> list[Decision]:
+        """What follows from a watch; `offences` are earlier blocks by address."""
+        if watch.total < self.rules.least:
+            return self._guard_known_services(watch)
         by_port: dict[int, dict[str, int]] = {}
         for (port, source), count in watch.syns.items():
             by_port.setdefault(port, {})[source] = count
         decisions: list[Decision] = []
         for port, syns in sorted(by_port.items()):
-            sample = Sample(Service(host, port), syns)
-            verdict = judge_syns(sample, self.rules, self._allow, self.known)
+            sample = Sample(Service(watch.host, port), syns)
+            verdict = judge_syns(sample, self.rules, self.allow, self.known)
             decisions += self._carry_out(sample.service, verdict, watch, offences)
         return decisions
+
+    def restore(self, decisions: Iterable[Decision]) -> None:
+        """Take up guards that a flood led to before a restart; those of the settings come by themselves."""
+        for decision in decisions:
+            port = decision.target.port
+            if decision.action == "protect" and decision.expires and port is not None:
+                self._guarded[Service(decision.target.address, port)] = decision
+
+    def release_all(self, now: int, reason: str) -> list[Decision]:
+        """Lift all guards that floods led to."""
+        lifted = [
+            _changed(each, action="unprotect", reason=reason, event_time=now)
+            for each in self._guarded.values()
+        ]
+        self._guarded.clear()
+        return lifted
 
     def due(self, now: int) -> list[Decision]:
         """Guards whose time is over."""
@@ -127,13 +173,8 @@ class SynDefence:
         self, service: Service, verdict: SynVerdict, watch: Watch, offences: Mapping[str, int]
     ) -> list[Decision]:
         decisions: list[Decision] = []
-        if verdict.protects and service not in self._always and service not in self._guarded:
-            expires = watch.now + self.rules.protect_s * SECOND
-            made = self._protect(
-                service, EVERY_SWITCH, verdict.reason, (watch.evidence,), watch.now, expires=expires
-            )
-            self._guarded[service] = made
-            decisions.append(made)
+        if verdict.protects:
+            decisions += self._guard(service, verdict.reason, watch)
         for source in verdict.block:
             if self._ledger.blocks_address(source):
                 continue
@@ -152,6 +193,14 @@ class SynDefence:
                 )
             )
         return decisions
+
+    def _guard(self, service: Service, reason: str, watch: Watch) -> list[Decision]:
+        if service in self._always or service in self._guarded:
+            return []
+        expires = watch.now + self.rules.protect_s * SECOND
+        made = self._protect(service, EVERY_SWITCH, reason, (watch.evidence,), watch.now, expires=expires)
+        self._guarded[service] = made
+        return [made]
 
     def _protect(
         self,
@@ -182,12 +231,3 @@ def _on(switch: str, decision: Decision) -> Decision:
 
 def _changed(old: Decision, **changes: Any) -> Decision:
     return Decision(**({name: getattr(old, name) for name in old.__struct_fields__} | changes))
-
-
-def syns_of(batch: RecordBatch) -> Iterator[tuple[int, str]]:
-    """Destination port and source address of each row of a batch of packets."""
-    names = ("ip_version", "ip_src_hi", "ip_src_lo", "tcp_dport")
-    for version, high, low, port in zip(*(batch[name].tolist() for name in names), strict=True):
-        if version:
-            address = ipaddress.IPv4Address(low) if version == 4 else ipaddress.IPv6Address(high << 64 | low)
-            yield port, str(address)

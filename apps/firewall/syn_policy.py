@@ -19,13 +19,15 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What the operator can set about SYN floods."""
 
     threshold: int = 100
-    """Half-open connections that come up within a window towards one host: a flood is suspected."""
+    """SYNs, or half-open connections, that come up within a window towards one host: a flood is suspected."""
     window_ms: int = 200
     """Length of that window."""
-    sample: int = 600
-    """SYNs looked at before it is decided."""
-    sample_ms: int = 150
-    """... but no longer than this, wall time."""
+    grace_ms: int = 100
+    """So long, wall time, may the handshakes of a surge of SYNs take to be finished."""
+    sample: int = 20_000
+    """SYNs kept at a time, to be looked at when a flood is suspected."""
+    least: int = 50
+    """Fewer unfinished SYNs in a sample are no flood."""
     repeats: int = 4
     """A source repeats when it sent this many unanswered SYNs of the sample."""
     share: float = 0.9
@@ -64,7 +66,7 @@ class SynVerdict:
 def judge_syns(sample: Sample, rules: SynRules, allow: AllowList, known: Collection[str]) -> SynVerdict:
     """Which defence follows from the number and repetition of sources."""
     total = sample.total
-    if total < rules.repeats:
+    if total < rules.least:
         return SynVerdict("nothing", (), f"{total} unfinished SYNs towards {sample.service} are no flood")
     repeating = {source: count for source, count in sample.syns.items() if count >= rules.repeats}
     theirs = sum(repeating.values())

@@ -83,20 +83,26 @@ class Rows(Protocol):
         """For each row its packet's row in the batch."""
 
 
+class Missing:
+    """What a batch and its selections could not tell."""
+
+    payloads = 0
+    """Packets whose payload a query needed and nobody copied."""
+
+
 class Packets:
-    """Packets of a batch, all or some: fields are read when first asked for.
+    """Packets of a batch, all or some: fields are read when first asked for."""
 
-    `without_payload` counts packets whose payload a query needed and nobody copied.
-    """
-
-    def __init__(self, batch: RecordBatch, rows: NDArray[np.intp] | None = None) -> None:
+    def __init__(
+        self, batch: RecordBatch, rows: NDArray[np.intp] | None = None, missing: "Missing | None" = None
+    ) -> None:
+        self.missing = missing or Missing()
         self._batch = batch
         self._rows = rows
         self._size = len(batch) if rows is None else len(rows)
         self._columns: dict[str, Column] = {}
         self._selections: dict[Expression, Packets] = {}
         self._once: Packets | None = None
-        self.without_payload = 0
 
     def __len__(self) -> int:
         return self._size
@@ -127,7 +133,7 @@ class Packets:
                 found = self
             else:
                 kept = np.flatnonzero(mask)
-                found = Packets(self._batch, kept if self._rows is None else self._rows[kept])
+                found = Packets(self._batch, kept if self._rows is None else self._rows[kept], self.missing)
             self._selections[condition] = found
         return found
 
@@ -142,7 +148,7 @@ class Packets:
             slots[home[::-1]] = rows[::-1]
             first = slots[home]
             kept = np.flatnonzero((first == rows) | (keys[first] != keys))
-            self._once = Packets(self._batch, self.origin[kept])
+            self._once = Packets(self._batch, self.origin[kept], self.missing)
         return self._once
 
     def _flow_keys(self) -> Hashes:
@@ -186,7 +192,7 @@ class Packets:
 
     def _frames(self, rows: NDArray[np.intp] | None) -> Frames | None:
         if "frame" not in self._batch:
-            self.without_payload += self._size if rows is None else len(rows)
+            self.missing.payloads += self._size if rows is None else len(rows)
             return None
         chosen = self.origin if rows is None else self.origin[rows]
         return Frames(self._batch["frame"][chosen], self._batch["captured"][chosen])

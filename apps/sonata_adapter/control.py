@@ -162,7 +162,7 @@ class Control:
         for lane in station.lanes:
             if name in lane.names:
                 lane.brought[name] = lane.brought.get(name, 0) + len(batch)
-                written += self._processed(station, lane, lane.merger.put(name, batch, now))
+                written += self._processed(station, lane, lane.merger.put(name, batch, now), now)
         return written
 
     def busy(self, switch: str, now: float) -> None:
@@ -187,24 +187,22 @@ class Control:
         written: list[Written] = []
         for station in self._stations.values():
             for lane in station.lanes:
-                written += self._processed(station, lane, lane.merger.release(now))
+                written += self._processed(station, lane, lane.merger.release(now), now)
+                if station.now_us is not None and lane.merger.is_quiet(now):
+                    written += self._addressed(station, lane.host.advance(station.now_us))
         return written
 
-    def advance(self, switch: str, now_us: int) -> list[Written]:
+    def advance(self, switch: str, now_us: int) -> None:
         """Capture time of a switch has come to `now_us`, though no packet may have come here."""
         station = self._station(switch)
         station.now_us = max(now_us, station.now_us or 0)
-        written: list[Written] = []
-        for lane in station.lanes:
-            written += self._addressed(station, lane.host.advance(now_us))
-        return written
 
     def finish(self) -> list[Written]:
         """No more packets will come."""
         written: list[Written] = []
         for station in self._stations.values():
             for lane in station.lanes:
-                written += self._processed(station, lane, lane.merger.flush())
+                written += self._processed(station, lane, lane.merger.flush(), None)
                 written += self._addressed(station, lane.host.finish())
         return written
 
@@ -285,8 +283,17 @@ class Control:
         query = self._requests[one.identity].query
         return Reports(query, one, base_us=station.base_us, since_us=station.now_us)
 
-    def _processed(self, station: _Station, lane: _Lane, batch: RecordBatch | None) -> list[Written]:
-        return [] if batch is None else self._addressed(station, lane.host.process(batch))
+    def _processed(
+        self, station: _Station, lane: _Lane, batch: RecordBatch | None, now: float | None
+    ) -> list[Written]:
+        """Run packets through the operators; windows close when all streams have come that far."""
+        horizon = None if now is None else lane.merger.horizon_us(now)
+        outputs: list[Result | Captured] = []
+        if batch is not None:
+            outputs += lane.host.process(batch, horizon_us=0 if horizon is None else horizon)
+        if horizon is not None:
+            outputs += lane.host.advance(horizon)
+        return self._addressed(station, outputs)
 
     def _addressed(self, station: _Station, outputs: Sequence[Result | Captured]) -> list[Written]:
         written: list[Written] = []

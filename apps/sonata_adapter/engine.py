@@ -165,8 +165,11 @@ class HostEngine:
         lengths = {running.window_us for running in self._queries.values()}
         self._windows = {key: window for key, window in self._windows.items() if key[0] in lengths}
 
-    def process(self, batch: RecordBatch) -> list[Result | Captured]:
-        """What the packets bring about, in order."""
+    def process(self, batch: RecordBatch, *, horizon_us: int | None = None) -> list[Result | Captured]:
+        """What the packets bring about, in order.
+
+        Windows close by the packets' own time; `horizon_us` says that earlier ones may still come.
+        """
         if not len(batch) or not self._queries:
             return []
         self.packets += len(batch)
@@ -177,8 +180,8 @@ class HostEngine:
         for length, queries in self._by_length().items():
             for index, packets in self._windows_of(whole, length, first - self.base_us, last - self.base_us):
                 outputs += self._feed(length, index, packets, queries, batch)
-        self.without_payload += whole.without_payload
-        outputs += self.advance(last)
+        self.without_payload += whole.missing.payloads
+        outputs += self.advance(last if horizon_us is None else horizon_us)
         self.results += len(outputs)
         return outputs
 
@@ -216,7 +219,7 @@ class HostEngine:
         for index in np.unique(indices).tolist():
             rows = np.flatnonzero(indices == index)
             if closed is None or index > closed:
-                yield index, Packets(whole.batch, rows)
+                yield index, Packets(whole.batch, rows, whole.missing)
             else:
                 self.late += len(rows)
 

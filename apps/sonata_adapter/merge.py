@@ -2,7 +2,7 @@
 
 The controller publishes what it copies under one key for each condition; a packet that meets two
 conditions comes twice.  Packets wait until every stream has come as far, until nothing has come for
-`hold_s` of the caller's clock, or for `LONGEST_WAIT_S`.
+`hold_s` of the caller's clock; streams that stay silent while others bring much are not waited for.
 """
 
 from typing import Final
@@ -15,6 +15,18 @@ DEFAULT_HOLD_S: Final = 0.1
 LONGEST_WAIT_S: Final = 1.0
 _MOST_ROWS: Final = 1 << 18
 _REMEMBERED: Final = 1 << 20
+_TURNS: Final = 64
+"""A stream that brought nothing while others did so often, and for `LONGEST_WAIT_S`, is silent."""
+
+
+class _Stream:
+    """How far one stream has come."""
+
+    def __init__(self) -> None:
+        self.arrival = -1
+        self.time_us: int | None = None
+        self.turn = 0
+        self.heard: float | None = None
 
 
 class Merger:
@@ -23,8 +35,10 @@ class Merger:
     def __init__(self, hold_s: float = DEFAULT_HOLD_S) -> None:
         self._hold_s = hold_s
         self._waiting: list[tuple[float, RecordBatch]] = []
-        self._reached: dict[str, int] = {}
+        self._streams: dict[str, _Stream] = {}
+        self._turn = 0
         self._heard = 0.0
+        self._newest_us: int | None = None
         self._released = -1
         self._seen = np.full(_REMEMBERED, -1, dtype=np.int64)
         self.twice = 0
@@ -32,18 +46,36 @@ class Merger:
         self.disordered = 0
         """Packets that were let go after later ones."""
 
-    def expect(self, streams: set[str]) -> None:
+    def expect(self, names: set[str]) -> None:
         """These streams there are from now on."""
-        self._reached = {name: self._reached.get(name, -1) for name in streams}
+        self._streams = {name: self._streams.get(name) or _Stream() for name in names}
 
-    def put(self, stream: str, batch: RecordBatch, now: float) -> RecordBatch | None:
+    def put(self, name: str, batch: RecordBatch, now: float) -> RecordBatch | None:
         """Take a batch of a stream; returns what can be let go."""
         self._heard = now
+        self._turn += 1
+        for stream in self._streams.values():
+            stream.heard = now if stream.heard is None else stream.heard
         if len(batch):
-            if stream in self._reached:
-                self._reached[stream] = int(batch["arrival"].max())
+            stream = self._streams.setdefault(name, _Stream())
+            stream.arrival = int(batch["arrival"].max())
+            stream.time_us = int(batch["time_us"].max())
+            stream.turn, stream.heard = self._turn, now
+            self._newest_us = max(stream.time_us, self._newest_us or stream.time_us)
             self._waiting.append((now, batch))
         return self.release(now)
+
+    def horizon_us(self, now: float) -> int | None:
+        """Capture time that all streams have come to; silent ones do not count.  None: not known."""
+        if now - self._heard >= self._hold_s:
+            return self._newest_us
+        times = [stream.time_us for stream in self._streams.values() if not self._is_silent(stream, now)]
+        known = [time_us for time_us in times if time_us is not None]
+        return min(known) if known and len(known) == len(times) else None
+
+    def _is_silent(self, stream: _Stream, now: float) -> bool:
+        waited = 0.0 if stream.heard is None else now - stream.heard
+        return self._turn - stream.turn >= _TURNS and waited >= LONGEST_WAIT_S
 
     def busy(self, now: float) -> None:
         """Until `now` the caller had no time to bring more."""
@@ -54,13 +86,14 @@ class Merger:
         if not self._waiting:
             return None
         rows = sum(len(batch) for _, batch in self._waiting)
-        if now - self._heard >= self._hold_s or not self._reached or rows > _MOST_ROWS:
+        if now - self._heard >= self._hold_s or rows > _MOST_ROWS:
             return self._up_to(None)
-        limit = min(self._reached.values())
-        for since, batch in self._waiting:
-            if now - since >= LONGEST_WAIT_S:
-                limit = max(limit, int(batch["arrival"].max()))
-        return self._up_to(limit)
+        live = [stream.arrival for stream in self._streams.values() if not self._is_silent(stream, now)]
+        return self._up_to(min(live) if live else None)
+
+    def is_quiet(self, now: float) -> bool:
+        """Nothing waits, and nothing has come for so long that nothing is on its way."""
+        return not self._waiting and now - self._heard >= LONGEST_WAIT_S
 
     def flush(self) -> RecordBatch | None:
         """All that waits."""

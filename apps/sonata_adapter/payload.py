@@ -13,6 +13,7 @@ _ETHERNET: Final = 14
 _VLANS: Final = (0x8100, 0x88A8, 0x9100)
 _TCP: Final = 6
 _UDP_HEADER: Final = 8
+_PLAIN_HEADERS: Final = 34
 _DNS_HEADER: Final = 12
 _LABELS: Final = 128
 _LETTERS: Final = (ord("A"), ord("Z"))
@@ -58,8 +59,18 @@ class Frames:
         at, kind = self._network()
         return np.where(kind == 0x0800, self.byte(at + 9), self.byte(at + 6))
 
+    def _is_plain(self) -> bool:
+        """Whether all are IPv4 without VLAN tags, options and fragments, as nearly all frames are."""
+        first = self._bytes[:, 12:15]
+        whole = (first == (0x08, 0x00, 0x45)).all() and not (self._bytes[:, 20] & 0x3F).any()
+        return bool(whole) and not self._bytes[:, 21].any() and bool((self._captured >= _PLAIN_HEADERS).all())
+
     def transport(self) -> tuple[Numbers, Numbers]:
         """Offset of the transport header, -1 where there is none, and where the packet's bytes end."""
+        if self._is_plain():
+            total = self._bytes[:, 16].astype(np.int64) << 8 | self._bytes[:, 17]
+            end = np.where(total == 0, self._captured, np.minimum(self._captured, _ETHERNET + total))
+            return np.full(len(self._rows), _ETHERNET + 20, dtype=np.int64), end
         at, kind = self._network()
         four, six = kind == 0x0800, kind == 0x86DD
         header = np.where(four, (self.byte(at) & 0xF) * 4, 40)

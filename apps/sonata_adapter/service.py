@@ -162,7 +162,7 @@ class SonataAdapterService:
             if fresh or again:
                 self._apply(self._control.everything(), only=name)
             if value.get("event_time"):
-                self._write(self._control.advance(name, int(value["event_time"]) // 1000))
+                self._control.advance(name, int(value["event_time"]) // 1000)
 
     def _apply(self, changes: Changes, only: str = "") -> None:
         """Tell the controller: what ends first, then counting entries, then classifier bits."""

@@ -96,18 +96,11 @@ class RedisPublisher:
     def append(self, path: str, payload: bytes) -> None:
         """See `Publisher.append`."""
         ledger = self._ledgers.get(path) or self._announce(path)
-        while True:
-            with self._lock:
-                if self._closed:
-                    raise UpdatesUnavailable("the engine is closed")
-                if ledger.has_room(len(payload)):
-                    self._send_entry(ledger.add(payload))
-                    if not ledger.half_full:
-                        return
-                    break
-                self._counts["held_back"] += 1
-            self._make_room(ledger)
-        if time.monotonic() - self._checked > _CHECK_SECONDS:
+        if not self._append(ledger, payload):
+            self._counts["held_back"] += 1
+            self._wait_for_readers(ledger)
+            self._append(ledger, payload, anyway=True)
+        if ledger.half_full and time.monotonic() - self._checked > _CHECK_SECONDS:
             self._check(ledger)
 
     def has_room(self, path: str) -> bool:
@@ -192,12 +185,26 @@ class RedisPublisher:
         except UpdatesUnavailable as error:
             self._lose(error)
 
-    def _make_room(self, ledger: StreamLedger) -> None:
-        """Wait a moment for readers or the connection."""
+    def _append(self, ledger: StreamLedger, payload: bytes, *, anyway: bool = False) -> bool:
         with self._lock:
-            self.poll() if self._wire is None else self._guarded_wait(0.001)
-        if not self._check(ledger) or not ledger.has_room(0):
-            time.sleep(0.002)
+            if self._closed:
+                raise UpdatesUnavailable("the engine is closed")
+            if not anyway and not ledger.has_room(len(payload)):
+                return False
+            self._send_entry(ledger.add(payload))
+            return True
+
+    def _wait_for_readers(self, ledger: StreamLedger) -> None:
+        """Back-pressure: until half of the window is free.  Asks less and less often while nothing moves."""
+        pause, kept = _CHECK_SECONDS / 16, ledger.kept_bytes
+        while ledger.half_full and ledger.kept and not self._closed:
+            with self._lock:
+                self.poll() if self._wire is None else self._guarded_wait(0.001)
+            self._check(ledger)
+            if ledger.half_full:
+                time.sleep(pause)
+            pause = _CHECK_SECONDS / 16 if ledger.kept_bytes < kept else min(2 * pause, 2 * _CHECK_SECONDS)
+            kept = ledger.kept_bytes
 
     def _check(self, ledger: StreamLedger) -> bool:
         """Ask how far the readers are and forget what they are done with."""

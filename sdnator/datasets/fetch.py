@@ -33,15 +33,15 @@ class FetchError(BadInput):
     """A data set that could not be fetched; the text says what, where and what to do."""
 
 
-class BadSource(FetchError):  # noqa: N818
+class BadSource(FetchError):
     """Not an http(s) URL, or the server refuses."""
 
 
-class Interrupted(FetchError):  # noqa: N818
+class Interrupted(FetchError):
     """The connection broke; what has come is kept for the next try."""
 
 
-class ChecksumMismatch(FetchError):  # noqa: N818
+class ChecksumMismatch(FetchError):
     """What came is not what was expected."""
 
 

@@ -29,7 +29,9 @@ def real_capture(tmp_path_factory):
 def attacked_capture(real_capture):
     """The real harmless packets with a generated attack behind them, and its labels."""
     attack = real_capture.with_name("attack.pcap")
-    done = sdnator("dataset", "make", "mirai-like", attack, "--no-background", "--seed", "5", "--attack-seconds", "240")
+    done = sdnator(
+        "dataset", "make", "mirai-like", attack, "--no-background", "--seed", "5", "--attack-seconds", "240"
+    )
     assert done.returncode == 0, done.stderr
     spliced = real_capture.with_name("attacked.pcap")
     done = sdnator("dataset", "splice", real_capture, attack, spliced)

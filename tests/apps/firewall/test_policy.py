@@ -45,7 +45,7 @@ def test_allow_list_always_wins(entry):
 
 def test_wrong_allow_entry_is_named():
     """The operator is told which entry is wrong."""
-    with pytest.raises(ValueError, match="'192.168.2.300'"):
+    with pytest.raises(ValueError, match=r"'192\.168\.2\.300'"):
         AllowList.parse(("10.0.0.1", "192.168.2.300"))
 
 

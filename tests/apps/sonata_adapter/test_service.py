@@ -26,9 +26,9 @@ def telemetry(states):
 def test_keys_become_queries_and_leave_with_them(stage):
     """Eleven keys: results equal the naive evaluator's; without interest the switch has no request."""
     adapter = stage.run("apps.sonata_adapter.service", {})
-    stage.controller()
     engine = stage.engine("observer")
     states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    stage.controller()
     wait_for(lambda: states.values("network.switch"))
     assert telemetry(states) == []
     keys = {name: f"{PREFIX}.{name}:window=2s" for name in CATALOGUE}
@@ -84,9 +84,9 @@ def found(results, name):
 def test_two_consumers_share_and_the_last_one_removes(stage):
     """One entry for two consumers of a key; gone in two seconds when the last one leaves."""
     stage.run("apps.sonata_adapter.service", {})
-    stage.controller()
     engine, other = stage.engine("observer"), stage.engine("other")
     states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    stage.controller()
     first = Heard(engine, f"{PREFIX}.new_tcp:threshold=5")
     second = Heard(other, f"{PREFIX}.new_tcp:threshold=5")
     wait_for(lambda: telemetry(states) == ["q0"], why=stage.log)

@@ -1,0 +1,95 @@
+"""What people tell the firewall: block, unblock, allow, disallow, panic.  Pure."""
+
+import ipaddress
+from collections.abc import Iterable
+
+from apps.firewall.history import allowed_by
+from apps.firewall.ledger import Ledger
+from apps.firewall.policy import AllowList, is_mac
+from apps.firewall.syn_defence import EVERY_SWITCH, SynDefence
+from apps.messages import Answer, Decision, Evidence, Instruction, Target
+
+Outcome = tuple[list[Decision], Answer]
+
+
+class Desk:
+    """Carries out instructions on the ledger, the guards and the allow-list; time is capture time in ns."""
+
+    def __init__(self, ledger: Ledger, syn: SynDefence, entries: Iterable[str]) -> None:
+        self._ledger = ledger
+        self._syn = syn
+        self.entries = tuple(entries)
+        self.allow = AllowList.parse(self.entries)
+
+    def take_up(self, instructions: Iterable[Instruction]) -> None:
+        """The allow-list as it was before a restart."""
+        self._set_entries(allowed_by(instructions, self.entries))
+
+    def carry_out(self, instruction: Instruction, evidence: Evidence, now: int) -> Outcome:
+        """Decisions to publish and the answer; what cannot be done changes nothing."""
+        try:
+            decisions, text = getattr(self, f"_{instruction.verb}")(instruction, evidence, now)
+        except ValueError as error:
+            return [], Answer(id=instruction.id, done=False, text=str(error))
+        return decisions, Answer(id=instruction.id, done=True, text=text)
+
+    def _block(self, instruction: Instruction, evidence: Evidence, now: int) -> tuple[list[Decision], str]:
+        target = target_in(instruction.subject)
+        if self.allow.covers_target(target):
+            raise ValueError(
+                f"{target.address} is on the allow-list, which always wins; `sdnator allow remove` it first"
+            )
+        if self._ledger.matching(target.address):
+            raise ValueError(f"{target.address} is blocked already")
+        reason = f"by hand: {instruction.reason or 'no reason given'}"
+        decision = self._ledger.open(
+            EVERY_SWITCH, target, reason, (evidence,), now, seconds=instruction.seconds
+        )
+        return [decision], f"block {decision.id} of {target.address} for {instruction.seconds} s"
+
+    def _unblock(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
+        found = self._ledger.matching(instruction.subject)
+        if not found:
+            raise ValueError(
+                f"no block has the id or address {instruction.subject}; see `sdnator blocks list`"
+            )
+        return self._lift(found, now, "by hand"), f"{len(found)} lifted"
+
+    def _panic(self, _: Instruction, __: Evidence, now: int) -> tuple[list[Decision], str]:
+        blocks = [block.decision for block in self._ledger.blocks.values()]
+        decisions = self._lift(blocks, now, "panic: everything is lifted")
+        decisions += self._syn.release_all(now, "panic: everything is lifted")
+        return decisions, f"{len(decisions)} lifted; guards that the settings name stay"
+
+    def _allow(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
+        self._set_entries((*self.entries, instruction.subject))
+        blocks = [block.decision for block in self._ledger.blocks.values()]
+        touched = [each for each in blocks if self.allow.covers_target(each.target)]
+        lifted = self._lift(touched, now, f"{instruction.subject} is on the allow-list now")
+        return lifted, f"{instruction.subject} is allowed; {len(lifted)} blocks lifted"
+
+    def _disallow(self, instruction: Instruction, _: Evidence, __: int) -> tuple[list[Decision], str]:
+        if instruction.subject not in self.entries:
+            raise ValueError(
+                f"{instruction.subject} is not on the allow-list: {', '.join(self.entries) or 'empty'}"
+            )
+        self._set_entries(tuple(each for each in self.entries if each != instruction.subject))
+        return [], f"{instruction.subject} is no longer allowed"
+
+    def _lift(self, decisions: Iterable[Decision], now: int, reason: str) -> list[Decision]:
+        lifted = (self._ledger.lift(each.id, now, reason) for each in decisions)
+        return [each for each in lifted if each is not None]
+
+    def _set_entries(self, entries: tuple[str, ...]) -> None:
+        self.allow = self._syn.allow = AllowList.parse(entries)
+        self.entries = tuple(dict.fromkeys(entries))
+
+
+def target_in(text: str) -> Target:
+    """An address or MAC address as a target; raises ValueError that says what would do."""
+    if is_mac(text):
+        return Target(kind="mac", address=text.lower())
+    try:
+        return Target(kind="ip", address=str(ipaddress.ip_address(text)))
+    except ValueError:
+        raise ValueError(f"{text!r} is no IP address and no MAC address") from None

@@ -1,0 +1,76 @@
+"""The SYNs of the last moments, as the batches they came in, and hosts towards which they surge.
+
+Who sent them is looked into only when a flood is suspected.
+"""
+
+import ipaddress
+from collections import Counter, deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from due import RecordBatch
+
+_HALF = 64
+
+
+class RecentSyns:
+    """Keeps at least the last `rows` SYNs, whole batches only."""
+
+    def __init__(self, rows: int) -> None:
+        self._rows = rows
+        self._batches: deque[RecordBatch] = deque()
+        self._kept = 0
+
+    def __len__(self) -> int:
+        return self._kept
+
+    def add(self, batch: RecordBatch) -> None:
+        """The columns time_us, ip_version, ip_src_*, ip_dst_* and tcp_dport are used."""
+        self._batches.append(batch)
+        self._kept += len(batch)
+        while self._kept - len(self._batches[0]) >= self._rows:
+            self._kept -= len(self._batches.popleft())
+
+    def towards(self, host: str, since: int) -> Iterator[tuple[int, str]]:
+        """Destination port and source address of SYNs to a host since a capture time in ns."""
+        address = ipaddress.ip_address(host)
+        high, low = int(address) >> _HALF, int(address) & ((1 << _HALF) - 1)
+        make = ipaddress.IPv4Address if address.version == 4 else ipaddress.IPv6Address
+        for batch in self._batches:
+            wanted = (batch["ip_version"] == address.version) & (batch["time_us"] >= since // 1000)
+            wanted &= (batch["ip_dst_hi"] == np.uint64(high)) & (batch["ip_dst_lo"] == np.uint64(low))
+            columns = (batch[name][wanted].tolist() for name in ("ip_src_hi", "ip_src_lo", "tcp_dport"))
+            for source_high, source_low, port in zip(*columns, strict=True):
+                yield port, str(make(source_high << _HALF | source_low))
+
+
+class Surges:
+    """Hosts to which `threshold` SYNs went within one window of `window_ms`."""
+
+    def __init__(self, threshold: int, window_ms: int) -> None:
+        self._threshold = threshold
+        self._window_us = window_ms * 1000
+        self._window = -1
+        self._counts: Counter[tuple[int, int, int]] = Counter()
+
+    def add(self, batch: RecordBatch) -> list[tuple[str, int]]:
+        """Hosts that reach the threshold with this batch, each with the begin of the window, ns."""
+        if not len(batch):
+            return []
+        window = int(batch["time_us"].max()) // self._window_us
+        if window > self._window:
+            self._window = window
+            self._counts.clear()
+        now = batch["time_us"] // self._window_us == self._window
+        names = ("ip_version", "ip_dst_hi", "ip_dst_lo")
+        rows = np.stack([batch[name][now].astype(np.uint64) for name in names])
+        hosts, counts = np.unique(rows, axis=1, return_counts=True)
+        surging = []
+        for version, high, low, count in zip(*hosts.tolist(), counts.tolist(), strict=True):
+            before = self._counts[version, high, low]
+            self._counts[version, high, low] = before + count
+            if before < self._threshold <= before + count and version:
+                make = ipaddress.IPv4Address if version == 4 else ipaddress.IPv6Address
+                surging.append((str(make(high << _HALF | low)), window * self._window_us * 1000))
+        return surging

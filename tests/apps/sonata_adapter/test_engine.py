@@ -1,0 +1,150 @@
+"""Windows: late and disordered packets, bounded memory, queries that come and go."""
+
+import random
+
+import numpy as np
+import pytest
+
+from apps.sonata_adapter.catalogue import CATALOGUE
+from apps.sonata_adapter.engine import HostEngine
+from apps.sonata_adapter.query import SYN, Query, count, field, ip, largest, length, tcp
+from apps.sonata_adapter.results import Captured
+from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, batches, office, udp
+from tests.apps.sonata_adapter.traffic import tcp as tcp_frame
+
+
+def syns(times_ms, dst="10.0.0.1"):
+    return [Frame(BASE_US + t * 1000, 60, tcp_frame("10.1.1.1", dst, 1000, 80, 2)) for t in times_ms]
+
+
+def counting(threshold=2, window_ms=1000):
+    query = Query("q", window_ms).filter(tcp.flags == SYN).map(dst=ip.dst)
+    return query.reduce("dst", count=count()).filter(field("count") >= threshold)
+
+
+def final(window_ms=1000):
+    """A query whose results are known at the end of a window only."""
+    query = Query("end", window_ms).filter(tcp.flags == SYN).map(dst=ip.dst, length=length)
+    return query.reduce("dst", longest=largest(field("length")))
+
+
+def test_out_of_order_packets_count_while_their_window_is_open():
+    """A window stays open for the lateness; what comes later is left out and counted."""
+    engine = HostEngine(lateness_us=300_000)
+    engine.add(final())
+    assert not engine.process(batch_of(syns([100, 900, 1200])))
+    assert not engine.process(batch_of(syns([950])))
+    closed = engine.process(batch_of(syns([1400])))
+    assert [(r.window_us - BASE_US, r.at_us - BASE_US) for r in closed] == [(0, 1_000_000)]
+    assert not engine.process(batch_of(syns([980])))
+    assert engine.late == 1
+    assert len(engine.finish()) == 1
+
+
+def test_lateness_is_at_most_a_window():
+    """Results of a window's end are one window late at most."""
+    engine = HostEngine(lateness_us=10_000_000)
+    engine.add(final())
+    engine.process(batch_of(syns([100])))
+    assert not engine.advance(BASE_US + 1_999_999)
+    assert len(engine.advance(BASE_US + 2_000_000)) == 1
+
+
+def test_a_key_is_reported_once_in_a_window_at_its_crossing():
+    """In batches of any size."""
+    for size in (1, 2, 100):
+        engine = HostEngine()
+        engine.add(counting(3))
+        found = []
+        for batch in batches(syns([10, 20, 30, 40, 50, 1100, 1200, 1300]), size):
+            found += engine.process(batch)
+        assert [r.at_us - BASE_US for r in found] == [30_000, 1_300_000]
+        assert [r.fields["count"] for r in found] == [3, 3]
+
+
+def test_beyond_the_bound_results_are_estimates_that_miss_nothing():
+    """Ten thousand keys with room for a hundred: every key over the threshold is still reported."""
+    rng = random.Random(2)
+    hosts = [f"10.{n // 250}.{n % 250}.1" for n in range(3000)]
+    heavy = hosts[-5:]
+    frames = [f for host in hosts for f in syns([1], host)]
+    frames += [f for host in heavy for f in syns([2] * 60, host)]
+    rng.shuffle(frames)
+    engine = HostEngine(limit=500)
+    engine.add(counting(50))
+    found = []
+    for batch in batches(frames, 512):
+        found += engine.process(batch)
+    assert set(heavy) <= {r.fields["dst"] for r in found}
+    assert any("beyond the bound of 500" in r.error for r in found if not r.exact)
+    assert all(r.exact == (not r.error) for r in found)
+
+
+def test_distinct_beyond_the_bound_says_how_much_it_may_miss():
+    """The Bloom filter lets nearly all new tuples pass."""
+    frames = [Frame(BASE_US, 60, udp("10.0.0.9", f"10.{n // 250}.{n % 250}.2", 1, 2)) for n in range(2000)]
+    engine = HostEngine(limit=1000)
+    engine.add(CATALOGUE["superspreader"].query({"threshold": 1950}))
+    found = [r for batch in batches(frames, 256) for r in engine.process(batch)]
+    assert [r.fields["src"] for r in found] == ["10.0.0.9"]
+    assert "missed" in found[0].error
+
+
+def test_a_query_that_comes_within_a_window_says_so():
+    """Its first window is partial, the next is not."""
+    engine = HostEngine()
+    engine.add(final(2000))
+    engine.process(batch_of(syns([10])))
+    engine.add(counting(1))
+    found = engine.process(batch_of(syns([300, 1300])))
+    assert [r.partial for r in found] == [True, False]
+
+
+def test_removing_a_query_forgets_it():
+    """No result comes any more, and no state stays."""
+    engine = HostEngine()
+    engine.add(counting(1))
+    engine.remove("q")
+    assert not engine.process(batch_of(syns([10])))
+    assert not engine.finish()
+    assert not engine.names
+
+
+def test_streams_report_packets_and_tuples():
+    """Without a reduce a query passes packets on, or the fields that its map names."""
+    engine = HostEngine()
+    engine.add(Query("packets").filter(tcp.flags == SYN))
+    engine.add(Query("tuples").filter(tcp.flags == SYN).map(dst=ip.dst, bytes=length))
+    frames = sorted(office(2, random.Random(1)))
+    found = [r for batch in batches(frames, 300) for r in engine.process(batch)]
+    assert all(isinstance(r, Captured) for r in found)
+    packets = [r.batch for r in found if r.query == "packets"]
+    tuples = [r.batch for r in found if r.query == "tuples"]
+    assert sum(map(len, packets)) == sum(map(len, tuples)) > 0
+    assert set(tuples[0].columns) == {"time_us", "dst_hi", "dst_lo", "bytes"}
+    assert all(((batch["tcp_flags"] & 0x17) == 2).all() for batch in packets)
+
+
+def test_distinct_alone_reports_each_new_tuple():
+    """In every window anew."""
+    engine = HostEngine()
+    engine.add(Query("talkers", 1000).map(src=ip.src).distinct())
+    found = engine.process(batch_of(syns([1, 2, 3, 1001])))
+    assert [(r.at_us - BASE_US, r.fields) for r in found] == [
+        (1000, {"src": "10.1.1.1"}),
+        (1_001_000, {"src": "10.1.1.1"}),
+    ]
+
+
+@pytest.mark.parametrize("name", ["dns_tunnel", "zorro"])
+def test_missing_bytes_are_counted(name):
+    """Headers alone cannot answer a query on payload: the engine says how many packets it could not read."""
+    frames = [Frame(BASE_US, 90, udp("10.0.0.1", "10.0.0.2", 53, 5000, bytes(40)))]
+    frames += [Frame(BASE_US, 90, tcp_frame("10.0.0.1", "10.0.0.2", 5000, 23, 24, b"zorro"))]
+    whole = batch_of(frames)
+    headers = type(whole)({n: whole[n] for n in whole.columns if n not in ("frame", "captured")})
+    engine = HostEngine()
+    engine.add(CATALOGUE[name].query())
+    engine.process(headers)
+    assert engine.without_payload == 1
+    assert np.array_equal(headers["length"], whole["length"])

@@ -1,0 +1,130 @@
+"""Plans keep the limits of the switch, stay in place, and say what they do."""
+
+import itertools
+import random
+
+import pytest
+
+from apps.sonata_adapter.catalogue import CATALOGUE
+from apps.sonata_adapter.columns import Packets, evaluate
+from apps.sonata_adapter.conditions import conditions_of, disjoint
+from apps.sonata_adapter.dataflow import PacketSource, Table, compile_query, sources
+from apps.sonata_adapter.keys import request_of
+from apps.sonata_adapter.planner import SwitchLimits, explain, plan, reciprocal
+from tests.apps.sonata_adapter.switch_model import matches
+from tests.apps.sonata_adapter.traffic import batch_of, mixed
+
+PREFIX = "network.traffic_query.sonata"
+EVERY = [f"{PREFIX}.{name}" for name in CATALOGUE]
+
+
+def requests(*keys):
+    return [request_of(key, CATALOGUE) for key in keys]
+
+
+def test_no_frame_matches_two_entries_of_a_stage():
+    """And cells do not overlap, a reduce stands behind its distinct, bits are unlike."""
+    found = plan(requests(*EVERY))
+    entries = found.entries
+    for one, other in itertools.combinations(entries.values(), 2):
+        if one.stage == other.stage:
+            assert disjoint(one.match, other.match)
+            assert one.base + one.size <= other.base or other.base + other.size <= one.base
+    for entry in entries.values():
+        assert entry.base + entry.size <= SwitchLimits().cells
+        if entry.behind >= 0:
+            assert entries[entry.behind].stage < entry.stage
+            assert entries[entry.behind].match == entry.match
+    bits = [*entries, *(copy.bit for copy in found.copies)]
+    assert len(bits) == len(set(bits))
+
+
+def test_threshold_queries_are_counted_in_the_switch():
+    """As the table of the design has it; the rest says why it is not."""
+    found = plan(requests(*EVERY))
+    inside = {one.identity.split(":")[0].rpartition(".")[2] for one in found.queries if one.in_switch}
+    assert inside == {"new_tcp", "ssh_brute_force", "superspreader", "port_scan", "ddos"}
+    assert all(one.reason for one in found.queries if not one.in_switch)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_stays_keeps_its_place(seed):
+    """Whatever comes and goes beside it."""
+    rng = random.Random(seed)
+    keys = [*EVERY, *(f"{PREFIX}.new_tcp:dst=10.0.{n}.0/24" for n in range(20))]
+    present, found = set(), None
+    for _ in range(30):
+        changed = set(rng.sample(keys, 3)) ^ present
+        before = found
+        found = plan(requests(*changed), before=before)
+        if before is not None:
+            staying = {one.identity for one in found.queries} & {one.identity for one in before.queries}
+            for identity in staying:
+                if before.of(identity).in_switch:
+                    assert found.of(identity).entries == before.of(identity).entries
+            for copy in found.copies:
+                assert all(old.match == copy.match for old in before.copies if old.bit == copy.bit)
+        present = changed
+    assert found is not None
+
+
+def test_two_hundred_queries_fit_or_fall_back():
+    """Bits run out: the last one copies every packet, and everything is still answered."""
+    keys = [f"{PREFIX}.slowloris:dst=10.{n // 250}.{n % 250}.0/24" for n in range(400)]
+    found = plan(requests(*keys))
+    assert len(found.copies) <= SwitchLimits().bits
+    assert any(not copy.match for copy in found.copies)
+    assert all(one.copies for one in found.queries)
+
+
+def test_same_conditions_share_a_copy():
+    """SYNs that three queries need are copied once."""
+    found = plan(requests(f"{PREFIX}.syn_flood", f"{PREFIX}.incomplete_flows", f"{PREFIX}.dns_tunnel"))
+    matches_ = [str(sorted(copy.match.items())) for copy in found.copies]
+    assert len(matches_) == len(set(matches_))
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_conditions_mean_what_the_filters_mean(name):
+    """Exact ones select the same packets; the others select at least those."""
+    batch = batch_of(mixed(CATALOGUE, seconds=6))
+    packets = Packets(batch)
+    outcome = compile_query(CATALOGUE[name].query())
+    for node in sources(outcome) if isinstance(outcome, Table) else [outcome.node]:
+        while not isinstance(node, PacketSource):
+            node = node.source
+        conditions = conditions_of(node.filters)
+        wanted = packets
+        for condition in node.filters:
+            wanted = wanted.where(condition)
+        chosen = set(wanted.origin.tolist())
+        rows = [{column: batch[column][row] for column in batch.columns} for row in range(len(batch))]
+        selected = {
+            row for row, packet in enumerate(rows) if any(matches(m, packet) for m in conditions.alternatives)
+        }
+        assert selected == chosen if conditions.exact else selected >= chosen
+    assert len(evaluate(node.filters[0], packets)) == len(batch)
+
+
+@pytest.mark.parametrize("window_ms", [100, 333, 3000, 60_000, 3_600_000])
+def test_reciprocal_divides_exactly(window_ms):
+    """Around the edges of windows, as far as the docstring says."""
+    window = window_ms * 1000
+    factor = reciprocal(window)
+    horizon = min((1 << 64) // max(1, factor * window - (1 << 64)), 1 << 48)
+    assert horizon >= 85 * 60 * 10**6
+    for number in (0, 1, 2, 1000, horizon // window - 1):
+        if (number + 1) * window > horizon:
+            continue
+        for time_us in (number * window, (number + 1) * window - 1):
+            assert time_us * factor >> 64 == time_us // window
+
+
+@pytest.mark.parametrize("key", EVERY)
+def test_explain_names_switch_and_host(key):
+    """For people: the query, the entries, what is left."""
+    (request,) = requests(key)
+    text = explain(request, plan([request]), meaning="meaning")
+    assert request.identity in text
+    assert "in the switch" in text
+    assert "on the host" in text

@@ -1,0 +1,55 @@
+"""Real SYN floods in network namespaces: without the product nobody connects, with it nobody notices."""
+
+import os
+import subprocess
+
+import pytest
+
+from sdnator.syn_flood import VOID_FROM, SynFloodOptions, run_syn_flood
+from tests.requirements import require_netns, require_program
+
+
+def options(**changes) -> SynFloodOptions:
+    return SynFloodOptions(
+        **({"seconds": 7.0, "unprotected_seconds": 5.0, "learning_seconds": 5.0} | changes)
+    )
+
+
+def namespaces() -> str:
+    return subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture(autouse=True)
+def needs():
+    """Root, namespaces, iproute2; and nothing may be left of them."""
+    require_netns()
+    require_program("ss")
+    yield
+    assert f"sdn{os.getpid()}-" not in namespaces()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", [4, 6])
+def test_spoofed_flood_hurts_nobody_when_the_service_is_guarded(version):
+    """Known clients connect at once, new ones at their second SYN; the backlog stays nearly empty."""
+    seen = run_syn_flood(options(sources="spoofed", version=version))
+    assert seen.void == ""
+    assert seen.client_success_unprotected is not None
+    assert seen.client_success_unprotected < VOID_FROM
+    assert seen.known_client_success is not None
+    assert seen.known_client_success >= 0.99
+    assert seen.new_client_success is not None
+    assert seen.new_client_success >= 0.95
+    assert seen.half_open_peak <= 64
+    assert seen.challenged > 0
+    assert seen.entries_peak < 5000
+
+
+@pytest.mark.slow
+def test_one_source_is_found_and_blocked():
+    """Nothing was guarded: the query sees the flood, the policy blocks its only source."""
+    seen = run_syn_flood(options(armed=False, seconds=11.0))
+    assert seen.void == ""
+    assert any(text.startswith("block 10.2.0.10:") for text in seen.decisions)
+    assert not any(text.startswith("block 10.1.") for text in seen.decisions)
+    assert seen.time_to_mitigate_ms is not None

@@ -1,0 +1,307 @@
+"""A standing pipeline as its operator meets it: up, looked at from all sides, parts that die, down."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from due.drivers.embedded_redis import EmbeddedServer
+from sdnator.wire import VethPair
+from tests.end_to_end.test_bad_input import MARK, processes_of
+from tests.requirements import optional_program, require_netns
+
+SECONDS = 120
+PARTS = {"updates", "coordinator", "switch", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall"}
+APPS = PARTS - {"updates", "switch"}
+
+
+class Operator:
+    """One user's shell: folders of his own, and a mark by which his processes are found."""
+
+    def __init__(self, folder: Path) -> None:
+        self.mark = uuid.uuid4().hex
+        self.environment = os.environ | {
+            "XDG_STATE_HOME": str(folder / "state"),
+            "XDG_DATA_HOME": str(folder / "data"),
+            MARK: self.mark,
+        }
+
+    def command(self, *words: str) -> list[str]:
+        return [sys.executable, "-m", "tests.end_to_end.operator_app", *words]
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            self.command(*words),
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=SECONDS,
+            check=False,
+        )
+
+    def figures(self, *words: str):
+        done = self.run(*words, "--json")
+        assert done.returncode == 0, done.stderr[-3000:]
+        return json.loads(done.stdout)
+
+    @contextmanager
+    def up(self, *words: str):
+        """A running pipeline and what it said of itself."""
+        process = subprocess.Popen(
+            self.command("up", "--json", *words),
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line, process.communicate()[1]
+            yield process, json.loads(line)
+        finally:
+            if process.poll() is None:
+                process.terminate()
+            process.communicate(timeout=SECONDS)
+
+
+def until(condition):
+    """The first true answer."""
+    deadline = time.monotonic() + SECONDS
+    while time.monotonic() < deadline:
+        if answer := condition():
+            return answer
+        time.sleep(0.1)
+    raise AssertionError(f"did not come about in {SECONDS} s")
+
+
+@pytest.fixture
+def operator(tmp_path):
+    return Operator(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory):
+    """An operator whose pipeline runs, and what it said of itself."""
+    operator = Operator(tmp_path_factory.mktemp("standing"))
+    with operator.up() as (_, said):
+        yield operator, said
+    assert processes_of(operator.mark) == []
+
+
+def test_all_parts_run_and_all_apps_are_active(standing):
+    operator, said = standing
+    found = until(lambda: (now := operator.figures("status"))["apps"].keys() >= APPS and now)
+    assert found["well"] is True
+    assert found["parts"].keys() == PARTS
+    assert all(part["alive"] for part in found["parts"].values())
+    assert {found["apps"][app] for app in APPS} == {"active"}
+    assert found["pid"] == said["pid"]
+    assert "kitsune" in operator.run("status").stdout
+
+
+def test_a_second_one_is_refused(standing):
+    operator, _ = standing
+    done = operator.run("up")
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert "sdnator down" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_others_find_it_by_themselves(standing):
+    """Apps, keys, flow, doctor, tables: without an address."""
+    operator, _ = standing
+    assert {one["app_id"] for one in operator.figures("apps")["instances"]} >= APPS
+    made = {one["key"] for one in operator.figures("keys")["capabilities"]}
+    assert "network.anomaly.kitsune.alert" in made
+    flow = until(lambda: operator.figures("flow")["flow"])
+    assert ("kitsune", "firewall") in {(one["producer"], one["consumer"]) for one in flow}
+    checks = {one["name"]: one for one in operator.figures("doctor")["checks"]}
+    assert checks["pipeline"]["state"] == "ok"
+    entries = operator.figures("tables", "s1")["entries"]
+    assert any(one["table"] == "ingress.telemetry_active" for one in entries)
+    assert operator.figures("counters")["switch"] == "s1"
+    done = operator.run("tables", "s2")
+    assert (done.returncode, "has s1" in done.stderr) == (2, True)
+
+
+def test_data_is_seen_as_it_comes_and_afterwards(standing):
+    operator, _ = standing
+    done = operator.run("observe", "due.health.kitsune", "--count", "2", "--json")
+    items = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [item["appId"] for item in items] == ["kitsune", "kitsune"]
+    past = operator.run("get", "due.event.coordinator", "--since", "1h", "--json")
+    joined = [json.loads(line)["value"] for line in past.stdout.splitlines()]
+    assert {"kitsune", "firewall"} <= {one["app_id"] for one in joined if one["event"] == "joined"}
+
+
+def test_observing_ends_well_with_ctrl_c(standing):
+    operator, _ = standing
+    command = operator.command("observe", "due.health.*")
+    with subprocess.Popen(
+        command, env=operator.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert "due.health." in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=SECONDS)
+    assert process.returncode == 0
+    assert "items" in error
+    assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("part", ["kitsune", "coordinator", "updates", "p4runtime_ctrl"])
+def test_a_part_that_dies_is_started_again(standing, part):
+    """Under a new process id, which status knows; and the app is active again."""
+    operator, _ = standing
+    before = operator.figures("status")["parts"][part]["pid"]
+    os.kill(before, signal.SIGKILL)
+
+    def well_again():
+        done = operator.run("status", "--json")
+        now = json.loads(done.stdout)
+        states = {app: now["apps"].get(app, "").split(", ") for app in APPS} if now.get("apps") else {}
+        active = states and all("active" in each for each in states.values())
+        return active and now["well"] and now["parts"][part]["pid"] != before
+
+    until(well_again)
+
+
+def test_down_ends_everything_and_keeps_the_archive(operator):
+    with operator.up() as (process, said):
+        done = operator.run("down")
+        assert (done.returncode, done.stdout) == (0, f"stopped (process {said['pid']})\n")
+        _, error = process.communicate(timeout=SECONDS)
+        assert process.returncode == 0
+        assert error.endswith("stopped; nothing was left running\n")
+    assert processes_of(operator.mark) == []
+    assert operator.run("status").returncode == 1
+    assert operator.run("get", "due.event.coordinator", "--json").stdout.count("joined") >= len(APPS) - 1
+
+
+def test_down_ends_one_that_is_still_starting(operator):
+    with subprocess.Popen(
+        operator.command("up"), env=operator.environment, stderr=subprocess.PIPE
+    ) as process:
+        until(lambda: "starting" in operator.run("status").stdout or process.poll() is not None)
+        done = operator.run("down")
+        _, error = process.communicate(timeout=SECONDS)
+    assert (process.returncode, done.returncode) == (0, 0)
+    assert b"sdnator: stopped" in error
+    assert processes_of(operator.mark) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_in_order(operator, number):
+    with operator.up() as (process, _):
+        process.send_signal(number)
+        _, error = process.communicate(timeout=SECONDS)
+        assert process.returncode == 0
+        assert "Traceback" not in error
+    assert processes_of(operator.mark) == []
+
+
+def test_killed_it_takes_all_along(operator):
+    """And the next one starts over what it left."""
+    with operator.up() as (process, _):
+        process.kill()
+        process.communicate(timeout=SECONDS)
+    until(lambda: not processes_of(operator.mark))
+    assert json.loads(operator.run("status", "--json").stdout) == {"running": False, "pid": None}
+    with operator.up():
+        pass
+
+
+def test_death_of_the_switch_ends_it_with_a_reason(operator):
+    with operator.up() as (process, said):
+        os.kill(said["parts"]["switch"], signal.SIGKILL)
+        _, error = process.communicate(timeout=SECONDS)
+        assert process.returncode == 1
+        assert "sdnator: switch was killed by SIGKILL" in error
+    assert processes_of(operator.mark) == []
+
+
+def test_given_backends_are_used(operator, tmp_path):
+    """Nothing embedded is started for Data Updates, and the archive is the given one."""
+    archive = f"sqlite://{tmp_path}/given.db"
+    with EmbeddedServer(tmp_path / "server") as server:
+        with operator.up("--updates", server.url, "--archive", archive) as (_, said):
+            assert "updates" not in said["parts"]
+            assert (said["updates"], said["archive"]) == (server.url, archive)
+            assert operator.run("observe", "due.health.firewall", "--count", "1").stdout.count("\n") == 1
+        assert server.pid
+    assert (tmp_path / "given.db").exists()
+    assert not (tmp_path / "data" / "sdnator" / "archive.db").exists()
+
+
+def test_a_switch_that_runs_already_is_used_and_left_running(operator):
+    """The pipeline loads its program into it."""
+    command = [sys.executable, "-m", "dataplane", "--device-id", "7"]
+    with subprocess.Popen(command, env=operator.environment, stdout=subprocess.PIPE) as switch:
+        try:
+            assert switch.stdout is not None
+            address = json.loads(switch.stdout.readline())["grpc"]
+            with operator.up("--switch", address, "--device-id", "7") as (_, said):
+                assert "switch" not in said["parts"]
+                until(lambda: operator.run("tables").returncode == 0)
+                assert operator.figures("tables", address, "--device-id", "7")["entries"]
+            assert switch.poll() is None
+        finally:
+            switch.terminate()
+
+
+@pytest.mark.parametrize("switch", ["embedded", "bmv2"])
+def test_two_interfaces_are_a_wire_and_their_packets_are_seen(operator, switch):
+    """Frames of one side leave at the other, and their headers come as record batches."""
+    require_netns()
+    if switch == "bmv2":
+        optional_program("simple_switch_grpc")
+    with ExitStack() as stack:
+        left, right = VethPair.make(stack, "upl"), VethPair.make(stack, "upr")
+        ports = ("--port", f"1=veth:{left.far}", "--port", f"2=veth:{right.far}")
+        stack.enter_context(operator.up("--switch", switch, *ports))
+        send, receive = (stack.enter_context(raw(name)) for name in (left.near, right.near))
+        frame = bytes.fromhex(
+            "020000000002020000000001 0800 4500001c00010000401100000a0000010a000002 0035003500080000"
+        )
+        receive.settimeout(0.2)
+
+        def passes():
+            send.send(frame.ljust(60, b"\0"))
+            try:
+                return receive.recv(2048).startswith(frame)
+            except TimeoutError:
+                return False
+
+        until(passes)
+        viewer = stack.enter_context(
+            subprocess.Popen(
+                operator.command(
+                    "observe", "network.packets.p4runtime_ctrl.s1.all", "--count", "1", "--json"
+                ),
+                env=operator.environment,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+        )
+        until(lambda: passes() and viewer.poll() is not None)
+        assert viewer.stdout is not None
+        batch = json.loads(viewer.stdout.read())["value"]
+        assert set(batch["port"]) == {1}
+        now_us = time.time_ns() // 1_000
+        assert all(abs(now_us - each) < SECONDS * 10**6 for each in batch["time_us"])
+
+
+def raw(interface):
+    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+    opened.bind((interface, 0))
+    return opened

@@ -1,0 +1,3 @@
+"""A part that is ready and then dies at once."""
+
+print('{"ready": true}', flush=True)

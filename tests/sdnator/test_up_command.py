@@ -1,0 +1,115 @@
+"""Ports and wires as typed, and what status and down say where nothing runs."""
+
+import json
+import os
+
+import pytest
+from typer.testing import CliRunner
+
+from sdnator.errors import BadInput
+from sdnator.running import claimed
+from sdnator.up_command import kitsune_settings, parse_ports, parse_wires
+from tests.end_to_end.operator_app import app
+
+
+@pytest.fixture(autouse=True)
+def no_pipeline(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+
+
+def run(*words):
+    return CliRunner().invoke(app, list(words), catch_exceptions=False)
+
+
+def test_ports_by_number():
+    assert parse_ports(["1=veth:lo", "2=null"], "embedded") == {1: "veth:lo", 2: "null"}
+    assert parse_ports([], "10.0.0.2:9559") == {}
+
+
+@pytest.mark.parametrize(
+    ("option", "switch", "word"),
+    [
+        ("1", "embedded", "N=veth:INTERFACE"),
+        ("1=veth:", "embedded", "N=veth:INTERFACE"),
+        ("1=capture:/x.sock", "embedded", "sdnator replay"),
+        ("x=null", "embedded", "1 to 509"),
+        ("0=null", "embedded", "1 to 509"),
+        ("510=null", "embedded", "1 to 509"),
+        ("1=veth:no-such-if", "embedded", "no-such-if"),
+        ("1=null", "bmv2", "BMv2"),
+        ("1=null", "10.0.0.2:9559", "leave --port out"),
+        ("1=null", "somewhere", "HOST:PORT"),
+    ],
+)
+def test_wrong_ports_are_named(option, switch, word):
+    with pytest.raises(BadInput, match=word):
+        parse_ports([option], switch)
+
+
+def test_a_port_is_given_once():
+    with pytest.raises(BadInput, match="twice"):
+        parse_ports(["1=null", "1=null"], "embedded")
+
+
+def test_two_ports_are_a_wire_by_themselves():
+    """One port only listens; of three, nobody can know."""
+    two = {1: "null", 5: "null"}
+    assert parse_wires(None, two, "embedded") == {1: 5, 5: 1}
+    assert parse_wires(["none"], two, "embedded") == {}
+    assert parse_wires(None, {1: "null"}, "embedded") == {}
+    assert parse_wires(None, {1: "null", 2: "null", 3: "null"}, "embedded") == {}
+    assert parse_wires(["7-8"], {}, "10.0.0.2:9559") == {7: 8, 8: 7}
+
+
+@pytest.mark.parametrize(
+    ("wires", "word"),
+    [
+        (["1"], "two ports"),
+        (["1-1"], "two ports"),
+        (["1-x"], "1 to 509"),
+        (["1-2", "2-3"], "a wire already"),
+        (["1-4"], "no port 4"),
+    ],
+)
+def test_wrong_wires_are_named(wires, word):
+    with pytest.raises(BadInput, match=word):
+        parse_wires(wires, {1: "null", 2: "null", 3: "null"}, "embedded")
+
+
+def test_a_model_is_used_where_it_exists_and_written_where_not(tmp_path):
+    model = tmp_path / "home.model"
+    assert kitsune_settings(55_000, None) == {"fm_grace": 5_000, "ad_grace": 50_000, "mode": "bounded"}
+    assert kitsune_settings(55_000, model)["save_model"] == str(model)
+    model.write_bytes(b"")
+    assert kitsune_settings(55_000, model)["load_model"] == str(model)
+    with pytest.raises(BadInput, match="--model"):
+        kitsune_settings(55_000, tmp_path / "none" / "home.model")
+
+
+def test_status_of_nothing_is_exit_code_1():
+    done = run("status")
+    assert (done.exit_code, "sdnator up" in done.stdout) == (1, True)
+    done = run("status", "--json")
+    assert (done.exit_code, json.loads(done.stdout)) == (1, {"running": False, "pid": None})
+
+
+def test_a_pipeline_that_starts_is_told(tmp_path):
+    with claimed(tmp_path / "state" / "sdnator"):
+        done = run("status")
+    assert (done.exit_code, done.stdout) == (
+        1,
+        f"a pipeline is starting or stopping (process {os.getpid()})\n",
+    )
+
+
+def test_down_is_content_where_nothing_runs():
+    done = run("down")
+    assert (done.exit_code, done.stdout) == (0, "no pipeline was running\n")
+    assert json.loads(run("down", "--json").stdout) == {"stopped": None}
+
+
+def test_wrong_archive_is_told_before_anything_starts(tmp_path):
+    with pytest.raises(BadInput, match="--archive"):
+        run("up", "--archive", "postgres://somewhere")
+    assert not (tmp_path / "state" / "sdnator" / "logs").exists()
