@@ -26,13 +26,13 @@ def _serialized_descriptor(path: str) -> bytes:
             isinstance(node, ast.keyword)
             and node.arg == "serialized_pb"
             and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, bytes)
         ):
-            return bytes(node.value.value)
+            return node.value.value
         # protoc >= 3.20 writes AddSerializedFile(b'...') instead
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "AddSerializedFile":
             return bytes(ast.literal_eval(node.args[0]))
-    msg = f"no file descriptor in {source}: the {_WHEEL} package has an unknown layout"
-    raise ImportError(msg)
+    raise ImportError(f"no file descriptor in {source}: the {_WHEEL} package has an unknown layout")
 
 
 def _namespace(path: str) -> Any:

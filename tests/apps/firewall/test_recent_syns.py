@@ -53,7 +53,7 @@ def test_a_surge_is_said_once_a_window():
     """Whichever batch brings the SYN that makes it one."""
     surges = Surges(10, 200)
     row = (1_000_000, "10.0.0.5", "10.0.0.1", 80)
-    other = (1_000_000, "10.0.0.5", "2001:db8::1", 80)
+    other = (1_000_000, "2001:db8::5", "2001:db8::1", 80)
     assert surges.add(batch(*[row] * 9, other)) == []
     assert surges.add(batch(row)) == [("10.0.0.1", 1_000_000_000)]
     assert surges.add(batch(*[row] * 30)) == []

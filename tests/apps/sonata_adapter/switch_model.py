@@ -6,6 +6,7 @@ would publish: copied packets and reports, by name of the offer.
 
 from dataclasses import dataclass, field
 from ipaddress import ip_network
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -20,9 +21,9 @@ class SwitchModel:
     """A switch; `base_us` is its clock zero."""
 
     base_us: int = 0
-    offers: dict = field(default_factory=dict)
-    stages: list = field(default_factory=lambda: [{} for _ in range(8)])
-    cells: list = field(default_factory=lambda: [{} for _ in range(8)])
+    offers: dict[str, Any] = field(default_factory=dict)
+    stages: list[dict[int, dict[str, int]]] = field(default_factory=lambda: [{} for _ in range(8)])
+    cells: list[dict[Any, Any]] = field(default_factory=lambda: [{} for _ in range(8)])
     shrink: int = 0
     """Divides the cells of every entry, to see keys without a cell; 0: every key has a cell."""
 
@@ -47,7 +48,8 @@ class SwitchModel:
 
     def process(self, batch):
         """(kind, name) -> record batch of what is sent for these packets."""
-        copies, reports = {}, {}
+        copies: dict[str, list[int]] = {}
+        reports: dict[str, list[tuple[int, bool, bool]]] = {}
         for row in range(len(batch)):
             packet = {name: batch[name][row] for name in batch.columns}
             matched = {o["bit"] for o in self.offers.values() if matches(o["conditions"], packet)}
@@ -84,7 +86,7 @@ class SwitchModel:
                 length & p["length_mask"],
             )
             epoch = now * p["reciprocal"] >> 64
-            slot = key
+            slot: Any = key
             if self.shrink:
                 slot = p["base"] + crc32(repr(key).encode()) % (p["size"] // self.shrink)
                 slot += CELLS // 2 * (epoch & 1)

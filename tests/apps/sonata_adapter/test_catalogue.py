@@ -24,7 +24,7 @@ def run(names, frames, *, size=1024, values=None):
     for batch in batches(frames, size):
         outputs += engine.process(batch)
     outputs += engine.finish()
-    found = {name: [] for name in names}
+    found: dict[str, list[sonata.Found]] = {name: [] for name in names}
     for result in outputs:
         assert isinstance(result, Result)
         assert result.exact

@@ -1,5 +1,7 @@
 """Switch and host together find what the naive evaluator finds, and nothing is there that nobody wants."""
 
+from typing import Any
+
 import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
@@ -30,7 +32,7 @@ def play(keys, frames, *, shrink=0, size=512):
                 written += control.packets("s1", name, sent, now)
         written += control.tick(now + 0.5)
     written += control.finish()
-    found = {}
+    found: dict[str, list[Any]] = {}
     for one in written:
         for key in one.keys:
             found.setdefault(key, []).append(one.output)

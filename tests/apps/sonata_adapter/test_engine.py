@@ -1,6 +1,7 @@
 """Windows: late and disordered packets, bounded memory, queries that come and go."""
 
 import random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,14 @@ from apps.sonata_adapter.query import SYN, Query, count, field, ip, largest, len
 from apps.sonata_adapter.results import Captured
 from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, batches, office, udp
 from tests.apps.sonata_adapter.traffic import tcp as tcp_frame
+
+
+def run(engine, frames, size=100_000):
+    """All outputs of batches of this size."""
+    found: list[Any] = []
+    for batch in batches(frames, size):
+        found += engine.process(batch)
+    return found
 
 
 def syns(times_ms, dst="10.0.0.1"):
@@ -32,11 +41,11 @@ def test_out_of_order_packets_count_while_their_window_is_open():
     """A window stays open for the lateness; what comes later is left out and counted."""
     engine = HostEngine(lateness_us=300_000)
     engine.add(final())
-    assert not engine.process(batch_of(syns([100, 900, 1200])))
-    assert not engine.process(batch_of(syns([950])))
-    closed = engine.process(batch_of(syns([1400])))
+    assert not run(engine, (syns([100, 900, 1200])))
+    assert not run(engine, (syns([950])))
+    closed = run(engine, (syns([1400])))
     assert [(r.window_us - BASE_US, r.at_us - BASE_US) for r in closed] == [(0, 1_000_000)]
-    assert not engine.process(batch_of(syns([980])))
+    assert not run(engine, (syns([980])))
     assert engine.late == 1
     assert len(engine.finish()) == 1
 
@@ -45,7 +54,7 @@ def test_lateness_is_at_most_a_window():
     """Results of a window's end are one window late at most."""
     engine = HostEngine(lateness_us=10_000_000)
     engine.add(final())
-    engine.process(batch_of(syns([100])))
+    run(engine, (syns([100])))
     assert not engine.advance(BASE_US + 1_999_999)
     assert len(engine.advance(BASE_US + 2_000_000)) == 1
 
@@ -55,9 +64,7 @@ def test_a_key_is_reported_once_in_a_window_at_its_crossing():
     for size in (1, 2, 100):
         engine = HostEngine()
         engine.add(counting(3))
-        found = []
-        for batch in batches(syns([10, 20, 30, 40, 50, 1100, 1200, 1300]), size):
-            found += engine.process(batch)
+        found = run(engine, syns([10, 20, 30, 40, 50, 1100, 1200, 1300]), size)
         assert [r.at_us - BASE_US for r in found] == [30_000, 1_300_000]
         assert [r.fields["count"] for r in found] == [3, 3]
 
@@ -72,9 +79,7 @@ def test_beyond_the_bound_results_are_estimates_that_miss_nothing():
     rng.shuffle(frames)
     engine = HostEngine(limit=500)
     engine.add(counting(50))
-    found = []
-    for batch in batches(frames, 512):
-        found += engine.process(batch)
+    found = run(engine, frames, 512)
     assert set(heavy) <= {r.fields["dst"] for r in found}
     assert any("beyond the bound of 500" in r.error for r in found if not r.exact)
     assert all(r.exact == (not r.error) for r in found)
@@ -85,7 +90,7 @@ def test_distinct_beyond_the_bound_says_how_much_it_may_miss():
     frames = [Frame(BASE_US, 60, udp("10.0.0.9", f"10.{n // 250}.{n % 250}.2", 1, 2)) for n in range(2000)]
     engine = HostEngine(limit=1000)
     engine.add(CATALOGUE["superspreader"].query({"threshold": 1950}))
-    found = [r for batch in batches(frames, 256) for r in engine.process(batch)]
+    found = run(engine, frames, 256)
     assert [r.fields["src"] for r in found] == ["10.0.0.9"]
     assert "missed" in found[0].error
 
@@ -94,9 +99,9 @@ def test_a_query_that_comes_within_a_window_says_so():
     """Its first window is partial, the next is not."""
     engine = HostEngine()
     engine.add(final(2000))
-    engine.process(batch_of(syns([10])))
+    run(engine, (syns([10])))
     engine.add(counting(1))
-    found = engine.process(batch_of(syns([300, 1300])))
+    found = run(engine, (syns([300, 1300])))
     assert [r.partial for r in found] == [True, False]
 
 
@@ -105,7 +110,7 @@ def test_removing_a_query_forgets_it():
     engine = HostEngine()
     engine.add(counting(1))
     engine.remove("q")
-    assert not engine.process(batch_of(syns([10])))
+    assert not run(engine, (syns([10])))
     assert not engine.finish()
     assert not engine.names
 
@@ -116,7 +121,7 @@ def test_streams_report_packets_and_tuples():
     engine.add(Query("packets").filter(tcp.flags == SYN))
     engine.add(Query("tuples").filter(tcp.flags == SYN).map(dst=ip.dst, bytes=length))
     frames = sorted(office(2, random.Random(1)))
-    found = [r for batch in batches(frames, 300) for r in engine.process(batch)]
+    found = run(engine, frames, 300)
     assert all(isinstance(r, Captured) for r in found)
     packets = [r.batch for r in found if r.query == "packets"]
     tuples = [r.batch for r in found if r.query == "tuples"]
@@ -129,7 +134,7 @@ def test_distinct_alone_reports_each_new_tuple():
     """In every window anew."""
     engine = HostEngine()
     engine.add(Query("talkers", 1000).map(src=ip.src).distinct())
-    found = engine.process(batch_of(syns([1, 2, 3, 1001])))
+    found = run(engine, (syns([1, 2, 3, 1001])))
     assert [(r.at_us - BASE_US, r.fields) for r in found] == [
         (1000, {"src": "10.1.1.1"}),
         (1_001_000, {"src": "10.1.1.1"}),

@@ -10,7 +10,7 @@ from apps.sonata_adapter.columns import Packets, evaluate
 from apps.sonata_adapter.conditions import conditions_of, disjoint
 from apps.sonata_adapter.dataflow import PacketSource, Table, compile_query, sources
 from apps.sonata_adapter.keys import request_of
-from apps.sonata_adapter.planner import SwitchLimits, explain, plan, reciprocal
+from apps.sonata_adapter.planner import Plan, SwitchLimits, explain, plan, reciprocal
 from tests.apps.sonata_adapter.switch_model import matches
 from tests.apps.sonata_adapter.traffic import batch_of, mixed
 
@@ -52,7 +52,8 @@ def test_what_stays_keeps_its_place(seed):
     """Whatever comes and goes beside it."""
     rng = random.Random(seed)
     keys = [*EVERY, *(f"{PREFIX}.new_tcp:dst=10.0.{n}.0/24" for n in range(20))]
-    present, found = set(), None
+    present: set[str] = set()
+    found: Plan | None = None
     for _ in range(30):
         changed = set(rng.sample(keys, 3)) ^ present
         before = found
@@ -84,6 +85,10 @@ def test_same_conditions_share_a_copy():
     assert len(matches_) == len(set(matches_))
 
 
+def packets_of(node):
+    return node if isinstance(node, PacketSource) else packets_of(node.source)
+
+
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_conditions_mean_what_the_filters_mean(name):
     """Exact ones select the same packets; the others select at least those."""
@@ -91,11 +96,10 @@ def test_conditions_mean_what_the_filters_mean(name):
     packets = Packets(batch)
     outcome = compile_query(CATALOGUE[name].query())
     for node in sources(outcome) if isinstance(outcome, Table) else [outcome.node]:
-        while not isinstance(node, PacketSource):
-            node = node.source
-        conditions = conditions_of(node.filters)
+        filters = packets_of(node).filters
+        conditions = conditions_of(filters)
         wanted = packets
-        for condition in node.filters:
+        for condition in filters:
             wanted = wanted.where(condition)
         chosen = set(wanted.origin.tolist())
         rows = [{column: batch[column][row] for column in batch.columns} for row in range(len(batch))]
@@ -103,7 +107,7 @@ def test_conditions_mean_what_the_filters_mean(name):
             row for row, packet in enumerate(rows) if any(matches(m, packet) for m in conditions.alternatives)
         }
         assert selected == chosen if conditions.exact else selected >= chosen
-    assert len(evaluate(node.filters[0], packets)) == len(batch)
+        assert len(evaluate(filters[0], packets)) == len(batch)
 
 
 @pytest.mark.parametrize("window_ms", [100, 333, 3000, 60_000, 3_600_000])

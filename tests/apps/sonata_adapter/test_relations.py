@@ -6,13 +6,14 @@ from hypothesis import strategies as st
 
 from apps.sonata_adapter.dataflow import PacketSource, Table, TableJoin
 from apps.sonata_adapter.relations import Relation
+from apps.sonata_adapter.tables import Column
 
 rows = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=12)
 _NOTHING = Table(PacketSource(()), (), (), ())
 
 
 def relation(pairs, name):
-    columns = {"k": (np.array([k for k, _ in pairs], dtype=np.int64),)}
+    columns: dict[str, Column] = {"k": (np.array([k for k, _ in pairs], dtype=np.int64),)}
     columns[name] = (np.array([v for _, v in pairs], dtype=np.int64),)
     return Relation(columns, len(pairs))
 
@@ -24,7 +25,7 @@ def joined(left, right, kind):
 
 
 def naive(left, right, kind):
-    out = []
+    out: list[tuple[int, ...]] = []
     for key, value in left:
         partners = [other for there, other in right if there == key]
         if kind == "anti":

@@ -1,5 +1,7 @@
 """The adapter among real processes: a key is declared, a query runs in the switch, and leaves with the key."""
 
+from functools import partial
+
 import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
@@ -54,11 +56,7 @@ def test_keys_become_queries_and_leave_with_them(stage):
     shifted = [Frame(f.time_us - TRAFFIC_US + BASE_US, f.length, f.data) for f in frames]
     for name in CATALOGUE:
         truth = {(f.window, f.fields) for f in expect(name, shifted, {"window": 2000})}
-        wait_for(
-            lambda name=name, truth=truth: found(results, name) >= truth,
-            5,
-            lambda name=name, truth=truth: (name, truth, found(results, name)),
-        )
+        wait_for(partial(at_least, results, name, truth), 5, partial(found, results, name))
         assert found(results, name) == truth
     results.stop()
 
@@ -67,6 +65,10 @@ def quiet(health):
     """Nothing has reached the adapter between its last three reports of health."""
     counts = [(v["app"]["host_packets"], v["app"]["reports"]) for v in health.values("health")[-3:]]
     return len(counts) == 3 and len(set(counts)) == 1 and min(counts[0]) > 0
+
+
+def at_least(results, name, truth):
+    return found(results, name) >= truth
 
 
 def found(results, name):

@@ -17,7 +17,8 @@ rounds = st.lists(st.lists(keys, max_size=60), max_size=6)
 @given(rounds)
 def test_keys_are_numbered_by_first_occurrence(batches):
     """The same numbers as a dictionary gives, and the rows where new keys stand first."""
-    table, twin = KeyTable(1 << 20), {}
+    table = KeyTable(1 << 20)
+    twin: dict[int, int] = {}
     for batch in batches:
         expected_new = []
         expected = []
@@ -35,7 +36,8 @@ def test_keys_are_numbered_by_first_occurrence(batches):
 @given(rounds, st.integers(1, 30))
 def test_a_full_table_keeps_what_it_has(batches, limit):
     """Beyond the limit keys are -1; keys with a number keep it."""
-    table, known = KeyTable(limit), {}
+    table = KeyTable(limit)
+    known: dict[int, int] = {}
     for batch in batches:
         numbers, first = table.number(np.array(batch, dtype=np.uint64))
         assert table.size <= limit
@@ -83,7 +85,8 @@ def test_bloom_never_takes_an_old_key_for_a_new_one(batch):
 @given(st.lists(st.tuples(st.integers(1, 40), st.integers(1, 9)), min_size=1, max_size=300))
 def test_count_min_never_counts_too_little(rows):
     """An estimate is at least the truth."""
-    sketch, truth = CountMin(64), {}
+    sketch = CountMin(64)
+    truth: dict[int, int] = {}
     for key, amount in rows:
         truth[key] = truth.get(key, 0) + amount
         estimate = sketch.add(np.array([key], dtype=np.uint64), np.array([amount]))
