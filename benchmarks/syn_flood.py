@@ -2,7 +2,7 @@
 
 Client success and half-open connections are measured with the guard armed beforehand;
 `time_to_mitigate_ms` without it, from the flood's first frame to the rule confirmed by the switch, where
-the firewall has to find the flood itself (`detected` has that run's success from 2 s after the rule:
+the firewall has to find the flood itself (`detected` has that run's success from 7 s after the rule:
 the backlog's own 7 s are waited out, no half-open connection is reset).
 """
 
@@ -46,9 +46,11 @@ def measure(sources: Sources, version: int, rounds: int) -> dict[str, Any]:
 
 
 def _run(sources: Sources, version: int, *, armed: bool) -> SynFloodResult:
-    result = run_syn_flood(SynFloodOptions(sources=sources, version=version, armed=armed, seconds=10.0))
-    if result.void:
-        print(f"{sources}: {result.void}", file=sys.stderr)
+    seconds = 10.0 if armed else 14.0
+    result = run_syn_flood(SynFloodOptions(sources=sources, version=version, armed=armed, seconds=seconds))
+    seen = f"known {result.known_client_success}, new {result.new_client_success}"
+    mitigated = f"mitigated after {result.time_to_mitigate_ms} ms"
+    print(f"{sources}, armed {armed}: {result.void or f'{seen}, {mitigated}'}", file=sys.stderr)
     return result
 
 

@@ -13,9 +13,14 @@ from typing import Annotated, NoReturn
 import typer
 
 from sdnator import __version__
+from sdnator.coordinator_commands import apps, flow, keys
 from sdnator.dataset_commands import dataset
 from sdnator.detect_command import detect_command
+from sdnator.doctor import doctor
+from sdnator.due_commands import get, observe
 from sdnator.errors import SdnatorError
+from sdnator.switch_commands import counters, tables
+from sdnator.up_command import down, status, up
 
 app = typer.Typer(
     name="sdnator",
@@ -26,6 +31,8 @@ app = typer.Typer(
 )
 app.add_typer(dataset, name="dataset")
 app.command("detect")(detect_command)
+for command in (up, status, down, observe, get, apps, keys, flow, tables, counters, doctor):
+    app.command(command.__name__)(command)
 
 
 def _show_version(wanted: bool) -> None:

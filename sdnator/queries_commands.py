@@ -19,6 +19,7 @@ from apps.packets import read_frames
 from apps.sonata_adapter.catalogue import Template
 from apps.sonata_adapter.engine import HostEngine
 from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.explain import explain as explain_plan
 from apps.sonata_adapter.keys import (
     CAPTURE_PREFIX,
     HANDSHAKE,
@@ -27,7 +28,6 @@ from apps.sonata_adapter.keys import (
     capture_parameters,
     request_of,
 )
-from apps.sonata_adapter.planner import explain as explain_plan
 from apps.sonata_adapter.planner import plan
 from apps.sonata_adapter.results import Captured, Result
 from apps.sonata_adapter.templates import QueryFolder, own_queries

@@ -7,15 +7,19 @@ Everything happens in network namespaces that are removed at the end, also after
 """
 
 import json
+import signal
 import statistics
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from sdnator import p4_program
+from sdnator.errors import PipelineError
 from sdnator.process import Child
 from sdnator.syn_flood_frames import Sources
 from sdnator.syn_flood_lab import BACKLOG, HALF_OPEN_S, PORT, Lab, mac
@@ -106,10 +110,27 @@ Show = Callable[[Second], None]
 def run_syn_flood(options: SynFloodOptions, show: Show = lambda _: None) -> SynFloodResult:
     """Both phases.  Raises `BadInput` where the machine lacks something, `PipelineError` after a fault."""
     guard = {"reflected": {"rate": 4 * options.rate, "burst": options.rate}}
-    with tempfile.TemporaryDirectory(prefix="sdnator-syn-flood-") as made:
+    with _terminable(), tempfile.TemporaryDirectory(prefix="sdnator-syn-flood-") as made:
         folder = options.keep or Path(made)
         with Lab(options.version) as lab, Stage(lab, folder, switch=options.switch, guard=guard) as stage:
             return _Run(options, lab, stage, show).run()
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM unwinds like Ctrl-C: namespaces outlive a process that just dies."""
+
+    def leave(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class _Run:
@@ -254,14 +275,21 @@ class _Run:
         )
         begin(flood)
         self._watch(seconds, attempts, flooding=True)
-        said = json.loads(report.read_text(encoding="utf-8"))
-        deadline = time.monotonic() + _LATE_S
-        while "sent" not in said and time.monotonic() < deadline:
-            self._stage.wait(0.1)
-            said = json.loads(report.read_text(encoding="utf-8"))
+        said = self._flood_report(report)
         self._stage.release(flood)
         self._result.sent += said.get("sent", 0)
         return float(said["first"])
+
+    def _flood_report(self, report: Path) -> dict[str, Any]:
+        """When it began and what was sent; a flood may be late on a busy machine."""
+        deadline = time.monotonic() + _LATE_S
+        while True:
+            lines = _lines(report)
+            if lines and ("sent" in lines[-1] or time.monotonic() > deadline):
+                return lines[-1]
+            if time.monotonic() > deadline:
+                raise PipelineError("the flood did not start")
+            self._stage.wait(0.1)
 
     def _watch(self, seconds: float, attempts: Path, *, flooding: bool = False) -> None:
         begun = time.monotonic()

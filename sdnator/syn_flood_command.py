@@ -45,8 +45,12 @@ def syn_flood_command(
         seconds=seconds,
         keep=keep,
     )
+    _run(options, as_json=as_json)
+
+
+def _run(options: SynFloodOptions, *, as_json: bool) -> None:
     if not as_json:
-        print(f"{options.sources} source(s), {rate:,} SYN/s; {NOTE}")
+        print(f"{options.sources} source(s), {options.rate:,} SYN/s; {NOTE}")
         print(f"{'':24}{'second':>7}{'tried':>7}{'connected':>11}{'half-open':>11}{'challenged':>12}")
     result = run_syn_flood(options, (lambda _: None) if as_json else _show)
     if as_json:

@@ -15,7 +15,6 @@ import json
 import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -121,16 +120,17 @@ def flood(options: dict[str, Any]) -> None:
     report = Path(options.pop("report"))
     plan = FloodPlan(**options)
     frames = [row.tobytes() for row in make_frames(plan)]
-    told = threading.Event()
-    # a handler, not a mask: numpy's threads exist already and would take the signal
-    signal.signal(signal.SIGUSR1, lambda *_: told.set())
+    told: list[int] = []
+    # a handler, not a mask: numpy's threads exist already and would take the signal; a list, not an
+    # Event, which its own waiter may hold when the handler interrupts it
+    signal.signal(signal.SIGUSR1, lambda number, _: told.append(number))
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as wire:
         wire.bind(("eth0", 0))
         _ready()
-        while not told.wait(_BURST_S):
-            pass
+        while not told:
+            time.sleep(_BURST_S)
         first, begun, sent, failed = time.time(), time.monotonic(), 0, 0
-        report.write_text(json.dumps({"first": first}), encoding="utf-8")
+        report.write_text(json.dumps({"first": first}) + "\n", encoding="utf-8")
         while sent < len(frames):
             due = min(len(frames), int((time.monotonic() - begun) * plan.rate) + 1)
             for frame in frames[sent:due]:
@@ -142,7 +142,7 @@ def flood(options: dict[str, Any]) -> None:
             time.sleep(_BURST_S)
     seconds = time.monotonic() - begun
     text = json.dumps({"first": first, "sent": sent - failed, "failed": failed, "seconds": seconds})
-    report.write_text(text, encoding="utf-8")
+    report.write_text(text + "\n", encoding="utf-8")
     signal.pause()
 
 

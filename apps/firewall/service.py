@@ -32,6 +32,7 @@ from apps.firewall.ledger import Ledger
 from apps.firewall.policy import AllowList, Rules, judge
 from apps.firewall.recent_syns import Surges
 from apps.firewall.services import Service
+from apps.firewall.surroundings import gateways, name_servers, own_addresses, worth_allowing
 from apps.firewall.syn_defence import Suspicion, SynDefence
 from apps.firewall.syn_policy import SynRules
 from apps.messages import (
@@ -73,6 +74,11 @@ CAPABILITIES = (
 EVIDENCE_KEPT = 10
 SENDERS_KEPT = 10_000
 HOSTS_WATCHED = 64
+_SURROUNDINGS = {
+    "/proc/net/fib_trie": own_addresses,
+    "/proc/net/route": gateways,
+    "/etc/resolv.conf": name_servers,
+}
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +98,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Known sources in the switch, the most recent ones."""
     known_days: int = 30
     """A handshake counts for so long."""
+    allow_surroundings: bool = False
+    """Never block this machine's own addresses, gateways and DNS servers; off in replays, whose captures
+    come from elsewhere."""
     eve_file: str = ""
     """Alerts and decisions are appended here as EVE JSON, a line each; empty: nowhere."""
 
@@ -110,9 +119,9 @@ class FirewallService:
         self._settings = settings
         services = tuple(Service.parse(text) for text in settings.guard)
         self._known = KnownSources(settings.known_limit)
-        allow = AllowList.parse(settings.rules.allow)
-        self._syn = SynDefence(settings.syn, services, self._ledger, allow, self._known)
-        self._desk = Desk(self._ledger, self._syn, settings.rules.allow)
+        allowed = (*settings.rules.allow, *(_surroundings() if settings.allow_surroundings else ()))
+        self._syn = SynDefence(settings.syn, services, self._ledger, AllowList.parse(allowed), self._known)
+        self._desk = Desk(self._ledger, self._syn, allowed)
         self._switches: dict[str, bool] = {}
         self._surges = Surges(settings.syn.threshold, settings.syn.window_ms)
         self._suspected: dict[str, tuple[float, Suspicion]] = {}
@@ -324,6 +333,17 @@ class FirewallService:
             [due.NO_WAIT],
             event_time=decision.event_time,
         )
+
+
+def _surroundings() -> tuple[str, ...]:
+    found: list[str] = []
+    for path, addresses_in in _SURROUNDINGS.items():
+        try:
+            found += addresses_in(Path(path).read_text(encoding="ascii", errors="replace"))
+        except OSError as error:
+            log.warning("%s: %s; its addresses are not on the allow-list", path, error.strerror)
+    log.info("allowed from the start: %s", ", ".join(worth_allowing(found)) or "nothing")
+    return worth_allowing(found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

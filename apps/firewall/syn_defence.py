@@ -132,7 +132,7 @@ class SynDefence:
 
     def conclude(self, watch: Watch, offences: Mapping[str, int]) -> list[Decision]:
         """What follows from a watch; `offences` are earlier blocks by address."""
-        if watch.total < self.rules.least:
+        if not len(self.recent):  # the stream of SYNs does not reach us
             return self._guard_known_services(watch)
         by_port: dict[int, dict[str, int]] = {}
         for (port, source), count in watch.syns.items():

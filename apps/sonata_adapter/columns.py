@@ -5,7 +5,7 @@ from `0.0.0.1`, the upper half of an IPv6 address is stored XOR `_SIX`, whose ow
 multicast prefix) is no source or destination of real packets.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from ipaddress import ip_network
 from typing import Any, Final, Protocol
@@ -333,9 +333,15 @@ def _prefix(text: str) -> tuple[int, int, int]:
 def plain_value(kind: Kind, column: Column, row: int) -> int | str:
     """One value as people read it."""
     if kind == "address":
-        high, low = int(column[0][row]), int(column[1][row])
-        return address_text(4, low) if high == 0 else address_text(6, (high ^ _SIX) << 64 | low)
+        parts = (int(column[0][row]), int(column[1][row]))
+        return address_text(6 if parts[0] else 4, address_number(parts))
     number = int(column[0][row])
     if kind == "mac":
         return ":".join(f"{byte:02x}" for byte in number.to_bytes(6, "big"))
     return f"{number:016x}" if kind == "name" else number
+
+
+def address_number(parts: Sequence[int]) -> int:
+    """The address that the two halves of a column stand for, as a number."""
+    high, low = parts
+    return low if high == 0 else (high ^ _SIX) << 64 | low

@@ -6,20 +6,24 @@ reports of counting stages ─────────────────�
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import count
 from typing import Any
 
 import msgspec
 
 from apps.messages import TableUpdate
 from apps.sonata_adapter.catalogue import Template
+from apps.sonata_adapter.dataflow import Table, compile_query
 from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.handshake import Handshakes
 from apps.sonata_adapter.keys import HANDSHAKE, Request, request_of
 from apps.sonata_adapter.merge import Merger
-from apps.sonata_adapter.planner import Entry, Plan, QueryPlan, SwitchLimits, plan
+from apps.sonata_adapter.placement import Entry, SwitchLimits
+from apps.sonata_adapter.planner import Plan, QueryPlan, plan
 from apps.sonata_adapter.reports import Reports
 from apps.sonata_adapter.results import Captured, Output, Result
+from apps.sonata_adapter.tallies import CellRead, Tallies
 from due import RecordBatch
 
 
@@ -70,9 +74,13 @@ class _Station:
         self.headers = _Lane(limit, lateness_us)
         self.frames = _Lane(limit, lateness_us)
         self.handshakes = Handshakes()
-        self.reports: dict[str, Reports] = {}
+        self.reports: dict[str, Reports | Tallies] = {}
         self.base_us = 0
         self.now_us: int | None = None
+
+    @property
+    def tallies(self) -> list[Tallies]:
+        return [each for each in self.reports.values() if isinstance(each, Tallies)]
 
     @property
     def lanes(self) -> tuple[_Lane, _Lane]:
@@ -98,6 +106,8 @@ class Control:
         self._requests: dict[str, Request] = {}
         self._outputs: dict[str, tuple[str, ...]] = {}
         self._refused: dict[str, str] = {}
+        self._numbers = count(1)
+        self._questions: dict[int, tuple[Tallies, int]] = {}
         self.plan = Plan((), ())
 
     @property
@@ -182,10 +192,48 @@ class Control:
                 written += self._addressed(station, station.reports[found.identity].take(bit, batch))
         return written
 
+    def reads(self, now: float) -> dict[str, list[CellRead]]:
+        """Questions to the switches about cells of windows that are over, by switch."""
+        found: dict[str, list[CellRead]] = {}
+        for name, station in self._stations.items():
+            for tallies in station.tallies:
+                if station.now_us is not None:
+                    found.setdefault(name, []).extend(
+                        self._numbered(tallies, tallies.due(station.now_us, now))
+                    )
+        return {name: reads for name, reads in found.items() if reads}
+
+    @property
+    def needs_cells(self) -> bool:
+        """Whether answers to such questions are expected."""
+        return any(station.tallies for station in self._stations.values())
+
+    def cells(self, switch: str, numbers: Sequence[int], counts: Sequence[int]) -> list[Written]:
+        """Answers: the count of each question."""
+        station = self._station(switch)
+        written: list[Written] = []
+        for number, counted in zip(numbers, counts, strict=True):
+            tallies, question = self._questions.pop(number, (None, 0))
+            if tallies is not None:
+                results = tallies.answer(question, counted, station.now_us or 0)
+                written += self._addressed(station, results)
+        return written
+
+    def _numbered(self, tallies: Tallies, reads: list[CellRead]) -> list[CellRead]:
+        """Numbers that are unlike for all queries."""
+        found = []
+        for read in reads:
+            number = next(self._numbers)
+            self._questions[number] = (tallies, read.id)
+            found.append(msgspec.structs.replace(read, id=number))
+        return found
+
     def tick(self, now: float) -> list[Written]:
         """Let go what has waited long enough."""
         written: list[Written] = []
         for station in self._stations.values():
+            for tallies in station.tallies:
+                written += self._addressed(station, tallies.expire(now))
             for lane in station.lanes:
                 written += self._processed(station, lane, lane.merger.release(now), now)
                 if station.now_us is not None and lane.merger.is_quiet(now):
@@ -272,16 +320,17 @@ class Control:
                 lane.host.add(self._requests[identity].query)
             lane.names = {_name(copy.bit) for one in mine for copy in one.copies}
             lane.merger.expect(lane.names)
-        reports = {}
+        reports: dict[str, Reports | Tallies] = {}
         for one in self.plan.queries:
             if one.in_switch:
                 held = station.reports.get(one.identity)
                 reports[one.identity] = held or self._new_reports(one, station)
         station.reports = reports
 
-    def _new_reports(self, one: QueryPlan, station: _Station) -> Reports:
+    def _new_reports(self, one: QueryPlan, station: _Station) -> Reports | Tallies:
         query = self._requests[one.identity].query
-        return Reports(query, one, base_us=station.base_us, since_us=station.now_us)
+        kind = Tallies if isinstance(compile_query(query), Table) else Reports
+        return kind(query, one, base_us=station.base_us, since_us=station.now_us)
 
     def _processed(
         self, station: _Station, lane: _Lane, batch: RecordBatch | None, now: float | None
@@ -357,3 +406,16 @@ def _update(kind: Any, entry: Entry, params: Mapping[str, int] | None = None) ->
         params={} if params is None else {name: hex(value) for name, value in params.items()},
         priority=1 + entry.bit,
     )
+
+
+def leftovers(commands: Iterable[Sequence[TableUpdate]]) -> tuple[TableUpdate, ...]:
+    """Deletions of what earlier commands, oldest first, left in a switch: of an adapter that was killed."""
+    held: dict[tuple[str, str], TableUpdate] = {}
+    for updates in commands:
+        for update in updates:
+            key = (update.table, str(update.match))
+            if update.kind == "delete":
+                held.pop(key, None)
+            elif update.kind == "insert":
+                held[key] = update
+    return tuple(msgspec.structs.replace(update, kind="delete", params={}) for update in held.values())

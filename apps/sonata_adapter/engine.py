@@ -22,7 +22,6 @@ from apps.sonata_adapter.dataflow import (
     ReduceNode,
     Stream,
     Table,
-    TableJoin,
     compile_query,
     kinds_of,
     sources,
@@ -37,7 +36,7 @@ from apps.sonata_adapter.operators import (
     filtered,
 )
 from apps.sonata_adapter.query import PACKET_KINDS, Query
-from apps.sonata_adapter.relations import Relation
+from apps.sonata_adapter.relations import Relation, relation_of
 from apps.sonata_adapter.results import Captured, Result
 from due import RecordBatch
 
@@ -98,13 +97,7 @@ class _Window:
 
     def relation(self, table: Table) -> Relation:
         """A table after all its steps."""
-        tuples = filtered(self._table(table.node), table.filters)
-        columns = {name: column_of(value, tuples) for name, value in table.names}
-        relation = Relation(columns, len(tuples))
-        for step in table.steps:
-            other = self.relation(step.other) if isinstance(step, TableJoin) else None
-            relation = relation.apply(step, other)
-        return relation
+        return relation_of(table, self._table)
 
     def _table(self, node: Node) -> Tuples:
         if isinstance(node, DistinctNode):

@@ -1,4 +1,3 @@
-# ruff: noqa: N818 - errors are named for what is wrong
 """Everything that the Sonata adapter raises.
 
 SonataError

@@ -9,11 +9,11 @@ each alternative of its filter and a place in a counting stage; in one stage, no
 entries.  Where there is no room for all, those queries go in first that save most tuples.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, Literal
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
+from apps.sonata_adapter.candidates import candidates
 from apps.sonata_adapter.conditions import Match, conditions_of, disjoint
 from apps.sonata_adapter.dataflow import (
     Crossing,
@@ -28,80 +28,9 @@ from apps.sonata_adapter.dataflow import (
 )
 from apps.sonata_adapter.errors import NotPlaced
 from apps.sonata_adapter.estimates import packets_per_second
-from apps.sonata_adapter.expressions import PAYLOAD_FIELDS, Expression, Field, Number, fields_of, text_of
+from apps.sonata_adapter.expressions import PAYLOAD_FIELDS, Expression, fields_of, text_of
 from apps.sonata_adapter.keys import Request
-from apps.sonata_adapter.query import duration_text
-
-_ADDRESS: Final = (1 << 128) - 1
-_SHORT: Final = (1 << 16) - 1
-_KEY_PARTS: Final = {
-    "ip.src": ("source_mask", _ADDRESS),
-    "ip.dst": ("destination_mask", _ADDRESS),
-    "tcp.dport": ("port_mask", _SHORT),
-    "udp.dport": ("port_mask", _SHORT),
-    "length": ("length_mask", _SHORT),
-}
-Role = Literal["distinct", "reduce"]
-
-
-class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the switch program has room for, and what of it queries may take."""
-
-    bits: int = 200
-    """Bits 0 up of the classifier; the controller keeps the others for ports and the whole stream."""
-    stages: int = 8
-    entries: int = 32
-    """Entries of a stage."""
-    cells: int = 32_768
-    """Cells of a stage in one bank."""
-    distinct_cells: int = 16_384
-    """What an entry for a distinct takes, if there is room; never less than a quarter."""
-    reduce_cells: int = 8_192
-
-
-class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One entry of a counting stage."""
-
-    role: Role
-    bit: int
-    stage: int
-    match: Match
-    """What the classifier's bit means."""
-    masks: tuple[tuple[str, int], ...]
-    threshold: int
-    by_bytes: int
-    window_us: int
-    base: int = 0
-    size: int = 0
-    behind: int = -1
-    """Of a reduce: the bit of the distinct that lets its tuples pass, -1 = none."""
-
-    def params(self, repeated: int = 0) -> dict[str, int]:
-        """Parameters of the action `count`; `repeated`: bits to forget for a key seen before."""
-        return {
-            "query": self.bit,
-            "bit_of_query": 1 << self.bit,
-            "source_mask": 0,
-            "destination_mask": 0,
-            "port_mask": 0,
-            "length_mask": 0,
-            **dict(self.masks),
-            "threshold": self.threshold,
-            "by_bytes": self.by_bytes,
-            "reciprocal": reciprocal(self.window_us),
-            "base": self.base,
-            "size": self.size,
-            "repeated": repeated,
-        }
-
-
-class Copy(msgspec.Struct, frozen=True, kw_only=True):
-    """Copies of packets to the host."""
-
-    bit: int
-    match: Match
-    payload: bool
-    """The frames' bytes are needed, not only their headers."""
+from apps.sonata_adapter.placement import Copy, Entry, Space, SwitchLimits, by_bytes, masks_of
 
 
 class QueryPlan(msgspec.Struct, frozen=True, kw_only=True):
@@ -144,15 +73,6 @@ class Plan(msgspec.Struct, frozen=True):
         return next(query for query in self.queries if query.identity == identity)
 
 
-def reciprocal(window_us: int) -> int:
-    """2^64 / window, rounded up: `time * reciprocal >> 64` is the window's number.
-
-    Exact for times below 2^64 / (reciprocal * window - 2^64): at least 71 days for 3 s, 85 minutes for
-    an hour; beyond, frames in the last microseconds of a window may fall into the next.
-    """
-    return -(-(1 << 64) // window_us)
-
-
 def plan(
     requests: Sequence[Request],
     limits: SwitchLimits | None = None,
@@ -164,7 +84,7 @@ def plan(
     The order of requests does not matter; of new ones those come first that save most.
     """
     limits = limits or SwitchLimits()
-    space = _Space(limits)
+    space = Space(limits)
     kept: dict[str, QueryPlan] = {}
     wanted = {request.identity: request for request in requests}
     held = before.copies if before is not None else ()
@@ -177,7 +97,7 @@ def plan(
     ordered = sorted(fresh, key=lambda request: (-_saving(request), request.identity))
     found = dict(kept)
     for request in ordered:
-        found[request.identity] = _counted(request, space)
+        found[request.identity] = _counted(request, space, limits)
     copies = _copies([wanted[one.identity] for one in found.values() if not one.in_switch], held, space)
     plans = []
     for identity in sorted(found):
@@ -243,11 +163,11 @@ def _expressions(node: Node) -> Iterator[Expression]:
             yield from _expressions(source)
 
 
-def _counted(request: Request, space: "_Space") -> QueryPlan:
+def _counted(request: Request, space: Space, limits: SwitchLimits) -> QueryPlan:
     """The query in the switch, or the reason why it is not there."""
     trial = space.copy()
     try:
-        entries = _entries(request, trial)
+        entries = _entries(request, trial, limits)
     except NotPlaced as reason:
         return QueryPlan(identity=request.identity, reason=str(reason))
     space.hold(entries)
@@ -258,63 +178,59 @@ def _counted(request: Request, space: "_Space") -> QueryPlan:
     )
 
 
-def _entries(request: Request, space: "_Space") -> list[Entry]:
+def _entries(request: Request, space: Space, limits: SwitchLimits) -> list[Entry]:
     outcome = compile_query(request.query)
     if request.kind != "query":
         raise NotPlaced("it asks for the packets themselves")
-    if not isinstance(outcome, Crossing):
+    window_us = request.query.window_us
+    if isinstance(outcome, Crossing):
+        return _count_entries(outcome.node, space, window_us, outcome.threshold)
+    if not isinstance(outcome, Table) or not limits.reads:
         raise NotPlaced("its result is known at the window's end only, and the values of cells are not read")
-    node = outcome.node
+    nodes = sources(outcome)
+    for node in nodes:
+        if not isinstance(node, ReduceNode) or not isinstance(node.source, PacketSource):
+            raise NotPlaced("what is read at the window's end are counts of packets, one for each key")
+    found: list[Entry] = []
+    for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):
+        found += _count_entries(node, space, window_us, threshold, source=place)
+    return found
+
+
+def _count_entries(
+    node: Node, space: Space, window_us: int, threshold: int, *, source: int = 0
+) -> list[Entry]:
+    """Entries of one reduce, and of the distinct before it."""
     if not isinstance(node, ReduceNode):
         raise NotPlaced("the switch reports counts that reach a threshold, not each new tuple")
-    source = _packets(node)
-    conditions = conditions_of(source.filters)
+    filters = _packets(node).filters
+    conditions = conditions_of(filters)
     if not conditions.exact:
-        raise NotPlaced(f"the classifier cannot express {' and '.join(map(text_of, source.filters))}")
+        raise NotPlaced(f"the classifier cannot express {' and '.join(map(text_of, filters))}")
     if node.filters or (isinstance(node.source, DistinctNode) and node.source.filters):
         raise NotPlaced("the switch cannot filter between its counting stages")
     if isinstance(node.source, DistinctNode) and not isinstance(node.source.source, PacketSource):
         raise NotPlaced("it has more operators in a row than a distinct and a reduce")
     found: list[Entry] = []
-    window_us = request.query.window_us
-    by_bytes = _by_bytes(node.value)
     for match in conditions.alternatives:
         first: Entry | None = None
         if isinstance(node.source, DistinctNode):
-            first = space.distinct(match, _masks(node.source.values), window_us)
+            first = space.distinct(match, masks_of(node.source.values), window_us)
             found.append(first)
         last = Entry(
             role="reduce",
             bit=0,
             stage=0,
             match=match,
-            masks=_masks(node.keys),
+            masks=masks_of(node.keys),
             window_us=window_us,
-            threshold=outcome.threshold,
-            by_bytes=by_bytes,
+            threshold=threshold,
+            by_bytes=by_bytes(node.value),
+            source=source,
             behind=-1 if first is None else first.bit,
         )
         found.append(space.place(last, after=-1 if first is None else first.stage))
     return found
-
-
-def _by_bytes(value: Expression) -> int:
-    if value == Number(1):
-        return 0
-    if value == Field("length"):
-        return 1
-    raise NotPlaced(f"the switch adds up frames or bytes, not {text_of(value)}")
-
-
-def _masks(keys: Iterable[Expression]) -> tuple[tuple[str, int], ...]:
-    masks: dict[str, int] = {}
-    for key in keys:
-        part = _KEY_PARTS.get(key.name) if isinstance(key, Field) else None
-        if part is None:
-            known = ", ".join(_KEY_PARTS)
-            raise NotPlaced(f"the key of a cell has no room for {text_of(key)}, only for {known}")
-        masks[part[0]] = part[1]
-    return tuple(sorted(masks.items()))
 
 
 def _serving(request: Request, copies: Sequence[Copy]) -> tuple[Copy, ...]:
@@ -327,7 +243,7 @@ def _serving(request: Request, copies: Sequence[Copy]) -> tuple[Copy, ...]:
     return tuple(found.values())
 
 
-def _copies(requests: Sequence[Request], held: Sequence[Copy], space: "_Space") -> list[Copy]:
+def _copies(requests: Sequence[Request], held: Sequence[Copy], space: Space) -> list[Copy]:
     """One copy for each condition; those of the plan before keep their bits.
 
     Where bits run out, the last one copies every packet for all that is left.
@@ -355,163 +271,3 @@ def _overlapping_too(needed: Sequence[tuple[Match, bool]]) -> list[tuple[Match, 
         (match, payload or any(bytes_too and not disjoint(match, other) for other, bytes_too in needed))
         for match, payload in needed
     ]
-
-
-class _Space:
-    """Bits, stages and cells that are still free."""
-
-    def __init__(self, limits: SwitchLimits) -> None:
-        self._limits = limits
-        self._bits: set[int] = set()
-        self._stages: list[list[Entry]] = [[] for _ in range(limits.stages)]
-
-    def copy(self) -> "_Space":
-        twin = _Space(self._limits)
-        twin._bits = set(self._bits)
-        twin._stages = [list(stage) for stage in self._stages]
-        return twin
-
-    def hold(self, entries: Iterable[Entry]) -> None:
-        for entry in entries:
-            if entry.bit not in self._bits:
-                self._bits.add(entry.bit)
-                self._stages[entry.stage].append(entry)
-
-    def take_bits(self, bits: Iterable[int]) -> None:
-        self._bits |= set(bits)
-
-    def bit(self) -> int:
-        """A free bit; raises `NotPlaced`."""
-        free = self.bit_for_copy()
-        if free is None:
-            raise NotPlaced(f"all {self._limits.bits} bits of the classifier are taken")
-        return free
-
-    @property
-    def last_bit(self) -> int:
-        """Kept for copies of every packet."""
-        return self._limits.bits - 1
-
-    def bit_for_copy(self) -> int | None:
-        """A free bit, None if there is none."""
-        free = next((bit for bit in range(self.last_bit) if bit not in self._bits), None)
-        if free is not None:
-            self._bits.add(free)
-        return free
-
-    def distinct(self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int) -> Entry:
-        """An entry for a distinct: one that is there already, with room behind it, or a new one."""
-        for number, held in enumerate(self._stages):
-            for entry in held:
-                wanted = ("distinct", match, masks, window_us)
-                if (entry.role, entry.match, entry.masks, entry.window_us) == wanted and self._room_behind(
-                    number, match
-                ):
-                    return entry
-        new = Entry(
-            role="distinct",
-            bit=0,
-            stage=0,
-            match=match,
-            masks=masks,
-            window_us=window_us,
-            threshold=0,
-            by_bytes=0,
-        )
-        return self.place(new, after=-1)
-
-    def _room_behind(self, stage: int, match: Match) -> bool:
-        return any(
-            all(disjoint(match, entry.match) for entry in held) and len(held) < self._limits.entries
-            for held in self._stages[stage + 1 :]
-        )
-
-    def place(self, wanted: Entry, *, after: int) -> Entry:
-        """The entry in the first stage behind `after` that has room; raises `NotPlaced`."""
-        wish = self._limits.distinct_cells if wanted.role == "distinct" else self._limits.reduce_cells
-        for number in range(after + 1, self._limits.stages):
-            held = self._stages[number]
-            if len(held) >= self._limits.entries:
-                continue
-            if not all(disjoint(wanted.match, entry.match) for entry in held):
-                continue
-            gap = self._gap(held, wish)
-            if gap is None:
-                continue
-            entry = msgspec.structs.replace(wanted, bit=self.bit(), stage=number, base=gap[0], size=gap[1])
-            held.append(entry)
-            return entry
-        raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its {wanted.role}")
-
-    def _gap(self, held: Iterable[Entry], wish: int) -> tuple[int, int] | None:
-        """The first gap of cells that is as large as wished, else the largest of at least a quarter."""
-        gaps = []
-        start = 0
-        for entry in sorted(held, key=lambda entry: entry.base):
-            gaps.append((start, entry.base - start))
-            start = entry.base + entry.size
-        gaps.append((start, self._limits.cells - start))
-        large = next(((base, wish) for base, size in gaps if size >= wish), None)
-        if large is not None:
-            return large
-        base, size = max(gaps, key=lambda gap: gap[1])
-        return (base, size) if size >= wish // 4 else None
-
-
-def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
-    """The plan of one query as a drawing in text."""
-    one = found.of(request.identity)
-    lines = [request.identity]
-    if meaning:
-        lines.append(f"  {meaning}")
-    lines += ["", *(f"  {line}" for line in request.query.text().splitlines()[1:]), ""]
-    lines.append(f"  in the switch{'' if one.in_switch else ': only copies, because ' + one.reason}")
-    for entry in one.entries:
-        lines += _entry_lines(entry)
-    for copy in one.copies:
-        what = "frames" if copy.payload else "headers"
-        lines.append(f"    bit {copy.bit:<3} copies {what} of {match_text(copy.match)}")
-    lines.append("  on the host")
-    if one.in_switch:
-        lines.append("    keys that reached the threshold, reported once in a window; keys without a cell")
-        lines.append(f"    saves about {one.saved_per_second:,.0f} copies a second of 10,000 packets")
-    else:
-        lines.append(
-            f"    all operators, on about {one.tuples_per_second:,.0f} tuples a second of 10,000 packets"
-        )
-    lines.append(f"    results for windows of {duration_text(request.query.window_ms)}")
-    return "\n".join(lines)
-
-
-def _entry_lines(entry: Entry) -> list[str]:
-    key = ", ".join(name.removesuffix("_mask") for name, _ in entry.masks)
-    unit = "bytes" if entry.by_bytes else "frames"
-    what = (
-        f"lets new ({key}) pass"
-        if entry.role == "distinct"
-        else f"counts {unit} by ({key}), reports {entry.threshold}"
-    )
-    cells = f"{entry.size:,} cells"
-    return [
-        f"    bit {entry.bit:<3} {match_text(entry.match)}",
-        f"      stage {entry.stage}: {what}, {cells}",
-    ]
-
-
-def match_text(match: Mapping[str, Any]) -> str:
-    """A condition of the classifier for people."""
-    if not match:
-        return "every packet"
-    parts = []
-    for name, value in sorted(match.items()):
-        if name == "ethertype":
-            parts.append(
-                {0x0800: "IPv4", 0x86DD: "IPv6", 0x0806: "ARP"}.get(value, f"ethertype {value:#06x}")
-            )
-        elif name in ("sport", "dport"):
-            parts.append(f"{name} {value[0]}" if value[0] == value[1] else f"{name} {value[0]}-{value[1]}")
-        elif name == "tcp_flags":
-            parts.append(f"flags & {value[1]:#04x} == {value[0]:#04x}")
-        elif name != "l4_valid":
-            parts.append(f"{name} {value}")
-    return ", ".join(parts)

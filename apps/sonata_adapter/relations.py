@@ -1,12 +1,13 @@
 """Steps over whole tables at a window's end: filter, map, distinct, reduce and join."""
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.columns import Tuples, column_of, evaluate
-from apps.sonata_adapter.dataflow import TableStep
+from apps.sonata_adapter.columns import Rows, Tuples, column_of, evaluate
+from apps.sonata_adapter.dataflow import Node, Table, TableJoin, TableStep
 from apps.sonata_adapter.query import Distinct, Filter, JoinKind, Map, Reduce
 from apps.sonata_adapter.tables import Column, Hashes, hashes, take
 
@@ -107,3 +108,15 @@ def _either(mine: Column, rows: NDArray[np.intp], theirs: Column, partners: NDAr
         np.where(rows != _MISSING, _pick(left, rows), _pick(right, partners))
         for left, right in zip(mine, theirs, strict=True)
     )
+
+
+def relation_of(table: Table, held: Callable[[Node], Tuples]) -> Relation:
+    """A table after all its steps, where `held` gives what a node holds."""
+    rows: Rows = held(table.node)
+    for condition in table.filters:
+        rows = rows.where(condition)
+    relation = Relation({name: column_of(value, rows) for name, value in table.names}, len(rows))
+    for step in table.steps:
+        other = relation_of(step.other, held) if isinstance(step, TableJoin) else None
+        relation = relation.apply(step, other)
+    return relation

@@ -20,21 +20,24 @@ import msgspec
 import numpy as np
 
 import due.service
-from apps.messages import TableCommand
+from apps.messages import TableCommand, TableUpdate
 from apps.packets import read_frames
 from apps.sonata_adapter.catalogue import CATALOGUE, Template
-from apps.sonata_adapter.control import Changes, Control, Source, Written
+from apps.sonata_adapter.control import Changes, Control, Source, Written, leftovers
 from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
-from apps.sonata_adapter.planner import SwitchLimits
+from apps.sonata_adapter.placement import SwitchLimits
 from apps.sonata_adapter.results import Captured
+from apps.sonata_adapter.tallies import CellRead
 from apps.sonata_adapter.templates import QueryFolder, own_queries
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
 TELEMETRY: Final = "network.telemetry.sonata_adapter"
 COMMAND: Final = "network.p4_command.sonata_adapter"
+CELL_REQUEST: Final = "network.cell_request.sonata_adapter"
+CELLS: Final = "network.cell.p4runtime_ctrl.*"
 INCOMPATIBLE: Final = "network.incompatible.sonata_adapter"
 _OWN_PARAMETERS: Final = sorted(
     {each.name for template in CATALOGUE.values() for each in template.parameters}
@@ -62,7 +65,8 @@ CAPABILITIES = (
     ),
     Capability(HANDSHAKE, delivery="reliable", archive="always"),
     Capability(f"{TELEMETRY}.*", delivery="reliable"),
-    Capability(f"{COMMAND}.*", delivery="reliable"),
+    Capability(f"{COMMAND}.*", delivery="reliable", archive="always"),
+    Capability(f"{CELL_REQUEST}.*", delivery="reliable"),
     Capability(f"{INCOMPATIBLE}.*", archive="always"),
 )
 
@@ -101,8 +105,11 @@ class SonataAdapterService:
         )
         self._lock = threading.RLock()
         self._observed: dict[Source, Any] = {}
+        self._cells: Any = None
         self._switches: dict[str, Any] = {}
         self._wanted: frozenset[str] = frozenset()
+        self._swept: set[str] = set()
+        self._active = False
         self._heard: frozenset[str] = frozenset()
         self._commands = count(1)
         self._written = 0
@@ -118,6 +125,7 @@ class SonataAdapterService:
         """Packets that waited for other streams go on."""
         with self._lock:
             self._write(self._control.tick(time.monotonic()))
+            self._read_cells()
 
     def stop(self) -> None:
         """Report what is open, and take everything out of the switch."""
@@ -141,6 +149,8 @@ class SonataAdapterService:
         wanted = frozenset(each.key for each in assignments if each.key.startswith(_MY_KEYS))
         heard = frozenset(each.key for each in assignments) - wanted
         with self._lock:
+            self._active = bool(assignments)
+            self._sweep()
             if wanted != self._wanted:
                 self._wanted = wanted
                 self._control.know(self._templates())
@@ -159,21 +169,35 @@ class SonataAdapterService:
             primary = bool(value.get("primary"))
             again = primary and not self._switches.get(name, False)
             self._switches[name] = primary
+            self._sweep()
             if fresh or again:
                 self._apply(self._control.everything(), only=name)
             if value.get("event_time"):
                 self._control.advance(name, int(value["event_time"]) // 1000)
 
+    def _sweep(self) -> None:
+        """Once, when this instance is active: take out what one that was killed left in the switches."""
+        for switch in sorted(self._switches.keys() - self._swept) if self._active else ():
+            self._swept.add(switch)
+            past = []
+            for item in self._engine.get(f"{COMMAND}.{switch}"):
+                try:
+                    past.append(TableCommand.from_value(item.value).updates)
+                except msgspec.ValidationError as error:
+                    _LOG.warning("%s: not a command: %s", item.key, error)
+            self._command(switch, leftovers(past))
+
+    def _command(self, switch: str, updates: tuple[TableUpdate, ...]) -> None:
+        if updates:
+            command = TableCommand(id=f"sonata-{time.time_ns()}-{next(self._commands)}", updates=updates)
+            self._engine.write(f"{COMMAND}.{switch}", command.to_value(), [NO_WAIT])
+
     def _apply(self, changes: Changes, only: str = "") -> None:
         """Tell the controller: what ends first, then counting entries, then classifier bits."""
         for offer in changes.withdraw:
             self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
-        if changes.updates:
-            for switch in [only] if only else sorted(self._switches):
-                command = TableCommand(
-                    id=f"sonata-{time.time_ns()}-{next(self._commands)}", updates=changes.updates
-                )
-                self._engine.write(f"{COMMAND}.{switch}", command.to_value(), [NO_WAIT])
+        for switch in [only] if only else sorted(self._switches):
+            self._command(switch, changes.updates)
         for offer in changes.offer:
             self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
         for key, reason in changes.refused:
@@ -181,6 +205,11 @@ class SonataAdapterService:
             name = key.split(":")[0].rpartition(".")[2]
             self._engine.write(f"{INCOMPATIBLE}.{name}", {"key": key, "reason": reason}, [NO_WAIT])
         self._observe(self._control.sources)
+        if self._control.needs_cells and self._cells is None:
+            self._cells = self._engine.observe(CELLS).subscribe(self._on_cells)
+        elif not self._control.needs_cells and self._cells is not None:
+            self._cells.dispose()
+            self._cells = None
 
     def _observe(self, sources: set[Source]) -> None:
         for source in self._observed.keys() - sources:
@@ -198,6 +227,17 @@ class SonataAdapterService:
             else:
                 self._write(self._control.packets(switch, name, batch, time.monotonic()))
                 self._control.busy(switch, time.monotonic())
+            self._read_cells()
+
+    def _on_cells(self, item: Item) -> None:
+        """Answers of a switch: `id` and `count` of each question."""
+        switch = item.key.rpartition(".")[2]
+        with self._lock:
+            self._write(self._control.cells(switch, item.value["id"].tolist(), item.value["count"].tolist()))
+
+    def _read_cells(self) -> None:
+        for switch, reads in self._control.reads(time.monotonic()).items():
+            self._engine.write(f"{CELL_REQUEST}.{switch}", cell_request(reads), [NO_WAIT])
 
     def _write(self, written: Iterable[Written]) -> None:
         for one in written:
@@ -223,6 +263,24 @@ def with_frames(value: dict[str, Any]) -> RecordBatch:
     cut = [frame[:_WIDTH] for frame in frames]
     captured = np.array([len(frame) for frame in cut], dtype=np.uint16)
     return RecordBatch({**batch, "frame": np.array(cut, dtype=f"V{_WIDTH}"), "captured": captured})
+
+
+def cell_request(reads: Sequence[CellRead]) -> RecordBatch:
+    """Questions about cells as the controller takes them: addresses as two halves."""
+    low = (1 << 64) - 1
+    return RecordBatch(
+        {
+            "id": np.array([read.id for read in reads], dtype=np.uint64),
+            "query": np.array([read.bit for read in reads], dtype=np.uint8),
+            "src_hi": np.array([read.source >> 64 for read in reads], dtype=np.uint64),
+            "src_lo": np.array([read.source & low for read in reads], dtype=np.uint64),
+            "dst_hi": np.array([read.destination >> 64 for read in reads], dtype=np.uint64),
+            "dst_lo": np.array([read.destination & low for read in reads], dtype=np.uint64),
+            "port": np.array([read.port for read in reads], dtype=np.uint16),
+            "length": np.array([read.length for read in reads], dtype=np.uint16),
+            "time_us": np.array([read.time_us for read in reads], dtype=np.int64),
+        }
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

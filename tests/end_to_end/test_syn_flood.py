@@ -1,7 +1,9 @@
 """Real SYN floods in network namespaces: without the product nobody connects, with it nobody notices."""
 
 import os
+import signal
 import subprocess
+import sys
 
 import pytest
 
@@ -26,6 +28,32 @@ def needs():
     require_program("ss")
     yield
     assert f"sdn{os.getpid()}-" not in namespaces()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_leaves_nothing_behind(number, tmp_path):
+    """Neither namespaces nor processes, whenever it is stopped."""
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from sdnator.syn_flood import SynFloodOptions, run_syn_flood\n"
+        "run_syn_flood(SynFloodOptions(), lambda line: print(line, flush=True))\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    ) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline()
+        assert f"sdn{run.pid}-victim" in namespaces()
+        run.send_signal(number)
+        assert run.wait(60) != 0
+    assert f"sdn{run.pid}-" not in namespaces()
+    assert list(tmp_path.iterdir()) == []
+    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
+    assert str(tmp_path) not in running
 
 
 @pytest.mark.slow

@@ -140,8 +140,8 @@ def test_data_is_seen_as_it_comes_and_afterwards(standing):
     items = [json.loads(line) for line in done.stdout.splitlines()]
     assert [item["appId"] for item in items] == ["kitsune", "kitsune"]
     past = operator.run("get", "due.event.coordinator", "--since", "1h", "--json")
-    joined = [json.loads(line)["value"] for line in past.stdout.splitlines()]
-    assert {"kitsune", "firewall"} <= {one["app_id"] for one in joined if one["event"] == "joined"}
+    events = [json.loads(line)["value"] for line in past.stdout.splitlines()]
+    assert {"kitsune", "firewall"} <= {one["app_id"] for one in events if one["event"] == "activated"}
 
 
 def test_observing_ends_well_with_ctrl_c(standing):
@@ -185,7 +185,7 @@ def test_down_ends_everything_and_keeps_the_archive(operator):
         assert error.endswith("stopped; nothing was left running\n")
     assert processes_of(operator.mark) == []
     assert operator.run("status").returncode == 1
-    assert operator.run("get", "due.event.coordinator", "--json").stdout.count("joined") >= len(APPS) - 1
+    assert operator.run("get", "due.event.coordinator", "--json").stdout.count("activated") >= len(APPS) - 1
 
 
 def test_down_ends_one_that_is_still_starting(operator):

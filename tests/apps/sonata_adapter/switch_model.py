@@ -69,6 +69,23 @@ class SwitchModel:
             found["digests", name] = RecordBatch({**chosen, **flags})
         return found
 
+    def read(self, question):
+        """The count of a cell, 0 where the key has none in the window."""
+        packet = (question.source, question.destination, question.port, question.length)
+        for stage, cells in zip(self.stages, self.cells, strict=True):
+            if 1 << question.bit in stage:
+                p = stage[1 << question.bit]
+                key = (p["query"], *packet)
+                epoch = (question.time_us - self.base_us) * p["reciprocal"] >> 64
+                held = cells.get(self._slot(key, epoch, p), (-1, None, 0))
+                return held[2] if held[:2] == (epoch, key) else 0
+        raise AssertionError(question)
+
+    def _slot(self, key, epoch, p):
+        if not self.shrink:
+            return key, epoch & 1
+        return p["base"] + crc32(repr(key).encode()) % (p["size"] // self.shrink) + CELLS // 2 * (epoch & 1)
+
     def _count(self, matched, packet):
         crossed, overflow = set(), set()
         source, destination, port, length, now = numbers(packet, self.base_us)
@@ -86,10 +103,7 @@ class SwitchModel:
                 length & p["length_mask"],
             )
             epoch = now * p["reciprocal"] >> 64
-            slot: Any = key
-            if self.shrink:
-                slot = p["base"] + crc32(repr(key).encode()) % (p["size"] // self.shrink)
-                slot += CELLS // 2 * (epoch & 1)
+            slot = self._slot(key, epoch, p)
             held = cells.get(slot, (-1, None, 0))
             empty, mine = held[0] != epoch, held[0] == epoch and held[1] == key
             if empty or mine:

@@ -5,19 +5,20 @@ from typing import Any
 import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
-from apps.sonata_adapter.control import Control
+from apps.sonata_adapter.control import Changes, Control, leftovers
+from apps.sonata_adapter.placement import SwitchLimits
 from apps.sonata_adapter.results import Captured, Result
 from tests.apps.sonata_adapter.switch_model import SwitchModel
 from tests.apps.sonata_adapter.test_catalogue import expect, same
-from tests.apps.sonata_adapter.traffic import batch_of, batches, mixed, office
+from tests.apps.sonata_adapter.traffic import Frame, batch_of, batches, mixed, office, tcp
 from tests.naive import sonata
 
 PREFIX = "network.traffic_query.sonata"
 
 
-def play(keys, frames, *, shrink=0, size=512):
+def play(keys, frames, *, shrink=0, size=512, limits=None):
     """Outputs by key, and how many tuples reached the host."""
-    control, switch = Control(CATALOGUE), SwitchModel(shrink=shrink)
+    control, switch = Control(CATALOGUE, limits=limits), SwitchModel(shrink=shrink)
     control.switch("s1", 0)
     changes = control.want(keys)
     assert not changes.refused
@@ -30,6 +31,9 @@ def play(keys, frames, *, shrink=0, size=512):
                 written += control.digests("s1", name, sent)
             else:
                 written += control.packets("s1", name, sent, now)
+        for reads in control.reads(now).values():
+            tuples += len(reads)
+            written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
         written += control.tick(now + 0.5)
     written += control.finish()
     found: dict[str, list[Any]] = {}
@@ -40,6 +44,12 @@ def play(keys, frames, *, shrink=0, size=512):
     assert switch.empty
     assert not control.sources
     return found, tuples
+
+
+def ending(frames):
+    """A last SYN, some windows later: the switch's clock goes on, and results of the end come."""
+    last = frames[-1].time_us + 120_000_000
+    return [*frames, *(Frame(last + n, 60, tcp("10.0.0.1", "10.0.0.2", 1, 2, 2)) for n in range(5))]
 
 
 def rows(results):
@@ -178,3 +188,47 @@ def test_windows_follow_the_clock_of_the_switch():
         for one in written:
             assert isinstance(one.output, Result)
             assert (one.output.window_us - frames[0].time_us + 700_000) % 2_000_000 == 0
+
+
+@pytest.mark.parametrize("shrink", [0, 1, 2048])
+@pytest.mark.parametrize("name", ["syn_flood", "incomplete_flows"])
+def test_differences_are_read_at_the_end_of_the_window(name, shrink, everything):
+    """Exact, also for keys without a cell, with candidates and their cells as the only tuples."""
+    key = f"{PREFIX}.{name}:threshold=4,window=2s"
+    frames = ending(everything)
+    found, tuples = play([key], frames, size=64, limits=SwitchLimits(reads=True), shrink=shrink)
+    truth = [
+        f for f in expect(name, frames, {"threshold": 4, "window": 2000}) if f.at_us < frames[-1].time_us
+    ]
+    same(rows(found[next(iter(found))]), truth)
+    if not shrink:
+        assert tuples < len(everything) / 15
+
+
+def test_missing_answers_make_estimates(everything):
+    """A controller that does not answer: what is known is reported as an estimate, or not at all."""
+    control, switch = Control(CATALOGUE, limits=SwitchLimits(reads=True)), SwitchModel()
+    control.switch("s1", 0)
+    switch.change(control.want([f"{PREFIX}.syn_flood"]))
+    written = []
+    for now, batch in enumerate(batches(ending(everything), 64)):
+        for (_, name), sent in switch.process(batch).items():
+            written += control.digests("s1", name, sent)
+        control.reads(now)
+        written += control.tick(now)
+    written += control.tick(now + 10)
+    for one in written:
+        assert isinstance(one.output, Result)
+        assert "could not be read" in one.output.error
+
+
+def test_what_a_killed_adapter_left_is_taken_out():
+    """Entries that came and went are no matter; those that stayed are deleted."""
+    control, switch = Control(CATALOGUE), SwitchModel()
+    said = [control.want([f"{PREFIX}.ddos"]), control.want([f"{PREFIX}.ddos", f"{PREFIX}.new_tcp"])]
+    for changes in said:
+        switch.change(changes)
+    sweep = leftovers(changes.updates for changes in said)
+    assert sweep
+    switch.change(Changes(updates=sweep))
+    assert not any(switch.stages)

@@ -9,8 +9,10 @@ from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.columns import Packets, evaluate
 from apps.sonata_adapter.conditions import conditions_of, disjoint
 from apps.sonata_adapter.dataflow import PacketSource, Table, compile_query, sources
+from apps.sonata_adapter.explain import explain
 from apps.sonata_adapter.keys import request_of
-from apps.sonata_adapter.planner import Plan, SwitchLimits, explain, plan, reciprocal
+from apps.sonata_adapter.placement import SwitchLimits, reciprocal
+from apps.sonata_adapter.planner import Plan, plan
 from tests.apps.sonata_adapter.switch_model import matches
 from tests.apps.sonata_adapter.traffic import batch_of, mixed
 

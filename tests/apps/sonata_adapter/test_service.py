@@ -105,3 +105,22 @@ def test_wrong_parameter_is_answered(stage):
     Heard(engine, f"{PREFIX}.new_tcp:window=1ms")
     wait_for(lambda: answers.items)
     assert "100ms to 1h" in answers.items[0].value["reason"]
+
+
+def test_a_killed_adapter_leaves_nothing(stage):
+    """kill -9, then another instance: what the first put into the switch goes, what is wanted comes."""
+    first = stage.run("apps.sonata_adapter.service", {})
+    engine = stage.engine("observer")
+    states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    confirmations = Heard(engine, "network.confirmation.p4runtime_ctrl.s1")
+    stage.controller()
+    Heard(engine, f"{PREFIX}.new_tcp:threshold=7")
+    wait_for(lambda: telemetry(states) == ["q0"] and confirmations.items, why=stage.log)
+    wait_for(lambda: engine.get("network.p4_command.sonata_adapter.s1"))
+    stage.kill(first)
+    stage.run("apps.sonata_adapter.service", {})
+    wait_for(
+        lambda: "removed" in [item.value["state"] for item in confirmations.items],
+        why=lambda: ([item.value for item in confirmations.items], stage.log()[-2000:]),
+    )
+    wait_for(lambda: confirmations.items[-1].value["state"] in ("installed", "exists"))

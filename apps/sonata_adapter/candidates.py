@@ -1,0 +1,120 @@
+"""Which keys of counts can become results of a query that is known at the window's end only.
+
+A result must meet `syns + syn_acks - acks >= 3`; counts are not negative, so one of the positive ones
+is at least 2.  The switch reports keys at that count, and the host reads the others for these alone.
+"""
+
+from collections.abc import Iterator, Mapping
+
+from apps.sonata_adapter.dataflow import VALUE, Table, TableJoin, conjuncts
+from apps.sonata_adapter.errors import NotPlaced
+from apps.sonata_adapter.expressions import Binary, Expression, Field, Number, substitute
+from apps.sonata_adapter.query import Filter, Map
+
+_Terms = tuple[dict[str, int], int]
+"""Coefficient of each count, and the constant."""
+
+
+def candidates(table: Table) -> list[int]:
+    """For each of `dataflow.sources(table)` the count at which its keys are candidates, 0 = at none.
+
+    Every result is a candidate of at least one source.  Raises `NotPlaced` where that cannot be said.
+    """
+    walk = _Walk()
+    _, conditions = walk.table(table)
+    best: list[int] = []
+    for condition in conditions:
+        found = _thresholds(condition, walk.sources)
+        if any(found) and (not best or sum(map(bool, found)) < sum(map(bool, best))):
+            best = found
+    if not best:
+        raise NotPlaced("no count of a key says early that the key may become a result")
+    return best
+
+
+class _Walk:
+    """Follows names through the steps; the count of source n is called `#n`."""
+
+    def __init__(self) -> None:
+        self.sources = 0
+
+    def table(self, table: Table) -> tuple[dict[str, Expression], list[Expression]]:
+        """Names and conditions after all steps."""
+        mine = {VALUE: Field(f"{VALUE}{self.sources}")}
+        self.sources += 1
+        names = {name: substitute(value, mine) for name, value in table.names}
+        conditions = [substitute(condition, mine) for condition in table.filters]
+        for step in table.steps:
+            match step:
+                case Filter(condition):
+                    conditions += conjuncts(substitute(condition, names))
+                case Map(fields):
+                    names = {name: substitute(value, names) for name, value in fields}
+                case TableJoin():
+                    names, more = self._join(names, step)
+                    conditions += more
+                case _:
+                    raise NotPlaced("the switch counts before a join, not behind it")
+        return names, conditions
+
+    def _join(
+        self, names: Mapping[str, Expression], step: TableJoin
+    ) -> tuple[dict[str, Expression], list[Expression]]:
+        theirs, conditions = self.table(step.other)
+        for side in (names, theirs):
+            if {name for name, value in side.items() if not _is_count(value)} != set(step.keys):
+                raise NotPlaced("cells can be read for whole keys only, and the join has others")
+        if step.kind == "anti" or (step.kind != "inner" and conditions):
+            raise NotPlaced(f"a join of kind {step.kind} needs all keys of the other side")
+        return {**theirs, **names}, conditions
+
+
+def _is_count(value: Expression) -> bool:
+    return not isinstance(value, Field) or value.name.startswith(VALUE)
+
+
+def _thresholds(condition: Expression, sources: int) -> list[int]:
+    """Counts that the condition implies, one of which must be reached; zeros: it implies nothing."""
+    none = [0] * sources
+    if not isinstance(condition, Binary) or condition.operator not in (">=", ">"):
+        return none
+    left, right = _linear(condition.left), _linear(condition.right)
+    if left is None or right is None:
+        return none
+    terms = {name: left[0].get(name, 0) - right[0].get(name, 0) for name in {*left[0], *right[0]}}
+    least = right[1] - left[1] + (condition.operator == ">")
+    positive = {name: factor for name, factor in terms.items() if factor > 0}
+    if least < 1 or not positive:
+        return none
+    share = -(-least // len(positive))
+    found = list(none)
+    for name, factor in positive.items():
+        found[int(name.removeprefix(VALUE))] = -(-share // factor)
+    return found
+
+
+def _linear(expression: Expression) -> _Terms | None:
+    match expression:
+        case Number(value):
+            return {}, value
+        case Field(name) if name.startswith(VALUE):
+            return {name: 1}, 0
+        case Binary("+" | "-", left, right):
+            parts = list(_both(left, right))
+            if len(parts) < 2:
+                return None
+            (terms, constant), (more, other) = parts
+            sign = 1 if expression.operator == "+" else -1
+            names = {*terms, *more}
+            return {n: terms.get(n, 0) + sign * more.get(n, 0) for n in names}, constant + sign * other
+        case Binary("*", left, Number(factor)) if (found := _linear(left)) is not None:
+            return {name: value * factor for name, value in found[0].items()}, found[1] * factor
+        case _:
+            return None
+
+
+def _both(left: Expression, right: Expression) -> Iterator[_Terms]:
+    for side in (left, right):
+        found = _linear(side)
+        if found is not None:
+            yield found

@@ -1,0 +1,68 @@
+"""Plans as text for people."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from apps.sonata_adapter.keys import Request
+from apps.sonata_adapter.placement import Entry
+from apps.sonata_adapter.planner import Plan
+from apps.sonata_adapter.query import duration_text
+
+
+def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
+    """The plan of one query as a drawing in text."""
+    one = found.of(request.identity)
+    lines = [request.identity]
+    if meaning:
+        lines.append(f"  {meaning}")
+    lines += ["", *(f"  {line}" for line in request.query.text().splitlines()[1:]), ""]
+    lines.append(f"  in the switch{'' if one.in_switch else ': only copies, because ' + one.reason}")
+    for entry in one.entries:
+        lines += _entry_lines(entry)
+    for copy in one.copies:
+        what = "frames" if copy.payload else "headers"
+        lines.append(f"    bit {copy.bit:<3} copies {what} of {match_text(copy.match)}")
+    lines.append("  on the host")
+    if one.in_switch:
+        lines.append("    keys that reached the threshold, reported once in a window; keys without a cell")
+        lines.append(f"    saves about {one.saved_per_second:,.0f} copies a second of 10,000 packets")
+    else:
+        lines.append(
+            f"    all operators, on about {one.tuples_per_second:,.0f} tuples a second of 10,000 packets"
+        )
+    lines.append(f"    results for windows of {duration_text(request.query.window_ms)}")
+    return "\n".join(lines)
+
+
+def _entry_lines(entry: Entry) -> list[str]:
+    key = ", ".join(name.removesuffix("_mask") for name, _ in entry.masks)
+    unit = "bytes" if entry.by_bytes else "frames"
+    what = (
+        f"lets new ({key}) pass"
+        if entry.role == "distinct"
+        else f"counts {unit} by ({key}), reports {entry.threshold}"
+    )
+    cells = f"{entry.size:,} cells"
+    return [
+        f"    bit {entry.bit:<3} {match_text(entry.match)}",
+        f"      stage {entry.stage}: {what}, {cells}",
+    ]
+
+
+def match_text(match: Mapping[str, Any]) -> str:
+    """A condition of the classifier for people."""
+    if not match:
+        return "every packet"
+    parts = []
+    for name, value in sorted(match.items()):
+        if name == "ethertype":
+            parts.append(
+                {0x0800: "IPv4", 0x86DD: "IPv6", 0x0806: "ARP"}.get(value, f"ethertype {value:#06x}")
+            )
+        elif name in ("sport", "dport"):
+            parts.append(f"{name} {value[0]}" if value[0] == value[1] else f"{name} {value[0]}-{value[1]}")
+        elif name == "tcp_flags":
+            parts.append(f"flags & {value[1]:#04x} == {value[0]:#04x}")
+        elif name != "l4_valid":
+            parts.append(f"{name} {value}")
+    return ", ".join(parts)

@@ -1,0 +1,218 @@
+"""Room in the switch: bits of the classifier, places in counting stages, cells.
+
+A distinct or reduce takes a bit and a place in a stage; no frame may match two entries of one stage,
+a reduce behind a distinct stands in a later stage.
+"""
+
+from collections.abc import Iterable
+from typing import Final, Literal
+
+import msgspec
+
+from apps.sonata_adapter.conditions import Match, disjoint
+from apps.sonata_adapter.errors import NotPlaced
+from apps.sonata_adapter.expressions import Expression, Field, Number, text_of
+
+_ADDRESS: Final = (1 << 128) - 1
+_SHORT: Final = (1 << 16) - 1
+_KEY_PARTS: Final = {
+    "ip.src": ("source_mask", _ADDRESS),
+    "ip.dst": ("destination_mask", _ADDRESS),
+    "tcp.dport": ("port_mask", _SHORT),
+    "udp.dport": ("port_mask", _SHORT),
+    "length": ("length_mask", _SHORT),
+}
+Role = Literal["distinct", "reduce"]
+
+
+class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the switch program has room for, and what of it queries may take."""
+
+    bits: int = 200
+    """Bits 0 up of the classifier; the controller keeps the others for ports and the whole stream."""
+    stages: int = 8
+    entries: int = 32
+    """Entries of a stage."""
+    cells: int = 32_768
+    """Cells of a stage in one bank."""
+    distinct_cells: int = 16_384
+    """What an entry for a distinct takes, if there is room; never less than a quarter."""
+    reduce_cells: int = 8_192
+    reads: bool = False
+    """Whether the controller answers requests for cells: then differences are counted in the switch, too."""
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """One entry of a counting stage."""
+
+    role: Role
+    bit: int
+    stage: int
+    match: Match
+    """What the classifier's bit means."""
+    masks: tuple[tuple[str, int], ...]
+    threshold: int
+    by_bytes: int
+    window_us: int
+    base: int = 0
+    size: int = 0
+    source: int = 0
+    """Which of the query's counts it is, in the order of `dataflow.sources`."""
+    behind: int = -1
+    """Of a reduce: the bit of the distinct that lets its tuples pass, -1 = none."""
+
+    def params(self, repeated: int = 0) -> dict[str, int]:
+        """Parameters of the action `count`; `repeated`: bits to forget for a key seen before."""
+        return {
+            "query": self.bit,
+            "bit_of_query": 1 << self.bit,
+            "source_mask": 0,
+            "destination_mask": 0,
+            "port_mask": 0,
+            "length_mask": 0,
+            **dict(self.masks),
+            "threshold": self.threshold,
+            "by_bytes": self.by_bytes,
+            "reciprocal": reciprocal(self.window_us),
+            "base": self.base,
+            "size": self.size,
+            "repeated": repeated,
+        }
+
+
+class Copy(msgspec.Struct, frozen=True, kw_only=True):
+    """Copies of packets to the host."""
+
+    bit: int
+    match: Match
+    payload: bool
+    """The frames' bytes are needed, not only their headers."""
+
+
+def reciprocal(window_us: int) -> int:
+    """2^64 / window, rounded up: `time * reciprocal >> 64` is the window's number.
+
+    Exact for times below 2^64 / (reciprocal * window - 2^64): at least 71 days for 3 s, 85 minutes for
+    an hour; beyond, frames in the last microseconds of a window may fall into the next.
+    """
+    return -(-(1 << 64) // window_us)
+
+
+def by_bytes(value: Expression) -> int:
+    if value == Number(1):
+        return 0
+    if value == Field("length"):
+        return 1
+    raise NotPlaced(f"the switch adds up frames or bytes, not {text_of(value)}")
+
+
+def masks_of(keys: Iterable[Expression]) -> tuple[tuple[str, int], ...]:
+    masks: dict[str, int] = {}
+    for key in keys:
+        part = _KEY_PARTS.get(key.name) if isinstance(key, Field) else None
+        if part is None:
+            known = ", ".join(_KEY_PARTS)
+            raise NotPlaced(f"the key of a cell has no room for {text_of(key)}, only for {known}")
+        masks[part[0]] = part[1]
+    return tuple(sorted(masks.items()))
+
+
+class Space:
+    """Bits, stages and cells that are still free."""
+
+    def __init__(self, limits: SwitchLimits) -> None:
+        self._limits = limits
+        self._bits: set[int] = set()
+        self._stages: list[list[Entry]] = [[] for _ in range(limits.stages)]
+
+    def copy(self) -> "Space":
+        twin = Space(self._limits)
+        twin._bits = set(self._bits)
+        twin._stages = [list(stage) for stage in self._stages]
+        return twin
+
+    def hold(self, entries: Iterable[Entry]) -> None:
+        for entry in entries:
+            if entry.bit not in self._bits:
+                self._bits.add(entry.bit)
+                self._stages[entry.stage].append(entry)
+
+    def take_bits(self, bits: Iterable[int]) -> None:
+        self._bits |= set(bits)
+
+    def bit(self) -> int:
+        """A free bit; raises `NotPlaced`."""
+        free = self.bit_for_copy()
+        if free is None:
+            raise NotPlaced(f"all {self._limits.bits} bits of the classifier are taken")
+        return free
+
+    @property
+    def last_bit(self) -> int:
+        """Kept for copies of every packet."""
+        return self._limits.bits - 1
+
+    def bit_for_copy(self) -> int | None:
+        """A free bit, None if there is none."""
+        free = next((bit for bit in range(self.last_bit) if bit not in self._bits), None)
+        if free is not None:
+            self._bits.add(free)
+        return free
+
+    def distinct(self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int) -> Entry:
+        """An entry for a distinct: one that is there already, with room behind it, or a new one."""
+        for number, held in enumerate(self._stages):
+            for entry in held:
+                wanted = ("distinct", match, masks, window_us)
+                if (entry.role, entry.match, entry.masks, entry.window_us) == wanted and self._room_behind(
+                    number, match
+                ):
+                    return entry
+        new = Entry(
+            role="distinct",
+            bit=0,
+            stage=0,
+            match=match,
+            masks=masks,
+            window_us=window_us,
+            threshold=0,
+            by_bytes=0,
+        )
+        return self.place(new, after=-1)
+
+    def _room_behind(self, stage: int, match: Match) -> bool:
+        return any(
+            all(disjoint(match, entry.match) for entry in held) and len(held) < self._limits.entries
+            for held in self._stages[stage + 1 :]
+        )
+
+    def place(self, wanted: Entry, *, after: int) -> Entry:
+        """The entry in the first stage behind `after` that has room; raises `NotPlaced`."""
+        wish = self._limits.distinct_cells if wanted.role == "distinct" else self._limits.reduce_cells
+        for number in range(after + 1, self._limits.stages):
+            held = self._stages[number]
+            if len(held) >= self._limits.entries:
+                continue
+            if not all(disjoint(wanted.match, entry.match) for entry in held):
+                continue
+            gap = self._gap(held, wish)
+            if gap is None:
+                continue
+            entry = msgspec.structs.replace(wanted, bit=self.bit(), stage=number, base=gap[0], size=gap[1])
+            held.append(entry)
+            return entry
+        raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its {wanted.role}")
+
+    def _gap(self, held: Iterable[Entry], wish: int) -> tuple[int, int] | None:
+        """The first gap of cells that is as large as wished, else the largest of at least a quarter."""
+        gaps = []
+        start = 0
+        for entry in sorted(held, key=lambda entry: entry.base):
+            gaps.append((start, entry.base - start))
+            start = entry.base + entry.size
+        gaps.append((start, self._limits.cells - start))
+        large = next(((base, wish) for base, size in gaps if size >= wish), None)
+        if large is not None:
+            return large
+        base, size = max(gaps, key=lambda gap: gap[1])
+        return (base, size) if size >= wish // 4 else None
