@@ -13,6 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from sdnator import __version__
+from sdnator.blocks_commands import allow, blocks
 from sdnator.coordinator_commands import apps, flow, keys
 from sdnator.dataset_commands import dataset
 from sdnator.detect_command import detect_command
@@ -20,6 +21,7 @@ from sdnator.doctor import doctor
 from sdnator.due_commands import get, observe
 from sdnator.errors import SdnatorError
 from sdnator.switch_commands import counters, tables
+from sdnator.syn_flood_command import syn_flood_command
 from sdnator.up_command import down, status, up
 
 app = typer.Typer(
@@ -30,6 +32,11 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(dataset, name="dataset")
+app.add_typer(blocks, name="blocks")
+app.add_typer(allow, name="allow")
+demos = typer.Typer()
+app.add_typer(demos, name="demo")
+demos.command("syn-flood")(syn_flood_command)
 app.command("detect")(detect_command)
 for command in (up, status, down, observe, get, apps, keys, flow, tables, counters, doctor):
     app.command(command.__name__)(command)
@@ -106,14 +113,17 @@ def replay(
     )
 
 
-@app.command()
+@demos.callback(invoke_without_command=True)
 def demo(
+    context: typer.Context,
     *,
     folder: Annotated[Path, typer.Option(help="Where capture and report go.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Of the generated capture.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Make a capture of an infected home network, replay it, and see the attack blocked."""
+    if context.invoked_subcommand is not None:
+        return
     from sdnator.replay_command import run_demo
 
     run_demo(folder, seed, as_json=as_json)
