@@ -32,7 +32,7 @@ from tests.apps.sonata_adapter.traffic import BASE_US, Frame, attack, batch_of, 
 from tests.requirements import shared_data
 
 CAPTURES = ("synflood_spoofed", "synflood_one_source", "ssh_guessing", "ftp_bruteforce")
-BATCH = 16_384
+BATCH = 32_768
 _BLOCK_S = 60
 _BLOCKS = 12
 _ATTACK_EVERY = 6

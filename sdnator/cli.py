@@ -20,6 +20,7 @@ from sdnator.detect_command import detect_command
 from sdnator.doctor import doctor
 from sdnator.due_commands import get, observe
 from sdnator.errors import SdnatorError
+from sdnator.queries_commands import queries
 from sdnator.switch_commands import counters, tables
 from sdnator.syn_flood_command import syn_flood_command
 from sdnator.up_command import down, status, up
@@ -34,6 +35,7 @@ app = typer.Typer(
 app.add_typer(dataset, name="dataset")
 app.add_typer(blocks, name="blocks")
 app.add_typer(allow, name="allow")
+app.add_typer(queries, name="queries")
 demos = typer.Typer()
 app.add_typer(demos, name="demo")
 demos.command("syn-flood")(syn_flood_command)

@@ -8,7 +8,7 @@ SQLite (Data Archives)               ├─ kitsune
 import json
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,6 +41,9 @@ class PipelinePlan:
     device_id: int = 1
     base_us: int = 0
     """What the controller adds to the switch's time stamps, in microseconds."""
+    first: "Callable[[Pipeline], None] | None" = None
+    """Called when Data Updates and the Coordinator run, before any app starts: data is made on demand,
+    so whoever must miss nothing makes his interests known here."""
     kitsune: Mapping[str, Any] = field(default_factory=dict)
     firewall: Mapping[str, Any] = field(default_factory=dict)
 
@@ -92,6 +95,8 @@ class Pipeline:
         coordinator = self._app("coordinator", "coordinator.service", {})
         self._switch = self._start_switch()
         coordinator.wait_ready()
+        if self._plan.first is not None:
+            self._plan.first(self)
         apps = [
             self._app("p4runtime_ctrl", "apps.p4runtime_ctrl.service", self._controller_settings()),
             self._app("kitsune", "apps.kitsune.service", self._plan.kitsune),

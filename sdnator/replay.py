@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ WIRE_WINDOW = 16
 """Most packets in flight into a real interface: BMv2's capture ring has 32 slots, the kernel drops the rest."""
 POLL_SECONDS = 0.002
 LOOK_SECONDS = 0.1
+COORDINATED = "coordinated"
+"""Phase of an engine whose declarations the Coordinator knows."""
 PACKETS = "packets"
 """The controller's name for the request of every packet."""
 INTERESTS = (
@@ -179,38 +182,48 @@ class ReplayPass:
         with tempfile.TemporaryDirectory(prefix="sdnator-", ignore_cleanup_errors=True) as temporary:
             folder = Path(temporary) if options.keep is None else options.keep / name
             folder.mkdir(parents=True, exist_ok=True)
+            engine = Engine()
             plan = PipelinePlan(
                 folder=folder,
                 switch=options.switch,
                 inject=options.inject,
                 base_us=self._survey.base_us,
+                first=partial(self._join, engine),
                 kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},
                 firewall={"rules": {"dry_run": not self._result.mitigate}},
             )
             with Pipeline(plan) as pipeline:
-                self._run(pipeline, progress)
+                try:
+                    self._run(pipeline, engine, progress)
+                finally:
+                    engine.close()
         return self._result
 
-    def _run(self, pipeline: Pipeline, progress: Progress | None) -> None:
-        engine = Engine()
+    def _join(self, engine: Engine, pipeline: Pipeline) -> None:
+        """Make our interests known before any app runs, so that Kitsune's first scores are wanted."""
         engine.set_pubsub(pipeline.updates)
         engine.set_db(pipeline.archive)
         engine.init("replay", CONSUMER, interests=INTERESTS)
+        self._observer.subscribe(engine)
+        deadline = time.monotonic() + STALL_SECONDS
+        while engine.health()["phase"] != COORDINATED:
+            pipeline.check()
+            if time.monotonic() > deadline:
+                raise PipelineError(f"the coordinator did not answer within {STALL_SECONDS:.0f} s")
+            time.sleep(0.01)
+
+    def _run(self, pipeline: Pipeline, engine: Engine, progress: Progress | None) -> None:
+        self._wait_for_packets(pipeline, engine)
+        started = time.monotonic()
+        feed = pipeline.feed()
         try:
-            self._observer.subscribe(engine)
-            self._wait_for_packets(pipeline, engine)
-            started = time.monotonic()
-            feed = pipeline.feed()
-            try:
-                self._feed(pipeline, feed, progress)
-            except CaptureError as error:
-                pipeline.check()  # says which part died, and how
-                raise PipelineError(str(error)) from error
-            finally:
-                feed.close()
-            self._result.seconds = time.monotonic() - started
+            self._feed(pipeline, feed, progress)
+        except CaptureError as error:
+            pipeline.check()  # says which part died, and how
+            raise PipelineError(str(error)) from error
         finally:
-            engine.close()
+            feed.close()
+        self._result.seconds = time.monotonic() - started
 
     def _wait_for_packets(self, pipeline: Pipeline, engine: Engine) -> None:
         """Wait until the controller has told the switch to send packets, because Kitsune wants them.

@@ -10,6 +10,7 @@ AfterImage's state is not part of it: the statistics of a capture begin anew, as
 import io
 import json
 import os
+import tokenize
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -86,6 +87,20 @@ def save_model(path: Path, network: KitNet, notes: dict[str, Any]) -> None:
         ) from error
 
 
+_DAMAGE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    AttributeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy's reader raises on damaged bytes; array headers are Python literals to it."""
+
+
 def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:
     """Reads a model; raises `ModelFileError` that names the file and what is wrong with it."""
     try:
@@ -93,7 +108,7 @@ def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:
             arrays = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise ModelFileError(f"{path}: no such model; write one with --save-model") from None
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+    except _DAMAGE as error:
         raise NotAModelError(
             f"{path}: not a whole Kitsune model ({error}); train again and save it anew"
         ) from error

@@ -391,7 +391,7 @@ def _name(bit: int) -> str:
 
 
 def _offer(bit: int, match: Mapping[str, Any], *, copy: bool) -> dict[str, Any]:
-    """The value of `network.telemetry.sonata_adapter.<name>`."""
+    """The value of `network.telemetry.sonata.<name>`."""
     return {"name": _name(bit), "bit": bit, "conditions": dict(match), "copy": copy, "active": True}
 
 

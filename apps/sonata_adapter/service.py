@@ -1,6 +1,6 @@
 """The Sonata adapter as a DUE app: keys become queries in the switch, results come back.
 
-    network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata_adapter.*, network.p4_command.sonata_adapter.*
+    network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata.*, network.p4_command.sonata_adapter.*
     network.packets|frames|digests.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
 
 Nothing is observed and nothing is offered while nobody wants a result: with no interest the switch
@@ -34,7 +34,7 @@ from apps.sonata_adapter.templates import QueryFolder, own_queries
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
-TELEMETRY: Final = "network.telemetry.sonata_adapter"
+TELEMETRY: Final = "network.telemetry.sonata"
 COMMAND: Final = "network.p4_command.sonata_adapter"
 CELL_REQUEST: Final = "network.cell_request.sonata_adapter"
 CELLS: Final = "network.cell.p4runtime_ctrl.*"

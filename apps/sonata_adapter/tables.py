@@ -22,6 +22,7 @@ Column = tuple[Part, ...]
 
 _DTYPES: Final = {"address": (np.uint64, np.uint64), "name": (np.uint64,)}
 _SMALL: Final = 1 << 10
+_ROOMY: Final = 1 << 16
 _ODD: Final = np.array([secrets.randbits(64) | 1 for _ in range(24)], dtype=np.uint64)
 _SHIFT: Final = np.uint64(29)
 _FINAL: Final = np.uint64(0x9E3779B97F4A7C15)
@@ -86,19 +87,18 @@ class KeyTable:
         rest = np.flatnonzero(self._slots[place] != keys)
         claimed: list[NDArray[np.intp]] = []
         while len(rest):
-            rest = self._claim(keys, place, rest, claimed)
-            place[rest] = (place[rest] + 1) & mask
+            rest, taken = self._claim(keys, place, rest, claimed)
+            place[rest] = (place[rest] + taken) & mask
         fresh = np.sort(np.concatenate(claimed)) if claimed else rest
         self._numbers[place[fresh]] = np.arange(before, before + len(fresh))
         numbers = self._numbers[place]
-        if self.size >= self._limit:
-            numbers[place < 0] = -1
+        numbers[place < 0] = -1
         return numbers, fresh
 
     def _claim(
         self, keys: Hashes, place: Numbers, rest: NDArray[np.intp], claimed: list[NDArray[np.intp]]
-    ) -> NDArray[np.intp]:
-        """Give empty slots to keys; returns the rows whose slot belongs to another key."""
+    ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Give empty slots to keys; returns the rows that are left, and whether another has their slot."""
         slots, wanted = place[rest], keys[rest]
         found = self._slots[slots]
         empty = np.flatnonzero(found == _UNSEEN)[: self._limit - self.size]
@@ -111,16 +111,17 @@ class KeyTable:
             claimed.append(rest[won])
             self.size += len(won)
             found = self._slots[slots]
-        full = found == _UNSEEN
-        if full.any():
-            place[rest[full]] = -1
-        kept: NDArray[np.intp] = rest[(found != wanted) & ~full]
-        return kept
+        left = found != wanted
+        taken = found != _UNSEEN
+        if self.size >= self._limit:
+            place[rest[~taken]] = -1
+            left &= taken
+        return rest[left], taken[left]
 
     def _reserve(self, keys: int) -> None:
-        """Room for this many keys at half load."""
+        """Room for this many keys: a quarter full while that is cheap, then half full."""
         size = len(self._slots)
-        while size < 2 * keys:
+        while size < (4 if keys <= _ROOMY else 2) * keys:
             size *= 2
         if size == len(self._slots):
             return

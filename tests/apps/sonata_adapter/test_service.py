@@ -124,3 +124,17 @@ def test_a_killed_adapter_leaves_nothing(stage):
         why=lambda: ([item.value for item in confirmations.items], stage.log()[-2000:]),
     )
     wait_for(lambda: confirmations.items[-1].value["state"] in ("installed", "exists"))
+
+
+def test_a_new_controller_is_told_everything(stage):
+    """kill -9 of the controller, then another one: the switch has what is wanted again."""
+    stage.run("apps.sonata_adapter.service", {})
+    controller = stage.controller()
+    engine = stage.engine("observer")
+    Heard(engine, f"{PREFIX}.ddos", "network.traffic_capture.sonata.udp:dport=53")
+    states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    wait_for(lambda: len(telemetry(states)) == 5, why=lambda: (telemetry(states), stage.log()[-2000:]))
+    stage.kill(controller)
+    states.items.clear()
+    stage.controller()
+    wait_for(lambda: len(telemetry(states)) == 5, why=lambda: (telemetry(states), stage.log()[-2000:]))
