@@ -17,7 +17,7 @@ class ProgramError(DataplaneError):
     """The JSON cannot be read as a BMv2 program."""
 
 
-class Unsupported(ProgramError):  # noqa: N818 - what the program is, here
+class Unsupported(ProgramError):
     """The program uses a part of BMv2 that this target does not have; the text names it and its place."""
 
 
@@ -25,5 +25,5 @@ class CompilerError(DataplaneError):
     """The generated C could not be compiled or loaded."""
 
 
-class InvalidIndex(DataplaneError):  # noqa: N818 - named as the tables' errors are
+class InvalidIndex(DataplaneError):
     """An array index that the program did not declare."""

@@ -26,7 +26,7 @@ UNKNOWN = 2
 SPACE = "sdnator-embedded"
 
 
-class Refused(DataplaneError):  # noqa: N818 - a refusal is an answer, not a fault
+class Refused(DataplaneError):
     """A request, or one update of it, that the server does not carry out."""
 
     code: ClassVar[int] = UNKNOWN

@@ -23,19 +23,19 @@ class TableError(DataplaneError):
     """A table operation that was refused."""
 
 
-class AlreadyExists(TableError):  # noqa: N818 - the protocol's own words
+class AlreadyExists(TableError):
     """An entry with this match (and priority) is in the table."""
 
 
-class NotFound(TableError):  # noqa: N818 - the protocol's own words
+class NotFound(TableError):
     """No entry with this match (and priority)."""
 
 
-class TableFull(TableError):  # noqa: N818 - the protocol's own words
+class TableFull(TableError):
     """The table holds as many entries as the program gave it room for."""
 
 
-class InvalidEntry(TableError):  # noqa: N818 - the protocol's own words
+class InvalidEntry(TableError):
     """The entry does not fit the table's key or actions."""
 
 

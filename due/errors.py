@@ -1,4 +1,4 @@
-# ruff: noqa: N818 - errors are named for what is wrong, as in httpx
+
 
 """Everything that DUE raises.
 

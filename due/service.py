@@ -56,7 +56,7 @@ class Service(Protocol):
         ...
 
 
-def run(  # noqa: PLR0917 - the order in which an app declares itself
+def run(
     app_id: str,
     service: Callable[[Engine, Any], Service],
     settings: type[Any],

@@ -34,7 +34,7 @@ def capture(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("document", "line"), shell_lines(), ids=lambda text: text)
-def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch):  # noqa: ARG001
+def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch):
     """A `make` line names a target; an `sdnator` line runs to a good end on a small capture."""
     words = shlex.split(line)
     if words[0] == "make":

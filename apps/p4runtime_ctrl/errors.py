@@ -30,9 +30,9 @@ class SwitchError(ControllerError):
     """The switch answered with an error."""
 
 
-class NotPrimary(SwitchError):  # noqa: N818 - a state rather than an accident
+class NotPrimary(SwitchError):
     """Another controller is primary; this one may not write."""
 
 
-class Unreachable(SwitchError):  # noqa: N818 - reads better where it is caught
+class Unreachable(SwitchError):
     """There is no connection to the switch."""

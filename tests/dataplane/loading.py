@@ -33,7 +33,7 @@ def ethernet(etype: int, payload: bytes) -> bytes:
     return bytes.fromhex("020000000002 020000000001") + etype.to_bytes(2, "big") + payload
 
 
-def frame(  # noqa: PLR0917 - the header's own order
+def frame(
     what: int, a: int = 0, b: int = 0, c: int = 0, d: int = 0, e: int = 0, *, rest: bytes = b""
 ) -> bytes:
     """A frame of features.p4's own type; the header is 20 bytes behind Ethernet."""

@@ -8,7 +8,7 @@ CLIENT, SERVER = (4, 0, 0x0A000001), (4, 0, 0x0A000002)
 SYN, SYN_ACK, RST, ACK = 0x02, 0x12, 0x04, 0x10
 
 
-def say(talk, time, source, destination, ports, flags=0, *, tcp=True):  # noqa: PLR0917
+def say(talk, time, source, destination, ports, flags=0, *, tcp=True):
     number = {CLIENT: 1, SERVER: 2}[source]
     key = (tcp, source, ports[0], ports[1])
     reverse = (tcp, destination, ports[1], ports[0])
