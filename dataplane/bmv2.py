@@ -1,22 +1,26 @@
 """Starts BMv2's simple_switch_grpc, where it is installed, as a stand-in for the embedded switch."""
 
-import ctypes
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
 from dataplane.errors import DataplaneError
 
 PROGRAM = "simple_switch_grpc"
-_PR_SET_PDEATHSIG = 1
+_STARTER = """
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+if os.getppid() != int(sys.argv[1]):
+    sys.exit(1)
+os.execv(sys.argv[2], sys.argv[2:])
+"""
 _POLL_S = 0.05
 
 
@@ -69,11 +73,7 @@ class Bmv2:
             command += ["--dp-grpc-server-addr", self.packet_address]
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
-                command,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                cwd=folder,
-                preexec_fn=_end_with_parent(),  # noqa: PLW1509
+                _ending_with_us(command), stdout=log, stderr=subprocess.STDOUT, cwd=folder
             )
         self._wait(timeout_s)
 
@@ -124,15 +124,11 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _end_with_parent() -> Callable[[], None] | None:
+def _ending_with_us(command: list[str]) -> list[str]:
+    """The command behind a starter that has the kernel end it when this process does.
+
+    Not a `preexec_fn`: that forks a process with gRPC's threads in it, which may hang before it starts.
+    """
     if sys.platform != "linux":
-        return None
-    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
-
-    def ask() -> None:
-        # BMv2 may hang in its own shutdown while streams are open
-        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
-
-    return ask
+        return command
+    return [sys.executable, "-c", _STARTER, str(os.getpid()), *command]
