@@ -30,9 +30,7 @@ demo: venv
 
 test: venv
 	@echo "==> tests"
-	@$(BIN)/python -m pytest || { \
-	  echo "==> once more, only what failed: what passes now is flaky, and a defect to mend"; \
-	  $(BIN)/python -m pytest --last-failed --last-failed-no-failures none; }
+	@$(BIN)/python -m pytest
 
 check: venv
 	$(BIN)/ruff check .
