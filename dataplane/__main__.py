@@ -128,7 +128,8 @@ def _credentials(arguments: argparse.Namespace) -> grpc.ServerCredentials | None
 def _end_with_parent() -> None:
     if sys.platform != "linux":
         return
-    parent = os.getppid()
+    # told by whoever starts us, for it may die while we are still importing
+    parent = int(os.environ.pop("DUE_PARENT", "0")) or os.getppid()
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
         # it died before the kernel knew of our wish

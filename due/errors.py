@@ -1,5 +1,3 @@
-
-
 """Everything that DUE raises.
 
     DueError

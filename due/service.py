@@ -33,6 +33,9 @@ _TICKS_PER_HEALTH = 20
 HEALTH = "due.health"
 """`due.health.<app>`: the app's and the engine's health, every second, best effort."""
 
+PARENT_VARIABLE = "DUE_PARENT"
+"""Environment variable by which a starter may tell its process id: we end where it has ended already."""
+
 S = TypeVar("S")
 
 
@@ -73,7 +76,8 @@ def run(
         stream=sys.stderr,
         format=f"%(asctime)s {app_id} %(levelname)s %(name)s: %(message)s",
     )
-    parent = os.getppid()
+    # told by whoever starts us, for it may die while we are still importing
+    parent = int(os.environ.pop(PARENT_VARIABLE, "0")) or os.getppid()
     if not arguments.stay:
         die_with_parent(signal.SIGTERM)
     try:

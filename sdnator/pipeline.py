@@ -20,6 +20,7 @@ from dataplane.capture_port import CaptureFeed
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
 from sdnator.errors import PipelineError
+from sdnator.held_signals import held_signals
 from sdnator.process import Child
 from sdnator.wire import Feed, VethPair, WireFeed
 
@@ -91,7 +92,8 @@ class Pipeline:
 
     def _start(self) -> None:
         self._logs.mkdir(parents=True, exist_ok=True)
-        self.updates = self._stack.enter_context(EmbeddedServer(self._run / "updates")).url
+        with held_signals():
+            self.updates = self._stack.enter_context(EmbeddedServer(self._run / "updates")).url
         coordinator = self._app("coordinator", "coordinator.service", {})
         self._switch = self._start_switch()
         coordinator.wait_ready()
@@ -129,7 +131,8 @@ class Pipeline:
         leave = VethPair.make(self._stack, "out")
         began_us = time.time_ns() // 1_000
         ports = {INGRESS_PORT: entry.far, EGRESS_PORT: leave.near}
-        switch = self._stack.enter_context(Bmv2(ports, device_id=self._plan.device_id))
+        with held_signals():
+            switch = self._stack.enter_context(Bmv2(ports, device_id=self._plan.device_id))
         return _StartedSwitch(switch.address, entry.near, began_us)
 
     @property
@@ -168,8 +171,9 @@ class Pipeline:
         )
 
     def _child(self, name: str, *arguments: str) -> Child:
-        child = Child(name, arguments, self._logs)
-        self._children.append(child)
+        with held_signals():
+            child = Child(name, arguments, self._logs)
+            self._children.append(child)
         return child
 
     def check(self) -> None:

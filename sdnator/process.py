@@ -15,6 +15,8 @@ from sdnator.errors import PipelineError
 
 START_SECONDS = 30.0
 STOP_SECONDS = 10.0
+_PARENT_VARIABLE = "DUE_PARENT"
+"""`due.service.PARENT_VARIABLE`; importing that takes longer than `sdnator --help` may."""
 
 
 class Child:
@@ -37,6 +39,7 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=stderr,
                 start_new_session=True,
+                env=os.environ | {_PARENT_VARIABLE: str(os.getpid())},
             )
 
     @property

@@ -27,6 +27,7 @@ from due.drivers.redis_wire import Wire
 from due.errors import DueError, InvalidOption, UpdatesUnavailable
 from sdnator import p4_program
 from sdnator.errors import BadInput, PipelineError
+from sdnator.held_signals import held_signals
 from sdnator.process import Child
 
 SWITCH_NAME = "s1"
@@ -129,7 +130,8 @@ class StandingPipeline:
             if self.updates:
                 Wire(self.updates).close()
             else:
-                self._server = self._stack.enter_context(EmbeddedServer(self._fresh_folder()))
+                with held_signals():
+                    self._server = self._stack.enter_context(EmbeddedServer(self._fresh_folder()))
                 self.updates = self._server.url
         except InvalidOption as error:
             raise BadInput(f"--updates: {error}") from None
@@ -162,7 +164,8 @@ class StandingPipeline:
             began_us = time.time_ns() // 1_000
             interfaces = {number: kind.removeprefix("veth:") for number, kind in self._plan.ports.items()}
             try:
-                bmv2 = self._stack.enter_context(Bmv2(interfaces, device_id=self._plan.device_id))
+                with held_signals():
+                    bmv2 = self._stack.enter_context(Bmv2(interfaces, device_id=self._plan.device_id))
             except Bmv2Error as error:
                 raise PipelineError(str(error)) from None
             self.switch_address = bmv2.address
@@ -202,7 +205,8 @@ class StandingPipeline:
 
     def _child(self, name: str, *arguments: str) -> Child:
         self._commands[name] = arguments
-        child = self._children[name] = Child(name, arguments, self._logs)
+        with held_signals():
+            child = self._children[name] = Child(name, arguments, self._logs)
         return child
 
     def watch(self) -> bool:
@@ -248,7 +252,8 @@ class StandingPipeline:
             self._count_death("updates", PipelineError(str(error)))
             self._server.kill()
             try:
-                self._server.start()
+                with held_signals():
+                    self._server.start()
             except UpdatesUnavailable as again:
                 raise PipelineError(str(again)) from None
             self._tell("Data Updates server had ended: started again")

@@ -21,6 +21,7 @@ from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
 from sdnator.errors import PipelineError
+from sdnator.held_signals import held_signals
 from sdnator.process import Child
 from sdnator.syn_flood_lab import HOSTS, Lab, mac
 
@@ -76,7 +77,8 @@ class Stage:
     def _start(self) -> None:
         (self.folder / "logs").mkdir(parents=True, exist_ok=True)
         run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-syn-")))
-        self._updates = self._stack.enter_context(EmbeddedServer(run)).url
+        with held_signals():
+            self._updates = self._stack.enter_context(EmbeddedServer(run)).url
         self._archive = f"sqlite:///{self.folder / 'archive.db'}"
         coordinator = self.app("coordinator", "coordinator.service", {})
         base_us = time.time_ns() // 1000
@@ -90,7 +92,8 @@ class Stage:
     def _start_switch(self) -> str:
         ports = {number: f"p{number}" for number in range(1, len(HOSTS) + 1)}
         if self._kind == "bmv2":
-            return self._stack.enter_context(Bmv2(ports, device_id=_DEVICE)).address
+            with held_signals():
+                return self._stack.enter_context(Bmv2(ports, device_id=_DEVICE)).address
         options = [option for number, name in ports.items() for option in ("--port", f"{number}=veth:{name}")]
         state = ("--state-json", str(self.folder / "switch.json"))
         return str(self._child("switch", "dataplane", *options, *state).wait_ready()["grpc"])
@@ -185,8 +188,9 @@ class Stage:
         return str(path)
 
     def _child(self, name: str, *arguments: str) -> Child:
-        child = Child(name, arguments, self.folder / "logs")
-        self._children.append(child)
+        with held_signals():
+            child = Child(name, arguments, self.folder / "logs")
+            self._children.append(child)
         return child
 
     def wait(self, seconds: float) -> None:

@@ -104,6 +104,15 @@ def test_a_wrong_option_is_one_clear_line(start, tmp_path, arguments, text):
     assert "Traceback" not in stderr
 
 
+def test_a_service_whose_starter_died_first_ends_at_once(start, monkeypatch):
+    """Killed while the service was still importing, the starter would leave it for ever."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
+        pass
+    monkeypatch.setenv("DUE_PARENT", str(gone.pid))
+    process = start()
+    assert process.wait(60) == 0
+
+
 def test_a_service_ends_with_its_parent(tmp_path, server):
     program = tmp_path / "app.py"
     program.write_text(textwrap.dedent(APP))
