@@ -6,7 +6,7 @@
 
 A switch on a wire gives no verdicts.  There the order of the loop tells: a packet that is overtaken by
 the score of a later one made no copy, so it was dropped (or lost, which the sequence numbers of the
-packet-ins show).
+packet-ins show).  Of the last ones, which nothing overtakes, the switch's drop counters tell.
 """
 
 import enum
@@ -99,6 +99,15 @@ class FlightLog:
         self.decided += int(fresh.sum())
         if not self._verdicts:
             self._drop_before(int(index[-1]))
+
+    def settle_counted(self, drops: int) -> None:
+        """The switch has counted so many drops in all: where they make up all in flight, it was dropped."""
+        if (
+            not self._verdicts
+            and self.in_flight
+            and drops == self.count(PacketState.DROPPED) + self.in_flight
+        ):
+            self._drop_before(self.sent)
 
     def settle(self) -> None:
         """Nothing comes back any more: on a switch without verdicts, what is in flight was dropped."""

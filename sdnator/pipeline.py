@@ -19,6 +19,7 @@ from dataplane.bmv2 import Bmv2
 from dataplane.capture_port import CaptureFeed
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
+from sdnator.drop_counters import DropCounters
 from sdnator.errors import PipelineError
 from sdnator.held_signals import held_signals
 from sdnator.process import Child
@@ -139,6 +140,10 @@ class Pipeline:
     def gives_verdicts(self) -> bool:
         """Whether the switch says of each frame what became of it."""
         return self._switch.inject is None
+
+    def drop_counters(self) -> DropCounters:
+        """What the switch's block entries count, for switches that give no verdicts."""
+        return DropCounters(self._switch.address, self._plan.device_id)
 
     def feed(self) -> Feed:
         """Where to put frames."""

@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -22,6 +23,7 @@ from apps.messages import Alert, Confirmation, Decision
 from dataplane.capture_port import CaptureError
 from due import CONSUMER, Engine, Interest, Item
 from sdnator.captures import Capture
+from sdnator.drop_counters import DropCounters
 from sdnator.errors import PipelineError
 from sdnator.flight import FlightLog, PacketState
 from sdnator.pipeline import SWITCH_NAME, Pipeline, PipelinePlan
@@ -35,7 +37,9 @@ CHUNK = 64
 STALL_SECONDS = 30.0
 """The loop has failed when nothing comes back for so long."""
 SETTLE_SECONDS = 0.5
-"""On a switch that gives no verdicts: silence for so long means that what is in flight was dropped."""
+"""On a switch that gives no verdicts: silence for so long means that what is in flight was dropped or lost."""
+ASK_SECONDS = 0.003
+"""On a switch that gives no verdicts: silence for so long, and its drop counters are asked."""
 WIRE_WINDOW = 16
 """Most packets in flight into a real interface: BMv2's capture ring has 32 slots, the kernel drops the rest."""
 POLL_SECONDS = 0.002
@@ -173,6 +177,7 @@ class ReplayPass:
         self._watch = watch
         self._result = PassResult(FlightLog(survey.packets, verdicts=options.switch == "embedded"), mitigate)
         self._observer = _Observer(self._result)
+        self._drops: DropCounters | None = None
         self._looked = 0.0
 
     def run(self, progress: Progress | None = None) -> PassResult:
@@ -215,14 +220,16 @@ class ReplayPass:
     def _run(self, pipeline: Pipeline, engine: Engine, progress: Progress | None) -> None:
         self._wait_for_packets(pipeline, engine)
         started = time.monotonic()
-        feed = pipeline.feed()
-        try:
-            self._feed(pipeline, feed, progress)
-        except CaptureError as error:
-            pipeline.check()  # says which part died, and how
-            raise PipelineError(str(error)) from error
-        finally:
-            feed.close()
+        with ExitStack() as stack:
+            feed = pipeline.feed()
+            stack.callback(feed.close)
+            if not pipeline.gives_verdicts:
+                self._drops = stack.enter_context(pipeline.drop_counters())
+            try:
+                self._feed(pipeline, feed, progress)
+            except CaptureError as error:
+                pipeline.check()  # says which part died, and how
+                raise PipelineError(str(error)) from error
         self._result.seconds = time.monotonic() - started
 
     def _wait_for_packets(self, pipeline: Pipeline, engine: Engine) -> None:
@@ -344,9 +351,8 @@ class ReplayPass:
             now = time.monotonic()
             if flight.decided != last:
                 last, since = flight.decided, now
-            elif now - since > SETTLE_SECONDS and self._observer.blocks:
-                with self._observer.moved:
-                    flight.settle()
+            elif self._observer.blocks:
+                self._settle(now - since)
             self._look(pipeline, progress)
             if now - since > STALL_SECONDS:
                 raise PipelineError(
@@ -358,6 +364,17 @@ class ReplayPass:
                         else "; frames were lost on the wire: try a smaller --window"
                     )
                 )
+
+    def _settle(self, silence: float) -> None:
+        """Packets are dropped and nothing comes back: were all that are in flight?"""
+        flight = self._result.flight
+        if self._drops is not None and silence > ASK_SECONDS:
+            drops = self._drops.dropped()
+            with self._observer.moved:
+                flight.settle_counted(drops)
+        if silence > SETTLE_SECONDS:
+            with self._observer.moved:
+                flight.settle()
 
 
 def wall_seconds_to_block(result: PassResult, first_attack: int | None) -> float | None:

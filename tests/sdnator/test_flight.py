@@ -51,6 +51,17 @@ def test_without_verdicts_order_tells_what_was_dropped():
     assert (flight.in_flight, flight.state[4]) == (0, PacketState.DROPPED)
 
 
+def test_drop_counters_decide_only_where_they_make_up_all_in_flight():
+    """One packet of three may still be on its way to Kitsune: two counted drops settle nothing yet."""
+    flight = FlightLog(4, verdicts=False)
+    flight.send(4)
+    flight.scored(*scores(0))
+    flight.settle_counted(2)
+    assert flight.in_flight == 3
+    flight.settle_counted(3)
+    assert (flight.in_flight, flight.count(PacketState.DROPPED)) == (0, 3)
+
+
 def test_late_score_corrects_a_settled_packet():
     """Settling is a guess after silence; a score that comes after all is the truth."""
     flight = FlightLog(2, verdicts=False)
