@@ -82,6 +82,16 @@ class Bmv2:
         """Its process id."""
         return self._process.pid
 
+    def check(self) -> None:
+        """Raise Bmv2Error with its last words if it has ended."""
+        code = self._process.poll()
+        if code is not None:
+            raise Bmv2Error(f"{PROGRAM} ended with exit code {code}; it said: {self._last_words()}")
+
+    def _last_words(self) -> str:
+        said = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
+        return " | ".join(said) or "nothing"
+
     def _wait(self, timeout_s: float) -> None:
         host, _, port = self.address.rpartition(":")
         deadline = time.monotonic() + timeout_s
@@ -90,11 +100,9 @@ class Bmv2:
                 if probe.connect_ex((host, int(port))) == 0:
                     return
             time.sleep(_POLL_S)
-        said = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
+        said = self._last_words()
         self.close()
-        raise Bmv2Error(
-            f"{PROGRAM} did not serve {self.address} within {timeout_s} s; it said: {' | '.join(said)}"
-        )
+        raise Bmv2Error(f"{PROGRAM} did not serve {self.address} within {timeout_s} s; it said: {said}")
 
     def close(self) -> None:
         """End it and remove its folder."""

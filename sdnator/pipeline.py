@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from dataplane.bmv2 import Bmv2
+from dataplane.bmv2 import Bmv2, Bmv2Error
 from dataplane.capture_port import CaptureFeed
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
@@ -69,6 +69,7 @@ class Pipeline:
         self._logs = plan.folder / "logs"
         self._stack = ExitStack()
         self._children: list[Child] = []
+        self._bmv2: Bmv2 | None = None
         self.updates = ""
         """URL of Data Updates."""
         self.archive = f"sqlite:///{plan.folder / 'archive.db'}"
@@ -134,6 +135,7 @@ class Pipeline:
         ports = {INGRESS_PORT: entry.far, EGRESS_PORT: leave.near}
         with held_signals():
             switch = self._stack.enter_context(Bmv2(ports, device_id=self._plan.device_id))
+        self._bmv2 = switch
         return _StartedSwitch(switch.address, entry.near, began_us)
 
     @property
@@ -185,6 +187,11 @@ class Pipeline:
         """Raise PipelineError if a part has died."""
         for child in self._children:
             child.check()
+        if self._bmv2 is not None:
+            try:
+                self._bmv2.check()
+            except Bmv2Error as error:
+                raise PipelineError(str(error)) from None
 
     def stop(self) -> None:
         """Stop all parts, the last started first."""

@@ -1,5 +1,7 @@
 """The launcher of BMv2: bound to loopback, ended when told; a missing program is said plainly."""
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,16 @@ def test_a_program_that_ends_at_once_is_said_with_its_words(monkeypatch, tmp_pat
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
     with pytest.raises(Bmv2Error, match="it hurts"):
         Bmv2({})
+
+
+def test_its_death_is_told():
+    optional_program(PROGRAM)
+    with Bmv2({}, device_id=4) as switch:
+        switch.check()
+        os.kill(switch.pid, signal.SIGKILL)
+        os.waitid(os.P_PID, switch.pid, os.WEXITED | os.WNOWAIT)
+        with pytest.raises(Bmv2Error, match="ended with exit code"):
+            switch.check()
 
 
 def test_it_serves_on_loopback_and_ends():
