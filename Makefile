@@ -2,14 +2,18 @@
 # make test   set up .venv and run the tests
 # make venv   set up .venv alone
 # make check  ruff, mypy, import rules
+# make docs   the documentation as a site, in site/
 # make p4     compile p4/sdnator.p4 again (needs p4c)
 
 PYTHON ?= python3
 VENV := .venv
+# optional parts of pyproject.toml to install: `make EXTRAS=dev,spark test` tests the Spark engine too
+EXTRAS ?= dev
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.set-up
+comma := ,
+STAMP := $(VENV)/.set-up-$(subst $(comma),-,$(EXTRAS))
 
-.PHONY: venv demo test check p4 clean
+.PHONY: venv demo test check docs p4 clean
 .DEFAULT_GOAL := test
 
 venv: $(STAMP)
@@ -22,7 +26,7 @@ $(STAMP): pyproject.toml $(wildcard setup.py apps/*/*.c)
 	@$(PYTHON) -m venv $(VENV) \
 	  || { echo "Python cannot make virtual environments here; on Debian: apt install python3-venv" >&2; exit 2; }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	@touch $@
 
 demo: venv
@@ -37,8 +41,11 @@ check: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy due coordinator apps dataplane sdnator p4rt benchmarks examples sdnator_due.py
 
+docs: venv
+	$(BIN)/mkdocs build --strict
+
 p4: venv
 	$(BIN)/python -m sdnator.p4_program compile
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo
+	rm -rf $(VENV) build dist *.egg-info demo site
