@@ -11,25 +11,32 @@ VENV := .venv
 EXTRAS ?= dev
 BIN := $(VENV)/bin
 comma := ,
-STAMP := $(VENV)/.set-up-$(subst $(comma),-,$(EXTRAS))
+BASE := $(VENV)/.set-up
+STAMP := $(BASE)-$(subst $(comma),-,$(EXTRAS))
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .PHONY: venv demo test check docs p4 clean
 .DEFAULT_GOAL := test
 
 venv: $(STAMP)
 
-# The stamp holds what the environment was made from: a second run does nothing.
-$(STAMP): pyproject.toml $(wildcard setup.py apps/*/*.c)
+# The stamps hold what the environment was made from: a second run does nothing.
+$(BASE): pyproject.toml $(wildcard setup.py apps/*/*.c)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "SDNator needs Python 3.11 or later; $(PYTHON) is `$(PYTHON) -V 2>&1`. Try: make PYTHON=python3.11" >&2; exit 2; }
 	@echo "==> setting up $(VENV) (once; takes a minute or two)"
 	@$(PYTHON) -m venv $(VENV) \
 	  || { echo "Python cannot make virtual environments here; on Debian: apt install python3-venv" >&2; exit 2; }
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
+	@$(PIP_INSTALL) --upgrade pip
+	@$(PIP_INSTALL) --editable .
 	@touch $@
 
-demo: venv
+$(STAMP): $(BASE)
+	@echo "==> adding what tests and documentation need ($(EXTRAS))"
+	@$(PIP_INSTALL) --editable '.[$(EXTRAS)]'
+	@touch $@
+
+demo: $(BASE)
 	@$(BIN)/sdnator demo
 
 test: venv
