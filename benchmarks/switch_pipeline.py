@@ -7,7 +7,7 @@ and 1,000 ternary block entries over that with 10, in the thread's own time, run
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -119,15 +119,20 @@ def prepared(program: Program, backend: Backend, *, blocks: int, ternary: int) -
     switch = Switch(program, backend=backend)
     switch.set_clone_session(1, [Replica(510, 1)])
     switch.tables["ingress.forward_port"].insert(TableEntry((Exact(1),), "ingress.to_port", (2,)))
-    for n in range(blocks):
-        # addresses that send nothing: every frame is looked up, none is stopped
-        key = (Exact(1), Exact(0xC0000000 + n))
-        switch.tables["ingress.block_src"].insert(TableEntry(key, "ingress.drop_src"))
-    random = Random(1)
-    for n in range(ternary):
-        switch.tables["ingress.block"].insert(_block(random, n))
+    for table, entry in block_entries(blocks, ternary):
+        switch.tables[table].insert(entry)
     _queries(switch)
     return switch
+
+
+def block_entries(blocks: int, ternary: int) -> Iterator[tuple[str, TableEntry]]:
+    """Entries of block_src and block, with their table; for addresses that send nothing: every frame is
+    looked up, none is stopped."""
+    for n in range(blocks):
+        yield "ingress.block_src", TableEntry((Exact(1), Exact(0xC0000000 + n)), "ingress.drop_src")
+    random = Random(1)
+    for n in range(ternary):
+        yield "ingress.block", _block(random, n)
 
 
 def _block(random: Random, n: int) -> TableEntry:
@@ -171,7 +176,7 @@ def _queries(switch: Switch) -> None:
         for query in (stage, stage + 8)[: 2 if stage + 8 < _QUERIES else 1]:
             bit = 1 << query
             reciprocal = (1 << 64) // 3_000_000
-            params = (query, bit, 0, _ALL >> 128, 0, 0, 40, 0, reciprocal, 0, 32768, 0)
+            params = (query, bit, 0, _ALL >> 128, 0, 0, 40, 0, reciprocal, 0, 32768, 0, 0)
             entry = TableEntry((Ternary(bit, bit),), f"ingress.count_{stage}.count", params, 1 + query)
             table.insert(entry)
 

@@ -4,7 +4,8 @@
                              ▲                                            │
                              └── not again while in the cache ◄───────────┘ until ack or ack_timeout
 
-Lists are written as protobuf bytes directly, for the reason given in packet_io.py.  Pure but for the
+Lists are written as protobuf bytes directly, for the reason given in packet_io.py; their samples come
+from the switch as they travel (compiler/samples.py).  Pure but for the
 time stamp of a list: times are arguments.
 """
 
@@ -13,8 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataplane.bytestrings import encode
-from dataplane.packet_io import varint
+from dataplane.compiler.samples import varint
 from dataplane.schema import BoundDigest, Schema
 from dataplane.status import Exists, InvalidArgument, Missing
 from dataplane.switch import Digest
@@ -22,13 +22,6 @@ from dataplane.table_entities import DELETE, INSERT, Undo
 from p4rt import p4runtime
 
 MAX_LIST = 4096
-_MAX_VALUE_BYTES = 256
-
-_MEMBER_PREFIXES = [
-    b"\x0a" + varint(1 + len(varint(size)) + size) + b"\x0a" + varint(size)
-    for size in range(_MAX_VALUE_BYTES + 1)
-]
-_SMALL_MEMBERS = [_MEMBER_PREFIXES[1] + bytes([value]) for value in range(256)]
 
 
 @dataclass(slots=True)
@@ -37,10 +30,10 @@ class _Stream:
 
     digest: BoundDigest
     config: Any
-    buffer: dict[tuple[int, ...], None] = field(default_factory=dict)
+    buffer: dict[bytes, None] = field(default_factory=dict)
     since_ns: int = 0
-    cache: dict[int, tuple[int, tuple[tuple[int, ...], ...]]] = field(default_factory=dict)
-    cached: set[tuple[int, ...]] = field(default_factory=set)
+    cache: dict[int, tuple[int, tuple[bytes, ...]]] = field(default_factory=dict)
+    cached: set[bytes] = field(default_factory=set)
 
     @property
     def list_size(self) -> int:
@@ -127,13 +120,13 @@ class DigestLists:
             if stream is None:
                 self.unconfigured += 1
                 continue
-            values, buffer = digest.values, stream.buffer
-            if values in buffer or values in stream.cached:
+            sample, buffer = digest.sample, stream.buffer
+            if sample in buffer or sample in stream.cached:
                 self.suppressed += 1
                 continue
             if not buffer:
                 stream.since_ns = now_ns
-            buffer[values] = None
+            buffer[sample] = None
             if len(buffer) >= stream.list_size:
                 ready.append(self._list(stream, now_ns))
         return ready
@@ -179,22 +172,11 @@ class DigestLists:
         return encode_list(stream.digest, self._list_id, samples, self._wall_ns())
 
 
-def encode_list(
-    digest: BoundDigest, list_id: int, samples: Iterable[tuple[int, ...]], stamp_ns: int
-) -> bytes:
-    """A StreamMessageResponse with a DigestList of struct samples."""
-    parts = [b"\x08", varint(digest.id), b"\x10", varint(list_id)]
-    for values in samples:
-        members = b"".join([_SMALL_MEMBERS[v] if v < 256 else _member(encode(v)) for v in values])
-        struct = b"".join((b"\x2a", varint(len(members)), members))
-        parts += (b"\x1a", varint(len(struct)), struct)
-    parts += (b"\x20", varint(stamp_ns))
-    body = b"".join(parts)
+def encode_list(digest: BoundDigest, list_id: int, samples: Iterable[bytes], stamp_ns: int) -> bytes:
+    """A StreamMessageResponse with a DigestList of samples."""
+    head = b"".join((b"\x08", varint(digest.id), b"\x10", varint(list_id)))
+    body = b"".join((head, *samples, b"\x20", varint(stamp_ns)))
     return b"".join((b"\x1a", varint(len(body)), body))
-
-
-def _member(value: bytes) -> bytes:
-    return _MEMBER_PREFIXES[len(value)] + value
 
 
 def _copy(message: Any) -> Any:

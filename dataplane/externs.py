@@ -107,6 +107,8 @@ class _Registers(Protocol):
 
     def write(self, index: int, value: int) -> None: ...
 
+    def written(self) -> list[tuple[int, int]]: ...
+
 
 class _Array:
     """An array of `size` cells, named as in the program."""
@@ -189,6 +191,11 @@ class RegisterArray(_Array):
             raise DataplaneError(f"{value} does not fit the {self.width} bits of register {self.name}")
         with self._lock:
             self._store.write(index, value)
+
+    def written(self) -> list[tuple[int, int]]:
+        """(index, value) of the cells that are not 0, in order; quick for large arrays."""
+        with self._lock:
+            return self._store.written()
 
 
 # -- hashes -----------------------------------------------------------------------------------------

@@ -15,22 +15,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from dataplane import bytestrings
+from dataplane.compiler.samples import varint
 from dataplane.schema import MetadataField
 from dataplane.status import InvalidArgument, Refused
 
 _CACHED_BITS = 10
 
 Piece = Callable[[bytes, int], bytes]
-
-
-def varint(value: int) -> bytes:
-    """A protobuf varint."""
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
 
 
 _VARINTS = tuple(varint(value) for value in range(1 << 14))

@@ -7,10 +7,11 @@ VERIFY_AND_COMMIT      a new, empty pipeline comes into force
 RECONCILE_AND_COMMIT   a new pipeline with all entities of the old one, or nothing at all
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dataplane.errors import DataplaneError
 from dataplane.pipeline import Pipeline, Verified, verify
 from dataplane.reads import Reader
 from dataplane.status import InvalidArgument, Missing
@@ -74,6 +75,7 @@ def _carry_over(old: Pipeline | None, new: Pipeline) -> None:
         return
     with old.switch.lock:
         updates = [_update(entity, new) for entity in _state(old)]
+        registers = {name: array.written() for name, array in old.switch.registers.items()}
     results = Writer(new).apply(
         [update for update in updates if update is not None], p4runtime.WriteRequest.ROLLBACK_ON_ERROR
     )
@@ -82,9 +84,26 @@ def _carry_over(old: Pipeline | None, new: Pipeline) -> None:
         for error in results
         if error is not None and not str(error).startswith(("undone", "not tried"))
     ]
+    causes += _carry_registers(registers, new)
     if causes:
         new.close()
         raise InvalidArgument(f"the forwarding state cannot be kept: {causes[0]}")
+
+
+def _carry_registers(written: Mapping[str, list[tuple[int, int]]], new: Pipeline) -> list[str]:
+    """What does not fit; read by array, since a program may have millions of cells."""
+    causes = []
+    for name, cells in written.items():
+        array = new.switch.registers.get(name)
+        if array is None:
+            causes += [f"there is no register {name}"] if cells else []
+            continue
+        try:
+            for index, value in cells:
+                array.write(index, value)
+        except DataplaneError as error:
+            causes.append(str(error))
+    return causes
 
 
 def _state(old: Pipeline) -> list[Any]:
@@ -97,7 +116,7 @@ def _state(old: Pipeline) -> list[Any]:
     groups.packet_replication_engine_entry.multicast_group_entry.SetInParent()
     sessions.packet_replication_engine_entry.clone_session_entry.SetInParent()
     filters = [entries, defaults, groups, sessions]
-    for name in ("counter_entry", "meter_entry", "register_entry", "digest_entry"):
+    for name in ("counter_entry", "meter_entry", "digest_entry"):
         one = entity()
         getattr(one, name).SetInParent()
         filters.append(one)
@@ -129,10 +148,8 @@ def _update(found: Any, new: Pipeline) -> Any | None:
 def _written(found: Any, kind: str) -> bool:
     if kind == "meter_entry":
         return bool(found.meter_entry.HasField("config"))
-    if kind == "counter_entry":
-        data = found.counter_entry.data
-        return bool(data.packet_count or data.byte_count)
-    return bool(found.register_entry.data.bitstring != b"\0")
+    data = found.counter_entry.data
+    return bool(data.packet_count or data.byte_count)
 
 
 def answer(request: Any, config: Any | None) -> Any:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dataplane.compiler import Backend, build
-from dataplane.compiler.machine import DROP_PORT, Batch, Replicas
+from dataplane.compiler.machine import DROP_PORT, Batch, Digest, Replicas
 from dataplane.errors import DataplaneError
 from dataplane.externs import CounterArray, MeterArray, RegisterArray
 from dataplane.program import Program
@@ -26,14 +26,6 @@ __all__ = ["DROP_PORT", "Backend", "Digest", "Replica", "Result", "Switch"]
 
 _MAX_SESSION = 0x7FFF
 _MAX_GROUP = 0xFFFF
-
-
-@dataclass(frozen=True, slots=True)
-class Digest:
-    """One digest message: its name in the program and its fields in order."""
-
-    name: str
-    values: tuple[int, ...]
 
 
 @dataclass(slots=True)
@@ -220,5 +212,4 @@ def _pairs(replicas: tuple[Replica, ...]) -> Replicas:
 
 
 def _result(batch: Batch) -> Result:
-    digests = [Digest(name, values) for name, values in batch.digests]
-    return Result(batch.outputs, batch.packet_ins, digests, batch.verdicts)
+    return Result(batch.outputs, batch.packet_ins, batch.digests, batch.verdicts)

@@ -9,9 +9,9 @@ DataplaneError (errors.py)
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from heapq import heappop, heappush
 from threading import RLock
+from typing import NamedTuple
 
 from dataplane.compiler.machine import RangePart, Row, TableStore
 from dataplane.errors import DataplaneError
@@ -39,37 +39,32 @@ class InvalidEntry(TableError):
     """The entry does not fit the table's key or actions."""
 
 
-@dataclass(frozen=True, slots=True)
-class Exact:
+class Exact(NamedTuple):
     value: int
 
 
-@dataclass(frozen=True, slots=True)
-class Ternary:
+class Ternary(NamedTuple):
     """`value` under `mask`; mask 0 = any."""
 
     value: int
     mask: int
 
 
-@dataclass(frozen=True, slots=True)
-class Lpm:
+class Lpm(NamedTuple):
     """The first `prefix_len` bits of `value`; 0 = any."""
 
     value: int
     prefix_len: int
 
 
-@dataclass(frozen=True, slots=True)
-class Range:
+class Range(NamedTuple):
     """low <= field <= high."""
 
     low: int
     high: int
 
 
-@dataclass(frozen=True, slots=True)
-class Optional:
+class Optional(NamedTuple):
     """Exactly `value`, or anything when None."""
 
     value: int | None
@@ -79,8 +74,7 @@ MatchValue = Exact | Ternary | Lpm | Range | Optional
 Match = tuple[MatchValue, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class TableEntry:
+class TableEntry(NamedTuple):
     """One entry: the match values in the order of the table's key.
 
     priority: larger wins (P4Runtime); 0 in tables without ternary, range or optional keys
@@ -115,10 +109,12 @@ class Table:
         self._clock = clock
         self._actions = {a.name: (actions[a.name], a) for a in spec.actions}
         self._keys = tuple(zip(spec.keys, store.place.shifts, strict=True))
+        self._full_mask = sum(((1 << k.width) - 1) << shift for k, shift in self._keys)
         self._needs_priority = spec.needs_priority
         self._only_lpm = not spec.needs_priority and any(k.kind is MatchKind.LPM for k in spec.keys)
+        self._exact_widths = [k.width for k in spec.keys] if _all_exact(spec) else None
         self._slots: dict[tuple[Match, int], int] = {}
-        self._entries: dict[tuple[Match, int], TableEntry] = {}
+        self._entries: dict[int, TableEntry] = {}
         self._meters: dict[tuple[Match, int], MeterConfig] = {}
         self._free: list[int] = []
         self._timed: dict[tuple[Match, int], int] = {}
@@ -147,7 +143,7 @@ class Table:
         slot = heappop(self._free) if self._free else len(self._slots)
         self._store.insert(slot, row, self._clock())
         self._slots[key] = slot
-        self._entries[key] = entry
+        self._entries[slot] = entry
         if entry.idle_timeout_ns:
             self._timed[key] = self._clock()
 
@@ -164,7 +160,7 @@ class Table:
             key = (entry.match, entry.priority)
             slot = self._slot(*key)
             self._store.replace(slot, number, params)
-            self._entries[key] = entry
+            self._entries[slot] = entry
             self._timed.pop(key, None)
             if entry.idle_timeout_ns:
                 self._store.touch(slot, self._clock())
@@ -178,19 +174,20 @@ class Table:
             self._store.remove(slot)
             key = (match, priority)
             heappush(self._free, slot)
-            del self._slots[key], self._entries[key]
+            del self._slots[key], self._entries[slot]
             self._timed.pop(key, None)
             self._meters.pop(key, None)
 
     def get(self, match: Match, priority: int = 0) -> TableEntry | None:
         """The entry with this key, or None."""
         with self._lock:
-            return self._entries.get((match, priority))
+            slot = self._slots.get((match, priority))
+            return None if slot is None else self._entries[slot]
 
     def entries(self) -> list[TableEntry]:
         """All entries in the order of insertion (const entries of the program too)."""
         with self._lock:
-            return list(self._entries.values())
+            return [self._entries[slot] for slot in self._slots.values()]
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -271,8 +268,9 @@ class Table:
         with self._lock:
             result = []
             for key, reported in self._timed.items():
-                entry = self._entries[key]
-                since = max(reported, self._store.hit_us(self._slots[key]))
+                slot = self._slots[key]
+                entry = self._entries[slot]
+                since = max(reported, self._store.hit_us(slot))
                 if (now_us - since) * 1000 >= entry.idle_timeout_ns:
                     self._timed[key] = now_us
                     result.append(entry)
@@ -308,6 +306,8 @@ class Table:
         if found is None:
             raise InvalidEntry(f"table {self.name} has no action {name}; it has {', '.join(self._actions)}")
         number, spec = found
+        if not params and not spec.params:
+            return number, ()
         if len(params) != len(spec.params):
             raise InvalidEntry(f"action {name} takes {len(spec.params)} parameters, got {len(params)}")
         for param, value in zip(spec.params, params, strict=True):
@@ -320,6 +320,8 @@ class Table:
         if len(match) != len(self._keys):
             raise InvalidEntry(f"table {self.name} has {len(self._keys)} key fields, got {len(match)}")
         self._check_priority(priority)
+        if self._exact_widths is not None:
+            return self._compiled_exact(match, self._exact_widths), self._full_mask, (), 0
         value = mask = 0
         rank = priority
         ranges: list[RangePart] = []
@@ -333,6 +335,15 @@ class Table:
             if self._only_lpm and isinstance(m, Lpm):
                 rank = m.prefix_len
         return value, mask, tuple(ranges), rank
+
+    def _compiled_exact(self, match: Match, widths: Sequence[int]) -> int:
+        compiled = 0
+        for (spec, shift), width, m in zip(self._keys, widths, match, strict=True):
+            value: int = m[0] if m.__class__ is Exact else self._value_and_mask(spec, m)[0]
+            if value >> width:
+                self._value_and_mask(spec, m)
+            compiled |= value << shift
+        return compiled
 
     def _check_priority(self, priority: int) -> None:
         if self._needs_priority and priority < 1:
@@ -375,6 +386,10 @@ class Table:
         if value & ~mask:
             raise InvalidEntry(f"table {self.name}: {spec.name}={m} has bits set outside its mask")
         return value, mask
+
+
+def _all_exact(spec: TableSpec) -> bool:
+    return all(key.kind is MatchKind.EXACT for key in spec.keys)
 
 
 _KINDS: dict[MatchKind, type[MatchValue]] = {

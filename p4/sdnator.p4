@@ -43,6 +43,7 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
         meta.destination = hdr.packet_out.key_destination;
         meta.destination_port = hdr.packet_out.key_port;
         meta.length = (bit<32>)hdr.packet_out.key_length;
+        meta.source_port = hdr.packet_out.key_source_port;
         meta.timestamp = hdr.packet_out.timestamp;
     }
     action answer_reading() {
@@ -69,6 +70,14 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
         });
     }
 
+    // A frame makes one digest at most (of two, BMv2 sends the last): who is learnt goes first, and whoever
+    // wanted a digest of the frame gets a copy of it instead.  What was counted cannot be said otherwise.
+    action make_learn_digest() {
+        digest<learn_digest_t>(1, { hdr.ethernet.source, meta.ingress_port, meta.timestamp, meta.vid });
+        meta.copies = meta.copies | meta.digests;
+        meta.digests = 0;
+    }
+
     action number_frame() {
         frame_numbers.read(meta.arrival, 0);
         frame_numbers.write(0, meta.arrival + 1);
@@ -87,7 +96,7 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
                 prepare_reading();
             } else {
                 number_frame();
-                enforcement.apply(hdr, meta);
+                enforcement.apply(hdr, meta, standard);
                 if (meta.blocked == 0) {
                     syn_guard.apply(hdr, meta, standard);
                 }
@@ -104,6 +113,9 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
             if (meta.reading == 1) {
                 answer_reading();
             } else {
+                if (meta.learns == 1 && meta.crossed == 0 && meta.overflow == 0) {
+                    make_learn_digest();
+                }
                 if (meta.copies != 0 || meta.digests != 0) {
                     number_copy();
                 }

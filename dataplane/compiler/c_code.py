@@ -197,14 +197,14 @@ class CGenerator(CStatements):
         for number, spec in self.program.digests.items():
             count = sum(words(w) for w in spec.widths)
             with self.block(f"if (p->digest == {number})"):
-                self.line(f"arena(m, {16 + 8 * count});")
                 self.line(f"u64 w[{count + 1}];")
+                limbs = ", ".join(str(words(w)) for w in spec.widths)
+                self.line(f"static const u8 limbs[] = {{{limbs or 0}}};")
                 at = 0
                 for e, width in zip(spec.fields, spec.widths, strict=True):
                     self.digest_field(e, width, at)
                     at += words(width)
-                self.line(f"memcpy(m->out + m->out_used + 16, w, {8 * count});")
-                self.line(f"record(m, OUT_DIGEST, {number}, {8 * count});")
+                self.line(f"sample(m, {number}, w, limbs, {len(spec.widths)});")
 
     def digest_field(self, e: Expression, width: int, at: int) -> None:
         kind = kind_of(width)
@@ -239,8 +239,7 @@ def _structures(g: CGenerator) -> list[str]:
         "u64 *reg[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;",
         "u64 stats[6], out_used, out_room, seed; u8 *out; u8 verdict; int budget; job *head, **tail;",
         "} machine;",
-        "static u8 *arena(machine *m, u64 more);",
-        "static void record(machine *m, u32 kind, u32 id, u64 length);",
+        "PLAIN void sample(machine *m, u32 id, const u64 *w, const u8 *limbs, u32 members);",
         "#define STD(p, name) (p)->STD_##name",
     ]
     for f in layout.fields.get(STANDARD, ()):

@@ -11,7 +11,7 @@ from dataplane.compiler import machine as m
 from dataplane.compiler.c_build import library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
-from dataplane.compiler.machine import Batch, KeyPlace, Replicas, Row
+from dataplane.compiler.machine import Batch, Digest, KeyPlace, Replicas, Row
 from dataplane.errors import DataplaneError
 from dataplane.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
@@ -39,6 +39,7 @@ void dp_meter(void *h, uint32_t array, uint32_t index, const uint64_t *rates);
 uint64_t *dp_register(void *h, uint32_t array, uint64_t limb);
 """
 _NONE = 0xFFFFFFFF
+_BLOCK = 256
 _OUT_PORT, _OUT_CPU, _OUT_DIGEST = 1, 2, 3
 _RECORD = struct.Struct("<III4x")
 _WORD = (1 << 64) - 1
@@ -176,7 +177,7 @@ class CRegisters:
 
     def __init__(self, native: _Native, number: int, spec: ArraySpec) -> None:
         self._native, self._number = native, number
-        self._words = words(spec.width)
+        self._words, self._size = words(spec.width), spec.size
 
     def _cell(self, index: int) -> Any:
         return self._native.lib.dp_register(self._native.handle, self._number, index * self._words)
@@ -189,6 +190,20 @@ class CRegisters:
         cell = self._cell(index)
         for i in range(self._words):
             cell[i] = (value >> 64 * i) & _WORD
+
+    def written(self) -> list[tuple[int, int]]:
+        width = 8 * self._words
+        memory = self._native.ffi.buffer(self._cell(0), self._size * width)
+        found = []
+        for first in range(0, self._size, _BLOCK):
+            block = memory[first * width : (first + _BLOCK) * width]
+            if block.count(0) == len(block):
+                continue  # most of a large array, and of a million cells none may be looked at one by one
+            for at in range(0, len(block), width):
+                value = int.from_bytes(block[at : at + width], "little")
+                if value:
+                    found.append((first + at // width, value))
+        return found
 
 
 class CMachine:
@@ -212,10 +227,7 @@ class CMachine:
         self.registers = {
             name: CRegisters(native, i, spec) for i, (name, spec) in enumerate(program.registers.items())
         }
-        self._digests = {
-            number: (spec.name, tuple(words(w) for w in spec.widths))
-            for number, spec in program.digests.items()
-        }
+        self._digests = {number: spec.name for number, spec in program.digests.items()}
 
     def _know_actions(self, program: Program, node: Node) -> None:
         table = self.tables.get(node.name)
@@ -248,20 +260,8 @@ class CMachine:
             elif kind == _OUT_CPU:
                 batch.packet_ins.append(records[at : at + length])
             else:
-                batch.digests.append(self._digest(number, records, at))
+                batch.digests.append(Digest(self._digests[number], records[at : at + length]))
             at += (length + 7) & ~7
-
-    def _digest(self, number: int, records: bytes, at: int) -> tuple[str, tuple[int, ...]]:
-        name, counts = self._digests[number]
-        values = struct.unpack_from(f"<{sum(counts)}Q", records, at)
-        if all(c == 1 for c in counts):
-            return name, values
-        joined: list[int] = []
-        i = 0
-        for count in counts:
-            joined.append(sum(values[i + j] << 64 * j for j in range(count)))
-            i += count
-        return name, tuple(joined)
 
     def set_clone_session(self, session: int, replicas: Replicas | None, packet_length: int) -> None:
         count, pairs = self._pairs(replicas)

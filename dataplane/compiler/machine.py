@@ -8,8 +8,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
+from dataplane.compiler import samples
+
 Replicas = tuple[tuple[int, int], ...]
 """(port, instance) of each copy."""
+
+
+class Digest(NamedTuple):
+    """One digest message: its name in the program, and its fields as samples.py has them."""
+
+    name: str
+    sample: bytes
+
+    @property
+    def values(self) -> tuple[int, ...]:
+        """The fields in order."""
+        return samples.decode(self.sample)
 
 
 @dataclass(slots=True)
@@ -18,7 +32,7 @@ class Batch:
 
     outputs: list[tuple[int, bytes]] = field(default_factory=list)
     packet_ins: list[bytes] = field(default_factory=list)
-    digests: list[tuple[str, tuple[int, ...]]] = field(default_factory=list)
+    digests: list[Digest] = field(default_factory=list)
     verdicts: bytes = b""
 
 
@@ -94,6 +108,10 @@ class RegisterStore(Protocol):
     def read(self, index: int) -> int: ...
 
     def write(self, index: int, value: int) -> None: ...
+
+    def written(self) -> list[tuple[int, int]]:
+        """(index, value) of the cells that are not 0."""
+        ...
 
 
 class Machine(Protocol):

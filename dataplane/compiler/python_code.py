@@ -214,7 +214,9 @@ class PythonGenerator(PythonStatements):
         for number, spec in self.program.digests.items():
             self.branch(head, f"{self.reg('DIGEST')} == {number}")
             values = [self.key_unsigned(e, w) for e, w in zip(spec.fields, spec.widths, strict=True)]
-            self.line(f"return {spec.name!r}, ({', '.join(values)}{',' if len(values) == 1 else ''})")
+            self.line(
+                f"return Digest({spec.name!r}, sample(({', '.join(values)}{',' if len(values) == 1 else ''})))"
+            )
             head = "elif"
         if head == "elif":
             self.close()

@@ -12,6 +12,7 @@ from typing import Any
 from dataplane import externs
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
+from dataplane.compiler import samples
 from dataplane.compiler.machine import Batch, Replicas
 from dataplane.compiler.python_code import generate
 from dataplane.compiler.python_statements import NO_TRUNCATION, Slots
@@ -50,6 +51,7 @@ def sat_cast(value: int, width: int) -> int:
 
 def _names() -> dict[str, Any]:
     names: dict[str, Any] = {"from_bytes": int.from_bytes, "randint": randint, "look": look}
+    names |= {"Digest": m.Digest, "sample": samples.encode}
     names |= {"two_comp_mod": two_comp_mod, "usat_cast": usat_cast, "sat_cast": sat_cast}
     return names | {f"hash_{name}": function for name, function in externs.HASHES.items()}
 
@@ -78,7 +80,7 @@ class PythonMachine:
         self._ingress: Callable[[_Packet], None] = space["ingress"]
         self._egress: Callable[[_Packet], None] = space["egress"]
         self._deparse: Callable[[_Packet], bytes] = space["deparse"]
-        self._digest: Callable[[_Packet], tuple[str, tuple[int, ...]] | None] = space["digest"]
+        self._digest: Callable[[_Packet], m.Digest | None] = space["digest"]
         self._at = _Places(self.slots)
         self._sessions: dict[int, tuple[Replicas, int]] = {}
         self._groups: dict[int, Replicas] = {}

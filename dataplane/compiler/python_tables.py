@@ -182,3 +182,6 @@ class PythonRegisters:
 
     def write(self, index: int, value: int) -> None:
         self.values[index] = value
+
+    def written(self) -> list[tuple[int, int]]:
+        return [(index, value) for index, value in enumerate(self.values) if value]

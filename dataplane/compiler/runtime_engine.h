@@ -30,6 +30,45 @@ static void record(machine *m, u32 kind, u32 id, u64 length) {
     m->out_used += 16 + ((length + 7) & ~7ull);
 }
 
+static u8 *varint(u8 *to, u64 value) {
+    for (; value > 0x7F; value >>= 7) *to++ = (u8)(value | 0x80);
+    *to++ = (u8)value;
+    return to;
+}
+static u32 varint_size(u64 value) {
+    u32 n = 1;
+    while (value >>= 7) n++;
+    return n;
+}
+
+/* A digest as samples.py has it.  w: the members, each of so many limbs, the lowest first. */
+PLAIN void sample(machine *m, u32 id, const u64 *w, const u8 *limbs, u32 members) {
+    u8 sizes[members + 1];
+    u64 inner = 0, at = 0;
+    for (u32 i = 0; i < members; at += limbs[i++]) {
+        u32 top = limbs[i];
+        while (top > 1 && !w[at + top - 1]) top--;
+        u64 x = w[at + top - 1];
+        sizes[i] = (u8)(8 * (top - 1) + (x ? (71 - (u32)__builtin_clzll(x)) / 8 : 1));
+        inner += 4 + sizes[i];
+    }
+    u64 outer = 1 + varint_size(inner) + inner;
+    u8 *start = arena(m, 16 + 11 + outer + 8) + 16, *to = start;
+    *to++ = 0x1A;
+    to = varint(to, outer);
+    *to++ = 0x2A;
+    to = varint(to, inner);
+    for (u32 i = 0; i < members; w += limbs[i++]) {
+        u32 size = sizes[i];
+        *to++ = 0x0A;
+        *to++ = (u8)(2 + size);
+        *to++ = 0x0A;
+        *to++ = (u8)size;
+        while (size--) *to++ = (u8)(w[size / 8] >> 8 * (size % 8));
+    }
+    record(m, OUT_DIGEST, id, (u64)(to - start));
+}
+
 static void ingress_pass(machine *m, phv *p, u32 port);
 static void egress_pass(machine *m, phv *p, u32 port);
 

@@ -6,34 +6,34 @@
 
 const bit<32> CELLS = 65536;              // of a stage, both banks together
 
-struct cell_key_t { bit<8> query; address_t source; address_t destination; bit<32> extra; }
-
 control CountStage(in headers_t hdr, inout metadata_t meta) {
-    // epoch (window number + 1) 32 | query 8 | source 128 | destination 128 | extra 32 | count 32
-    @name("cells") register<bit<360>>(CELLS) cells;
+    // epoch (window number + 1) 32 | query 8 | source 128 | destination 128 | extra 48 | count 32
+    @name("cells") register<bit<376>>(CELLS) cells;
     direct_counter(CounterType.packets) stage_counter;
 
     // Params: query: number of the query. *_mask: which parts of the frame are its key; extra is the
-    // destination port and the length. threshold: report when the count reaches it (0 = never).
+    // destination port, the length and the source port. threshold: report when the count reaches it (0 = never).
     // by_bytes: count bytes. reciprocal: 2^64 / window in us. base, size: the query's cells in a bank.
     // repeated: queries to forget for this frame when its key was seen before (distinct, then reduce).
     action count(bit<8> query, query_map_t bit_of_query, address_t source_mask, address_t destination_mask,
                  bit<16> port_mask, bit<16> length_mask, bit<32> threshold, bit<1> by_bytes,
-                 bit<64> reciprocal, bit<32> base, bit<32> size, query_map_t repeated) {
+                 bit<64> reciprocal, bit<32> base, bit<32> size, query_map_t repeated,
+                 bit<16> source_port_mask) {
         stage_counter.count();
         address_t source = meta.source & source_mask;
         address_t destination = meta.destination & destination_mask;
-        bit<32> extra = (meta.destination_port & port_mask) ++ ((bit<16>)meta.length & length_mask);
+        bit<48> extra = (meta.destination_port & port_mask) ++ ((bit<16>)meta.length & length_mask)
+                        ++ (meta.source_port & source_port_mask);
         bit<112> product = (bit<112>)meta.timestamp * (bit<112>)reciprocal;
         bit<32> epoch = (bit<32>)(product >> 64) + 1; // a cell of zeros belongs to no window
         bit<32> slot;
         hash(slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
         slot = slot + (epoch[0:0] == 1 ? CELLS / 2 : 32w0);
-        bit<360> cell;
+        bit<376> cell;
         cells.read(cell, slot);
-        bool is_empty = cell[359:328] != epoch;
-        bool is_mine = !is_empty && cell[327:320] == query && cell[319:192] == source
-                       && cell[191:64] == destination && cell[63:32] == extra;
+        bool is_empty = cell[375:344] != epoch;
+        bool is_mine = !is_empty && cell[343:336] == query && cell[335:208] == source
+                       && cell[207:80] == destination && cell[79:32] == extra;
         bit<32> before = is_mine ? cell[31:0] : 32w0;
         bit<32> step = by_bytes == 1 ? meta.length : 32w1;
         bit<32> after = before |+| step;

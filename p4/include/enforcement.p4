@@ -1,10 +1,13 @@
 // Who may send at all.  `allow` always wins; a blocked frame is neither forwarded nor copied.
+// Frames that the parser cannot take apart are counted by cause, and pass unless the cause has an entry.
 
-control Enforcement(inout headers_t hdr, inout metadata_t meta) {
+control Enforcement(inout headers_t hdr, inout metadata_t meta, in standard_metadata_t standard) {
     @name(".ingress.allow_counter") direct_counter(CounterType.packets_and_bytes) allow_counter;
     @name(".ingress.block_src_counter") direct_counter(CounterType.packets_and_bytes) block_src_counter;
     @name(".ingress.block_mac_counter") direct_counter(CounterType.packets_and_bytes) block_mac_counter;
     @name(".ingress.block_counter") direct_counter(CounterType.packets_and_bytes) block_counter;
+    @name(".ingress.unparsed_counter") direct_counter(CounterType.packets_and_bytes) unparsed_counter;
+    @name(".ingress.unparsed_frames") counter(8, CounterType.packets_and_bytes) unparsed_frames;
 
     @name(".ingress.allow_frame") action allow_frame() { allow_counter.count(); }
     @name(".ingress.no_allow") action no_allow() { allow_counter.count(); }
@@ -14,6 +17,12 @@ control Enforcement(inout headers_t hdr, inout metadata_t meta) {
     @name(".ingress.pass_mac") action pass_mac() { block_mac_counter.count(); }
     @name(".ingress.drop_frame") action drop_frame() { meta.blocked = 1; block_counter.count(); }
     @name(".ingress.pass_frame") action pass_frame() { block_counter.count(); }
+    @name(".ingress.drop_unparsed") action drop_unparsed() { meta.blocked = 1; unparsed_counter.count(); }
+    @name(".ingress.pass_unparsed") action pass_unparsed() { unparsed_counter.count(); }
+    @name(".ingress.count_unparsed") action count_unparsed() {
+        unparsed_frames.count((bit<32>)meta.unparsed);
+        meta.l4_valid = 0;
+    }
 
     @name(".ingress.allow")
     @brief("Senders and services that no block may touch")
@@ -81,12 +90,31 @@ control Enforcement(inout headers_t hdr, inout metadata_t meta) {
         support_timeout = true;
         size = 1024;
     }
+    @name(".ingress.unparsed")
+    @brief("Frames that the parser cannot take apart, by cause: they pass where no entry drops them")
+    table unparsed {
+        key = { meta.unparsed: exact @name("cause"); }
+        actions = { drop_unparsed; pass_unparsed; }
+        default_action = pass_unparsed();
+        counters = unparsed_counter;
+        size = 8;
+    }
 
     apply {
+        if (standard.parser_error != error.NoError) {
+            meta.unparsed = UNPARSED_CUT;
+        }
+        if (meta.unparsed != UNPARSED_NOTHING) {
+            count_unparsed();
+        }
         if (!allow.apply().hit) {
             if (!block_src.apply().hit) {
                 if (!block_mac.apply().hit) {
-                    block.apply();
+                    if (!block.apply().hit) {
+                        if (meta.unparsed != UNPARSED_NOTHING) {
+                            unparsed.apply();
+                        }
+                    }
                 }
             }
         }

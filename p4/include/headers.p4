@@ -13,6 +13,14 @@ const bit<32> INSTANCE_REPLICATION = 5;
 const bit<7> OPERATION_SEND = 0;
 const bit<7> OPERATION_READ_CELL = 1;
 
+// metadata_t.unparsed, and index of unparsed_frames: what the parser could not take apart, and why
+const bit<3> UNPARSED_NOTHING = 0;        // all of it was taken apart
+const bit<3> UNPARSED_CUT = 1;            // the frame ends within a header
+const bit<3> UNPARSED_MALFORMED = 2;      // IP of another version than its EtherType says, or no IPv4 header length
+const bit<3> UNPARSED_EXTENSIONS = 3;     // more IPv6 extension headers, or in another order, than are followed
+const bit<3> UNPARSED_PROTOCOL = 4;       // neither TCP, UDP nor ICMP above IP
+const bit<3> UNPARSED_ETHERTYPE = 5;      // neither IP nor ARP, or a third VLAN tag
+
 // packet_in.reason: 0 = a telemetry query wants the frame
 const bit<7> REASON_CELL = 1;             // answer to OPERATION_READ_CELL: sequence = count, arrival = window
 
@@ -29,6 +37,7 @@ const bit<8> PROTO_UDP = 17;
 const bit<8> PROTO_ROUTING = 43;
 const bit<8> PROTO_FRAGMENT = 44;
 const bit<8> PROTO_ICMPV6 = 58;
+const bit<8> PROTO_NO_NEXT = 59;
 const bit<8> PROTO_DESTINATION_OPTIONS = 60;
 
 typedef bit<48> mac_t;
@@ -55,6 +64,7 @@ header packet_out_t {
     address_t key_destination;
     bit<16> key_port;
     bit<16> key_length;
+    bit<16> key_source_port;
     bit<48> timestamp;                    // any time in the window that is asked for, us
 }
 
@@ -132,6 +142,7 @@ struct metadata_t {
     bit<1> l4_valid;                      // ports (or ICMP type) below are those of the frame
     bit<16> source_port;
     bit<16> destination_port;
+    bit<3> unparsed;
     bit<8> tcp_flags;
     bit<32> tcp_sequence;
     bit<32> tcp_acknowledgement;
@@ -143,6 +154,7 @@ struct metadata_t {
     mac_t arp_sender_mac;
     mac_t arp_target_mac;
     // verdicts
+    bit<1> learns;                        // the controller shall hear of the sending station
     bit<1> blocked;
     bit<1> answered;                      // the switch itself answers (SYN cookie)
     query_map_t copies;                   // queries that want a packet-in
@@ -185,4 +197,12 @@ struct frame_digest_t {
     bit<16> arp_operation;
     mac_t arp_sender_mac;
     mac_t arp_target_mac;
+}
+
+// A station that sends and is not known, or from another port than it was known at.
+struct learn_digest_t {
+    mac_t mac;
+    bit<9> port;
+    bit<48> timestamp;
+    bit<12> vid;
 }

@@ -1,6 +1,6 @@
 // Ethernet, two VLAN tags, ARP, IPv4 with options, IPv6 with three extension headers, first fragments,
 // TCP, UDP, ICMP and the ports that an ICMP error quotes.  What it cannot follow is accepted with
-// l4_valid = 0: the BMv2 back end has no explicit reject.
+// l4_valid = 0 and the reason in `unparsed`: the BMv2 back end has no explicit reject.
 
 parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
                    inout standard_metadata_t standard) {
@@ -29,7 +29,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             ETHERTYPE_ARP: arp;
             ETHERTYPE_IPV4: ipv4;
             ETHERTYPE_IPV6: ipv6;
-            default: accept;
+            default: unknown_ethertype;
         }
     }
     state outer_vlan {
@@ -42,7 +42,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             ETHERTYPE_ARP: arp;
             ETHERTYPE_IPV4: ipv4;
             ETHERTYPE_IPV6: ipv6;
-            default: accept;
+            default: unknown_ethertype;
         }
     }
     state inner_vlan {
@@ -52,7 +52,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             ETHERTYPE_ARP: arp;
             ETHERTYPE_IPV4: ipv4;
             ETHERTYPE_IPV6: ipv6;
-            default: accept;
+            default: unknown_ethertype;
         }
     }
     state arp {
@@ -72,10 +72,10 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
         meta.source = (address_t)hdr.ipv4.source;
         meta.destination = (address_t)hdr.ipv4.destination;
         meta.protocol = hdr.ipv4.protocol;
-        transition select(hdr.ipv4.ihl) {
-            5: ipv4_payload;
-            6..15: ipv4_options;
-            default: accept;
+        transition select(hdr.ipv4.version, hdr.ipv4.ihl) {
+            (4, 5): ipv4_payload;
+            (4, 6..15): ipv4_options;
+            default: malformed;
         }
     }
     state ipv4_options {
@@ -102,7 +102,7 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             PROTO_TCP: tcp;
             PROTO_UDP: udp;
             PROTO_ICMP: icmp;
-            default: accept;
+            default: unknown_protocol;
         }
     }
 
@@ -111,6 +111,12 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
         meta.source = hdr.ipv6.source;
         meta.destination = hdr.ipv6.destination;
         meta.protocol = hdr.ipv6.next_header;
+        transition select(hdr.ipv6.version) {
+            6: ipv6_payload;
+            default: malformed;
+        }
+    }
+    state ipv6_payload {
         transition select(hdr.ipv6.next_header) {
             PROTO_HOP_BY_HOP: extension0;
             PROTO_DESTINATION_OPTIONS: extension0;
@@ -119,7 +125,8 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             PROTO_TCP: tcp;
             PROTO_UDP: udp;
             PROTO_ICMPV6: icmpv6;
-            default: accept;
+            PROTO_NO_NEXT: accept;
+            default: unknown_protocol;
         }
     }
     state extension0 {
@@ -133,7 +140,9 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             PROTO_TCP: tcp;
             PROTO_UDP: udp;
             PROTO_ICMPV6: icmpv6;
-            default: accept;
+            PROTO_NO_NEXT: accept;
+            PROTO_HOP_BY_HOP: too_many_extensions;
+            default: unknown_protocol;
         }
     }
     state extension1 {
@@ -147,7 +156,9 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             PROTO_TCP: tcp;
             PROTO_UDP: udp;
             PROTO_ICMPV6: icmpv6;
-            default: accept;
+            PROTO_NO_NEXT: accept;
+            PROTO_HOP_BY_HOP: too_many_extensions;
+            default: unknown_protocol;
         }
     }
     state extension2 {
@@ -159,7 +170,11 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             PROTO_TCP: tcp;
             PROTO_UDP: udp;
             PROTO_ICMPV6: icmpv6;
-            default: accept;
+            PROTO_NO_NEXT: accept;
+            PROTO_HOP_BY_HOP: too_many_extensions;
+            PROTO_DESTINATION_OPTIONS: too_many_extensions;
+            PROTO_ROUTING: too_many_extensions;
+            default: unknown_protocol;
         }
     }
     state fragment {
@@ -177,7 +192,11 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
             PROTO_TCP: tcp;
             PROTO_UDP: udp;
             PROTO_ICMPV6: icmpv6;
-            default: accept;
+            PROTO_NO_NEXT: accept;
+            PROTO_HOP_BY_HOP: too_many_extensions;
+            PROTO_DESTINATION_OPTIONS: too_many_extensions;
+            PROTO_ROUTING: too_many_extensions;
+            default: unknown_protocol;
         }
     }
 
@@ -256,6 +275,23 @@ parser FrameParser(packet_in packet, out headers_t hdr, inout metadata_t meta,
         meta.quoted = 1;
         meta.source_port = hdr.quoted_ports.source_port;
         meta.destination_port = hdr.quoted_ports.destination_port;
+        transition accept;
+    }
+
+    state unknown_ethertype {
+        meta.unparsed = UNPARSED_ETHERTYPE;
+        transition accept;
+    }
+    state unknown_protocol {
+        meta.unparsed = UNPARSED_PROTOCOL;
+        transition accept;
+    }
+    state too_many_extensions {
+        meta.unparsed = UNPARSED_EXTENSIONS;
+        transition accept;
+    }
+    state malformed {
+        meta.unparsed = UNPARSED_MALFORMED;
         transition accept;
     }
 }

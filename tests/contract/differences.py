@@ -1,41 +1,86 @@
-"""Where BMv2 (1.15 with PI) and the embedded switch differ, and why: the list behind `docs/`.
+"""Where BMv2 (1.15 with PI) and the embedded switch differ, and why: the list that docs/dataplane.md shows.
 
 A contract test that treats the two differently names an entry of this list; nothing else may differ.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class Difference(NamedTuple):
+    """One row of the documentation."""
+
+    bmv2: str
+    embedded: str
+    reason: str
+
+
+_SPECIFIED = "the specification"
 
 DIFFERENCES = {
-    "takeover": "When a primary leaves, BMv2 makes the backup with the highest id primary at once; the "
-    "specification (and the embedded switch) leaves the role empty until a controller sends an id that is "
-    "at least the highest seen. A controller that raises its id is right on both.",
-    "device-ids": "BMv2 accepts a stream for any device id; the embedded switch answers NOT_FOUND.",
-    "empty-program": "BMv2 accepts JSON that is no program, and a p4info that does not fit; the embedded "
-    "switch refuses both with INVALID_ARGUMENT.",
-    "metadata-limit": "BMv2 loses the details of batches with more than about 80 failures, because its "
-    "metadata limit is not raised; the embedded switch's is 64 MiB.",
-    "table-full": "BMv2 reports a full table as UNKNOWN; the embedded switch as RESOURCE_EXHAUSTED.",
-    "meter-check": "BMv2 takes a meter whose peak rate is below its committed rate; the embedded switch refuses "
-    "the whole update.",
-    "constant-table": "BMv2 reports an insert into a constant table as UNKNOWN; the embedded switch as "
-    "PERMISSION_DENIED.",
-    "read-by-priority": "BMv2 ignores the priority of a read without match; the embedded switch selects by it.",
-    "atomicity": "BMv2 has CONTINUE_ON_ERROR only; the embedded switch also ROLLBACK_ON_ERROR and "
-    "DATAPLANE_ATOMIC.",
-    "cell-index": "BMv2 reports array indices out of range with codes of its own; the embedded switch with "
-    "INVALID_ARGUMENT (negative) and OUT_OF_RANGE.",
-    "registers": "BMv2 cannot read or write registers through P4Runtime; the embedded switch can.",
-    "stream-errors": "BMv2 drops wrong packet-outs and acknowledgements silently; the embedded switch also "
-    "answers with a StreamError.",
-    "packet-out-metadata": "BMv2 sends a packet-out that lacks a metadata field, with 0 in its place; the "
-    "embedded switch refuses it.",
-    "digest-lists": "BMv2 buffers digests in two layers: samples made before the digest was configured may "
-    "still arrive, and lists of configured size may wait; the embedded switch follows the specification.",
-    "save-and-reconcile": "BMv2 does not keep entries on RECONCILE_AND_COMMIT and swaps late on COMMIT; the "
-    "embedded switch does both as specified.",
-    "clocks": "Meters, idle time-outs and time stamps run on the wall clock on BMv2, on the packets' clock on "
-    "the embedded switch.",
-    "hit-age": "BMv2's age of an entry has a resolution of milliseconds, and is 0 without an idle time-out.",
+    "takeover": Difference(
+        "when a primary leaves, the backup with the highest id is primary at once",
+        "the role is empty until a controller sends an id that is at least the highest seen",
+        f"{_SPECIFIED}; a controller that raises its id is right on both",
+    ),
+    "device-ids": Difference("a stream for any device id is accepted", "NOT_FOUND", _SPECIFIED),
+    "empty-program": Difference(
+        "JSON that is no program, and a p4info that does not fit, are accepted",
+        "both are refused with INVALID_ARGUMENT",
+        "what is wrong is said where it is wrong, not in a later write",
+    ),
+    "metadata-limit": Difference(
+        "the details of batches with more than about 80 failures are lost",
+        "metadata of 64 MiB",
+        "every update has its error",
+    ),
+    "table-full": Difference("a full table is UNKNOWN", "RESOURCE_EXHAUSTED", _SPECIFIED),
+    "meter-check": Difference(
+        "a peak rate below the committed rate is taken", "the update is refused", "RFC 2698, section 2"
+    ),
+    "constant-table": Difference(
+        "an insert into a constant table is UNKNOWN", "PERMISSION_DENIED", _SPECIFIED
+    ),
+    "read-by-priority": Difference(
+        "the priority of a read without match is ignored", "it selects", _SPECIFIED
+    ),
+    "atomicity": Difference(
+        "CONTINUE_ON_ERROR only",
+        "also ROLLBACK_ON_ERROR and DATAPLANE_ATOMIC",
+        "half a batch is nobody's wish",
+    ),
+    "cell-index": Difference(
+        "array indices out of range have codes of their own",
+        "INVALID_ARGUMENT (negative), OUT_OF_RANGE (too high)",
+        _SPECIFIED,
+    ),
+    "registers": Difference(
+        "neither read nor written through P4Runtime", "both", f"{_SPECIFIED}; the product does not need it"
+    ),
+    "stream-errors": Difference(
+        "wrong packet-outs and acknowledgements are dropped silently", "a StreamError as well", _SPECIFIED
+    ),
+    "packet-out-metadata": Difference(
+        "a packet-out that lacks a field is sent with 0 in its place", "it is refused", _SPECIFIED
+    ),
+    "digest-lists": Difference(
+        "two layers of buffers: samples from before the configuration may arrive, lists may wait; equal samples "
+        "may be suppressed at any time",
+        "lists by size and time-out; a sample equal to one that waits, or is not acknowledged, is left out",
+        _SPECIFIED,
+    ),
+    "save-and-reconcile": Difference(
+        "RECONCILE_AND_COMMIT keeps no entries, COMMIT swaps late", "both do what they say", _SPECIFIED
+    ),
+    "clocks": Difference(
+        "meters, idle time-outs and time stamps run on the wall clock",
+        "on the packets' clock",
+        "a replay runs on the time of its capture",
+    ),
+    "hit-age": Difference(
+        "an entry's age is in ms, and 0 without an idle time-out",
+        "in µs, always",
+        "nothing speaks against it",
+    ),
 }
 
 
@@ -47,8 +92,8 @@ def differs(target: Any, name: str) -> bool:
 
 def markdown() -> str:
     """The list as a table for the documentation."""
-    rows = [f"| {name} | {text} |" for name, text in DIFFERENCES.items()]
-    return "\n".join(("| matter | what differs |", "|---|---|", *rows))
+    rows = [f"| {name} | {' | '.join(difference)} |" for name, difference in DIFFERENCES.items()]
+    return "\n".join(("| matter | BMv2 | here | reason |", "|---|---|---|---|", *rows))
 
 
 if __name__ == "__main__":

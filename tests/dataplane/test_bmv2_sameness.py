@@ -8,7 +8,7 @@ import itertools
 import os
 import queue
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from dataplane.bmv2 import PROGRAM
 from dataplane.schema import Schema, bind
 from dataplane.switch import Replica, Result, Switch
 from dataplane.table_codec import TableCodec
-from dataplane.tables import TableEntry, TableError
+from dataplane.tables import Exact, TableEntry, TableError
 from dataplane.tree import MatchKind, Program
 from p4rt import p4runtime
 from tests.contract.targets import Bmv2Target
@@ -62,8 +62,11 @@ class Case:
         *,
         mask: Callable[[bytes], bytes] = bytes,
         skip: Callable[[bytes], bool] = lambda _: False,
+        layer_2: bool = False,
     ) -> None:
         self.path, self.program, self.maker, self.mask, self.skip = path, program, maker, mask, skip
+        self.layer_2 = layer_2
+        """Nothing but stations and floods: random entries seldom let a frame come so far."""
 
 
 CASES = {
@@ -75,6 +78,9 @@ CASES = {
         lambda: shared_data("p4/sketch.json"), lambda: shared("sketch"), network_frame, mask=_no_clock
     ),
     "sdnator": Case(lambda: _HERE.parents[1] / "p4" / "sdnator", sdnator, network_frame, mask=_no_clock),
+    "layer 2": Case(
+        lambda: _HERE.parents[1] / "p4" / "sdnator", sdnator, network_frame, mask=_no_clock, layer_2=True
+    ),
 }
 
 
@@ -100,10 +106,13 @@ class Pair:
         program = case.program()
         self.schema: Schema = bind(config.p4info, program)
         self.switch = Switch(program, backend="c" if seed % 2 else "python")
-        updates = [*self._tables(), *self._replicas(), *self._digests(config)]
+        tables = self._layer_2() if case.layer_2 else self._tables()
+        updates = [*tables, *self._replicas(), *self._digests(config)]
         for first in range(0, len(updates), _UPDATES):
             self.controller.write(*updates[first : first + _UPDATES])
-        self.digests: set[tuple[int, ...]] = set()
+        self._digest_names = {d.preamble.id: d.preamble.name for d in config.p4info.digests}
+        self._clocks = _clock_members(config.p4info)
+        self.digests: set[tuple[str, tuple[int, ...]]] = set()
         for port in (*_PORTS, 4):
             self.exchange(port, [b"\0"])  # BMv2 knows a port once something came from it
 
@@ -130,13 +139,34 @@ class Pair:
             actions = [a.spec for a in bound.actions if a.as_default]
             if not bound.const_default and actions and self.chooser.random.random() < 0.4:
                 action = self.chooser.random.choice(actions)
-                params = self.chooser.params(action)
-                table.set_default(action.name, params)
-                entity = p4runtime.Entity()
-                entity.table_entry.table_id = bound.id
-                entity.table_entry.is_default_action = True
-                codec.write_action(action.name, params, entity.table_entry)
-                yield modify(entity)
+                yield self._default(name, action.name, self.chooser.params(action))
+
+    def _layer_2(self) -> Iterable[Any]:
+        default = (("ingress.flood", (1,)), ("ingress.drop_unknown", ()))[self.chooser.random.random() < 0.3]
+        yield self._default("ingress.dmac", *default)
+        yield self._entry("ingress.vlan_flood", (Exact(2),), "ingress.flood_vlan", 2)
+        for vid, station in itertools.product((0, 1, 2), (1, 2, 3)):
+            port, key = self.chooser.random.choice(_PORTS), (Exact(vid), Exact(0x020000000000 + station))
+            if self.chooser.random.random() < 0.5:
+                yield self._entry("ingress.smac", key, "ingress.known_station", port)
+            if self.chooser.random.random() < 0.5:
+                yield self._entry("ingress.dmac", key, "ingress.set_egress", port)
+
+    def _default(self, name: str, action: str, params: tuple[int, ...]) -> Any:
+        self.switch.tables[name].set_default(action, params)
+        bound = self.schema.table_of(name)
+        entity = p4runtime.Entity()
+        entity.table_entry.table_id = bound.id
+        entity.table_entry.is_default_action = True
+        TableCodec(bound).write_action(action, params, entity.table_entry)
+        return modify(entity)
+
+    def _entry(self, name: str, match: tuple[Exact, ...], action: str, *params: int) -> Any:
+        entry = TableEntry(match, action, params)
+        self.switch.tables[name].insert(entry)
+        entity = p4runtime.Entity()
+        TableCodec(self.schema.table_of(name)).write(entry, entity.table_entry)
+        return insert(entity)
 
     def _entries(self, bound: Any, codec: TableCodec) -> Iterable[Any]:
         actions = [a.spec for a in bound.actions if a.in_entries]
@@ -209,7 +239,7 @@ class Pair:
             assert sorted(self.target.sent(port, len(ours))) == sorted(ours), (port, shown)
         theirs = sorted(self.case.mask(p) for p in self._packet_ins(len(result.packet_ins)))
         assert theirs == sorted(self.case.mask(p) for p in result.packet_ins), shown
-        self.digests |= {d.values for d in result.digests}
+        self.digests |= {self._digest(d.name, d.values) for d in result.digests}
 
     def _packet_ins(self, count: int) -> list[bytes]:
         found = []
@@ -231,16 +261,23 @@ class Pair:
         time.sleep(0.2)
         assert self.controller.packets.empty()
         assert all(q.empty() for q in self.target._frames.values())
-        theirs: set[tuple[int, ...]] = set()
+        theirs: set[tuple[str, tuple[int, ...]]] = set()
         while not self.controller.digests.empty():
-            for sample in self.controller.digests.get().data:
-                theirs.add(tuple(int.from_bytes(m.bitstring, "big") for m in sample.struct.members))
+            received = self.controller.digests.get()
+            name = self._digest_names[received.digest_id]
+            for sample in received.data:
+                values = [int.from_bytes(m.bitstring, "big") for m in sample.struct.members]
+                theirs.add(self._digest(name, values))
         assert theirs == self.digests
         for name, table in self.switch.tables.items():
             if table.spec.has_counter and table.spec.keys:
                 self._compare_counters(name)
         self.controller.close()
         self.switch.close()
+
+    def _digest(self, name: str, values: Sequence[int]) -> tuple[str, tuple[int, ...]]:
+        clock = self._clocks.get(name)
+        return name, tuple(0 if n == clock else value for n, value in enumerate(values))
 
     def _compare_counters(self, name: str) -> None:
         bound = self.schema.table_of(name)
@@ -254,6 +291,16 @@ class Pair:
                 ours = self.switch.tables[name].counter(codec.match(entry.match), entry.priority)
                 data = entry.counter_data
                 assert (data.packet_count, data.byte_count) == (ours.packets, ours.bytes), (name, entry)
+
+
+def _clock_members(info: Any) -> dict[str, int]:
+    """Which member of a digest is a time."""
+    found = {}
+    for name, struct in info.type_info.structs.items():
+        names = [member.name for member in struct.members]
+        if "timestamp" in names:
+            found[name] = names.index("timestamp")
+    return found
 
 
 def _add(message: Any, replicas: Iterable[Replica]) -> None:

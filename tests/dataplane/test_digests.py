@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataplane.bytestrings import encode
+from dataplane.compiler.samples import encode as sample
 from dataplane.digests import DigestLists, encode_list
 from dataplane.schema import BoundDigest, Schema
 from dataplane.status import Exists, InvalidArgument, Missing
@@ -33,7 +34,7 @@ def entry(timeout=SECOND, size=3, ack=0, digest_id=77):
 
 
 def samples(*values):
-    return [Digest("note", (value, 0)) for value in values]
+    return [Digest("note", sample((value, 0))) for value in values]
 
 
 def firsts(messages):
@@ -49,12 +50,15 @@ def firsts(messages):
 def test_the_bytes_are_those_of_protobuf(values, number):
     message = p4runtime.StreamMessageResponse()
     message.digest.digest_id, message.digest.list_id, message.digest.timestamp = 77, number, 5
-    for sample in values:
+    for members in values:
         struct = message.digest.data.add().struct
         struct.SetInParent()
-        for value in sample:
+        for value in members:
             struct.members.add().bitstring = encode(value)
-    assert p4runtime.StreamMessageResponse.FromString(encode_list(NOTE, number, values, 5)) == message
+    assert (
+        p4runtime.StreamMessageResponse.FromString(encode_list(NOTE, number, map(sample, values), 5))
+        == message
+    )
 
 
 def test_without_a_configuration_samples_are_counted_and_dropped():

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataplane.bytestrings import encode
-from dataplane.packet_io import PacketInEncoder, PacketOutDecoder, varint
+from dataplane.compiler.samples import varint
+from dataplane.packet_io import PacketInEncoder, PacketOutDecoder
 from dataplane.schema import MetadataField
 from dataplane.status import InvalidArgument
 from p4rt import p4runtime

@@ -4,6 +4,7 @@ import zlib
 
 import pytest
 
+from dataplane.compiler.samples import encode
 from dataplane.externs import MeterConfig, crc16, csum16
 from dataplane.switch import Digest, Replica, Switch
 from dataplane.tables import Exact, Lpm, Range, TableEntry, Ternary
@@ -241,7 +242,7 @@ def test_range_ternary_exact_with_direct_meter_and_action_run(switch):
     assert fields(only(switch, frame(6, a=1, c=15, d=0x1FF)))["b"] == 0
     assert fields(only(switch, frame(6, a=1, c=15, d=0x1FF)))["b"] == 2
     result = switch.process(1, frame(6, a=1, c=21, d=0x1FF), 0)
-    assert (result.outputs, result.digests) == ([], [Digest("other_t", (6, 253))])
+    assert (result.outputs, result.digests) == ([], [Digest("other_t", encode((6, 253)))])
     assert fields(only(switch, frame(6, a=2)))["b"] == 0xEE
 
 
@@ -253,7 +254,7 @@ def test_const_entries_first_wins(switch):
 
 def test_digest_values(switch):
     result = switch.process(1, frame(11, d=77), 0)
-    assert result.digests == [Digest("note_t", (1, 0x020000000001, 77))]
+    assert result.digests == [Digest("note_t", encode((1, 0x020000000001, 77)))]
 
 
 def test_truncate_in_ingress(switch):
@@ -334,7 +335,7 @@ def test_batches_equal_single_frames(switch):
     batch = switch.process_many(1, frames, [1, 2, 3, 4])
     assert batch.verdicts == b"\2\2\2\2"
     assert len(batch.outputs) == 4
-    assert batch.digests == [Digest("note_t", (1, 0x020000000001, 0))]
+    assert batch.digests == [Digest("note_t", encode((1, 0x020000000001, 0)))]
     assert switch.process_many(1, [], []).verdicts == b""
 
 
@@ -354,7 +355,7 @@ def test_small_program_punts_clones_and_learns(backend):
     acl.insert(TableEntry(key, "I.punt", (5,), 1))
     assert switch.process(1, data, 0).packet_ins == [b"\0\x85" + data]
     acl.insert(TableEntry(key, "I.learn", (2,), 2))
-    assert switch.process(1, data, 0).digests == [Digest("digest_t", (0x0A000001, 0x0A000002, 0x51))]
+    assert switch.process(1, data, 0).digests == [Digest("digest_t", encode((0x0A000001, 0x0A000002, 0x51)))]
     acl.insert(TableEntry(key, "I.punt_clone", (2,), 3))
     switch.set_clone_session(99, [Replica(510, 1)])
     result = switch.process(1, data, 0)

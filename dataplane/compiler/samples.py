@@ -1,0 +1,56 @@
+"""A digest's sample as it travels: one element of the field `data` of a P4Runtime DigestList.
+
+    0x1a <len> 0x2a <len> ┌ 0x0a <len> 0x0a <len> value          (for each member, big endian, shortest)
+    data       struct     └ members    bitstring
+
+The back ends write samples so at once: of a list of hundreds with thirty members each, nothing but the
+joining is left to do (runtime_engine.h has the same in C).
+"""
+
+from collections.abc import Iterable
+
+_MOST_BYTES = 64
+
+
+def varint(value: int) -> bytes:
+    """A protobuf varint."""
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+_PREFIXES = [bytes((0x0A, 2 + size, 0x0A, size)) for size in range(_MOST_BYTES + 1)]
+_SMALL = [_PREFIXES[1] + bytes([value]) for value in range(256)]
+
+
+def encode(values: Iterable[int]) -> bytes:
+    """A sample of these members, each below 2^512."""
+    members = b"".join([_SMALL[v] if v < 256 else _member(v) for v in values])
+    struct = b"".join((b"\x2a", varint(len(members)), members))
+    return b"".join((b"\x1a", varint(len(struct)), struct))
+
+
+def _member(value: int) -> bytes:
+    size = (value.bit_length() + 7) // 8
+    return _PREFIXES[size] + value.to_bytes(size, "big")
+
+
+def decode(sample: bytes) -> tuple[int, ...]:
+    """The members of a sample that `encode` or the C back end made."""
+    at = _behind_varint(sample, 1)
+    at = _behind_varint(sample, at + 1)
+    values = []
+    while at < len(sample):
+        first, size = at + 4, sample[at + 3]
+        values.append(int.from_bytes(sample[first : first + size], "big"))
+        at = first + size
+    return tuple(values)
+
+
+def _behind_varint(data: bytes, at: int) -> int:
+    while data[at] & 0x80:
+        at += 1
+    return at + 1

@@ -1,0 +1,30 @@
+"""The product's program on both back ends."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from dataplane.externs import CounterValue
+from dataplane.switch import Switch
+from tests.dataplane.loading import BACKENDS, sdnator
+from tests.p4.sdnator_switch import made
+
+
+@pytest.fixture(scope="session", params=BACKENDS)
+def standing_switch(request) -> Iterator[Switch]:
+    made_switch = made(sdnator(), request.param)
+    yield made_switch
+    made_switch.close()
+
+
+@pytest.fixture
+def switch(standing_switch) -> Switch:
+    """Without entries, with the program's default actions; registers keep what is in them."""
+    for table in standing_switch.tables.values():
+        table.clear()
+        if not table.spec.default_is_const:
+            table.reset_default()
+    unparsed = standing_switch.counters["ingress.unparsed_frames"]
+    for cause in range(unparsed.spec.size):
+        unparsed.write(cause, CounterValue())
+    return standing_switch
