@@ -5,7 +5,6 @@ deputy with the lowest id there is; when the switch says that there is no primar
 moment for the chief, then asks for its place.
 """
 
-import queue
 import threading
 import time
 from itertools import groupby
@@ -13,7 +12,7 @@ from typing import Any, Final, Protocol
 
 import grpc
 
-from apps.p4runtime_ctrl.session import Address, Pipeline, Session, translated
+from apps.p4runtime_ctrl.session import Address, Outgoing, Pipeline, Session, translated
 from p4rt import P4RuntimeStub, p4runtime
 
 _FIRST_PAUSE: Final = 0.05
@@ -48,8 +47,9 @@ class Connection:
         *,
         batch: int = 1024,
         linger_s: float = 0.002,
-        longest_pause_s: float = 0.5,
+        longest_pause_s: float = 0.2,
         chief: bool = True,
+        patience_s: float = _DEPUTY_WAITS_S,
     ) -> None:
         self._address = address
         self._pipeline = pipeline
@@ -62,11 +62,12 @@ class Connection:
         self._changed = threading.Condition()
         self._call: Any = None
         self._stub: Any = None
-        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._requests = Outgoing()
         self._election_id: Any = None
         self._told: tuple[bool, Any] | None = None
         """What the listener knows: primary or not, and under which election id its writes go."""
         self._chief = chief
+        self._patience_s = patience_s
         self._patience: threading.Timer | None = None
         name = address.target
         self._threads = [
@@ -122,12 +123,12 @@ class Connection:
 
     def _one_stream(self) -> str:
         """Open the stream, read it to its end, say why it ended."""
-        self._requests = queue.SimpleQueue()
+        self._requests = Outgoing()
         self._told = None
         with self._address.channel() as stream, self._address.channel() as calls:
             self._stub = P4RuntimeStub(calls)
             self._claim(self._usual_id())
-            self._call = P4RuntimeStub(stream).StreamChannel(iter(self._requests.get, None))
+            self._call = P4RuntimeStub(stream).StreamChannel(iter(self._requests))
             try:
                 for message in self._call:
                     self._take(message)
@@ -137,7 +138,7 @@ class Connection:
                 return f"switch at {self._address.target} closed the stream"
             finally:
                 self._stop_waiting()
-                self._requests.put(None)
+                self._requests.end()
                 self._call = None
 
     def _usual_id(self) -> int:
@@ -177,7 +178,7 @@ class Connection:
             return
         self._told = told
         if primary:
-            session = Session(self._stub, self._address, self._pipeline, self._election_id)
+            session = Session(self._stub, self._address, self._pipeline, self._election_id, self._requests)
             self._listener.became_primary(session)
         else:
             self._listener.became_backup()
@@ -186,7 +187,7 @@ class Connection:
         if self._chief:
             self._claim(election_id)
             return
-        self._patience = threading.Timer(_DEPUTY_WAITS_S, self._claim, (election_id,))
+        self._patience = threading.Timer(self._patience_s, self._claim, (election_id,))
         self._patience.daemon = True
         self._patience.start()
 

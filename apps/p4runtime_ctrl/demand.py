@@ -18,6 +18,7 @@ from typing import Any, Final, Literal
 import msgspec
 
 from apps.messages import Message
+from apps.p4runtime_ctrl.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry import EVERY_PACKET, Request
 from due import Key
 
@@ -25,8 +26,8 @@ Kind = Literal["packets", "frames", "digests"]
 KINDS: Final[tuple[Kind, ...]] = ("packets", "frames", "digests")
 APP: Final = "p4runtime_ctrl"
 ALL: Final = "all"
-_PORT_BITS: Final = 55
-"""Bits 200-254 are for ports; queries of other apps take 0-199."""
+_PORT_BITS: Final = 47
+"""Bits 208-254 are for ports, 200-207 for what digests do not say; queries of other apps take 0-199."""
 
 
 def key_of(kind: Kind, switch: str, which: str) -> str:
@@ -78,7 +79,8 @@ def demand_for(
 ) -> Demand:
     """The demand on one switch by the keys that somebody wants.
 
-    `by_digest`: record batches are made from digests, and frames are copied only for who wants frames.
+    `by_digest`: record batches are made from digests, and frames are copied only for who wants frames,
+    or where the digest does not say all.
     """
     keys = [Key.parse(text) for text in wanted]
     named = sorted({key.segments[-1] for key in keys} - {"*", "**", ALL})
@@ -97,7 +99,8 @@ def demand_for(
     if by_digest:
         known = {which: _by_digest(request, routes, which) for which, request in known.items()}
     requests = {which: known[which] for kind in KINDS for which in routes[kind]}
-    return Demand(tuple(sorted(requests.values(), key=lambda request: -request.bit)), routes)
+    wanted_requests = [*requests.values(), *(FALLBACK if by_digest and routes["packets"] else ())]
+    return Demand(tuple(sorted(wanted_requests, key=lambda request: -request.bit)), routes)
 
 
 def _by_digest(request: Request, routes: Mapping[Kind, Mapping[str, int]], which: str) -> Request:

@@ -1,8 +1,7 @@
 """Digest lists of a switch → packet records, with what the counting stages said of each frame.
 
 A digest holds the header fields that the switch's parser found: the same columns as of a copied frame,
-many frames to a message.  What the parser does not follow (a third VLAN tag, a fourth IPv6 extension
-header, fragments behind the first) is absent in its row.
+many frames to a message.  What the parser does not cover (`coverage`) is absent in its row.
 """
 
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.p4runtime_ctrl.coverage import uncovered
 from apps.p4runtime_ctrl.errors import ProgramError
 from apps.p4runtime_ctrl.p4info import Program
 from apps.p4runtime_ctrl.progress import Progress
@@ -21,7 +21,7 @@ from due import RecordBatch
 
 _DIGEST: Final = "frame_digest_t"
 _NEEDED: Final = frozenset(
-    ("queries", "crossed", "overflow", "timestamp", "arrival", "sequence", "ingress_port", "vid",
+    ("queries", "crossed", "overflow", "fragment", "timestamp", "arrival", "sequence", "ingress_port", "vid",
      "ethertype", "length", "eth_src", "eth_dst", "src", "dst", "protocol", "l4_valid", "quoted",
      "quoted_protocol", "sport", "dport", "tcp_flags", "tcp_sequence", "tcp_acknowledgement", "icmp_type",
      "icmp_code", "arp_operation", "arp_sender_mac", "arp_target_mac")
@@ -42,13 +42,11 @@ class Reports:
     """For which counting queries its key reached the threshold with it."""
     overflow: NDArray[np.uint8]
     """Which counting queries had no cell for its key."""
+    covered: NDArray[np.bool_]
+    """Whether its row says all that its frame would."""
 
     def __len__(self) -> int:
         return len(self.queries)
-
-    def records(self, bit: int) -> RecordBatch:
-        """Frames that meet a request, as packet records."""
-        return self._batch(has_bit(self.queries, bit), {})
 
     def counted(self, bit: int) -> RecordBatch:
         """Frames that a query reports, with the columns `crossed` and `overflow` (0 or 1) beside."""
@@ -84,7 +82,7 @@ class DigestReader:
         found = self._layout.array(rows)
         columns = _columns(found, self._base_us)
         self._progress.digests(columns["sequence"], columns["arrival"], columns["time_us"])
-        return Reports(columns, found["queries"], found["crossed"], found["overflow"])
+        return Reports(columns, found["queries"], found["crossed"], found["overflow"], ~uncovered(found))
 
 
 def _columns(found: NDArray[Any], base_us: int) -> dict[str, NDArray[Any]]:

@@ -7,11 +7,14 @@ while consumers of reliable keys are behind; then the stream is not read on and 
 from collections.abc import Callable
 from typing import Any, Final
 
-from apps.p4runtime_ctrl.demand import Demand, Kind, key_of
+import numpy as np
+
+from apps.p4runtime_ctrl.demand import APP, Demand, Kind, key_of
 from apps.p4runtime_ctrl.digest_in import DigestReader
 from apps.p4runtime_ctrl.p4info import Program
-from apps.p4runtime_ctrl.packet_in import PacketReader
+from apps.p4runtime_ctrl.packet_in import PacketReader, Packets
 from apps.p4runtime_ctrl.progress import Progress, Source
+from apps.p4runtime_ctrl.unison import Rows, Unison
 from apps.packets import read_frames
 
 Write = Callable[[str, Any, int], object]
@@ -35,7 +38,21 @@ class Outbound:
         self._by_digest = by_digest
         self._packets = PacketReader(program, base_us, self.progress)
         self._digests = DigestReader(program, base_us, self.progress)
+        self.answers = 0
+        """Cells that the switch told."""
         self._routes: dict[Kind, list[tuple[str, int]]] = {}
+        self._unison = Unison()
+        self._waited = 0
+
+    @property
+    def fell_back(self) -> int:
+        """Records made from copied frames because digests did not say all."""
+        return self._unison.copies
+
+    @property
+    def skipped(self) -> int:
+        """Frames left out of the records because they came too late, or not at all."""
+        return self._unison.skipped
 
     @property
     def second(self) -> int:
@@ -57,10 +74,13 @@ class Outbound:
     def packets(self, messages: list[Any]) -> None:
         """Packet-ins, in the order of their stream."""
         packets = self._packets.read(messages)
-        for key, bit in () if self._by_digest else self._routes.get("packets", ()):
-            chosen = packets.matching(bit)
-            if len(chosen):
-                self._write(key, chosen.batch(read_frames), int(chosen.time_us[-1]) * 1000)
+        if packets.cells is not None and len(packets.cells):
+            self.answers += len(packets.cells)
+            self._write(f"network.cell.{APP}.{self._name}", packets.cells, self.progress.time_us * 1000)
+        if self._by_digest:
+            self._write_records(self._unison.packets(_rows(packets)))
+        else:
+            self._publish_copies(packets)
         for key, bit in self._routes.get("frames", ()):
             chosen = packets.matching(bit)
             if len(chosen):
@@ -69,11 +89,34 @@ class Outbound:
     def digests(self, lists: list[Any]) -> None:
         """Digest lists, in the order of their stream."""
         reports = self._digests.read(lists)
-        for key, bit in self._routes.get("packets", ()) if self._by_digest else ():
-            batch = reports.records(bit)
-            if len(batch):
-                self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+        if self._by_digest:
+            rows = Rows(reports.columns, reports.queries, reports.covered)
+            self._write_records(self._unison.digests(rows))
         for key, bit in self._routes.get("digests", ()):
             batch = reports.counted(bit)
             if len(batch):
                 self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+
+    def settle(self) -> None:
+        """Called from time to time: records that have waited since the last call go without what is missing."""
+        waits = self._unison.waits_for
+        if waits and waits == self._waited:
+            self._write_records(self._unison.flush())
+        self._waited = waits
+
+    def _publish_copies(self, packets: Packets) -> None:
+        for key, bit in self._routes.get("packets", ()):
+            chosen = packets.matching(bit)
+            if len(chosen):
+                self._write(key, chosen.batch(read_frames), int(chosen.time_us[-1]) * 1000)
+
+    def _write_records(self, told: list[Rows]) -> None:
+        for rows in told:
+            for key, bit in self._routes.get("packets", ()):
+                batch = rows.matching(bit)
+                if len(batch):
+                    self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+
+
+def _rows(packets: Packets) -> Rows:
+    return Rows(dict(packets.batch(read_frames)), packets.queries, np.ones(len(packets), dtype=np.bool_))

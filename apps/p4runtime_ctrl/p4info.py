@@ -125,6 +125,10 @@ class Program:
         members = self.message.type_info.structs[struct].members
         return [(member.name, member.type_spec.bitstring.bit.bitwidth) for member in members]
 
+    def digest_id(self, struct: str) -> int:
+        """Number of a digest, 0 where the program has none of that name."""
+        return next((int(one.preamble.id) for one in self.message.digests if one.preamble.name == struct), 0)
+
     def entry(self, update: TableUpdate) -> Any:
         """The P4Runtime `TableEntry` that an update means.
 

@@ -4,8 +4,8 @@ The switch numbers its packet-ins from 1, so a gap is a loss between switch and 
 counts microseconds since a base that the controller knows: absolute times are integers made before
 any float (`base_us + timestamp`).
 
-A packet-in whose `reason` is not 0 is no copied frame but an answer to a packet-out; it has no number
-in the sequence.
+A packet-in whose `reason` is not 0 is no copied frame but the answer to a question about a counting
+cell (`packet_out`); it has no number in the sequence.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.p4runtime_ctrl.p4info import Program
+from apps.p4runtime_ctrl.packet_out import question_of
 from apps.p4runtime_ctrl.progress import Progress
 from apps.p4runtime_ctrl.rows import Layout, has_bit
 from due import RecordBatch
@@ -24,6 +25,7 @@ ReadFrames = Callable[..., RecordBatch]
 """`apps.packets.read_frames(frames, lengths=, times_us=, ports=, sequence=, arrival=)`."""
 
 _HEADER: Final = "packet_in"
+_CELL: Final = 1
 _NEEDED: Final = ("ingress_port", "reason", "timestamp", "length", "sequence", "arrival", "query_map")
 
 
@@ -39,6 +41,10 @@ class Packets:
     arrival: NDArray[np.uint64]
     queries: NDArray[np.uint8]
     """Which queries each frame matched: 256 bits a row, big-endian."""
+
+    cells: RecordBatch | None = None
+    """Answers that came among them: `id` of the question, `count`, `epoch` (number of the window) and
+    `overflow` (1: the cell holds another key)."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -103,7 +109,9 @@ class PacketReader:
         header = self._layout.array([self._values(message.metadata) for message in messages])
         frames = [message.payload for message in messages]
         copies = header["reason"] == 0
+        cells = None
         if not copies.all():
+            cells = _cells(header[~copies], [frames[row] for row in np.flatnonzero(~copies)])
             frames = [frames[row] for row in np.flatnonzero(copies)]
             header = header[copies]
         packets = Packets(
@@ -114,6 +122,7 @@ class PacketReader:
             sequence=header["sequence"].astype(np.uint64),
             arrival=header["arrival"].astype(np.uint64),
             queries=header["query_map"],
+            cells=cells,
         )
         self._progress.packets(packets.sequence, packets.arrival, packets.time_us)
         return packets
@@ -124,3 +133,17 @@ class PacketReader:
             return [item.value for item in metadata]
         found = {item.metadata_id: item.value for item in metadata}
         return [found.get(each, b"") for each in self._ids]
+
+
+def _cells(header: NDArray[Any], payloads: list[bytes]) -> RecordBatch:
+    numbers = [question_of(payload) for payload in payloads]
+    known = np.array([number is not None for number in numbers], dtype=np.bool_) & (header["reason"] == _CELL)
+    header = header[known]
+    return RecordBatch(
+        {
+            "id": np.array([number for number, keep in zip(numbers, known, strict=True) if keep], np.uint64),
+            "count": header["sequence"].astype(np.uint32),
+            "epoch": header["arrival"].astype(np.uint32),
+            "overflow": header["query_map"].any(axis=1).astype(np.uint8),
+        }
+    )

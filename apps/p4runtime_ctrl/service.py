@@ -1,47 +1,40 @@
-"""The P4Runtime controller: one agent per switch between gRPC and DUE.
-
-packets thread of a connection   packet-ins → record batch → DUE (blocks while consumers are behind)
-worker thread of a switch        decisions, commands, requests, counters: one after the other
-DUE's dispatcher                 puts work into the workers' bounded queues
-"""
+"""The P4Runtime controller: between DUE and one agent per switch."""
 
 import logging
-import queue
-import secrets
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import due.service
-from apps.messages import Confirmation, Decision, TableCommand
+from apps.messages import Decision, TableCommand
+from apps.p4runtime_ctrl.agent import Agent
 from apps.p4runtime_ctrl.connection import Connection
 from apps.p4runtime_ctrl.demand import ALL, KINDS, Demand, Offer, demand_for, key_of
-from apps.p4runtime_ctrl.errors import ControllerError, ProgramError, SwitchError
-from apps.p4runtime_ctrl.history import DECISIONS, commands_of, decisions_for, is_for, read
-from apps.p4runtime_ctrl.outbound import Outbound
+from apps.p4runtime_ctrl.errors import ProgramError
+from apps.p4runtime_ctrl.history import DECISIONS, is_for, read
 from apps.p4runtime_ctrl.p4info import Program
-from apps.p4runtime_ctrl.readings import Readings
-from apps.p4runtime_ctrl.session import Address, Pipeline, Session, credentials
+from apps.p4runtime_ctrl.sentinel import Sentinel
+from apps.p4runtime_ctrl.session import Pipeline, address_of
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
-from apps.p4runtime_ctrl.switch import Switch
-from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item
+from due import Assignment, Capability, Engine, Interest, Item
 
 INTERESTS = (
     Interest("network.block.firewall.*"),
     Interest("network.protect.firewall.*"),
     Interest("network.p4_command.*.*"),
     Interest("network.telemetry.*.*"),
+    Interest("network.cell_request.*.*"),
+    Interest("network.packet_out.*.*"),
 )
 CAPABILITIES = (
     Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.frames.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.digests.p4runtime_ctrl.*.*", delivery="reliable"),
+    Capability("network.cell.p4runtime_ctrl.*", delivery="reliable"),
     Capability("network.confirmation.p4runtime_ctrl.*", delivery="reliable", archive="always"),
     Capability("network.switch.p4runtime_ctrl.*", archive="always"),
 )
@@ -49,341 +42,8 @@ CAPABILITIES = (
 _OFFERS: Final = "network.telemetry.*.*"
 _DATA: Final = tuple(key_of(kind, "*", "*") for kind in KINDS)
 _LOG = logging.getLogger(__name__)
-_JOBS: Final = 10_000
-_ALIVE_S: Final = 1.0
 _START_S: Final = 10.0
-_COUNTING_SHARE: Final = 5
-"""Reading counters takes at most one part in so many of the worker's time."""
 _LOOK_EVERY_S: Final = 0.25
-
-
-@dataclass(frozen=True)
-class _Decide:
-    decision: Decision
-
-
-_Job = _Decide | Callable[[], None]
-
-
-class Agent:
-    """Keeps one switch as desired, and publishes what it sends."""
-
-    def __init__(self, engine: Engine, settings: Settings, mine: SwitchSettings, pipeline: Pipeline) -> None:
-        self.name = mine.name
-        self._engine = engine
-        self._mine = mine
-        self._settings = settings
-        self._program = Program(pipeline.p4info)
-        by_digest = settings.telemetry == "digest"
-        self._outbound = Outbound(mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest)
-        self._progress = self._outbound.progress
-        self._program_name = Path(settings.program).name
-        forward = {int(port): egress for port, egress in mine.forward.items()}
-        self._switch = Switch(
-            mine.name, self._program, self._now, forward=forward, fail=mine.fail, guard=settings.guard
-        )
-        self._connection = Connection(
-            _address(settings, mine),
-            pipeline,
-            self,
-            batch=settings.batch,
-            linger_s=settings.linger_ms / 1000,
-        )
-        self._jobs: queue.Queue[_Job] = queue.Queue(_JOBS)
-        self._closing = threading.Event()
-        self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
-        self._session: Session | None = None
-        self._connected = False
-        self._was_backup = False
-        self._recent: deque[Decision] = deque(maxlen=_JOBS)
-        self._readings = Readings()
-        self._counting = threading.Event()
-        self._counted_second = 0
-        self._counted_at = 0.0
-        self._count_after = 0.0
-        self._alive_at = 0.0
-        self._secret_at = float("-inf")
-        self._stated = (0, 0, 0.0)
-        self._change = "starting"
-        self.settled = threading.Event()
-        """The first attempt to reach the switch has ended, well or badly."""
-
-    # -- from the service ---------------------------------------------------------------------
-
-    def start(self, *, chief: bool) -> None:
-        self._restore()
-        self._worker.start()
-        self._connection.stand(chief=chief)
-        self._connection.open()
-
-    def stand(self, *, chief: bool) -> None:
-        self._connection.stand(chief=chief)
-
-    def stop(self) -> None:
-        self._put(self._leave)
-        self._closing.set()
-        self._worker.join(timeout=self._settings.timeout_s * 2)
-        self._connection.close()
-
-    def decide(self, decision: Decision) -> None:
-        self._recent.append(decision)
-        self._put(_Decide(decision))
-
-    def command(self, command: TableCommand) -> None:
-        self._put(partial(self._command, command))
-
-    def want(self, demand: Demand) -> None:
-        self._put(partial(self._want, demand))
-
-    def say_again(self) -> None:
-        """Somebody new may be listening: the state is best effort and said on change only."""
-        self._put(self._write_state)
-
-    def tick(self) -> None:
-        """Wall-clock duties: is the switch alive, are counters due, has the state changed."""
-        if not self._worker.is_alive() or not self._connection.works:
-            raise ControllerError(f"{self.name}: a thread has ended with an error; the log has the reason")
-        now = time.monotonic()
-        if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
-            self._alive_at = now
-            self._put(self._check_alive)
-        if now - self._counted_at > 1:
-            self._count_soon()
-        if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
-            self._secret_at = now
-            self._put(self._change_secret)
-        received, lost, stated_at = self._stated
-        if now - stated_at > 1 and (received, lost) != (self._heard(), self._progress.lost):
-            self._put(self._write_state)
-
-    def health(self) -> dict[str, Any]:
-        return self._state()
-
-    # -- from the connection ------------------------------------------------------------------
-
-    def became_primary(self, session: Session) -> None:
-        self._put(partial(self._take_over, session))
-
-    def became_backup(self) -> None:
-        self._put(self._stand_back)
-
-    def lost(self, cause: str) -> None:
-        self._session = None
-        self._put(partial(self._lose, cause))
-
-    def packets(self, messages: list[Any]) -> None:
-        self._outbound.packets(messages)
-        self._count_each_second()
-
-    def digests(self, lists: list[Any]) -> None:
-        self._outbound.digests(lists)
-        self._count_each_second()
-
-    def other(self, message: Any) -> None:
-        if message.WhichOneof("update") == "idle_timeout_notification":
-            self._put(partial(self._expire, list(message.idle_timeout_notification.table_entry)))
-
-    def _publish(self, key: str, value: Any, event_time: int) -> None:
-        self._engine.write(key, value, [NO_WAIT], event_time=event_time)
-
-    def _count_each_second(self) -> None:
-        if self._outbound.second != self._counted_second:
-            self._count_soon()
-
-    # -- the worker ---------------------------------------------------------------------------
-
-    def _put(self, job: _Job) -> None:
-        while not self._closing.is_set():
-            try:
-                self._jobs.put(job, timeout=1)
-            except queue.Full:
-                continue
-            return
-
-    def _work(self) -> None:
-        while not (self._closing.is_set() and self._jobs.empty()):
-            try:
-                jobs = [self._jobs.get(timeout=0.2)]
-            except queue.Empty:
-                continue
-            while len(jobs) < _JOBS and not self._jobs.empty():
-                jobs.append(self._jobs.get())
-            self._run(jobs)
-
-    def _run(self, jobs: Sequence[_Job]) -> None:
-        decisions: list[Decision] = []
-        for job in jobs:
-            if isinstance(job, _Decide):
-                decisions.append(job.decision)
-                continue
-            self._decide(decisions)
-            decisions = []
-            try:
-                job()
-            except ControllerError as error:
-                _LOG.error("%s: %s", self.name, error)
-                self._say(str(error))
-        self._decide(decisions)
-        if self._session is not None and self._session.broken:
-            self._session = None
-            self._connection.break_off()
-
-    def _take_over(self, session: Session) -> None:
-        self._connected = True
-        if self._was_backup:
-            self._was_backup = False
-            self._restore()
-        try:
-            report = self._switch.bring_up(session)
-        except SwitchError:
-            self._connection.break_off()
-            raise
-        finally:
-            self.settled.set()
-        if report.program_loaded:
-            self._progress.expect_first()
-        self._session = session
-        self._confirm(report.confirmations)
-        _LOG.info("%s: primary; %s", self.name, report)
-        self._say(f"primary: {report}")
-
-    def _stand_back(self) -> None:
-        self._connected = True
-        self._was_backup = True
-        self._session = None
-        self.settled.set()
-        self._say("backup: another controller is primary")
-
-    def _lose(self, cause: str) -> None:
-        if self._connected:
-            _LOG.warning("%s: lost: %s", self.name, cause)
-        self._connected = False
-        self.settled.set()
-        self._say(f"lost: {cause}")
-
-    def _leave(self) -> None:
-        if self._session is not None:
-            self._switch.withdraw(self._session)
-
-    def _decide(self, decisions: Sequence[Decision]) -> None:
-        if not decisions:
-            return
-        self._confirm(self._switch.decide(decisions, self._session))
-        self._count_soon()
-
-    def _command(self, command: TableCommand) -> None:
-        self._confirm(self._switch.command(command, self._session))
-
-    def _want(self, demand: Demand) -> None:
-        """What is not wanted any more is not published any more; what is new is, before it is asked for."""
-        self._outbound.route(demand)
-        for text in self._switch.want(demand.requests, self._session):
-            _LOG.error("%s: %s", self.name, text)
-        names = ", ".join(request.name for request in demand.requests) or "nothing"
-        self._say(f"telemetry: {names}")
-
-    def _expire(self, entries: Iterable[Any]) -> None:
-        if self._session is not None:
-            self._confirm(self._switch.expire(entries, self._session))
-
-    def _check_alive(self) -> None:
-        if self._session is not None:
-            self._session.alive()
-
-    def _change_secret(self) -> None:
-        self._switch.change_secret(secrets.randbits(32), secrets.randbits(32), self._session)
-
-    def _count_soon(self) -> None:
-        """Have block counters read, unless that is under way, not due, or there is nothing to count."""
-        if self._counting.is_set() or self._session is None or not self._switch.blocks:
-            return
-        if time.monotonic() < self._count_after:
-            return
-        self._counting.set()
-        self._put(self._count)
-
-    def _count(self) -> None:
-        began = time.monotonic()
-        try:
-            if self._session is not None:
-                self._readings.take(self._switch.count_blocks(self._session))
-                self._write_state()
-        finally:
-            self._counted_second = self._outbound.second
-            self._counted_at = time.monotonic()
-            spent = self._counted_at - began
-            self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
-            self._counting.clear()
-
-    def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
-        key = f"network.confirmation.p4runtime_ctrl.{self.name}"
-        waiting = list(confirmations)
-        for place, confirmation in enumerate(waiting, start=1):
-            flags = [NO_WAIT] if place == len(waiting) else []
-            at = confirmation.event_time or None
-            self._engine.write(key, confirmation.to_value(), flags, event_time=at)
-
-    def _say(self, change: str) -> None:
-        self._change = change
-        self._write_state()
-
-    def _write_state(self) -> None:
-        self._stated = (self._heard(), self._progress.lost, time.monotonic())
-        if not self._switch.blocks:
-            self._readings.take([])
-        key = f"network.switch.p4runtime_ctrl.{self.name}"
-        self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
-
-    def _heard(self) -> int:
-        return self._progress.received + self._progress.reported
-
-    def _state(self) -> dict[str, Any]:
-        event_time, arrival = self._now()
-        return {
-            "switch": self.name,
-            "connected": self._connected,
-            "primary": self._session is not None,
-            "target": self._mine.target or self._mine.address,
-            "program": self._program_name,
-            "base_us": self._mine.base_us,
-            "fail": self._mine.fail,
-            "telemetry": [request.name for request in self._switch.requests or ()],
-            "packet_in": self._progress.received,
-            "digests": self._progress.reported,
-            "lost": self._progress.lost,
-            "restarts": self._progress.restarts,
-            "arrival": arrival,
-            "event_time": event_time,
-            "blocks": self._readings.shown,
-            "blocks_total": self._switch.blocks,
-            "change": self._change,
-        }
-
-    def _now(self) -> tuple[int, int]:
-        return self._progress.time_us * 1000, self._progress.arrival
-
-    def _restore(self) -> None:
-        """Desired state from Data Archives, and what was heard since."""
-        if not self._settings.restore:
-            return
-        since = self._settings.restore_since
-        items = [item for key in DECISIONS for item in self._engine.get(key)]
-        decisions = decisions_for(self.name, items, list(self._recent), since)
-        commands = commands_of(self._engine.get(f"network.p4_command.*.{self.name}"), since)
-        for problem in self._switch.restore(decisions, commands):
-            _LOG.warning("%s: not restored: %s", self.name, problem)
-
-
-def _address(settings: Settings, mine: SwitchSettings) -> Address:
-    return Address(
-        mine.address,
-        mine.device_id,
-        settings.rank,
-        copies_session=settings.copy_session,
-        cpu_port=settings.cpu_port,
-        timeout_s=settings.timeout_s,
-        credentials=credentials(settings.tls_ca, settings.tls_certificate, settings.tls_key),
-    )
 
 
 class P4RuntimeCtrlService:
@@ -396,12 +56,13 @@ class P4RuntimeCtrlService:
         names = [each.name for each in settings.switches]
         if len(set(names)) != len(names):
             raise ProgramError(f"two switches have one name: {', '.join(sorted(names))}")
-        self._agents = {each.name: Agent(engine, settings, each, pipeline) for each in settings.switches}
+        self._agents = {each.name: self._agent(each, pipeline) for each in settings.switches}
         self._offers: dict[str, Offer] = {}
         self._wanted: tuple[str, ...] = ()
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
         self._by_digest = settings.telemetry == "digest"
+        self._sentinel = Sentinel(settings)
         self._chief = True
         self._looked_at = 0.0
 
@@ -413,22 +74,37 @@ class P4RuntimeCtrlService:
         for item in self._engine.get(_OFFERS) if self._settings.restore else ():
             if item.timestamp > self._settings.restore_since:
                 self._take_offer(item)
+        self._sentinel.start()
         for agent in self._agents.values():
             agent.start(chief=self._chief)
         for key in DECISIONS:
             self._engine.observe(key).subscribe(self._on_decision)
         self._engine.observe("network.p4_command.*.*").subscribe(self._on_command)
         self._engine.observe(_OFFERS).subscribe(self._on_offer)
+        self._engine.observe("network.cell_request.*.*").subscribe(self._on_questions)
+        self._engine.observe("network.packet_out.*.*").subscribe(self._on_frames)
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
             agent.settled.wait(max(0.0, deadline - time.monotonic()))
+
+    def _agent(self, mine: SwitchSettings, pipeline: Pipeline) -> Agent:
+        settings = self._settings
+        connect = partial(
+            Connection,
+            address_of(settings, mine),
+            pipeline,
+            batch=settings.batch,
+            linger_s=settings.linger_ms / 1000,
+        )
+        return Agent(self._engine, settings, mine, Program(pipeline.p4info), connect)
 
     def tick(self) -> None:
         for agent in self._agents.values():
             agent.tick()
         if time.monotonic() - self._looked_at > _LOOK_EVERY_S:
             self._looked_at = time.monotonic()
+            self._sentinel.keep()
             self._look_at_duty()
             self._demand_changed()
 
@@ -448,6 +124,7 @@ class P4RuntimeCtrlService:
     def stop(self) -> None:
         for agent in self._agents.values():
             agent.stop()
+        self._sentinel.dismiss()
 
     def health(self) -> dict[str, Any]:
         return {"switches": [agent.health() for agent in self._agents.values()]}
@@ -465,6 +142,16 @@ class P4RuntimeCtrlService:
         command = read(TableCommand, item) if agent is not None else None
         if agent is not None and command is not None:
             agent.command(command)
+
+    def _on_questions(self, item: Item) -> None:
+        agent = self._agents.get(item.key.rpartition(".")[2])
+        if agent is not None:
+            agent.ask(item.value)
+
+    def _on_frames(self, item: Item) -> None:
+        agent = self._agents.get(item.key.rpartition(".")[2])
+        if agent is not None:
+            agent.send(item.value)
 
     def _on_offer(self, item: Item) -> None:
         self._take_offer(item)

@@ -4,6 +4,8 @@ The calls have a channel of their own, so that a held-up stream never delays a w
 """
 
 import hashlib
+import queue
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +15,14 @@ import grpc
 
 from apps.p4runtime_ctrl.desired_state import Change
 from apps.p4runtime_ctrl.errors import NotPrimary, ProgramError, SwitchError, Unreachable
+from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.switch import Outcome
 from p4rt import P4RuntimeStub, p4runtime, status
 
 _METADATA_BYTES: Final = 16 << 20  # a failed batch explains each of its updates in trailing metadata
 _BATCH: Final = 5_000
+_AHEAD: Final = 1_000
+"""Packet-outs that may wait for the switch."""
 _DIGEST_WAITS_NS: Final = 2_000_000
 _DIGEST_LIST: Final = 512
 _DIGEST_ACK_NS: Final = 1_000_000_000
@@ -81,11 +86,65 @@ def credentials(ca: str, certificate: str, key: str) -> grpc.ChannelCredentials 
     return grpc.ssl_channel_credentials(*parts)
 
 
+def address_of(settings: Settings, mine: SwitchSettings) -> Address:
+    """Where a switch of the settings is, and as whom it is addressed."""
+    return Address(
+        mine.address,
+        mine.device_id,
+        settings.rank,
+        copies_session=settings.copy_session,
+        cpu_port=settings.cpu_port,
+        timeout_s=settings.timeout_s,
+        credentials=credentials(settings.tls_ca, settings.tls_certificate, settings.tls_key),
+    )
+
+
+class Outgoing:
+    """What is to go to the switch on its stream: arbitration and acknowledgements at any time, packet-outs
+    as fast as the switch takes them."""
+
+    def __init__(self) -> None:
+        self._waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._ended = False
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._waiting.get, None)
+
+    def put(self, message: Any) -> None:
+        self._waiting.put(message)
+
+    def end(self) -> None:
+        """The stream is over."""
+        self._ended = True
+        self._waiting.put(None)
+
+    def send(self, packets: Sequence[Any], patience_s: float) -> int:
+        """Packet-outs; waits while the switch is behind.  Returns how many of them went."""
+        deadline = time.monotonic() + patience_s
+        for sent, packet in enumerate(packets):
+            while self._waiting.qsize() >= _AHEAD and not self._ended:
+                if time.monotonic() > deadline:
+                    return sent
+                time.sleep(0.001)
+            if self._ended:
+                return sent
+            self._waiting.put(p4runtime.StreamMessageRequest(packet=packet))
+        return len(packets)
+
+
 class Session:
     """Calls to a switch while this controller is primary (a `switch.Transport`)."""
 
-    def __init__(self, stub: P4RuntimeStub, address: Address, pipeline: Pipeline, election_id: Any) -> None:
+    def __init__(
+        self,
+        stub: P4RuntimeStub,
+        address: Address,
+        pipeline: Pipeline,
+        election_id: Any,
+        outgoing: Outgoing | None = None,
+    ) -> None:
         self._stub = stub
+        self._outgoing = outgoing or Outgoing()
         self._election_id = election_id
         self.broken = False
         """A call found no switch: the stream is to be opened anew."""
@@ -126,6 +185,13 @@ class Session:
             if outcome.code:
                 raise SwitchError(f"{self._address.target}: digest {digest.preamble.name}: {outcome.message}")
 
+    def ensure_group(self, group: int, ports: Sequence[int]) -> None:
+        outcome = self._write_group(p4runtime.Update.INSERT, group, ports)
+        if outcome.code:
+            outcome = self._write_group(p4runtime.Update.MODIFY, group, ports)
+        if outcome.code:
+            raise SwitchError(f"{self._address.target}: multicast group {group} refused: {outcome.message}")
+
     def write(self, changes: Sequence[Change]) -> list[Outcome]:
         updates = [change.update for change in changes]
         outcomes: list[Outcome] = []
@@ -143,6 +209,10 @@ class Session:
 
     def read_counters(self, table_id: int) -> Iterator[Any]:
         return self._read(p4runtime.TableEntry(table_id=table_id, counter_data=p4runtime.CounterData()))
+
+    def send(self, packets: Sequence[Any]) -> int:
+        """Packet-outs on the stream; returns how many went before it ended or the switch stood still."""
+        return self._outgoing.send(packets, self._address.timeout_s)
 
     def alive(self) -> str:
         """The switch's P4Runtime version; raises `Unreachable` when it does not answer."""
@@ -168,6 +238,14 @@ class Session:
         session.session_id = self._address.copies_session
         if kind != p4runtime.Update.DELETE:
             session.replicas.add(egress_port=self._address.cpu_port, instance=1)
+        return self._write_updates([update])[0]
+
+    def _write_group(self, kind: int, group: int, ports: Sequence[int]) -> Outcome:
+        update = p4runtime.Update(type=kind)
+        entry = update.entity.packet_replication_engine_entry.multicast_group_entry
+        entry.multicast_group_id = group
+        for port in ports:
+            entry.replicas.add(egress_port=port, instance=1)
         return self._write_updates([update])[0]
 
     def _write_digest(self, kind: int, digest_id: int) -> Outcome:

@@ -5,6 +5,7 @@ from typing import Literal
 import msgspec
 
 from apps.p4runtime_ctrl.guard import GuardSettings
+from apps.p4runtime_ctrl.stations import LearnSettings
 
 
 class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -19,6 +20,8 @@ class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """Absolute time of the switch's clock zero: integer microseconds since the epoch."""
     forward: dict[str, int] = {}
     """Wires: ingress port to egress port."""
+    learn: LearnSettings | None = None
+    """Switch by learnt MAC addresses where there is no wire; off unless ports are named."""
     fail: Literal["open", "closed"] = "open"
     """While it is not under control: open keeps the wires, closed takes them out, and puts them in last."""
     target: str = ""

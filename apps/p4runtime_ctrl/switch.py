@@ -7,9 +7,9 @@ the difference.  No thread, clock or socket of its own: the service calls it fro
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Literal, Protocol
 
-from apps.messages import Confirmation, Decision, State, TableCommand, TableUpdate
+from apps.messages import Confirmation, Decision, State, TableCommand
 from apps.p4runtime_ctrl.blocks import BLOCK_TABLES
 from apps.p4runtime_ctrl.desired_state import (
     DELETE,
@@ -28,9 +28,10 @@ from apps.p4runtime_ctrl.errors import EntryError, ProgramError, SwitchError
 from apps.p4runtime_ctrl.guard import SECRET_WORDS, GuardSettings, secrets_entry
 from apps.p4runtime_ctrl.orders import Order, OrderBook, Owner, owner_of
 from apps.p4runtime_ctrl.p4info import Program
+from apps.p4runtime_ctrl.stations import GROUP, LearnSettings, Stations, no_flood
 from apps.p4runtime_ctrl.telemetry import Classifier, Request
+from apps.p4runtime_ctrl.wires import wires_of
 
-_FORWARD: Final = "ingress.forward_port"
 _OK, _NOT_FOUND, _EXISTS = 0, 5, 6
 
 
@@ -53,6 +54,9 @@ class Transport(Protocol):
 
     def ensure_digests(self) -> None:
         """Digests of the program are sent in lists."""
+
+    def ensure_group(self, group: int, ports: Sequence[int]) -> None:
+        """Multicast group of these ports."""
 
     def write(self, changes: Sequence[Change]) -> list[Outcome]:
         """One outcome for each change, in order; each succeeds or fails by itself."""
@@ -107,6 +111,7 @@ class Switch:
         forward: Mapping[int, int] | None = None,
         fail: Literal["open", "closed"] = "open",
         guard: GuardSettings | None = None,
+        learn: LearnSettings | None = None,
     ) -> None:
         self.name = name
         self.program = program
@@ -117,8 +122,13 @@ class Switch:
         self._classifier = Classifier(program)
         self._book = OrderBook(program, guard or GuardSettings(), self._classifier.table_ids)
         self._block_tables = {program.table(each).id for each in BLOCK_TABLES}
-        self._forward = [self._wire(*ports) for ports in (forward or {}).items()]
+        self._forward = wires_of(program, forward or {})
         self._desired = EntrySet(self._forward)
+        self.stations = Stations(program, learn) if learn is not None else None
+        """Those learnt, where learning is on."""
+        self._unlearnt = no_flood(program) if self.stations is None else []
+        if self.stations is not None:
+            self._desired.put(self.stations.flood())
         self._owners: dict[bytes, Owner] = {}
         self._unconfirmed: dict[bytes, Order] = {}
         self._telemetry = EntrySet()
@@ -153,10 +163,18 @@ class Switch:
         report = BringUp(program_loaded=transport.ensure_program())
         transport.ensure_copies()
         transport.ensure_digests()
+        if self.stations is not None:
+            transport.ensure_group(GROUP, self.stations.ports)
         standing = [entry for entry in self._desired if is_standing(entry)]
         standing += [entry for entry in self._classifier.entries(()) if is_standing(entry)]
+        unlearnt = [entry for entry in self._unlearnt if entry not in self._desired]
         read = [entry for entry in transport.read_entries() if not entry.is_const]
-        read += transport.read_standing(standing)
+        read += transport.read_standing(standing + unlearnt)
+        for entry in unlearnt:  # the switch may flood for a controller before this one
+            if entry in EntrySet(each for each in read if is_standing(each)):
+                self._desired.put(entry)
+        for learnt in self.stations.adopt(read) if self.stations is not None else ():
+            self._desired.put(learnt)
         ids = self._classifier.table_ids
         present = EntrySet(entry for entry in read if table_id(entry) not in ids)
         telemetry = EntrySet(entry for entry in read if table_id(entry) in ids)
@@ -210,6 +228,11 @@ class Switch:
             if outcome.code != _OK
         ]
 
+    def learn(self, lists: Iterable[Any], transport: Transport) -> None:
+        """Enter the stations that the switch reports; one that it refuses is reported again."""
+        if self.stations is not None:
+            self._write_stations(self.stations.learn(lists), transport)
+
     def change_secret(self, first: int, second: int, transport: Transport | None) -> None:
         """Replace the older of the two cookie secrets, and use it from now on."""
         current, words = self._secrets
@@ -224,6 +247,11 @@ class Switch:
     def expire(self, entries: Iterable[Any], transport: Transport) -> list[Confirmation]:
         """Delete entries that the switch reports as idle; those already gone are not confirmed twice."""
         idle = [entry for entry in entries if entry in self._desired]
+        if self.stations is not None:
+            silent = [entry for entry in idle if self.stations.owns(entry)]
+            gone = [change for entry in silent for change in self.stations.forget(entry)]
+            self._write_stations(gone, transport)
+            idle = [entry for entry in idle if entry in self._desired]
         outcomes = transport.write([deletion(entry) for entry in idle]) if idle else []
         answers = []
         for entry, outcome in zip(idle, outcomes, strict=True):
@@ -254,16 +282,18 @@ class Switch:
         if self.fail == "closed" and self._forward:
             transport.write([deletion(entry) for entry in self._forward])
 
-    def _wire(self, ingress: int, egress: int) -> Any:
-        return self.program.entry(
-            TableUpdate(
-                kind="insert",
-                table=_FORWARD,
-                match={"ingress_port": ingress},
-                action="to_port",
-                params={"port": egress},
-            )
-        )
+    def _write_stations(self, changes: list[Change], transport: Transport) -> None:
+        for change in changes:
+            if change.kind == DELETE:
+                self._desired.discard(change.entry)
+            else:
+                self._desired.put(change.entry)
+        outcomes = transport.write([_bare(change) for change in changes]) if changes else []
+        bad = [change for change, said in zip(changes, outcomes, strict=True) if not _achieved(change, said)]
+        if bad and self.stations is not None:
+            self.stations.undo(bad)
+            for change in bad:
+                self._desired.discard(change.entry)
 
     def _plan(self, present: EntrySet, telemetry: EntrySet) -> list[Change]:
         wires = {entry_key(entry) for entry in self._forward}
@@ -389,6 +419,10 @@ class Switch:
             event_time=event_time or owner.event_time,
             arrival=arrival,
         )
+
+
+def _bare(change: Change) -> Change:
+    return deletion(change.entry) if change.kind == DELETE else change
 
 
 def _achieved(change: Change, outcome: Outcome) -> bool:

@@ -48,6 +48,7 @@ class FakeSwitch:
         self.entries = {}
         self.defaults = {}
         self.copies = {}
+        self.groups = {}
         self.digests = {}
 
     # -- life ---------------------------------------------------------------------------------
@@ -141,7 +142,11 @@ class FakeSwitch:
 
     def _update(self, update):
         if update.entity.WhichOneof("entity") == "packet_replication_engine_entry":
-            session = update.entity.packet_replication_engine_entry.clone_session_entry
+            replication = update.entity.packet_replication_engine_entry
+            if replication.WhichOneof("type") == "multicast_group_entry":
+                group = replication.multicast_group_entry
+                return _store(self.groups, group.multicast_group_id, group, update.type)
+            session = replication.clone_session_entry
             return _store(self.copies, session.session_id, session, update.type)
         if update.entity.WhichOneof("entity") == "digest_entry":
             digest = update.entity.digest_entry

@@ -36,8 +36,8 @@ class Stage:
         self._sockets = folder / "in.sock"
         entry = f"veth:{veth}" if veth else f"capture:{self._sockets}"
         self.target = Target(kind, folder, ports=(f"1={entry}", "2=null"))
-        self._switch_options = switch_options
-        self._processes: list[subprocess.Popen[str]] = []
+        self.switch_options = switch_options
+        self.processes: list[subprocess.Popen[str]] = []
         self._engines: list[Engine] = []
         self.server = EmbeddedServer(folder / "updates")
         self.items: list[Item] = []
@@ -51,7 +51,7 @@ class Stage:
     def __exit__(self, *_: object) -> None:
         for engine in self._engines:
             engine.close()
-        for process in reversed(self._processes):
+        for process in reversed(self.processes):
             end(process)
         self.target.stop()
         self.server.__exit__(None, None, None)
@@ -61,14 +61,14 @@ class Stage:
         command = [sys.executable, "-m", module, "--updates", self.server.url, "--archive", self.archive]
         command += ["--directory", str(self.folder / "due")]
         if settings is not None:
-            path = self.folder / f"settings{len(self._processes)}.json"
+            path = self.folder / f"settings{len(self.processes)}.json"
             path.write_text(json.dumps(settings))
             command += ["--settings", str(path)]
         log = (self.folder / f"{module}.log").open("a")
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment)
         log.close()
-        self._processes.append(process)
+        self.processes.append(process)
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line, (self.folder / f"{module}.log").read_text()[-4000:]
@@ -81,7 +81,7 @@ class Stage:
             "address": self.target.address,
             "base_us": BASE_US,
             "forward": {"1": 2},
-            **self._switch_options,
+            **self.switch_options,
         }
         switches = options.pop("switches", [switch])
         settings = {"switches": switches, "program": str(PROGRAM), "p4info": str(P4INFO), **options}

@@ -7,6 +7,7 @@ from apps.p4runtime_ctrl.digest_in import DigestReader
 from apps.p4runtime_ctrl.errors import ProgramError
 from apps.p4runtime_ctrl.p4info import Program
 from apps.p4runtime_ctrl.progress import Progress
+from apps.p4runtime_ctrl.unison import Rows
 from apps.p4runtime_ctrl.values import canonical
 from apps.packets import PACKET_COLUMNS
 from p4rt import p4runtime
@@ -42,7 +43,7 @@ def digest_list(*frames):
 def test_columns_and_reports():
     progress = Progress()
     reports = DigestReader(program(), 1000, progress).read([digest_list(SYN, ARP), digest_list(QUOTED)])
-    records = reports.records(255)
+    records = Rows(reports.columns, reports.queries, reports.covered).matching(255)
     assert list(records.columns) == list(PACKET_COLUMNS)
     assert {name: str(np.dtype(kind)) for name, kind in PACKET_COLUMNS.items()} == {
         name: str(records[name].dtype) for name in records.columns
@@ -58,6 +59,25 @@ def test_columns_and_reports():
     assert (counted["udp_dport"][0], counted["icmp6_type"][0], counted["quoted"][0]) == (53, 1, 1)
     assert (counted["ip_src_hi"][0], counted["tcp_dport"][0]) == (0x20010DB8 << 32, -1)
     assert (progress.reported, progress.lost) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("frame", "covered"),
+    [
+        (SYN, True),
+        (ARP, True),
+        (QUOTED, True),
+        ({**SYN, "l4_valid": 0}, False),
+        ({**SYN, "l4_valid": 0, "fragment": 2}, True),
+        ({**SYN, "ethertype": 0x0042}, False),
+        ({**SYN, "ethertype": 0x9100}, False),
+        ({**SYN, "ethertype": 0x88CC, "l4_valid": 0}, True),
+        ({**SYN, "protocol": 1, "sport": 0}, False),
+        ({**QUOTED, "sport": 0}, False),
+    ],
+)
+def test_what_the_parser_does_not_cover_is_known(frame, covered):
+    assert DigestReader(program(), 0, Progress()).read([digest_list(frame)]).covered.tolist() == [covered]
 
 
 def test_a_program_without_such_a_digest():

@@ -44,7 +44,20 @@ def test_nothing_is_written_that_nobody_wants():
 def test_records_come_from_digests_where_that_is_chosen():
     made, written = outbound(ALL, by_digest=True)
     made.digests([digest_list(SYN, QUOTED)])
+    assert not written, "numbers 1 to 3 may still come"
+    made.settle()
+    made.settle()
     assert [(key, value["arrival"].tolist()) for key, value, _ in written] == [(ALL, [3])]
     made, written = outbound(key_of("digests", "s1", "q"), offers={"q": Offer(name="q", bit=3, copy=False)})
     made.digests([digest_list(SYN, QUOTED)])
     assert [value["crossed"].tolist() for _, value, _ in written] == [[1]]
+
+
+def test_a_frame_that_its_digest_does_not_tell_comes_from_its_copy():
+    made, written = outbound(ALL, by_digest=True)
+    made.digests([digest_list({**SYN, "sequence": 1, "arrival": 0}, {**SYN, "sequence": 2, "l4_valid": 0})])
+    assert [value["sequence"].tolist() for _, value, _ in written] == [[1]]
+    made.packets([packet_in(2, frame=frame(1), timestamp=9)])
+    assert [value["sequence"].tolist() for _, value, _ in written] == [[1], [2]]
+    assert written[1][1]["udp_dport"].tolist() == [53]
+    assert made.fell_back == 1

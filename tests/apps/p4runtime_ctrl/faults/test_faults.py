@@ -109,7 +109,7 @@ def test_the_controller_is_killed(stage):
 
 def test_the_connection_is_cut_under_traffic(stage):
     with Cable(stage.target.address) as cable:
-        stage._switch_options["address"] = cable.address
+        stage.switch_options["address"] = cable.address
         stage.controller(timeout_s=1.0)
         firewall = Firewall(stage)
         wait_for(lambda: firewall.state().get("telemetry") == ["packets"], why=stage.log)

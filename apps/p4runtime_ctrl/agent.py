@@ -1,0 +1,429 @@
+"""One switch's part of the service: a worker between DUE and the switch, and what it publishes.  I/O.
+
+packets thread of a connection   packet-ins → record batch → DUE (blocks while consumers are behind)
+worker thread of a switch        decisions, commands, requests, counters: one after the other
+DUE's dispatcher                 puts work into the worker's bounded queue
+"""
+
+import logging
+import queue
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from apps.messages import Confirmation, Decision, TableCommand
+from apps.p4runtime_ctrl.connection import Connection, Listener
+from apps.p4runtime_ctrl.coverage import FALLBACK
+from apps.p4runtime_ctrl.demand import Demand
+from apps.p4runtime_ctrl.errors import ControllerError, SwitchError
+from apps.p4runtime_ctrl.history import DECISIONS, commands_of, decisions_for
+from apps.p4runtime_ctrl.outbound import Outbound
+from apps.p4runtime_ctrl.p4info import Program
+from apps.p4runtime_ctrl.packet_out import PacketOuts
+from apps.p4runtime_ctrl.readings import Readings
+from apps.p4runtime_ctrl.session import Session
+from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.stations import DIGEST
+from apps.p4runtime_ctrl.switch import Switch
+from due import NO_WAIT, Engine
+
+_LOG = logging.getLogger(__name__)
+_JOBS: Final = 10_000
+_ALIVE_S: Final = 1.0
+_SETTLE_S: Final = 1.0
+_COUNTING_SHARE: Final = 5
+"""Reading counters takes at most one part in so many of the worker's time."""
+
+Connect = Callable[[Listener], Connection]
+
+
+@dataclass(frozen=True)
+class _Decide:
+    decision: Decision
+
+
+_Job = _Decide | Callable[[], None]
+
+
+class Agent:
+    """Keeps one switch as desired, and publishes what it sends."""
+
+    def __init__(
+        self, engine: Engine, settings: Settings, mine: SwitchSettings, program: Program, connect: Connect
+    ) -> None:
+        self.name = mine.name
+        self._engine = engine
+        self._mine = mine
+        self._settings = settings
+        self._program = program
+        by_digest = settings.telemetry == "digest"
+        self._outbound = Outbound(mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest)
+        self._progress = self._outbound.progress
+        self._packet_outs = PacketOuts(self._program, mine.base_us)
+        self._sent = {"cells_asked": 0, "frames_sent": 0, "packet_outs_refused": 0}
+        self._program_name = Path(settings.program).name
+        forward = {int(port): egress for port, egress in mine.forward.items()}
+        self._switch = Switch(
+            mine.name,
+            self._program,
+            self._now,
+            forward=forward,
+            fail=mine.fail,
+            guard=settings.guard,
+            learn=mine.learn,
+        )
+        self._learn_id = self._program.digest_id(DIGEST)
+        self._connection = connect(self)
+        self._jobs: queue.Queue[_Job] = queue.Queue(_JOBS)
+        self._closing = threading.Event()
+        self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
+        self._session: Session | None = None
+        self._connected = False
+        self._was_backup = False
+        self._recent: deque[Decision] = deque(maxlen=_JOBS)
+        self._readings = Readings()
+        self._publishing = threading.Lock()
+        self._counting = threading.Event()
+        self._counted_second = 0
+        self._counted_at = 0.0
+        self._count_after = 0.0
+        self._alive_at = 0.0
+        self._settled_at = 0.0
+        self._secret_at = float("-inf")
+        self._stated = (0, 0, 0.0)
+        self._change = "starting"
+        self._brought_up_ms = 0.0
+        self.settled = threading.Event()
+        """The first attempt to reach the switch has ended, well or badly."""
+
+    # -- from the service ---------------------------------------------------------------------
+
+    def start(self, *, chief: bool) -> None:
+        self._restore()
+        self._worker.start()
+        self._connection.stand(chief=chief)
+        self._connection.open()
+
+    def stand(self, *, chief: bool) -> None:
+        self._connection.stand(chief=chief)
+
+    def stop(self) -> None:
+        self._put(self._leave)
+        self._closing.set()
+        self._worker.join(timeout=self._settings.timeout_s * 2)
+        self._connection.close()
+
+    def decide(self, decision: Decision) -> None:
+        self._recent.append(decision)
+        self._put(_Decide(decision))
+
+    def command(self, command: TableCommand) -> None:
+        self._put(partial(self._command, command))
+
+    def want(self, demand: Demand) -> None:
+        self._put(partial(self._want, demand))
+
+    def ask(self, request: Any) -> None:
+        """Cells of counting stages that somebody wants to know."""
+        self._put(partial(self._ask, request))
+
+    def send(self, frames: Any) -> None:
+        """Frames that somebody wants the switch to send."""
+        self._put(partial(self._send, frames))
+
+    def say_again(self) -> None:
+        """Somebody new may be listening: the state is best effort and said on change only."""
+        self._put(self._write_state)
+
+    def tick(self) -> None:
+        """Wall-clock duties: is the switch alive, are counters due, has the state changed."""
+        if not self._worker.is_alive() or not self._connection.works:
+            raise ControllerError(f"{self.name}: a thread has ended with an error; the log has the reason")
+        now = time.monotonic()
+        if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
+            self._alive_at = now
+            self._put(self._check_alive)
+        if now - self._counted_at > 1:
+            self._count_soon()
+        self._settle(now)
+        if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
+            self._secret_at = now
+            self._put(self._change_secret)
+        received, lost, stated_at = self._stated
+        if now - stated_at > 1 and (received, lost) != (self._heard(), self._progress.lost):
+            self._put(self._write_state)
+
+    def _settle(self, now: float) -> None:
+        """Not while packets are published: that may take as long as consumers are behind."""
+        if now - self._settled_at > _SETTLE_S and self._publishing.acquire(blocking=False):
+            try:
+                self._settled_at = now
+                self._outbound.settle()
+            finally:
+                self._publishing.release()
+
+    def health(self) -> dict[str, Any]:
+        return self._state()
+
+    # -- from the connection ------------------------------------------------------------------
+
+    def became_primary(self, session: Session) -> None:
+        self._put(partial(self._take_over, session))
+
+    def became_backup(self) -> None:
+        self._put(self._stand_back)
+
+    def lost(self, cause: str) -> None:
+        self._session = None
+        self._put(partial(self._lose, cause))
+
+    def packets(self, messages: list[Any]) -> None:
+        with self._publishing:
+            self._outbound.packets(messages)
+        self._count_each_second()
+
+    def digests(self, lists: list[Any]) -> None:
+        learnt = [each for each in lists if each.digest_id == self._learn_id]
+        if learnt:
+            self._put(partial(self._learn, learnt))
+            lists = [each for each in lists if each.digest_id != self._learn_id]
+        if lists:
+            with self._publishing:
+                self._outbound.digests(lists)
+        self._count_each_second()
+
+    def other(self, message: Any) -> None:
+        if message.WhichOneof("update") == "idle_timeout_notification":
+            self._put(partial(self._expire, list(message.idle_timeout_notification.table_entry)))
+
+    def _publish(self, key: str, value: Any, event_time: int) -> None:
+        self._engine.write(key, value, [NO_WAIT], event_time=event_time or None)
+
+    def _count_each_second(self) -> None:
+        if self._outbound.second != self._counted_second:
+            self._count_soon()
+
+    # -- the worker ---------------------------------------------------------------------------
+
+    def _put(self, job: _Job) -> None:
+        while not self._closing.is_set():
+            try:
+                self._jobs.put(job, timeout=1)
+            except queue.Full:
+                continue
+            return
+
+    def _work(self) -> None:
+        while not (self._closing.is_set() and self._jobs.empty()):
+            try:
+                jobs = [self._jobs.get(timeout=0.2)]
+            except queue.Empty:
+                continue
+            while len(jobs) < _JOBS and not self._jobs.empty():
+                jobs.append(self._jobs.get())
+            self._run(jobs)
+
+    def _run(self, jobs: Sequence[_Job]) -> None:
+        decisions: list[Decision] = []
+        for job in jobs:
+            if isinstance(job, _Decide):
+                decisions.append(job.decision)
+                continue
+            self._decide(decisions)
+            decisions = []
+            try:
+                job()
+            except ControllerError as error:
+                _LOG.error("%s: %s", self.name, error)
+                self._say(str(error))
+        self._decide(decisions)
+        if self._session is not None and self._session.broken:
+            self._session = None
+            self._connection.break_off()
+
+    def _take_over(self, session: Session) -> None:
+        self._connected = True
+        if self._was_backup:
+            self._was_backup = False
+            self._restore()
+        began = time.monotonic()
+        try:
+            report = self._switch.bring_up(session)
+        except SwitchError:
+            self._connection.break_off()
+            raise
+        finally:
+            self.settled.set()
+        if report.program_loaded:
+            self._progress.expect_first()
+        self._brought_up_ms = (time.monotonic() - began) * 1000
+        self._session = session
+        self._confirm(report.confirmations)
+        _LOG.info("%s: primary; %s", self.name, report)
+        self._say(f"primary: {report}")
+
+    def _stand_back(self) -> None:
+        self._connected = True
+        self._was_backup = True
+        self._session = None
+        self.settled.set()
+        self._say("backup: another controller is primary")
+
+    def _lose(self, cause: str) -> None:
+        if self._connected:
+            _LOG.warning("%s: lost: %s", self.name, cause)
+        self._connected = False
+        self.settled.set()
+        self._say(f"lost: {cause}")
+
+    def _leave(self) -> None:
+        if self._session is not None:
+            self._switch.withdraw(self._session)
+
+    def _decide(self, decisions: Sequence[Decision]) -> None:
+        if not decisions:
+            return
+        self._confirm(self._switch.decide(decisions, self._session))
+        self._count_soon()
+
+    def _command(self, command: TableCommand) -> None:
+        self._confirm(self._switch.command(command, self._session))
+
+    def _want(self, demand: Demand) -> None:
+        """What is not wanted any more is not published any more; what is new is, before it is asked for."""
+        self._outbound.route(demand)
+        for text in self._switch.want(demand.requests, self._session):
+            _LOG.error("%s: %s", self.name, text)
+        names = ", ".join(each.name for each in demand.requests if each not in FALLBACK) or "nothing"
+        self._say(f"telemetry: {names}")
+
+    def _expire(self, entries: Iterable[Any]) -> None:
+        if self._session is not None:
+            self._confirm(self._switch.expire(entries, self._session))
+
+    def _ask(self, request: Any) -> None:
+        questions, refused = self._packet_outs.questions(request)
+        self._sent["packet_outs_refused"] += refused
+        self._send_out(questions, "cells_asked")
+
+    def _send(self, frames: Any) -> None:
+        self._send_out(self._packet_outs.frames(frames), "frames_sent")
+
+    def _send_out(self, packets: Sequence[Any], what: str) -> None:
+        """Best effort, as frames are; what cannot go out is counted."""
+        if self._session is None:
+            self._sent["packet_outs_refused"] += len(packets)
+            return
+        sent = self._session.send(packets)
+        self._sent[what] += sent
+        self._sent["packet_outs_refused"] += len(packets) - sent
+
+    def _learn(self, lists: Iterable[Any]) -> None:
+        if self._session is not None:
+            self._switch.learn(lists, self._session)
+
+    def _check_alive(self) -> None:
+        if self._session is not None:
+            self._session.alive()
+
+    def _change_secret(self) -> None:
+        self._switch.change_secret(secrets.randbits(32), secrets.randbits(32), self._session)
+
+    def _count_soon(self) -> None:
+        """Have block counters read, unless that is under way, not due, or there is nothing to count."""
+        if self._counting.is_set() or self._session is None or not self._switch.blocks:
+            return
+        if time.monotonic() < self._count_after:
+            return
+        self._counting.set()
+        self._put(self._count)
+
+    def _count(self) -> None:
+        began = time.monotonic()
+        try:
+            if self._session is not None:
+                self._readings.take(self._switch.count_blocks(self._session))
+                self._write_state()
+        finally:
+            self._counted_second = self._outbound.second
+            self._counted_at = time.monotonic()
+            spent = self._counted_at - began
+            self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
+            self._counting.clear()
+
+    def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
+        key = f"network.confirmation.p4runtime_ctrl.{self.name}"
+        waiting = list(confirmations)
+        for place, confirmation in enumerate(waiting, start=1):
+            flags = [NO_WAIT] if place == len(waiting) else []
+            at = confirmation.event_time or None
+            self._engine.write(key, confirmation.to_value(), flags, event_time=at)
+
+    def _say(self, change: str) -> None:
+        self._change = change
+        self._write_state()
+
+    def _write_state(self) -> None:
+        self._stated = (self._heard(), self._progress.lost, time.monotonic())
+        if not self._switch.blocks:
+            self._readings.take([])
+        key = f"network.switch.p4runtime_ctrl.{self.name}"
+        self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
+
+    def _heard(self) -> int:
+        sent = sum(self._sent.values()) + self._outbound.answers
+        return self._progress.received + self._progress.reported + sent
+
+    def _state(self) -> dict[str, Any]:
+        event_time, arrival = self._now()
+        return {
+            "switch": self.name,
+            "connected": self._connected,
+            "primary": self._session is not None,
+            "target": self._mine.target or self._mine.address,
+            "program": self._program_name,
+            "base_us": self._mine.base_us,
+            "fail": self._mine.fail,
+            "telemetry": [each.name for each in self._switch.requests or () if each not in FALLBACK],
+            "packet_in": self._progress.received,
+            "digests": self._progress.reported,
+            "fell_back": self._outbound.fell_back,
+            "skipped": self._outbound.skipped,
+            "lost": self._progress.lost,
+            "restarts": self._progress.restarts,
+            "cells_answered": self._outbound.answers,
+            **self._sent,
+            "arrival": arrival,
+            "event_time": event_time,
+            "blocks": self._readings.shown,
+            "blocks_total": self._switch.blocks,
+            **self._stations(),
+            "change": self._change,
+            "brought_up_ms": self._brought_up_ms,
+        }
+
+    def _stations(self) -> dict[str, Any]:
+        stations = self._switch.stations
+        if stations is None:
+            return {}
+        return {"stations": len(stations), "moved": stations.moved, "stations_refused": stations.refused}
+
+    def _now(self) -> tuple[int, int]:
+        return self._progress.time_us * 1000, self._progress.arrival
+
+    def _restore(self) -> None:
+        """Desired state from Data Archives, and what was heard since."""
+        if not self._settings.restore:
+            return
+        since = self._settings.restore_since
+        items = [item for key in DECISIONS for item in self._engine.get(key)]
+        decisions = decisions_for(self.name, items, list(self._recent), since)
+        commands = commands_of(self._engine.get(f"network.p4_command.*.{self.name}"), since)
+        for problem in self._switch.restore(decisions, commands):
+            _LOG.warning("%s: not restored: %s", self.name, problem)

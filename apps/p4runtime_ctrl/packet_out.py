@@ -1,0 +1,122 @@
+"""What apps have a switch send, or answer in band → packet-out messages.
+
+    network.packet_out.<app>.<switch>     frames to be sent out of a port
+    network.cell_request.<app>.<switch>   questions about counting cells; the answers come as packet-ins
+
+A question carries its number as the payload of its packet-out, and the answer brings it back: nothing
+has to be remembered between the two.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.p4runtime_ctrl.errors import EntryError
+from apps.p4runtime_ctrl.p4info import Program
+from apps.p4runtime_ctrl.values import canonical
+from p4rt import p4runtime
+
+_HEADER: Final = "packet_out"
+_NEEDED: Final = (
+    "egress_port", "operation", "query", "key_source", "key_destination", "key_port", "key_length", "timestamp",
+)  # fmt: skip
+_SEND, _READ_CELL = 0, 1
+_QUESTION: Final = ("id", "query", "src_hi", "src_lo", "dst_hi", "dst_lo", "port", "length", "time_us")
+_ID_BYTES: Final = 8
+_CLOCK_BITS: Final = 48
+
+
+class PacketOuts:
+    """Makes the packet-outs of one program.  Raises `ProgramError` where its header lacks a field."""
+
+    def __init__(self, program: Program, base_us: int) -> None:
+        program.header(_HEADER, _NEEDED)
+        self._fields = program.headers[_HEADER]
+        self._largest_port = (1 << self._width("egress_port")) - 1
+        self._has_source_port = any(field.name == "key_source_port" for field in self._fields)
+        self._base_us = base_us
+
+    def frames(self, value: Any) -> list[Any]:
+        """Frames to be sent, `{"port": [..], "length": [..], "frames": bytes end to end}`.
+
+        Raises `EntryError` for a value of another shape and for a port that cannot be.
+        """
+        try:
+            ports = [int(port) for port in value["port"]]
+            lengths = [int(length) for length in value["length"]]
+            data = bytes(value["frames"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise EntryError(f"packet_out: {error!r}; give port, length and frames") from None
+        if len(ports) != len(lengths) or min(lengths, default=1) < 1 or sum(lengths) != len(data):
+            raise EntryError(
+                f"packet_out: {len(ports)} ports, {len(lengths)} lengths of {sum(lengths)} bytes in all, "
+                f"{len(data)} bytes of frames; they have to agree"
+            )
+        wrong = [port for port in ports if not 0 <= port <= self._largest_port]
+        if wrong:
+            raise EntryError(f"packet_out: there is no port {wrong[0]}; the highest is {self._largest_port}")
+        ends = np.cumsum(lengths).tolist()
+        return [
+            self._message({"egress_port": port, "operation": _SEND}, data[end - length : end])
+            for port, length, end in zip(ports, lengths, ends, strict=True)
+        ]
+
+    def questions(self, batch: Any) -> tuple[list[Any], int]:
+        """One packet-out for each row of a request for cells, and how many rows cannot be asked.
+
+        Columns: `id`, `query` (bit), `src_hi`, `src_lo`, `dst_hi`, `dst_lo`, `port`, `length`, `time_us`
+        (absolute, within the window that is meant), and `source_port` where the program counts by it.
+        Raises `EntryError` for a value without these.
+        """
+        columns = _columns(batch)
+        clock = columns["time_us"].astype(np.int64) - self._base_us
+        askable = (clock >= 0) & (clock < 1 << _CLOCK_BITS)
+        source_ports = columns.get("source_port")
+        if source_ports is not None and not self._has_source_port:
+            askable &= source_ports == 0
+        rows = np.flatnonzero(askable).tolist()
+        return [self._question(columns, row, int(clock[row])) for row in rows], len(askable) - len(rows)
+
+    def _question(self, columns: Mapping[str, NDArray[Any]], row: int, clock: int) -> Any:
+        def number(name: str) -> int:
+            return int(columns[name][row]) if name in columns else 0
+
+        header = {
+            "operation": _READ_CELL,
+            "query": number("query"),
+            "key_source": number("src_hi") << 64 | number("src_lo"),
+            "key_destination": number("dst_hi") << 64 | number("dst_lo"),
+            "key_port": number("port"),
+            "key_length": number("length"),
+            "key_source_port": number("source_port"),
+            "timestamp": clock,
+        }
+        return self._message(header, number("id").to_bytes(_ID_BYTES, "big"))
+
+    def _message(self, header: Mapping[str, int], payload: bytes) -> Any:
+        packet = p4runtime.PacketOut(payload=payload)
+        for field in self._fields:
+            packet.metadata.add(metadata_id=field.id, value=canonical(header.get(field.name, 0)))
+        return packet
+
+    def _width(self, name: str) -> int:
+        return next(field.width for field in self._fields if field.name == name)
+
+
+def _columns(batch: Any) -> dict[str, NDArray[Any]]:
+    try:
+        columns = {name: np.asarray(batch[name]) for name in _QUESTION}
+        if "source_port" in batch:
+            columns["source_port"] = np.asarray(batch["source_port"])
+    except (KeyError, TypeError) as error:
+        raise EntryError(f"cell_request: {error!r}; its columns are {', '.join(_QUESTION)}") from None
+    if len({column.shape for column in columns.values()}) != 1:
+        raise EntryError("cell_request: its columns have different lengths")
+    return columns
+
+
+def question_of(payload: bytes) -> int | None:
+    """The number of the question that an answer belongs to; None for what no question of ours made."""
+    return int.from_bytes(payload[:_ID_BYTES], "big") if len(payload) >= _ID_BYTES else None

@@ -1,0 +1,214 @@
+"""Apps' frames leave through the switch; what its counting stages have counted is told to who asks."""
+
+import os
+import socket
+import subprocess
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from apps.messages import TableCommand, TableUpdate
+from apps.p4runtime_ctrl.errors import EntryError
+from apps.p4runtime_ctrl.packet_out import PacketOuts, question_of
+from due import Capability, RecordBatch
+from tests.apps.p4runtime_ctrl.programs import program
+from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, frame, wait_for
+from tests.apps.p4runtime_ctrl.targets import KINDS
+from tests.requirements import optional_program, require_netns
+
+BIT = 3
+WINDOW_US = 3_600_000_000
+_EVERY = 3  # ETH_P_ALL
+FRAMES = "network.packet_out.firewall.s1"
+REQUEST = "network.cell_request.sonata_adapter.s1"
+CAPABILITIES = tuple(
+    Capability(f"network.{kind}.*", delivery="reliable", archive="always")
+    for kind in ("cell_request.sonata_adapter", "p4_command.sonata_adapter", "telemetry.sonata")
+)
+STATE = "network.switch.p4runtime_ctrl.s1"
+
+
+def counting(stage=0, bit=BIT):
+    """UDP frames by their source address, in windows of an hour."""
+    table = program().table(f"ingress.count_{stage}.queries")
+    given = {
+        "query": bit,
+        "bit_of_query": hex(1 << bit),
+        "source_mask": hex((1 << 128) - 1),
+        "reciprocal": hex((1 << 64) // WINDOW_US),
+        "size": 1024,
+    }
+    action = next(action for action in table.actions if action.params)
+    params = {param.name: given.get(param.name, 0) for param in action.params}
+    match = {"query_map": [hex(1 << bit), hex(1 << bit)]}
+    return TableUpdate(
+        kind="insert", table=table.name, match=match, action=action.name, params=params, priority=1
+    )
+
+
+@contextmanager
+def wired(kind, folder):
+    """A stage and a function that sends frames into its switch."""
+    if kind == "embedded":
+        with Stage(folder) as stage:
+            feed = stage.feed()
+            yield stage, lambda frames: feed.send([1000] * len(frames), [60] * len(frames), frames)
+            feed.close()
+        return
+    optional_program("simple_switch_grpc")
+    with cabled(kind, folder) as (stage, wire):
+        yield stage, lambda frames: [wire.send(each) for each in frames]
+
+
+@contextmanager
+def cabled(kind, folder):
+    """A stage whose switch has one end of a cable, and a socket at the other."""
+    require_netns()
+    near, far = f"sdn{os.getpid() % 100_000}c", f"sdn{os.getpid() % 100_000}d"
+    subprocess.run(["ip", "link", "add", near, "type", "veth", "peer", "name", far], check=True)
+    try:
+        for end in (near, far):
+            subprocess.run(["sysctl", "-qw", f"net.ipv6.conf.{end}.disable_ipv6=1"], check=False)
+            subprocess.run(["ip", "link", "set", end, "up"], check=True)
+        with (
+            Stage(folder, kind=kind, veth=far, forward={}) as stage,
+            socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY)) as wire,
+        ):
+            wire.bind((near, 0))
+            wire.settimeout(90)
+            yield stage, wire
+    finally:
+        subprocess.run(["ip", "link", "delete", near], check=True)
+
+
+def request(numbers, sources, time_us=BASE_US + 5_000_000):
+    zeros = np.zeros(len(numbers), dtype=np.uint64)
+    return RecordBatch(
+        {
+            "id": np.array(numbers, dtype=np.uint64),
+            "query": np.full(len(numbers), BIT, dtype=np.uint8),
+            "src_hi": zeros,
+            "src_lo": np.array([0x0A000000 + source for source in sources], dtype=np.uint64),
+            "dst_hi": zeros,
+            "dst_lo": zeros,
+            "port": zeros.astype(np.uint16),
+            "length": zeros.astype(np.uint16),
+            "time_us": np.full(len(numbers), time_us, dtype=np.int64),
+        }
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cells_are_read_in_band(kind, tmp_path):
+    with wired(kind, tmp_path) as (stage, send):
+        stage.controller()
+        engine = stage.engine("sonata_adapter", capabilities=CAPABILITIES)
+        heard = Heard(
+            engine, "network.cell.p4runtime_ctrl.*", STATE, "network.confirmation.p4runtime_ctrl.*",
+            f"network.packets.p4runtime_ctrl.s1.q{BIT}",
+        )  # fmt: skip
+        command = TableCommand(id="c1", updates=(counting(),))
+        engine.write("network.p4_command.sonata_adapter.s1", command.to_value())
+        offer = {"name": f"q{BIT}", "bit": BIT, "conditions": {"protocol": 17}}
+        engine.write(f"network.telemetry.sonata.q{BIT}", offer)
+        wait_for(lambda: heard.values("confirmation"), why=stage.log)
+        assert heard.values("confirmation")[0]["state"] == "installed"
+        wait_for(lambda: any(v["telemetry"] for v in heard.values("network.switch")), why=stage.log)
+        assert heard.values("network.switch")[-1]["base_us"] == BASE_US
+        send([frame(1 + number % 3) for number in range(8)])
+        wait_for(lambda: sum(map(len, heard.values("network.packets"))) == 8, 60, why=stage.log)
+
+        def answers():
+            found = {}
+            for batch in heard.values("network.cell"):
+                found |= dict(zip(batch["id"].tolist(), batch["count"].tolist(), strict=True))
+            return found
+
+        engine.write(REQUEST, request([7, 1 << 40, 9, 11], [1, 2, 3, 4]))
+        wait_for(lambda: len(answers()) == 4, 60, why=stage.log)
+        assert answers() == {7: 3, 1 << 40: 3, 9: 2, 11: 0}
+        engine.write(REQUEST, request([12], [1], time_us=5))
+        wait_for(
+            lambda: heard.values("network.switch")[-1]["packet_outs_refused"] == 1,
+            60,
+            why=lambda: heard.values("network.switch")[-1],
+        )
+        state = heard.values("network.switch")[-1]
+        assert (state["cells_asked"], state["cells_answered"], state["lost"]) == (4, 4, 0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_leave_through_their_port(kind, tmp_path):
+    if kind == "bmv2":
+        optional_program("simple_switch_grpc")
+    with cabled(kind, tmp_path) as (stage, wire):
+        stage.controller()
+        out = Capability("network.packet_out.firewall.*", delivery="reliable")
+        engine = stage.engine(capabilities=(out,))
+        heard = Heard(engine, STATE)
+        frames = [frame(1), frame(2) + b"y" * 40, frame(3)]
+        value = {
+            "port": np.ones(3, dtype=np.uint16),
+            "length": np.array([len(each) for each in frames], dtype=np.uint16),
+            "frames": b"".join(frames),
+        }
+        wait_for(
+            lambda: heard.values("network.switch")[-1:] and heard.values("network.switch")[-1]["primary"]
+        )
+        engine.write(FRAMES, {**value, "frames": b"short"})
+        engine.write(FRAMES, value)
+        got = []
+        while len(got) < 3:
+            data, address = wire.recvfrom(2000)
+            got += [data] if address[2] != socket.PACKET_OUTGOING else []
+        assert got == frames
+        wait_for(lambda: heard.values("network.switch")[-1]["frames_sent"] == 3, 60, why=stage.log)
+        assert "3 lengths of 220 bytes in all, 5 bytes of frames" in stage.log()
+
+
+OUTS = PacketOuts(program(), BASE_US)
+
+
+def header_of(packet):
+    by_id = {field.id: field.name for field in program().headers["packet_out"]}
+    return {by_id[item.metadata_id]: int.from_bytes(item.value, "big") for item in packet.metadata}
+
+
+def test_a_question_carries_its_key_and_its_number():
+    batch = {**request([77], [1]), "dst_hi": np.array([1], np.uint64), "port": np.array([53], np.uint16)}
+    (packet,), refused = OUTS.questions(batch)
+    header = header_of(packet)
+    assert refused == 0
+    assert question_of(packet.payload) == 77
+    assert (header["operation"], header["query"], header["key_port"]) == (1, BIT, 53)
+    assert (header["key_source"], header["key_destination"]) == (0x0A000001, 1 << 64)
+    assert header["timestamp"] == 5_000_000
+    assert question_of(b"short") is None
+
+
+@pytest.mark.parametrize("time_us", [BASE_US - 1, BASE_US + (1 << 48)])
+def test_times_outside_the_switch_clock_are_counted(time_us):
+    assert OUTS.questions(request([1, 2], [1, 2], time_us=time_us)) == ([], 2)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        {"port": [1], "length": [60]},
+        {"port": [1, 2], "length": [1], "frames": b"x"},
+        {"port": [1], "length": [2], "frames": b"x"},
+        {"port": [1], "length": [0], "frames": b""},
+        {"port": [512], "length": [1], "frames": b"x"},
+    ],
+)
+def test_frames_of_another_shape_are_refused(value):
+    with pytest.raises(EntryError, match="packet_out"):
+        OUTS.frames(value)
+
+
+@pytest.mark.parametrize("value", [None, {"id": [1]}, {**request([1], [1]), "length": [1, 2]}])
+def test_questions_of_another_shape_are_refused(value):
+    with pytest.raises(EntryError, match="cell_request"):
+        OUTS.questions(value)
