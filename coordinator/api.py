@@ -194,7 +194,7 @@ class _Handlers:
         for window in _WINDOWS_NS:
             start = max(since, until - window)
             bounds = {"timestamp": {"$gte": start, "$lt": until}}
-            found = self._north.engine.get({"$and": [query, bounds]})
+            found = self._north.engine.get({"$and": [query, bounds]}, limit=limit + 1)
             if len(found) >= limit or start == since:
                 break
         shown = [views.item(one) for one in found[-limit:]]

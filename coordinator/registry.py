@@ -67,6 +67,17 @@ class Event:
         }
 
 
+class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
+    """The registry's knowledge worth keeping."""
+
+    epochs: dict[str, int]
+    """Of every app ever seen."""
+    active: dict[str, str]
+    """App id to its working instance."""
+    registrations: tuple[Registration, ...]
+    """Of the live instances."""
+
+
 class _App:
     """The instances of one app and what they were last told."""
 
@@ -123,12 +134,16 @@ class Registry:
         self.leading = False
         self.matched = Matched()
         self.failovers = 0
+        self.changes = 0
+        """Grows when a checkpoint would differ."""
         self._select = select
         self._missed = missed
         self._shortest_timeout_s = shortest_timeout_s
         self._forget_s = forget_s
         self._apps: dict[str, _App] = {}
         self._epochs: dict[str, int] = {}
+        self._remembered: dict[str, Registration] = {}
+        self._preferred: dict[str, str] = {}
         self._first_epoch = first_epoch
         self._version = version
         self._heard: float | None = None
@@ -146,7 +161,8 @@ class Registry:
         self._hear(known, now)
         if known is None:
             app.instances[message.instance_id] = Instance(message, now)
-            self._note("joined", message.app_id, message.instance_id)
+            if self._remembered.pop(message.instance_id, None) is None:
+                self._note("joined", message.app_id, message.instance_id)
         else:
             if not known.alive:
                 self._note("returned", message.app_id, message.instance_id)
@@ -161,6 +177,9 @@ class Registry:
         if message.epoch > app.epoch:
             # what is older than it knows an instance does not obey
             app.epoch, self._dirty = message.epoch, True
+        remembered = self._remembered.get(message.instance_id)
+        if remembered is not None:
+            self._return_of(remembered, message, now)
         known = app.instances.get(message.instance_id)
         self._hear(known, now)
         if message.state == "offline":
@@ -178,6 +197,21 @@ class Registry:
         known.seen, known.beat, known.gone = now, message, None
         if self.leading and (app.sent is None or app.sent.version != message.version):
             self._answer(message.app_id)
+
+    def recall(self, checkpoint: Checkpoint) -> None:
+        """Take what an earlier Coordinator left as a hint; what is known already stays."""
+        for name, epoch in checkpoint.epochs.items():
+            self._epochs[name] = max(epoch, self._epochs.get(name, 0))
+            if name in self._apps and self._apps[name].epoch < epoch:
+                self._apps[name].epoch, self._dirty = epoch, True
+        self._remembered.update({one.instance_id: one for one in checkpoint.registrations})
+        self._preferred.update(checkpoint.active)
+
+    def checkpoint(self) -> Checkpoint:
+        """What to leave for the next Coordinator."""
+        alive = [one.registration for app in self._apps.values() for one in app.alive]
+        active = {name: app.active for name, app in self._apps.items() if app.active}
+        return Checkpoint(epochs=self.epochs(), active=active, registrations=tuple(alive))
 
     def expire(self, now: float) -> None:
         """Find who has been silent too long, and drop who has been gone for long.  Call often."""
@@ -213,6 +247,7 @@ class Registry:
         """What to send now: answers, and what changed since the last call."""
         if self._dirty and self.leading:
             self._dirty = False
+            self.changes += 1
             self._elect()
             self._match()
         messages = []
@@ -308,11 +343,21 @@ class Registry:
                 continue
             before, claim = app.active, app.claim()
             candidates = [(one.registration, one.beat) for one in app.alive]
-            app.active = claim or self._select(candidates)[0].instance_id
+            app.active = claim or self._former(name, app) or self._select(candidates)[0].instance_id
             app.epoch = max(app.epoch + 1, self._first_epoch)
             if before and before != app.active:
                 self.failovers += 1
             self._note("activated", name, app.active, f"epoch {app.epoch}")
+
+    def _former(self, name: str, app: _App) -> str:
+        """The instance that worked by the checkpoint, if it lives."""
+        known = app.instances.get(self._preferred.pop(name, ""))
+        return known.registration.instance_id if known is not None and known.alive else ""
+
+    def _return_of(self, remembered: Registration, message: Heartbeat, now: float) -> None:
+        """The checkpoint's registration spares an instance to register again, if it still holds."""
+        if message.state == "online" and remembered.revision == message.revision:
+            self.registered(remembered, now)
 
     def _match(self) -> None:
         self.matched = match(self.declarations())

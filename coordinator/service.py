@@ -4,6 +4,7 @@
     due.leader.coordinator ◄──────────────► Leadership
     HTTP on loopback ──► api.py ──► views of the registry, the archive, live data
     Retention ──► Data Archives, where a limit of age or size is set
+    Checkpoints ◄──► Data Archives: what the next Coordinator may know from its start
 
 Run it with `python -m coordinator.service`; it is an app like any other and registers with itself.
 """
@@ -19,8 +20,9 @@ from typing import Any, TypeVar
 import msgspec
 
 from coordinator.api import Api, Northbound
+from coordinator.checkpoint import Checkpoints
 from coordinator.leadership import Claim, Leadership
-from coordinator.registry import Registry
+from coordinator.registry import Checkpoint, Registry
 from coordinator.retention import Retention
 from coordinator.selection import STRATEGIES
 from due import NO_WAIT, PUB_ONLY, Capability, DueError, Engine, Interest, Item
@@ -103,6 +105,7 @@ class CoordinatorService:
         self._counts = {"registrations": 0, "heartbeats": 0, "misunderstood": 0, "assignments_sent": 0}
         self._apps_health: dict[str, Any] = {}
         self._api: Api | None = None
+        self._checkpoints = Checkpoints(engine)
         self._retention = Retention(
             lambda: open_archive(default_archive(engine.options)),
             lambda: self._leadership.leading,
@@ -123,6 +126,11 @@ class CoordinatorService:
         if self._settings.http:
             self._serve()
         self._retention.start()
+        self._checkpoints.find(self._recall)
+
+    def ready(self) -> dict[str, str]:
+        """Where the HTTP API is."""
+        return {"http": self._api.url} if self._api is not None else {}
 
     def tick(self) -> None:
         """Announce, look for the silent, send what changed."""
@@ -132,8 +140,10 @@ class CoordinatorService:
             claim = self._leadership.tick(now)
             self._registry.expire(now)
             self._obey(led)
-            messages, events = self._registry.outgoing(), self._registry.events()
+            messages = self._registry.outgoing()
             leading = self._leadership.leading
+            # while nobody leads yet they wait: the leader to be writes them, all others would repeat them
+            events = self._registry.events() if leading or self._leadership.leader else []
         if claim is not None:
             self._write(_LEADER, msgspec.to_builtins(claim))
         for message in messages:
@@ -142,6 +152,8 @@ class CoordinatorService:
         for event in events if leading else ():
             log.info("%s %s %s %s", event.app_id, event.instance_id, event.kind, event.detail)
             self._engine.write(EVENTS, event.to_value())
+        if leading:
+            self._checkpoints.write(self._registry.changes, self._checkpoint, now)
 
     def stop(self) -> None:
         """Stop serving; a last word lets another Coordinator lead at once."""
@@ -198,6 +210,14 @@ class CoordinatorService:
             self._registry.follow()
         if led and not leading:
             log.warning("another Coordinator (%s) leads: waiting", self._leadership.leader or "not yet known")
+
+    def _recall(self, checkpoint: Checkpoint) -> None:
+        with self._lock:
+            self._registry.recall(checkpoint)
+
+    def _checkpoint(self) -> Checkpoint:
+        with self._lock:
+            return self._registry.checkpoint()
 
     def _registered(self, item: Item) -> None:
         message = self._understood(item, Registration)

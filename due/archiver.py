@@ -15,12 +15,13 @@ from collections import deque
 
 from due.backoff import Backoff
 from due.drivers.base import ArchiveDriver, Spool
-from due.errors import ArchiveUnavailable, BackendError, Timeout
+from due.errors import ArchiveUnavailable, DueError, Timeout
 from due.messages import PackedFrame
 
 log = logging.getLogger("due.archive")
 
 _SPOOL_FRAMES = 64
+_ADOPT_SECONDS = 5.0
 
 
 class Archiver:
@@ -50,6 +51,7 @@ class Archiver:
         self._condition = threading.Condition()
         self._backoff = Backoff(0.1, 5.0)
         self._away = False
+        self._adopt_at = 0.0
         self._counts = {"archived": 0, "spooled": 0, "lost": 0, "refused": 0, "held_back": 0}
         self._thread = threading.Thread(target=self._run, name="due-archiver", daemon=True)
         self._thread.start()
@@ -110,7 +112,10 @@ class Archiver:
                     self._condition.notify_all()
             if self._closing and not self._queue:
                 return
-            self._drain_spool()
+            try:
+                self._drain_spool()
+            except DueError as error:
+                self._spool_failed(error)
 
     def _next(self) -> list[PackedFrame]:
         """Wait for a batch; [] now and then, so that the spool gets its turn."""
@@ -131,7 +136,7 @@ class Archiver:
     def _store(self, frames: list[PackedFrame]) -> None:
         while not self._insert(frames):
             if self._spool is not None:
-                lost = self._spool.put(frames)
+                lost = self._spool.put(frames)  # what a disk refuses counts as lost
                 self._counts["lost"] += lost
                 self._counts["spooled"] += sum(f.count for f in frames) - lost
                 return
@@ -153,7 +158,10 @@ class Archiver:
                 log.warning("Data Archives is away: %s; trying again in %.1f s", error, delay)
             self._away = True
             return False
-        except BackendError as error:
+        except DueError as error:
+            # one bad frame shall not cost the others of its batch
+            if len(frames) > 1:
+                return all(self._insert([frame]) for frame in frames)
             self._counts["refused"] += count
             log.error("Data Archives refused %d items of %s: %s", count, frames[0].key, error)  # noqa: TRY400
             return True
@@ -168,8 +176,19 @@ class Archiver:
         return self._spool is not None and len(self._spool) > 0 and self._backoff.due(time.monotonic())
 
     def _drain_spool(self) -> None:
-        if self._spool is None or not self._can_drain():
+        if self._spool is None:
+            return
+        now = time.monotonic()
+        if now >= self._adopt_at and not self._away:
+            self._adopt_at = now + _ADOPT_SECONDS
+            self._spool.adopt()
+        if not self._can_drain():
             return
         frames = self._spool.take(_SPOOL_FRAMES)
         if frames and self._insert(frames):
             self._spool.done(len(frames))
+
+    def _spool_failed(self, error: DueError) -> None:
+        """A broken disk must not end the thread; what is in the spool stays there."""
+        delay = self._backoff.failed(time.monotonic())
+        log.error("%s; trying again in %.1f s", error, delay)

@@ -34,12 +34,12 @@ def open_archive(url: str) -> ArchiveDriver:
 
 
 def open_spool(folder: Path, options: Options) -> Spool | None:
-    """A spool in `folder`; None where the options give it no space."""
+    """A spool in `folder`, one of several of the app; None where the options give it no space."""
     if options.spool_bytes <= 0:
         return None
-    from due.drivers.spool import DiskSpool
+    from due.drivers.spool_slots import SlottedSpool
 
-    return DiskSpool(folder, options.spool_bytes)
+    return SlottedSpool(folder, options.spool_bytes)
 
 
 def default_updates(options: Options) -> str:

@@ -52,6 +52,11 @@ class Dispatcher:
         """Whether the caller is a callback."""
         return threading.current_thread() is self._thread
 
+    @property
+    def observing(self) -> bool:
+        """Whether anything is received."""
+        return bool(self._observations)
+
     def open(self, observation: Observation) -> None:
         """Begin to receive for it."""
         with self._lock:

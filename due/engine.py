@@ -161,7 +161,8 @@ class Engine:
         """A ReactiveX Subject of the items under `key` (wildcards allowed); subscribe to receive.
 
         Callbacks run one at a time in the dispatcher thread; a slow one holds back the producers of
-        reliable keys.  `since` replays reliable keys from a time (int ns, datetime) or a stream id, as
+        reliable keys.  The place in a reliable key is kept while the app is away; it is given up soon
+        after its last subscription is disposed.  `since` replays reliable keys from a time (int ns, datetime) or a stream id, as
         far as they are kept.  Raises `InvalidKey`, `NotAllowed`.
         """
         session = self._require()
@@ -169,8 +170,10 @@ class Engine:
             raise NotAllowed(f"observe({key!r}): init was not given the role CONSUMER")
         return Observation(Key.parse(key), frequency, _start_id(since), session.opened, session.closed)
 
-    def get(self, query: str | Mapping[str, Any]) -> list[Item]:
+    def get(self, query: str | Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
         """Items from Data Archives, oldest first: of a key (wildcards allowed) or a MongoDB-dialect query.
+
+        Of more than `limit` the youngest.
 
         Flushes this engine's own archive writes first.  Raises `InvalidKey`, `InvalidQuery`,
         `ArchiveUnavailable`.
@@ -179,7 +182,7 @@ class Engine:
         if isinstance(query, str):
             query = {"dataKey": Key.parse(query).text}
         session.flush_archive(_FLUSH_SECONDS)
-        return session.archive.find(query)
+        return session.archive.find(query, limit=limit)
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back, in the dispatcher thread, when what is wanted of this app changes, and once now."""

@@ -19,6 +19,8 @@ from due.membership import Verdict
 from due.outlet import ARCHIVE, Outlet, Waiting
 from due.pacing import Pacer
 
+_SHORTEST_VISIT = 0.001
+
 
 class Gate:
     """Applies permissions to the outlets of one engine."""
@@ -65,16 +67,19 @@ class Gate:
         if permission.verdict is not Verdict.OPEN or outlet.pacer is not None:
             outlet.fast = False
 
-    def service(self, outlet: Outlet, now: int) -> bool:
-        """The sender's visit: whether none is needed again before the next write."""
-        if outlet.reliable and not self._publisher.has_room(outlet.key.path):
-            return False
+    def blocked(self, outlet: Outlet) -> bool:
+        """Whether sending would wait for readers."""
+        return outlet.reliable and not self._publisher.has_room(outlet.key.path)
+
+    def service(self, outlet: Outlet, now: int) -> float | None:
+        """The sender's visit: seconds until the next; None where none is needed before the next write."""
         self.review(outlet)
         pacer = outlet.pacer
         while pacer is not None and (item := pacer.release(now)) is not None:
             _put(outlet, item)
         outlet.cut()
-        return pacer is None or pacer.due() is None
+        due = pacer.due() if pacer is not None else None
+        return None if due is None else max(_SHORTEST_VISIT, (due - now) / 1e9)
 
     def _place(self, outlet: Outlet, item: Waiting) -> bool:
         permission = outlet.permission

@@ -24,8 +24,8 @@ from due.membership import (
 
 log = logging.getLogger("due")
 
-_TICK = 0.05
-_BUSY_TICK = 0.01
+_TICK = 0.1
+_SLOW_TICK = 0.01
 _RENEW_SECONDS = 1.0
 _SLOW_CALLBACK = 0.02
 
@@ -54,6 +54,7 @@ class Keeper:
         self._pause = pause
         self._seen = -1
         self._renew_at = 0.0
+        self._poll_again = 0.0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="due-keeper", daemon=True)
 
@@ -104,7 +105,10 @@ class Keeper:
                 time.sleep(_TICK)
 
     def _listen(self) -> None:
-        tick = _TICK if self._dispatcher.busy_since is None else _BUSY_TICK
+        busy = self._dispatcher.busy_since
+        slow = busy is not None and time.monotonic() - busy > _SLOW_CALLBACK
+        tick = _SLOW_TICK if slow else _TICK if self._dispatcher.observing else self._pause / 4
+        tick = min(tick, self._poll_again)
         wait = min(tick, max(0.0, self.member.next_tick() - time.monotonic()))
         for delivery in self._control.receive(wait):
             try:
@@ -127,7 +131,7 @@ class Keeper:
             self._seen = changes
             self._dispatcher.activate(active, reading=reading, take_over=take_over)
             self.changed()
-        self._publisher.poll()
+        self._poll_again = self._publisher.poll()
         if now >= self._renew_at:
             self._renew_at = now + _RENEW_SECONDS
             self._dispatcher.receiver.renew()

@@ -61,6 +61,13 @@ class Outlet:
         self.sequence = 0
         """Of the newest item; items in the buffer have theirs already."""
         self.published = 0
+        self.filled = 0
+        """Frames that were sent because they were full."""
+        # the sender's notes
+        self.queued = False
+        self.due = 0.0
+        self.patience = 0.0
+        self.filled_before = 0
         self._identity = (key.text, app_id, instance_id)
         self._frame_bytes = frame_bytes
         self._single_bytes = single_bytes
@@ -99,6 +106,7 @@ class Outlet:
             self._events = [*self._times[:-1], event_time]
         self._size += size + _ITEM_OVERHEAD
         if self._size >= self._frame_bytes:
+            self.filled += 1
             self.cut()
 
     def cut(self) -> None:

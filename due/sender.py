@@ -1,24 +1,45 @@
-"""The thread that sends what waits: batches whose time is up, paced items, items held for permission."""
+"""The thread that sends what waits: batches whose time is up, paced items, items held for permission.
+
+    outlet ──dirty──► heap by due time ──► service(outlet): cut the batch, release what is due
+
+Few wake-ups: an outlet is in the heap once, one whose writer fills whole frames by itself is looked at
+rarely, and one whose writer waits for readers ever more rarely.
+"""
 
 import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from heapq import heappop, heappush
+from itertools import count
 
 from due.errors import DueError
 from due.outlet import Outlet
 
 log = logging.getLogger("due")
 
+_BUSY_LINGER = 0.005
+"""How long a batch lingers at most while its writer fills frames faster than that."""
+_LONGEST_WAIT = 0.05
+
+Service = Callable[[Outlet, int], float | None]
+
 
 class Sender:
-    """Visits outlets that are dirty, after they have lingered, or when their next paced item is due."""
+    """Visits outlets that are dirty, after they have lingered, or when their next paced item is due.
 
-    def __init__(self, linger: float, service: Callable[[Outlet, int], bool]) -> None:
+    `service` is called with the outlet's lock held and returns after how many seconds to come again, None
+    for not before the outlet is dirty again; `blocked` says that the outlet's writer waits for readers.
+    """
+
+    def __init__(self, linger: float, service: Service, blocked: Callable[[Outlet], bool]) -> None:
         self._linger = linger
         self._service = service
-        self._dirty: deque[Outlet] = deque()
+        self._blocked = blocked
+        self._new: deque[tuple[Outlet, float]] = deque()
+        self._heap: list[tuple[float, int, Outlet]] = []
+        self._numbers = count()
         self._kick = threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="due-sender", daemon=True)
@@ -28,10 +49,17 @@ class Sender:
         self._thread.start()
 
     def dirty(self, outlet: Outlet) -> None:
-        """Visit this outlet after the linger time."""
-        self._dirty.append(outlet)
-        if not self._kick.is_set():
+        """Visit this outlet after the linger time; the caller holds its lock."""
+        if not outlet.queued:
+            outlet.queued = True
+            self._new.append((outlet, time.monotonic() + self._linger))
             self._kick.set()
+
+    def hurry(self, outlet: Outlet) -> None:
+        """Visit this outlet now, whatever was planned."""
+        outlet.queued = True
+        self._new.append((outlet, 0.0))
+        self._kick.set()
 
     def close(self) -> None:
         """Stop; what waits stays."""
@@ -42,24 +70,44 @@ class Sender:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            self._kick.wait()
-            self._stopping.wait(self._linger)
-            self._kick.clear()
-            for outlet in {
-                id(o): o for o in (self._dirty.popleft() for _ in range(len(self._dirty)))
-            }.values():
-                if not self._visit(outlet):
-                    self._dirty.append(outlet)
-                    self._kick.set()
+            pause = max(0.0, self._heap[0][0] - time.monotonic()) if self._heap else None
+            if self._kick.wait(pause):
+                self._kick.clear()
+            while self._new:
+                self._plan(*self._new.popleft())
+            now = time.monotonic()
+            while self._heap and self._heap[0][0] <= now:
+                due, _, outlet = heappop(self._heap)
+                if outlet.due == due:
+                    again = self._visit(outlet, late=now - due)
+                    if again is not None:
+                        self._plan(outlet, now + again)
 
-    def _visit(self, outlet: Outlet) -> bool:
-        """Whether it needs no further visit now.  Never waits for a writer that waits for readers."""
-        if not outlet.lock.acquire(blocking=False):
-            return False
+    def _plan(self, outlet: Outlet, due: float) -> None:
+        outlet.due = due
+        heappush(self._heap, (due, next(self._numbers), outlet))
+
+    def _visit(self, outlet: Outlet, late: float) -> float | None:
+        """Seconds until the next visit.  Never waits for a writer that waits for readers.
+
+        Where cores are so short that we come `late`, we come more rarely: the writers need them more.
+        """
+        if outlet.filled != outlet.filled_before:
+            outlet.filled_before = outlet.filled
+            outlet.patience = self._linger
+            return max(self._linger, min(_BUSY_LINGER, 3 * self._linger), min(late, _LONGEST_WAIT))
+        if self._blocked(outlet) or not outlet.lock.acquire(blocking=False):
+            outlet.patience = min(max(2 * outlet.patience, self._linger, late), _LONGEST_WAIT)
+            return outlet.patience
         try:
-            return self._service(outlet, time.time_ns())
+            outlet.patience = self._linger
+            outlet.queued = False
+            again = self._service(outlet, time.time_ns())
+            outlet.queued = again is not None
         except DueError as error:
             log.error("%s: %s", outlet.key, error)  # noqa: TRY400 - no trace needed
-            return True
+            return None
+        else:
+            return again
         finally:
             outlet.lock.release()

@@ -1,9 +1,10 @@
 """Running an app as a process: options, signals, the ready line, ticks, health, an orderly end.
 
     python -m apps.kitsune.service --updates URL --archive URL --settings FILE.json
+                                   [--metrics HOST:PORT] [--log-format console|json]
 
-One JSON line on stdout when the app is ready, logs on stderr; SIGTERM or SIGINT: `stop()`, flush, offline
-heartbeat, exit 0.  The process ends with the one that started it (Linux: with the starting thread).
+One JSON line on stdout when the app is ready (with "metrics": "HOST:PORT" where asked for, and what the app's
+`ready()` adds), logs on stderr; SIGTERM or SIGINT: `stop()`, flush, offline heartbeat, exit 0.  The process ends with the one that started it (Linux: with the starting thread).
 Exit codes: 2 wrong options, 1 a backend or the app failed.
 """
 
@@ -16,15 +17,17 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
+from due import logs, metrics
 from due.config import Options
 from due.drivers.embedded_redis import die_with_parent
 from due.engine import Engine
 from due.errors import DueError, InvalidOption
 from due.messages import CONSUMER, PRODUCER, PUB_ONLY, Capability, Instances, Interest
+from due.status_server import StatusServer
 
 log = logging.getLogger("due.service")
 
@@ -59,6 +62,15 @@ class Service(Protocol):
         ...
 
 
+@runtime_checkable
+class Announcing(Protocol):
+    """A service with more to say in its ready line."""
+
+    def ready(self) -> dict[str, str]:
+        """Fields of the ready line, such as the address of an API; called after `start`."""
+        ...
+
+
 def run(
     app_id: str,
     service: Callable[[Engine, Any], Service],
@@ -71,17 +83,15 @@ def run(
 ) -> int:
     """Run one app until a signal ends it; returns the exit code."""
     arguments = _parser(app_id).parse_args(argv)
-    logging.basicConfig(
-        level=arguments.log.upper(),
-        stream=sys.stderr,
-        format=f"%(asctime)s {app_id} %(levelname)s %(name)s: %(message)s",
-    )
+    logs.set_up(app_id, arguments.log, arguments.log_format)
     # told by whoever starts us, for it may die while we are still importing
     parent = int(os.environ.pop(PARENT_VARIABLE, "0")) or os.getppid()
     if not arguments.stay:
         die_with_parent(signal.SIGTERM)
+    status: StatusServer | None = None
     try:
         chosen = read_struct(arguments.settings, settings)
+        status = StatusServer(arguments.metrics) if arguments.metrics else None
         engine = Engine(_options(arguments))
         engine.init(
             app_id,
@@ -92,14 +102,18 @@ def run(
         )
     except (DueError, OSError) as error:
         print(f"{app_id}: {error}", file=sys.stderr)
+        if status is not None:
+            status.close()
         return 2 if isinstance(error, InvalidOption) else 1
     stop = _stop_event()
     if os.getppid() != parent and not arguments.stay:
         stop.set()
     try:
-        return _drive(app_id, service(engine, chosen), engine, stop)
+        return _Run(app_id, service(engine, chosen), engine, status).drive(stop)
     finally:
         engine.close()
+        if status is not None:
+            status.close()
 
 
 def read_struct(path: str, kind: type[S]) -> S:
@@ -122,6 +136,13 @@ def _parser(app_id: str) -> argparse.ArgumentParser:
     parser.add_argument("--directory", default="", help="folder for spool and embedded defaults")
     parser.add_argument("--instances", default="", choices=("", "standby", "shared"))
     parser.add_argument("--log", default="info", choices=("debug", "info", "warning", "error"))
+    parser.add_argument("--log-format", default="console", choices=("console", "json"))
+    parser.add_argument(
+        "--metrics",
+        default="",
+        metavar="HOST:PORT",
+        help="serve /metrics (Prometheus) and /healthz there; port 0 takes a free one, the ready line names it",
+    )
     parser.add_argument("--stay", action="store_true", help="do not end with the parent process")
     return parser
 
@@ -141,24 +162,49 @@ def _stop_event() -> threading.Event:
     return stop
 
 
-def _drive(app_id: str, app: Service, engine: Engine, stop: threading.Event) -> int:
-    try:
-        app.start()
-    except (DueError, OSError) as error:
-        log.error("could not start: %s", error)  # noqa: TRY400 - one clear line
-        return 1
-    print(json.dumps({"ready": True, "app": app_id, "pid": os.getpid()}), flush=True)
-    ticks = 0
-    try:
-        while not stop.wait(TICK_SECONDS):
-            app.tick()
-            ticks += 1
-            if ticks % _TICKS_PER_HEALTH == 0:
-                engine.write(f"{HEALTH}.{app_id}", _health(app, engine), [PUB_ONLY])
-    finally:
-        app.stop()
-    return 0
+class _Run:
+    """One app from start to stop."""
 
+    def __init__(self, app_id: str, app: Service, engine: Engine, status: StatusServer | None) -> None:
+        self._app_id = app_id
+        self._app = app
+        self._engine = engine
+        self._status = status
 
-def _health(app: Service, engine: Engine) -> dict[str, Any]:
-    return {"app": app.health(), "engine": engine.health()}
+    def drive(self, stop: threading.Event) -> int:
+        """Start, tick until `stop` is set, end; returns the exit code."""
+        try:
+            self._app.start()
+        except (DueError, OSError) as error:
+            log.error("could not start: %s", error)  # noqa: TRY400 - one clear line
+            return 1
+        if self._status is not None:
+            self._report()
+            self._status.start()
+        print(json.dumps(self._ready()), flush=True)
+        ticks = 0
+        try:
+            while not stop.wait(TICK_SECONDS):
+                self._app.tick()
+                ticks += 1
+                if ticks % _TICKS_PER_HEALTH == 0:
+                    self._engine.write(f"{HEALTH}.{self._app_id}", self._report(), [PUB_ONLY])
+        finally:
+            self._app.stop()
+        return 0
+
+    def _ready(self) -> dict[str, Any]:
+        line: dict[str, Any] = {"ready": True, "app": self._app_id, "pid": os.getpid()}
+        if self._status is not None:
+            line["metrics"] = self._status.address
+        if isinstance(self._app, Announcing):
+            line |= self._app.ready()
+        return line
+
+    def _report(self) -> dict[str, Any]:
+        """The app's and the engine's health, as of now; the scraper gets the same."""
+        health, engine = self._app.health(), self._engine.health()
+        if self._status is not None:
+            state = {name: engine[name] for name in ("app", "instance", "phase", "active")}
+            self._status.report(metrics.render(self._app_id, engine, health), {**state, "pid": os.getpid()})
+        return {"app": health, "engine": engine}

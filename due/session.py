@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from due.archiver import Archiver
@@ -57,7 +58,7 @@ class Session:
         self.keeper.changed = self._changed
         self.keeper.written = lambda: sum(o.sequence for o in list(self.outlets.values()))
         self.gate = Gate(self.keeper, self.publisher, options.handshake_bytes)
-        self.sender = Sender(options.linger, self.gate.service)
+        self.sender = Sender(options.linger, self.gate.service, self.gate.blocked)
         self.outlets: dict[str, Outlet] = {}
         """By canonical key."""
         self._said: dict[str, Outlet] = {}
@@ -83,6 +84,8 @@ class Session:
         self.sender.start()
         self.keeper.start()
         self.dispatcher.start()
+        if any(self._spool_folder().glob("spool*.db")):
+            self._open_archiver()  # an earlier instance left something to archive
 
     def outlet(self, key: Key) -> Outlet:
         """The outlet of a key."""
@@ -154,6 +157,7 @@ class Session:
             "epoch": member.epoch,
             "written": self.keeper.written(),
             "unpublished": self._unpublished,
+            "outlets": len(self.outlets),
             **self.gate.counts,
             "updates": self.publisher.statistics(),
             "receiving": self.dispatcher.statistics(),
@@ -211,8 +215,7 @@ class Session:
         with self._lock:
             if self._archiver is None:
                 o = self._options
-                registration = self.keeper.member.registration
-                spool = open_spool(o.folder() / "spool" / registration.app_id, o)
+                spool = open_spool(self._spool_folder(), o)
                 self._archiver = Archiver(
                     self._archive,
                     spool,
@@ -221,6 +224,9 @@ class Session:
                     linger=o.archive_linger,
                 )
             return self._archiver
+
+    def _spool_folder(self) -> Path:
+        return self._options.folder() / "spool" / self.keeper.member.registration.app_id
 
     def _say(self, text: str, value: object) -> None:
         """Write a membership message, past all permissions."""
@@ -235,7 +241,7 @@ class Session:
         """Permissions may have changed."""
         for outlet in list(self.outlets.values()):
             outlet.fast = False
-            self.sender.dirty(outlet)
+            self.sender.hurry(outlet)
         self.gate.changed()
         self._tell()
 

@@ -43,8 +43,10 @@ class ArchiveDriver(Protocol):
         """
         ...
 
-    def find(self, query: Mapping[str, Any]) -> list[Item]:
+    def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
         """Items that match a MongoDB-dialect query, oldest first (timestamp, then sequence).
+
+        Of more than `limit` the youngest; what is older is not read then.
 
         A plain string under `dataKey` is a DUE key: wildcards allowed, fewer specs match more items
         (`due.keys.Key.matches`).  Times are int ns or datetime (naive = UTC).
@@ -81,6 +83,10 @@ class Spool(Protocol):
 
     def done(self, frames: int) -> None:
         """Remove that many of the oldest frames."""
+        ...
+
+    def adopt(self) -> None:
+        """Also take over what instances of the app that are gone have left."""
         ...
 
     def __len__(self) -> int:
@@ -129,8 +135,11 @@ class Publisher(Protocol):
         """Return when the server has acknowledged everything sent so far; raises `Timeout`."""
         ...
 
-    def poll(self) -> None:
-        """Periodic care: read acknowledgements, reconnect when due, re-send what the server lost."""
+    def poll(self) -> float:
+        """Periodic care: read acknowledgements, reconnect when due, re-send what the server lost.
+
+        Returns after how many seconds to come again.
+        """
         ...
 
     def statistics(self) -> dict[str, int]:

@@ -14,7 +14,6 @@ import threading
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from operator import attrgetter
 from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
@@ -28,6 +27,7 @@ from pymongo.uri_parser import parse_uri
 from due.codec import pack, unpack
 from due.drivers.query import Query, parse
 from due.drivers.query_tree import Condition
+from due.drivers.youngest import by_age, youngest
 from due.errors import ArchiveUnavailable, BackendError, InvalidOption
 from due.keys import ANY, Key
 from due.messages import Item, PackedFrame
@@ -40,7 +40,6 @@ _DOCUMENT_OVERHEAD = 300
 _MAX_NAMED_KEYS = 1000
 _INT64 = 2**63
 _SERVER_SELECTION_MS = "3000"
-_by_age = attrgetter("timestamp", "sequence", "instance_id", "key")
 
 
 class MongoArchive:
@@ -80,13 +79,17 @@ class MongoArchive:
         with self._errors():
             self._insert(documents, frames)
 
-    def find(self, query: Mapping[str, Any]) -> list[Item]:
-        """Items that match, oldest first (timestamp, then sequence)."""
+    def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
+        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
         parsed = parse(query)
         with self._errors():
-            documents = self._candidates(parsed)
-        items = [item for document in documents for item in _items(document, parsed)]
-        items.sort(key=_by_age)
+            criteria = self._criteria(parsed)
+            if limit is not None:
+                found = self._table().find(criteria, {"lastTimestamp": 1})
+                heads = [(int(document["lastTimestamp"]), str(document["_id"])) for document in found]
+                return youngest(heads, lambda names: self._read({"_id": {"$in": names}}, parsed), limit)
+            items = list(self._read(criteria, parsed))
+        items.sort(key=by_age)
         return items
 
     def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
@@ -201,7 +204,11 @@ class MongoArchive:
 
     # --- reading -------------------------------------------------------------------------------
 
-    def _candidates(self, query: Query) -> list[Document]:
+    def _read(self, criteria: Mapping[str, Any], query: Query) -> Iterator[Item]:
+        for document in self._table().find(criteria):
+            yield from _items(self._joined(document), query)
+
+    def _criteria(self, query: Query) -> dict[str, Any]:
         named = list(query.conditions("dataKey"))
         keys = list(self._table("_keys").find(_key_range(named)))
 
@@ -217,7 +224,7 @@ class MongoArchive:
         if not named and len(criteria) and len(keys) <= _MAX_NAMED_KEYS and "dataKey" not in criteria:
             # without a key no index would be used
             criteria = {"dataKey": {"$in": [d["_id"] for d in keys]}} | criteria
-        return [self._joined(document) for document in self._table().find(criteria)]
+        return criteria
 
     def _joined(self, document: Document) -> Document:
         count = document.get("parts", 0)

@@ -5,6 +5,7 @@ append  ──XADD due:stream:<path>──►             pipelined, kept until 
 """
 
 import logging
+import select
 import threading
 import time
 from collections import deque
@@ -14,16 +15,26 @@ from typing import Any
 import hiredis
 
 from due.backoff import Backoff
+from due.drivers.redis_progress import Question
 from due.drivers.redis_receiver import RedisReceiver, channel_name
-from due.drivers.redis_streams import STREAMS, Entry, StreamLedger, parse_id, progress, stream_name
+from due.drivers.redis_streams import STREAMS, Entry, StreamLedger, parse_id, stream_name
 from due.drivers.redis_wire import Wire, client
-from due.errors import BackendError, Timeout, UpdatesUnavailable
+from due.errors import Timeout, UpdatesUnavailable
 
 log = logging.getLogger("due.updates")
 
 _READ_REPLIES_AT = 16
 _MOST_OUTSTANDING = 1024
-_CHECK_SECONDS = 0.02
+_ASK_SECONDS = 0.02
+_POLL_SECONDS = 0.25
+_RECONNECT_SECONDS = 0.05
+
+
+_MESSAGE = "message"
+"""Stands for a best-effort message whose reply is awaited: lost if the connection is."""
+_COMMAND = "command"
+"""Stands for a command of our own."""
+_Awaited = Entry | Question | str
 
 
 class RedisUpdates:
@@ -63,15 +74,13 @@ class RedisPublisher:
     def __init__(self, url: str, window: int, retain: int, group_timeout: float) -> None:
         self._url = url
         self._limits = (window, retain, group_timeout)
-        self._client = client(url)
         self._lock = threading.RLock()
         self._wire: Wire | None = None
-        self._outstanding: deque[Entry | None] = deque()
+        self._outstanding: deque[_Awaited] = deque()
         self._ledgers: dict[str, StreamLedger] = {}
         self._channels: dict[str, bytes] = {}
         self._run_id = b""
         self._backoff = Backoff()
-        self._checked = 0.0
         self._collect_at = 0
         """No need to look for replies before so many are outstanding."""
         self._closed = False
@@ -87,7 +96,7 @@ class RedisPublisher:
             channel = self._channels.get(path) or self._channel(path)
             try:
                 self._wire.send(b"PUBLISH", channel, payload)
-                self._outstanding.append(None)
+                self._outstanding.append(_MESSAGE)
                 self._collect()
             except UpdatesUnavailable as error:
                 self._lose(error)
@@ -100,13 +109,13 @@ class RedisPublisher:
             self._counts["held_back"] += 1
             self._wait_for_readers(ledger)
             self._append(ledger, payload, anyway=True)
-        if ledger.half_full and time.monotonic() - self._checked > _CHECK_SECONDS:
-            self._check(ledger)
+        if ledger.half_full and ledger.ask_again(time.monotonic(), _ASK_SECONDS):
+            self._ask(ledger)
 
     def has_room(self, path: str) -> bool:
         """See `Publisher.has_room`."""
         ledger = self._ledgers.get(path)
-        return ledger is None or ledger.has_room(0)
+        return ledger is None or (not ledger.waiting and ledger.has_room(0))
 
     def settle(self, timeout: float | None = None) -> None:
         """See `Publisher.settle`."""
@@ -123,27 +132,33 @@ class RedisPublisher:
                 raise Timeout(f"{self._url} did not acknowledge within {timeout} s")
             time.sleep(0.01)
 
-    def poll(self) -> None:
+    def poll(self) -> float:
         """See `Publisher.poll`."""
         with self._lock:
             if self._wire is None:
                 if self._backoff.due(time.monotonic()):
                     self._connect()
-                return
+                return _RECONNECT_SECONDS
             try:
                 self._collect_at = 0
                 self._collect(at_least=1)
             except UpdatesUnavailable as error:
                 self._lose(error)
-        if time.monotonic() - self._checked > 5 * _CHECK_SECONDS:
+            now = time.monotonic()
             for ledger in list(self._ledgers.values()):
-                if ledger.kept:
-                    self._check(ledger)
+                if ledger.ask_again(now, _POLL_SECONDS / 2):
+                    self._ask(ledger)
+        return _POLL_SECONDS
 
     def statistics(self) -> dict[str, int]:
         """Counters, and bytes kept for readers that have not acknowledged."""
         with self._lock:
-            return {**self._counts, "kept_bytes": sum(x.kept_bytes for x in self._ledgers.values())}
+            connected = int(self._wire is not None)
+            return {
+                **self._counts,
+                "connected": connected,
+                "kept_bytes": sum(x.kept_bytes for x in self._ledgers.values()),
+            }
 
     def close(self) -> None:
         """See `Publisher.close`."""
@@ -152,7 +167,6 @@ class RedisPublisher:
             if self._wire is not None:
                 self._wire.close()
                 self._wire = None
-        self._client.close()
 
     def _channel(self, path: str) -> bytes:
         return self._channels.setdefault(path, channel_name(path))
@@ -173,7 +187,7 @@ class RedisPublisher:
         assert self._wire is not None  # noqa: S101 - callers checked
         self._wire.send(b"SADD", STREAMS, ledger.path)
         self._wire.send(b"PUBLISH", STREAMS, ledger.path)
-        self._outstanding.extend((None, None))
+        self._outstanding.extend((_COMMAND, _COMMAND))
 
     def _send_entry(self, entry: Entry) -> None:
         if self._wire is None:
@@ -196,29 +210,57 @@ class RedisPublisher:
 
     def _wait_for_readers(self, ledger: StreamLedger) -> None:
         """Back-pressure: until half of the window is free.  Asks less and less often while nothing moves."""
-        pause, kept = _CHECK_SECONDS / 16, ledger.kept_bytes
-        while ledger.half_full and ledger.kept and not self._closed:
-            with self._lock:
-                self.poll() if self._wire is None else self._guarded_wait(0.001)
-            self._check(ledger)
-            if ledger.half_full:
-                time.sleep(pause)
-            pause = _CHECK_SECONDS / 16 if ledger.kept_bytes < kept else min(2 * pause, 2 * _CHECK_SECONDS)
-            kept = ledger.kept_bytes
-
-    def _check(self, ledger: StreamLedger) -> bool:
-        """Ask how far the readers are and forget what they are done with."""
-        self._checked = time.monotonic()
+        pause, kept = _ASK_SECONDS / 8, ledger.kept_bytes
+        ledger.waiting = True
         try:
-            done = progress(self._client, ledger)
-            with self._lock:
-                ledger.acknowledged(done)
-                point = ledger.trim_point()
-            if point is not None:
-                self._client.xtrim(stream_name(ledger.path), minid=f"{point[0]}-{point[1]}", approximate=True)
-        except (BackendError, OSError):
-            return False
-        return True
+            while ledger.half_full and ledger.kept and not self._closed:
+                self._await_answer(ledger)
+                if ledger.half_full:
+                    time.sleep(pause)
+                pause = _ASK_SECONDS / 8 if ledger.kept_bytes < kept else min(2 * pause, _ASK_SECONDS)
+                kept = ledger.kept_bytes
+        finally:
+            ledger.waiting = False
+
+    def _await_answer(self, ledger: StreamLedger) -> None:
+        """Ask how far the readers are and wait a while for the answer, without keeping others out."""
+        with self._lock:
+            wire = self._wire
+            if wire is None:
+                self.poll()
+                return
+            if not ledger.asked:
+                self._ask(ledger)
+        poll = select.poll()
+        poll.register(wire, select.POLLIN)
+        poll.poll(1000 * _ASK_SECONDS)
+        with self._lock:
+            if self._wire is wire:  # nobody reconnected meanwhile
+                self._guarded_take(wire)
+
+    def _ask(self, ledger: StreamLedger) -> None:
+        with self._lock:
+            if self._wire is None or ledger.asked:
+                return
+            question = Question(ledger)
+            try:
+                self._wire.send_packed(question.command())
+            except UpdatesUnavailable as error:
+                self._lose(error)
+                return
+            ledger.asking(time.monotonic())
+            self._outstanding.extend([question] * question.size)
+
+    def _answered(self, question: Question) -> None:
+        """Forget what the readers are done with, here and on the server."""
+        ledger = question.ledger
+        ledger.asked = False
+        ledger.acknowledged(question.answer())
+        point = ledger.trim_point()
+        if point is not None and self._wire is not None:
+            command = (b"XTRIM", stream_name(ledger.path), b"MINID", b"~", f"{point[0]}-{point[1]}")
+            self._wire.send(*command)
+            self._outstanding.append(_COMMAND)
 
     def _collect(self, at_least: int = _READ_REPLIES_AT) -> None:
         if len(self._outstanding) < max(at_least, self._collect_at) or self._wire is None:
@@ -227,6 +269,12 @@ class RedisPublisher:
         while len(self._outstanding) > _MOST_OUTSTANDING:
             self._take(self._wire.wait())
         self._collect_at = len(self._outstanding) + _READ_REPLIES_AT
+
+    def _guarded_take(self, wire: Wire) -> None:
+        try:
+            self._take(wire.replies())
+        except UpdatesUnavailable as error:
+            self._lose(error)
 
     def _guarded_wait(self, timeout: float) -> None:
         if self._wire is None or not self._outstanding:
@@ -238,27 +286,31 @@ class RedisPublisher:
 
     def _take(self, replies: Iterable[Any]) -> None:
         for reply in replies:
-            entry = self._outstanding.popleft()
-            if isinstance(reply, hiredis.ReplyError):
-                self._refused(reply, entry)
-            elif entry is not None:
-                entry.id = parse_id(reply)
+            awaited = self._outstanding.popleft()
+            if isinstance(awaited, Question):
+                if awaited.take(reply):
+                    self._answered(awaited)
+            elif isinstance(reply, hiredis.ReplyError):
+                self._refused(reply, awaited)
+            elif isinstance(awaited, Entry):
+                awaited.id = parse_id(reply)
 
-    def _refused(self, reply: Exception, entry: Entry | None) -> None:
+    def _refused(self, reply: Exception, awaited: _Awaited) -> None:
         self._counts["refused"] += 1
         if self._counts["refused"] == 1:
             log.error("Data Updates refused a message: %s", reply)
-        if entry is not None:  # kept, and sent again on the next connection
-            raise UpdatesUnavailable(f"the server refused an entry of {entry.path}: {reply}")
+        if isinstance(awaited, Entry):  # kept, and sent again on the next connection
+            raise UpdatesUnavailable(f"the server refused an entry of {awaited.path}: {reply}")
 
     def _lose(self, error: Exception) -> None:
         if self._wire is None:
             return
         self._wire.close()
         self._wire = None
-        unanswered = sum(entry is None for entry in self._outstanding)
-        self._counts["lost_disconnected"] += unanswered
+        self._counts["lost_disconnected"] += self._outstanding.count(_MESSAGE)
         self._outstanding.clear()
+        for ledger in self._ledgers.values():
+            ledger.asked = False
         delay = self._backoff.failed(time.monotonic())
         log.warning("lost Data Updates at %s: %s; trying again in %.2f s", self._url, error, delay)
 

@@ -29,6 +29,10 @@ _SILENT_SECONDS = 3.0
 """A member whose lease is older is taken for dead."""
 _LOOK_SECONDS = 1.0
 _HOLD_SECONDS = 0.2
+_GONE_SECONDS = 30.0
+"""Whoever has not renewed his lease for so long holds no group."""
+_WITHDRAWN_SECONDS = 2.0
+_FORGET_SECONDS = 3600.0
 _ASIDE_LENGTH = 1000
 
 
@@ -56,6 +60,7 @@ class StreamReader:
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
+        self._withdrawn: dict[str, float] = {}
         self._look_at = 0.0
         self._claimed: deque[Delivery] = deque()
         self._backoff = Backoff()
@@ -78,11 +83,13 @@ class StreamReader:
             if path in self._paths and not reset:
                 return
             self._paths[path] = start
+            self._withdrawn.pop(path, None)
             self._held.add(path)
             self._look_at = 0.0
             self._stale = True
         self._create_group(path, start, reset=reset)
         self.renew()
+        self._tidy(path)
         self._interrupt()
 
     def leave(self, stays: Callable[[str], bool]) -> None:
@@ -93,6 +100,7 @@ class StreamReader:
                 del self._paths[path]
                 self._held.discard(path)
             self._stale = bool(gone)
+            self._withdrawn.update(dict.fromkeys(gone, time.monotonic()))
         self._write_leases(gone, 0)
         self._interrupt()
 
@@ -175,6 +183,7 @@ class StreamReader:
     def renew(self) -> None:
         """Renew the leases; a standby instance holds the group's place too."""
         self._write_leases(list(self._paths), int(time.time() * 1000))
+        self._drop_groups()
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
@@ -209,6 +218,39 @@ class StreamReader:
                 self._commands.xgroup_setid(stream_name(path), self._group, start)
         except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
             log.warning("group %s of %s cannot be made now: %s", self._group, path, error)
+
+    def _drop_groups(self) -> None:
+        """Of interests withdrawn a while ago: an app that withdraws them because it ends keeps its place."""
+        with self._lock:
+            due = [path for path, at in self._withdrawn.items() if time.monotonic() - at > _WITHDRAWN_SECONDS]
+            for path in due:
+                del self._withdrawn[path]
+        for path in due:
+            self._drop_group(path)
+
+    def _drop_group(self, path: str) -> None:
+        """Without another live member the group goes, and its place with it."""
+        try:
+            leases = self._commands.hgetall(readers_name(path))
+            stamps = [int(at) / 1000 for field, at in leases.items() if self._is_ours(field)]
+            if all(time.time() - at > _GONE_SECONDS for at in stamps):
+                self._commands.xgroup_destroy(stream_name(path), self._group)
+        except (redis.RedisError, OSError) as error:
+            log.debug("group %s of %s could not be dropped: %s", self._group, path, error)
+
+    def _tidy(self, path: str) -> None:
+        """Forget leases of members long gone."""
+        try:
+            leases = self._commands.hgetall(readers_name(path))
+            limit = 1000 * (time.time() - _FORGET_SECONDS)
+            old = [field for field, at in leases.items() if self._is_ours(field) and int(at) < limit]
+            if old:
+                self._commands.hdel(readers_name(path), *old)
+        except (redis.RedisError, OSError) as error:
+            log.debug("leases of %s could not be tidied: %s", path, error)
+
+    def _is_ours(self, field: bytes) -> bool:
+        return field.rpartition(b"/")[0] == self._group.encode()
 
     def _interrupt(self) -> None:
         """Make the server answer the blocked request now, so that a new one goes out."""

@@ -9,13 +9,7 @@ lease (hash `due:readers:<path>`, field `<group>/<instance>`, value unix ms, 0 =
 recognise repeats.  Readers' clocks must agree within a few seconds.
 """
 
-import time
 from collections import deque
-from typing import Any
-
-import redis
-
-from due.errors import BackendError, UpdatesUnavailable
 
 STREAMS = "due:streams"
 """Set of the paths that are streams, and the channel on which new ones are announced."""
@@ -61,7 +55,24 @@ class StreamLedger:
         self._retain = retain
         self._group_timeout = group_timeout
         self._leases: dict[str, float] = {}
-        self.announced = False
+        self.groups: tuple[bytes, ...] = ()
+        """Live groups of readers, as of the last answer."""
+        self.asked = False
+        """A question about the readers is on its way."""
+        self.asked_at = 0.0
+        self.waiting = False
+        """A writer waits for the readers."""
+        self._asked_bytes = 0
+
+    def ask_again(self, now: float, seconds: float) -> bool:
+        """Whether to ask how far the readers are: after so long, or when much was added since the last time."""
+        if self.asked or not self.kept:
+            return False
+        return now - self.asked_at > seconds or (self.kept_bytes - self._asked_bytes) * 4 > self._window
+
+    def asking(self, now: float) -> None:
+        """A question is being sent."""
+        self.asked, self.asked_at, self._asked_bytes = True, now, self.kept_bytes
 
     def has_room(self, size: int) -> bool:
         """Whether a payload of that size fits; a lone big one always does."""
@@ -106,39 +117,3 @@ def parse_id(text: bytes | str) -> tuple[int, int]:
     """A stream id as a pair that compares."""
     ms, _, number = (text.decode() if isinstance(text, bytes) else text).partition("-")
     return int(ms), int(number or 0)
-
-
-def progress(client: redis.Redis, ledger: StreamLedger) -> tuple[int, int]:
-    """The id up to which every live group has acknowledged; infinite when there is none.
-
-    Raises `UpdatesUnavailable`.
-    """
-    name = stream_name(ledger.path)
-    try:
-        pipe: Any = client.pipeline(transaction=False)
-        pipe.hgetall(readers_name(ledger.path))
-        pipe.xinfo_groups(name)
-        leases, groups = pipe.execute(raise_on_error=False)
-        if isinstance(groups, redis.ResponseError):  # no such stream
-            groups = []
-        for answer in (leases, groups):
-            if isinstance(answer, Exception):
-                raise answer
-        live = ledger.live_groups({f.decode(): int(v) / 1000 for f, v in leases.items()}, time.time())
-        positions = [_position(client, name, g) for g in groups if g["name"].decode() in live]
-    except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
-        raise UpdatesUnavailable(f"the readers of {ledger.path} cannot be asked: {error}") from None
-    except redis.RedisError as error:
-        raise BackendError(f"the readers of {ledger.path} cannot be asked: {error}") from None
-    if len(positions) < len(live):
-        return (0, 0)
-    return min(positions, default=(2**63, 0))
-
-
-def _position(client: redis.Redis, name: str, group: dict[str, Any]) -> tuple[int, int]:
-    if group["pending"]:
-        lowest = client.xpending(name, group["name"])["min"]
-        if lowest is not None:
-            ms, number = parse_id(lowest)
-            return (ms, number - 1)
-    return parse_id(group["last-delivered-id"])

@@ -20,27 +20,25 @@ _RECORD_OVERHEAD = 64
 
 
 class DiskSpool:
-    """`Spool` in `folder`/spool.db, of at most about `limit` bytes; raises BackendError if it cannot be opened.
+    """A spool in `folder`/`name`.db, of at most about `limit` bytes; raises BackendError if it cannot be opened.
 
     Survives kill -9 of its process.  What a full or broken disk does not take counts as not fitting.
     """
 
-    def __init__(self, folder: Path, limit: int) -> None:
-        self._path = folder / "spool.db"
+    def __init__(self, folder: Path, limit: int, name: str = "spool") -> None:
+        self.path = folder / f"{name}.db"
         self._limit = limit
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode = msgspec.msgpack.Decoder(PackedFrame).decode
         self._closed = False
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+            self._file = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
             self._file.executescript(_SCHEMA)
             self._file.execute("PRAGMA synchronous = NORMAL")
             self._count, self._bytes = self._measure()
         except (OSError, sqlite3.Error) as error:
-            raise BackendError(
-                f"spool {self._path} cannot be opened: {error}; name another folder"
-            ) from error
+            raise BackendError(f"spool {self.path} cannot be opened: {error}; name another folder") from error
 
     def put(self, frames: Sequence[PackedFrame]) -> int:
         """Append frames; returns how many items did not fit and are lost."""
@@ -55,29 +53,21 @@ class DiskSpool:
         try:
             self._append(rows)
         except sqlite3.Error as error:
-            log.warning("spool %s: %s", self._path, error)
+            log.warning("spool %s: %s", self.path, error)
             rows = []
         return sum(frame.count for frame in frames[len(rows) :])
 
     def take(self, frames: int) -> list[PackedFrame]:
-        """Up to `frames` of the oldest frames, which stay until `done`."""
+        """Up to `frames` of the oldest frames, which stay until `done`; damaged records are dropped."""
         try:
-            rows = self._file.execute("SELECT data FROM frames ORDER BY id LIMIT ?", (frames,)).fetchall()
+            rows = self._file.execute("SELECT id, data FROM frames ORDER BY id LIMIT ?", (frames,)).fetchall()
         except sqlite3.Error as error:
-            raise BackendError(f"spool {self._path}: {error}") from error
-        return [self._decode(data) for (data,) in rows]
+            raise BackendError(f"spool {self.path}: {error}") from error
+        return [frame for number, data in rows if (frame := self._read(number, data)) is not None]
 
     def done(self, frames: int) -> None:
         """Remove that many of the oldest frames."""
-        try:
-            removed = self._file.execute(
-                "DELETE FROM frames WHERE id IN (SELECT id FROM frames ORDER BY id LIMIT ?) RETURNING size",
-                (frames,),
-            ).fetchall()
-        except sqlite3.Error as error:
-            raise BackendError(f"spool {self._path}: {error}") from error
-        self._count -= len(removed)
-        self._bytes -= sum(size for (size,) in removed)
+        self._remove("id IN (SELECT id FROM frames ORDER BY id LIMIT ?)", frames)
 
     def __len__(self) -> int:
         return self._count
@@ -87,6 +77,14 @@ class DiskSpool:
         if not self._closed:
             self._closed = True
             self._file.close()
+
+    def _read(self, number: int, data: bytes) -> PackedFrame | None:
+        try:
+            return self._decode(data)
+        except msgspec.MsgspecError as error:
+            log.error("spool %s: record %d is damaged and dropped: %s", self.path, number, error)  # noqa: TRY400
+            self._remove("id = ?", number)
+            return None
 
     def _append(self, rows: Sequence[tuple[int, bytes]]) -> None:
         self._file.execute("BEGIN IMMEDIATE")
@@ -99,6 +97,17 @@ class DiskSpool:
             raise
         self._count += len(rows)
         self._bytes += sum(size for size, _ in rows)
+
+    def _remove(self, which: str, number: int) -> None:
+        try:
+            removed = self._file.execute(
+                f"DELETE FROM frames WHERE {which} RETURNING size",  # noqa: S608 our own text
+                (number,),
+            ).fetchall()
+        except sqlite3.Error as error:
+            raise BackendError(f"spool {self.path}: {error}") from error
+        self._count -= len(removed)
+        self._bytes -= sum(size for (size,) in removed)
 
     def _measure(self) -> tuple[int, int]:
         count, size = self._file.execute("SELECT count(*), total(size) FROM frames").fetchone()

@@ -18,6 +18,7 @@ from due.codec import decode_value, encode_value, unpack
 from due.drivers.query import Query, parse
 from due.drivers.query_tree import Condition
 from due.drivers.sqlite_file import SqliteFile
+from due.drivers.youngest import by_age, youngest
 from due.errors import InvalidOption
 from due.messages import Item, PackedFrame
 
@@ -29,6 +30,8 @@ _INSERT = "INSERT INTO frames VALUES(NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _SELECT = (
     "SELECT key_id, source_id, format, first_sequence, first_time, first_event, payload FROM frames WHERE "
 )
+_HEADS = "SELECT last_time, id FROM frames WHERE "
+_AMONG = "id IN (SELECT value FROM json_each(?))"
 _OVERLAP = """SELECT first_sequence, last_sequence FROM frames
 WHERE source_id = ? AND key_id = ? AND last_sequence >= ? ORDER BY last_sequence LIMIT 1"""
 _WIDEN = """UPDATE keys SET time_span = max(time_span, ?), event_span = max(event_span, ?) WHERE id = ?"""
@@ -38,7 +41,6 @@ _OLDEST = """SELECT first_time, id, count, length(payload) FROM frames WHERE key
 
 _by_identity = attrgetter("instance_id", "key", "sequence")
 _by_stream = attrgetter("instance_id", "key")
-_by_age = attrgetter("timestamp", "sequence", "instance_id", "key")
 
 
 class _Row(NamedTuple):
@@ -90,14 +92,22 @@ class SqliteArchive:
                 connection.execute(_INSERT, row)
                 self._widen(connection, row)
 
-    def find(self, query: Mapping[str, Any]) -> list[Item]:
-        """Items that match, oldest first (timestamp, then sequence)."""
+    def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
+        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
         parsed = parse(query)
         with self._file.reading() as connection:
             text, parameters = self._where(connection, parsed)
+            if limit is not None:
+                heads = connection.execute(_HEADS + text, parameters).fetchall()
+
+                def read(numbers: Sequence[int]) -> Iterator[Item]:
+                    rows = connection.execute(_SELECT + _AMONG, (f"[{','.join(map(str, numbers))}]",))
+                    return (item for row in rows.fetchall() for item in self._items(row, parsed))
+
+                return youngest(heads, read, limit)
             rows = connection.execute(_SELECT + text, parameters).fetchall()
         items = [item for row in rows for item in self._items(row, parsed)]
-        items.sort(key=_by_age)
+        items.sort(key=by_age)
         return items
 
     def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:

@@ -294,3 +294,43 @@ def test_every_strategy_picks_one_of_the_candidates(name: str) -> None:
 
 def test_states_are_the_four_of_the_design() -> None:
     assert [state.value for state in State] == ["active", "idle", "unresponsive", "offline"]
+
+
+def _left_by_a_former_coordinator() -> World:
+    old = World()
+    old.join("app", "a1")
+    old.join("app", "b2")
+    old.run(1.0, [("app", "a1"), ("app", "b2")])
+    old.run(1.0, [("app", "b2")])
+    assert old.told["app"].active == "b2"
+    return old
+
+
+def test_a_checkpoint_spares_the_question_and_keeps_who_worked() -> None:
+    old = _left_by_a_former_coordinator()
+    old.join("app", "a1")
+    new = World()
+    new.registry.recall(old.registry.checkpoint())
+    assert new.states() == {}, "remembered is not alive"
+    new.now = old.now
+    fields = {"version": old.told["app"].version, "epoch": old.told["app"].epoch}
+    # the first sign of life comes from the one that waits, and alone it would be chosen
+    new.registry.beat(Heartbeat(app_id="app", instance_id="a1", revision=1, **fields), new.now)
+    new.registry.beat(Heartbeat(app_id="app", instance_id="b2", revision=1, **fields), new.now)
+    new.send()
+    assert new.told["app"].active == "b2"
+    assert set(new.told["app"].revisions) == {"a1", "b2"}
+    assert new.told["app"].epoch > old.told["app"].epoch
+    assert [event.kind for event in new.registry.events()] == ["activated"], "nobody joined"
+
+
+def test_a_checkpoint_of_another_revision_is_not_trusted_and_epochs_never_fall() -> None:
+    old = _left_by_a_former_coordinator()
+    new = World()
+    new.registry.recall(old.registry.checkpoint())
+    new.registry.beat(Heartbeat(app_id="app", instance_id="b2", revision=2), new.now)
+    asked = new.send()
+    assert [message.revisions for message in asked] == [{}]
+    assert new.states() == {}
+    new.join("app", "c3")
+    assert new.told["app"].epoch > old.told["app"].epoch

@@ -71,8 +71,10 @@ class Site:
         ]
         process = self.start("-m", "coordinator.service", *places, "--settings", str(settings))
         assert process.stdout is not None
-        assert json.loads(process.stdout.readline())["ready"] is True
-        return process, httpx.Client(base_url=address.read_text(), trust_env=False)
+        ready = json.loads(process.stdout.readline())
+        assert ready["ready"] is True
+        assert ready["http"] == address.read_text()
+        return process, httpx.Client(base_url=ready["http"], trust_env=False)
 
     def options(self) -> dict[str, Any]:
         where = self.folder / str(len(self.engines) + len(self.processes))
@@ -142,6 +144,9 @@ def test_after_kill_9_it_knows_all_again_and_data_flows_meanwhile(site: Site) ->
     consumer.observe("a.b.producer").subscribe(got.append)
     until(producer.assignments)
     epoch = producer.health()["epoch"]
+    until(
+        lambda: any(len(one.value["registrations"]) > 1 for one in producer.get("due.checkpoint.coordinator"))
+    )
     process.kill()
     process.wait()
     before = len(got)
@@ -208,3 +213,15 @@ def test_settings_are_checked() -> None:
         Settings(selection="alphabetical")
     with pytest.raises(ValueError, match="http_port"):
         Settings(http_port=70000)
+
+
+def test_who_came_before_the_coordinator_led_is_in_its_history_too(site: Site) -> None:
+    early = site.engine()
+    early.init("early", PRODUCER)
+    _, client = site.coordinator("one")
+
+    def joined() -> list[Any]:
+        events = client.get("/apps/early/history").json()["items"]
+        return [event for event in events if event["value"]["event"] == "joined"]
+
+    until(joined)

@@ -2,6 +2,7 @@
 
 import threading
 
+import msgspec
 import pytest
 
 from due.archiver import Archiver
@@ -37,6 +38,13 @@ class Shelf:
     def close(self): ...
 
 
+class Bare(DiskSpool):
+    """A spool alone in its folder."""
+
+    def adopt(self):
+        pass
+
+
 def _frame(first: int, count: int = 10):
     return pack([Item("a.b", bytes(100), n, n, "app", "inst", n) for n in range(first, first + count)])
 
@@ -69,7 +77,7 @@ def test_batches_hold_at_least_so_many_items_under_load(shelf):
 
 def test_frames_go_to_the_spool_while_the_archive_is_away_and_come_back(shelf, tmp_path):
     shelf.problem = ArchiveUnavailable("away")
-    archiver = Archiver(shelf, DiskSpool(tmp_path, 1 << 20))
+    archiver = Archiver(shelf, Bare(tmp_path, 1 << 20))
     for first in range(0, 200, 10):
         archiver.put(_frame(first))
     archiver.flush(20)
@@ -83,18 +91,18 @@ def test_frames_go_to_the_spool_while_the_archive_is_away_and_come_back(shelf, t
 
 def test_the_spool_outlives_the_process(shelf, tmp_path):
     shelf.problem = ArchiveUnavailable("away")
-    archiver = Archiver(shelf, DiskSpool(tmp_path, 1 << 20))
+    archiver = Archiver(shelf, Bare(tmp_path, 1 << 20))
     archiver.put(_frame(0))
     archiver.close()
     shelf.problem = None
-    again = Archiver(shelf, DiskSpool(tmp_path, 1 << 20))
+    again = Archiver(shelf, Bare(tmp_path, 1 << 20))
     wait_for(lambda: len(shelf.items) == 10)
     again.close()
 
 
 def test_what_does_not_fit_into_the_spool_is_counted(shelf, tmp_path):
     shelf.problem = ArchiveUnavailable("away")
-    archiver = Archiver(shelf, DiskSpool(tmp_path, 4000))
+    archiver = Archiver(shelf, Bare(tmp_path, 4000))
     for first in range(0, 100, 10):
         archiver.put(_frame(first))
     archiver.flush(20)
@@ -134,4 +142,37 @@ def test_a_full_queue_makes_the_writer_wait(shelf):
     writer.join(20)
     archiver.flush(20)
     assert sorted(shelf.items) == list(range(100))
+    archiver.close()
+
+
+def test_one_bad_frame_does_not_cost_the_others_of_its_batch(shelf):
+    bad = msgspec.structs.replace(_frame(10), payload=b"DUE\x01 damaged")
+    archiver = Archiver(shelf, linger=30.0, batch=10**6)
+    for frame in (_frame(0), bad, _frame(20)):
+        archiver.put(frame)
+    archiver.flush(20)
+    assert sorted(shelf.items) == [*range(10), *range(20, 30)]
+    assert archiver.statistics()["refused"] == 10
+    archiver.put(_frame(30))
+    archiver.flush(20)
+    assert max(shelf.items) == 39
+    archiver.close()
+
+
+def test_a_broken_spool_does_not_end_the_archiver(shelf, tmp_path, monkeypatch):
+    spool = Bare(tmp_path, 1 << 20)
+    spool.put([_frame(0)])
+    broken = [True]
+    take = spool.take
+
+    def failing(frames):
+        if broken.pop():
+            raise BackendError("disk")
+        broken.append(False)
+        return take(frames)
+
+    monkeypatch.setattr(spool, "take", failing)
+    broken[:] = [False, True]
+    archiver = Archiver(shelf, spool)
+    wait_for(lambda: sorted(shelf.items) == list(range(10)))
     archiver.close()

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -85,9 +86,49 @@ def test_a_service_works_from_ready_to_sigterm(start, tmp_path, make_engine):
     wait_for(lambda: out == [21, "stopped"])
 
 
+def _fetch(address, path, host="localhost"):
+    request = urllib.request.Request(f"http://{address}{path}", headers={"Host": host})
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        with opener.open(request, timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path):
+    process = start(
+        "--metrics",
+        "127.0.0.1:0",
+        "--log-format",
+        "json",
+        "--log",
+        "debug",
+        "--archive",
+        f"sqlite://{tmp_path / 'a.db'}",
+    )
+    address = json.loads(process.stdout.readline())["metrics"]
+    status, text = _fetch(address, "/metrics")
+    assert status == 200
+    assert "doubler_ticks{" in text
+    assert "# TYPE due_written_items_total counter" in text
+    status, text = _fetch(address, "/healthz")
+    assert (status, json.loads(text)["status"], json.loads(text)["app"]) == (200, "ok", "doubler")
+    assert _fetch(address, "/other")[0] == 404
+    assert _fetch(address, "/metrics", host="evil.example")[0] == 400
+    process.send_signal(signal.SIGTERM)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 0
+    lines = [json.loads(line) for line in stderr.splitlines()]
+    assert all(line["app"] == "doubler" and line["message"] for line in lines)
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
+        (["--metrics", "nonsense"], "HOST:PORT"),
+        (["--metrics", "203.0.113.1:80"], "203.0.113.1:80"),
         (["--settings", "/nowhere.json"], "/nowhere.json"),
         (["--settings", "{folder}/wrong.json"], "factr"),
         (["--archive", "ftp://x"], "ftp://x"),

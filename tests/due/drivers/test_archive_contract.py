@@ -171,6 +171,32 @@ def test_record_batches_are_found_by_key_and_time(archive: ArchiveDriver) -> Non
     assert [i.value["x"][0] for i in found] == [2, 3]
 
 
+@pytest.mark.parametrize("limit", [1, 3, 30, 100, 1000])
+def test_of_more_than_the_limit_the_youngest_are_found_oldest_first(
+    archive: ArchiveDriver, limit: int
+) -> None:
+    # frames of two instances that overlap in time, and single items between them
+    for first in range(0, 200, 20):
+        archive.insert_frames([pack([item(n=first + k + 1) for k in range(20)])])
+        archive.insert([item(n=first + 10, instance_id="single", value=first)])
+        archive.insert_frames(
+            [
+                pack(
+                    [
+                        item(n=k + 1, instance_id="late", timestamp=T0 + (first + k) * 1000)
+                        for k in range(first, first + 20)
+                    ]
+                )
+            ]
+        )
+    for query in (
+        {"dataKey": "a.b.c"},
+        {"dataKey": "a.**", "instanceId": "late"},
+        {"timestamp": {"$lt": T0 + 90_000}},
+    ):
+        assert archive.find(query, limit=limit) == archive.find(query)[-limit:]
+
+
 def test_times_are_datetimes_or_nanoseconds(archive: ArchiveDriver) -> None:
     moment = dt.datetime(2024, 1, 1, tzinfo=dt.UTC)
     ns = 1_704_067_200_000_000_000

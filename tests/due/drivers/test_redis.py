@@ -83,3 +83,36 @@ def test_instances_of_a_shared_app_divide_a_stream(make_engine):
         producer.flush()
     wait_for(lambda: sum(map(len, got.values())) == number)
     assert sorted(got["a"] + got["b"]) == list(range(number))
+
+
+def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path):
+    with EmbeddedServer(tmp_path / "u") as server:
+        init = {"capabilities": [Capability("r.gone", delivery="reliable")]}
+        producer = make_engine("producer", url=server.url, init=init)
+        consumers = [make_engine("consumer", url=server.url) for _ in range(2)]
+        got: list[Any] = []
+        subscriptions = [
+            c.observe("r.gone").subscribe(lambda item: got.append(item.value)) for c in consumers
+        ]
+        producer.write("r.gone", 1, [PUB_ONLY])
+        wait_for(lambda: got == [1])
+        subscriptions[0].dispose()
+        consumers[0].close()
+        assert _groups(server.url) == 1, "the other instance still reads"
+        subscriptions[1].dispose()
+        wait_for(lambda: _groups(server.url) == 0)
+        producer.write("r.gone", 2, [PUB_ONLY])
+        producer.flush()
+        consumers[1].observe("r.gone").subscribe(lambda item: got.append(item.value))
+        producer.write("r.gone", 3, [PUB_ONLY])
+        wait_for(lambda: 3 in got)
+        assert got == [1, 3], "nothing of the time in between"
+        for engine in (producer, *consumers):
+            engine.close()
+
+
+def _groups(url: str) -> int:
+    wire = Wire(url)
+    groups = wire.call("XINFO", "GROUPS", "due:stream:r.gone")
+    wire.close()
+    return len(groups)

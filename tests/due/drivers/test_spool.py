@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from due.codec import pack
-from due.drivers.base import Spool
 from due.drivers.spool import DiskSpool
 from due.errors import BackendError
 from due.messages import Item, PackedFrame
@@ -22,7 +21,7 @@ def frame(n: int, size: int = 10, count: int = 2) -> PackedFrame:
 
 
 def test_first_in_first_out(tmp_path: Path) -> None:
-    spool: Spool = DiskSpool(tmp_path, 1 << 20)
+    spool = DiskSpool(tmp_path, 1 << 20)
     frames = [frame(n) for n in range(5)]
     assert spool.put(frames[:3]) == 0
     assert spool.put(frames[3:]) == 0

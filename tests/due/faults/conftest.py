@@ -39,6 +39,12 @@ class Program:
     def numbers(self) -> list[int]:
         return [int(line.split()[1]) for line in self.lines() if line[:1].isdigit() and " " in line]
 
+    def say(self) -> None:
+        """Send a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(b"\n")
+        self.process.stdin.flush()
+
     def stop(self, number: int) -> None:
         """Send a signal."""
         self.process.send_signal(number)

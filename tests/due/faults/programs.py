@@ -8,7 +8,7 @@ from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Optio
 
 KEY = "fault.stream"
 SPEECH = "fault.speech.speaker"
-OPTIONS = Options(coordinated=False, window_bytes=4 << 20)
+OPTIONS = Options(coordinated=False, window_bytes=4 << 20, backlog_bytes=4 << 20)
 
 
 def _engine(url: str, app: str, role=PRODUCER | CONSUMER, **init) -> Engine:
@@ -33,11 +33,12 @@ def produce(url: str, delivery: str, count: str, size: str) -> None:
     engine.flush(120)
     print("flushed", engine.health()["updates"]["resent"], flush=True)
     sys.stdin.readline()
+    engine.write(KEY, [int(count), padding], [PUB_ONLY])
     engine.close()
 
 
 def consume(url: str, app: str, count: str, delay_ms: str) -> None:
-    """Print `sequence number` of every item, `gaps N` at the end; stop after `count` items."""
+    """Print `sequence number` of every item, `missing N` on each gap, `gaps N` at the end after `count` items."""
     engine = _engine(url, app)
     left = [int(count)]
     delay = float(delay_ms) / 1000
@@ -50,11 +51,14 @@ def consume(url: str, app: str, count: str, delay_ms: str) -> None:
 
     engine.observe(KEY).subscribe(callback)
     print("ready", flush=True)
-    idle, before = 0.0, left[0]
+    idle, before, missing = 0.0, left[0], 0
     while left[0] > 0 and idle < 60:
         time.sleep(0.05)
         idle = idle + 0.05 if before == left[0] else 0.0
         before = left[0]
+        if engine.health()["receiving"]["gaps"] != missing:
+            missing = engine.health()["receiving"]["gaps"]
+            sys.stdout.write(f"missing {missing}\n")
         sys.stdout.flush()
     receiving = engine.health()["receiving"]
     print("gaps", receiving["gaps"], "repeats", receiving["repeats"], flush=True)

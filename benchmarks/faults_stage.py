@@ -1,0 +1,114 @@
+"""Programs as processes whose JSON lines are read while they run; all are killed at the end."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from due.drivers.embedded_redis import EmbeddedServer
+from due.drivers.redis_wire import Wire
+
+WATCHDOG_S = 120.0
+Line = dict[str, Any]
+T = TypeVar("T")
+
+
+class Program:
+    """A started program and what it has said."""
+
+    def __init__(self, output: Path, *arguments: object, module: str = "benchmarks.faults_programs") -> None:
+        self._output = output
+        command = [sys.executable, "-m", module, *map(str, arguments)]
+        with output.open("wb") as out:
+            self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=out)
+
+    def lines(self) -> list[Line]:
+        """All whole lines so far."""
+        text = self._output.read_text().rpartition("\n")[0]
+        return [json.loads(line) for line in text.splitlines()]
+
+    def wait(self, condition: Callable[[Line], bool]) -> Line:
+        """The first line that meets the condition; raises RuntimeError after two minutes."""
+        return until(lambda: next((line for line in self.lines() if condition(line)), None))
+
+    def finish(self) -> Line:
+        """Ask it to end; its last line."""
+        self.tell()
+        self.process.wait(WATCHDOG_S)
+        return self.lines()[-1]
+
+    def tell(self) -> None:
+        """Send a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(b"\n")
+        self.process.stdin.flush()
+
+    def kill(self) -> float:
+        """kill -9; returns when."""
+        at = time.monotonic()
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdin is not None:
+            self.process.stdin.close()
+        return at
+
+
+class Stage:
+    """One Data Updates server and the programs that use it; a context manager."""
+
+    def __init__(self, folder: Path, *, durable: bool = False) -> None:
+        self.folder = folder
+        self._stack = ExitStack()
+        self._programs: list[Program] = []
+        self.server = EmbeddedServer(folder / "updates", durable=durable)
+
+    def __enter__(self) -> Self:
+        self._stack.enter_context(self.server)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for program in self._programs:
+            program.kill()
+        self._stack.close()
+
+    def start(self, name: str, *arguments: object) -> Program:
+        """Start one of `benchmarks.faults_programs`."""
+        return self._started(name, self.server.url, *arguments)
+
+    def coordinator(self) -> Program:
+        """Start a Coordinator and wait until it is ready; `.wait` finds its ready line with the API's URL."""
+        archive = f"sqlite://{self.folder / 'archive.db'}"
+        options = ("--updates", self.server.url, "--archive", archive, "--log", "warning")
+        program = self._started(*options, module="coordinator.service")
+        program.wait(lambda line: bool(line.get("ready")))
+        return program
+
+    def used_memory(self) -> int:
+        """Bytes that the server holds."""
+        wire = Wire(self.server.url)
+        info = wire.call("INFO", "memory").decode()
+        wire.close()
+        return int(next(x for x in info.splitlines() if x.startswith("used_memory:")).split(":")[1])
+
+    def _started(self, *arguments: object, **options: Any) -> Program:
+        output = self.folder / f"program{len(self._programs)}.jsonl"
+        self._programs.append(Program(output, *arguments, **options))
+        return self._programs[-1]
+
+
+def until(condition: Callable[[], T | None]) -> T:
+    """The first true answer; raises RuntimeError after two minutes."""
+    deadline = time.monotonic() + WATCHDOG_S
+    while time.monotonic() < deadline:
+        answer = condition()
+        if answer:
+            return answer
+        time.sleep(0.02)
+    raise RuntimeError(f"nothing happened within {WATCHDOG_S:g} s")

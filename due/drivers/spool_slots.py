@@ -1,0 +1,122 @@
+"""Spools of the instances of one app, side by side in one folder: each has its own, none is left undrained.
+
+    spool.db  spool.lock      the first instance's      spool-1.db  spool-1.lock   the second's …
+
+An instance owns the spool whose lock it holds; the lock falls with its process.  So a restarted app finds
+its former spool free and goes on with it, and `adopt` takes over what others of the app left behind.
+"""
+
+import fcntl
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from due.drivers.spool import DiskSpool
+from due.errors import BackendError
+from due.messages import PackedFrame
+
+log = logging.getLogger("due.spool")
+
+_SLOTS = 1000
+
+
+class SlottedSpool:
+    """`Spool` of one instance; raises BackendError if no spool can be opened in the folder."""
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self._folder = folder
+        self._limit = limit
+        self._adopted: list[_Slot] = []
+        self._taken_from: DiskSpool | None = None
+        self._own = self._first_free()
+
+    def put(self, frames: Sequence[PackedFrame]) -> int:
+        """Append to our own; returns how many items did not fit and are lost."""
+        return self._own.spool.put(frames)
+
+    def take(self, frames: int) -> list[PackedFrame]:
+        """Up to `frames` of the oldest frames of one spool, adopted ones first; they stay until `done`."""
+        self._taken_from = next((slot.spool for slot in self._adopted if len(slot.spool)), self._own.spool)
+        return self._taken_from.take(frames)
+
+    def done(self, frames: int) -> None:
+        """Remove that many of what `take` gave; an adopted spool that is empty goes."""
+        (self._taken_from or self._own.spool).done(frames)
+        for slot in [slot for slot in self._adopted if not len(slot.spool)]:
+            self._adopted.remove(slot)
+            slot.remove()
+
+    def adopt(self) -> None:
+        """Take over the spools of instances that are gone."""
+        names = {path.stem for path in self._folder.glob("spool*.db")} - {self._own.name}
+        for name in sorted(names - {slot.name for slot in self._adopted}):
+            slot = self._try(name)
+            if slot is None:
+                continue
+            if len(slot.spool):
+                log.warning("archiving %d frames that another instance left in %s", len(slot.spool), name)
+                self._adopted.append(slot)
+            else:
+                slot.remove()
+
+    def __len__(self) -> int:
+        return len(self._own.spool) + sum(len(slot.spool) for slot in self._adopted)
+
+    def close(self) -> None:
+        """Close files; what is in them stays for the next start."""
+        for slot in (self._own, *self._adopted):
+            if slot.closed or len(slot.spool):
+                slot.close()
+            else:
+                slot.remove()
+
+    def _first_free(self) -> "_Slot":
+        for number in range(_SLOTS):
+            slot = self._try(f"spool-{number}" if number else "spool")
+            if slot is not None:
+                return slot
+        raise BackendError(f"all {_SLOTS} spools in {self._folder} are in use; name another folder")
+
+    def _try(self, name: str) -> "_Slot | None":
+        """The spool of this name if nobody has it."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(self._folder / f"{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise BackendError(f"spool in {self._folder}: {error}; name another folder") from error
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return _Slot(name, lock, DiskSpool(self._folder, self._limit, name))
+        except BlockingIOError:
+            os.close(lock)
+            return None
+        except BaseException:
+            os.close(lock)
+            raise
+
+
+class _Slot:
+    """One spool and the lock that makes it ours."""
+
+    def __init__(self, name: str, lock: int, spool: DiskSpool) -> None:
+        self.name = name
+        self.spool = spool
+        self._lock = lock
+        self.closed = False
+
+    def remove(self) -> None:
+        """Empty: take its files away.  The lock's file stays, or two could hold locks of one name."""
+        self.spool.close()
+        for suffix in (".db", ".db-wal", ".db-shm"):
+            with suppress(OSError):
+                self.spool.path.with_suffix(suffix).unlink()
+        self.close()
+
+    def close(self) -> None:
+        """Let go."""
+        if not self.closed:
+            self.closed = True
+            self.spool.close()
+            os.close(self._lock)

@@ -1,0 +1,135 @@
+"""`/metrics` and `/healthz` of one app, over HTTP, for a scraper and for whoever restarts what hangs.
+
+    main thread ──report(text, state)──► StatusServer ◄── GET /metrics   the last report
+                                              ◄── GET /healthz  200, or 503 where no report came for long
+
+Requests are answered from the last report, so a scraper never runs code of the app.
+"""
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from due.errors import InvalidOption
+from due.metrics import CONTENT_TYPE
+
+STALLED_SECONDS = 15.0
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_REQUEST_SECONDS = 5.0
+
+
+class StatusServer:
+    """Listens at once, answers from `start` on.  Raises `InvalidOption` where the address cannot be had."""
+
+    def __init__(self, address: str) -> None:
+        host, port = parse_address(address)
+        self._text = ""
+        self._state: Mapping[str, Any] = {}
+        self._reported = time.monotonic()
+        try:
+            self._server = _Server((host, port), _Handler)
+        except OSError as error:
+            raise InvalidOption(f"--metrics {address}: cannot listen: {error.strerror or error}") from None
+        self._server.status = self
+        self._server.hosts = _LOOPBACK if host in _LOOPBACK else ()
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.5}, name="due-status", daemon=True
+        )
+
+    @property
+    def address(self) -> str:
+        """HOST:PORT, the port as bound."""
+        host, port = self._server.server_address[:2]
+        return f"[{host!s}]:{port}" if ":" in str(host) else f"{host!s}:{port}"
+
+    def start(self) -> None:
+        """Begin to answer."""
+        self._thread.start()
+
+    def report(self, text: str, state: Mapping[str, Any]) -> None:
+        """What to answer from now on."""
+        self._text, self._state, self._reported = text, state, time.monotonic()
+
+    def metrics(self) -> tuple[int, str, str]:
+        """Status, content type and body of `/metrics`."""
+        return 200, CONTENT_TYPE, self._text
+
+    def health(self) -> tuple[int, str, str]:
+        """The same of `/healthz`."""
+        silent = time.monotonic() - self._reported
+        stalled = silent > STALLED_SECONDS
+        shown = {"status": "stalled" if stalled else "ok", **self._state, "silent_s": round(silent, 1)}
+        return 503 if stalled else 200, "application/json", json.dumps(shown) + "\n"
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._thread.is_alive():
+            self._server.shutdown()
+        self._server.server_close()
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """HOST:PORT or [IPV6]:PORT; raises `InvalidOption`."""
+    host, colon, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not (colon and host and port.isdecimal() and int(port) < 65536):
+        raise InvalidOption(f"--metrics {text}: give HOST:PORT; port 0 takes a free one")
+    return host, int(port)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    status: StatusServer
+    hosts: tuple[str, ...]
+    """Names under which we may be asked; empty: any.  On loopback no web page shall read along."""
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        super().__init__(address, handler)
+
+    def server_bind(self) -> None:
+        """Bind without looking up our own name, as the base class would."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that goes away is nothing to report."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = _REQUEST_SECONDS
+
+    def do_GET(self) -> None:
+        """Answer one request."""
+        answers = {"/metrics": self.server.status.metrics, "/healthz": self.server.status.health}
+        answer = answers.get(self.path.partition("?")[0])
+        if not self._asked_properly():
+            self._send(400, "text/plain", "asked under another host's name\n")
+        elif answer is None:
+            self._send(404, "text/plain", "here are /metrics and /healthz\n")
+        else:
+            self._send(*answer())
+
+    def log_message(self, *_arguments: Any) -> None:
+        """No line for each request."""
+
+    def _asked_properly(self) -> bool:
+        asked = self.headers.get("Host", "")
+        name = asked[: asked.find("]") + 1] if asked.startswith("[") else asked.partition(":")[0]
+        return not self.server.hosts or name.strip("[]") in self.server.hosts
+
+    def _send(self, status: int, kind: str, body: str) -> None:
+        data = body.encode()
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
