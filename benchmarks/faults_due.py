@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -13,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from benchmarks.faults_programs import KEY
-from benchmarks.faults_stage import Line, Program, Stage, until
+from benchmarks.faults_stage import ArchiveServer, Line, Program, Stage, until
 from due import DB_ONLY, Engine, Options
 
 Figures = dict[str, float | int | bool]
@@ -129,55 +127,57 @@ def instance_paused(folder: Path) -> Figures:
 
 def archive_away(folder: Path) -> Figures:
     """A MongoDB-speaking archive server (nx-27017) is away under load; frames wait on disk meanwhile."""
-    program = Path(sys.executable).with_name("nx-27017")
-    if not program.exists():
-        raise LookupError("nx-27017 is not installed: pip install nx-27017")
-    ended = threading.Event()
-    written = [0]
+    server = ArchiveServer(folder)
     with Stage(folder) as stage:
-        server = _nx(program, folder, 0)
-        port = _nx_port(folder)
-        url = f"mongodb://127.0.0.1:{port}/faults?serverSelectionTimeoutMS=500"
-        engine = Engine(
-            Options(updates=stage.server.url, archive=url, directory=str(folder), coordinated=False)
+        options = Options(
+            updates=stage.server.url, archive=server.start(), directory=str(folder), coordinated=False
         )
+        engine = Engine(options)
         engine.init("writer")
-
-        def write() -> None:
-            while not ended.wait(0.001):
-                engine.write(KEY, written[0], [DB_ONLY])
-                written[0] += 1
-
-        writer = threading.Thread(target=write)
-        writer.start()
+        load = _Load(engine)
+        load.start()
         try:
             until(lambda: engine.health().get("archive", {}).get("archived", 0) > 100)
-            server.terminate()
-            server.wait(30)
+            server.stop()
             time.sleep(AWAY_S)
-            server = _nx(program, folder, port)
-            _nx_port(folder)
+            server.start()
             back = time.monotonic()
-            ended.set()
-            writer.join()
+            load.stop()
             until(lambda: engine.health()["archive"]["backlog"] == 0)
             drained = time.monotonic() - back
-            counts = engine.health()["archive"]
+            spooled = engine.health()["archive"]["spooled"]
             found = [item.value for item in engine.get(KEY)]
         finally:
-            ended.set()
+            load.stop()
             engine.close()
-            server.terminate()
-            server.wait(30)
-    lost = written[0] - len(set(found))
+            server.stop()
     return {
         "away_s": AWAY_S,
-        "sent": written[0],
-        "lost": lost,
+        "sent": load.written,
+        "lost": load.written - len(set(found)),
         "twice": len(found) - len(set(found)),
-        "spooled": counts["spooled"],
+        "spooled": spooled,
         "drained_s": drained,
     }
+
+
+class _Load(threading.Thread):
+    """Writes numbers for the archive, about a thousand a second."""
+
+    def __init__(self, engine: Engine) -> None:
+        super().__init__(daemon=True)
+        self.written = 0
+        self._engine = engine
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        while not self._ended.wait(0.001):
+            self._engine.write(KEY, self.written, [DB_ONLY])
+            self.written += 1
+
+    def stop(self) -> None:
+        self._ended.set()
+        self.join()
 
 
 def slow_consumer_reliable(folder: Path) -> Figures:
@@ -261,31 +261,6 @@ def _known(url: str) -> set[str]:
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     with opener.open(f"{url}/instances", timeout=10) as answer:
         return {one["instance_id"] for one in json.load(answer) if one["app_id"] in ("speaker", "listener")}
-
-
-def _nx(program: Path, folder: Path, port: int) -> "subprocess.Popen[bytes]":
-    (folder / "nx.log").unlink(missing_ok=True)
-    files = [
-        "--db",
-        str(folder / "nx.db"),
-        "--pid-file",
-        str(folder / "nx.pid"),
-        "--log-file",
-        str(folder / "nx.log"),
-    ]
-    command = [str(program), "--port", str(port), *files]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
-def _nx_port(folder: Path) -> int:
-    mark = "Listening on 127.0.0.1:"
-
-    def port() -> int | None:
-        log = folder / "nx.log"
-        _, found, rest = (log.read_text() if log.exists() else "").partition(mark)
-        return int(rest.split()[0].rstrip(".,")) if found and rest.split() else None
-
-    return until(port)
 
 
 SCENARIOS: dict[str, Callable[[Path], Figures]] = {

@@ -1,6 +1,7 @@
 """Programs as processes whose JSON lines are read while they run; all are killed at the end."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -101,6 +102,43 @@ class Stage:
         output = self.folder / f"program{len(self._programs)}.jsonl"
         self._programs.append(Program(output, *arguments, **options))
         return self._programs[-1]
+
+
+class ArchiveServer:
+    """nx-27017, which speaks MongoDB's protocol over a file; raises LookupError where it is not installed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._program = Path(sys.executable).with_name("nx-27017")
+        if not self._program.exists():
+            raise LookupError("nx-27017 is not installed: pip install nx-27017")
+        self._folder = folder
+        self._port = 0
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> str:
+        """Start, on the same port as before; returns the archive's URL when it listens."""
+        files = {name: str(self._folder / f"nx.{name}") for name in ("db", "pid", "log")}
+        Path(files["log"]).unlink(missing_ok=True)
+        options = ["--db", files["db"], "--pid-file", files["pid"], "--log-file", files["log"]]
+        self._process = subprocess.Popen(
+            [str(self._program), "--port", str(self._port), *options],
+            cwd=self._folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self._port = until(lambda: _port_in(Path(files["log"])))
+        return f"mongodb://127.0.0.1:{self._port}/faults?serverSelectionTimeoutMS=500"
+
+    def stop(self) -> None:
+        """End it; may be called twice."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait(30)
+
+
+def _port_in(log: Path) -> int | None:
+    found = re.search(r"Listening on 127\.0\.0\.1:(\d+)", log.read_text() if log.exists() else "")
+    return int(found[1]) if found else None
 
 
 def until(condition: Callable[[], T | None]) -> T:

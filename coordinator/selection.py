@@ -1,8 +1,9 @@
 """Which instance of a standby app works.  A strategy picks once; the registry keeps its choice.
 
-Add one with `STRATEGIES["name"] = function`; the Coordinator's setting `selection` names it.
+The Coordinator's setting `selection` names one of `STRATEGIES`, or one of your own as `module:function`.
 """
 
+import importlib
 import random
 from collections.abc import Callable, Sequence
 
@@ -33,3 +34,17 @@ def _work(beat: Heartbeat | None) -> int:
 
 
 STRATEGIES: dict[str, Strategy] = {"random": at_random, "oldest": oldest, "least_busy": least_busy}
+
+
+def find(name: str) -> Strategy:
+    """The strategy of this name, or `module:function`; raises ValueError."""
+    if name in STRATEGIES:
+        return STRATEGIES[name]
+    module, colon, function = name.partition(":")
+    if not colon:
+        raise ValueError(f"selection {name!r}: one of {', '.join(sorted(STRATEGIES))}, or module:function")
+    try:
+        found: Strategy = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"selection {name!r}: {error}") from None
+    return found

@@ -24,7 +24,7 @@ from coordinator.checkpoint import Checkpoints
 from coordinator.leadership import Claim, Leadership
 from coordinator.registry import Checkpoint, Registry
 from coordinator.retention import Retention
-from coordinator.selection import STRATEGIES
+from coordinator.selection import find as find_strategy
 from due import NO_WAIT, PUB_ONLY, Capability, DueError, Engine, Interest, Item
 from due import service as due_service
 from due.backends import default_archive, open_archive
@@ -60,7 +60,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     address_file: str = ""
     """Where to write the API's URL once it listens; empty: nowhere."""
     selection: str = "random"
-    """How the working instance of a standby app is chosen: random, oldest or least_busy."""
+    """How the working instance of a standby app is chosen: random, oldest, least_busy or `module:function`."""
     missed_heartbeats: float = 4.0
     """So many heartbeats late, an instance is unresponsive."""
     forget_s: float = 300.0
@@ -76,8 +76,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Seconds between two looks at age and size."""
 
     def __post_init__(self) -> None:
-        if self.selection not in STRATEGIES:
-            raise ValueError(f"selection {self.selection!r}: one of {', '.join(sorted(STRATEGIES))}")
+        find_strategy(self.selection)
         if not 0 <= self.http_port < 65536:
             raise ValueError(f"http_port {self.http_port}: 0 to 65535")
 
@@ -92,7 +91,7 @@ class CoordinatorService:
         started = time.time_ns()
         self._registry = Registry(
             engine.instance_id,
-            select=STRATEGIES[settings.selection],
+            select=find_strategy(settings.selection),
             missed=settings.missed_heartbeats,
             forget_s=settings.forget_s,
             # both grow from one Coordinator to the next, so neither has to be remembered

@@ -141,12 +141,17 @@ class Engine:
         if now > session.keeper.alive_until:
             session.keeper.check_pause()
         with outlet.lock:
-            if not outlet.fast:
+            if outlet.fast:
+                if bits >= _NO_WAIT:
+                    outlet.put(value, mode, event_time, now, stays=False)
+                    outlet.cut()
+                else:
+                    outlet.put(value, mode, event_time, now)
+                return True
+            if not outlet.retired:
                 return session.gate.write(outlet, (freeze(value), mode, bits >= _NO_WAIT, event_time, now))
-            outlet.put(value, mode, event_time, now)
-            if bits >= _NO_WAIT:
-                outlet.cut()
-        return True
+        self._outlets.pop(key, None)
+        return self.write(key, value, (bits,), event_time=event_time)
 
     def flush(self, timeout: float = _FLUSH_SECONDS) -> None:
         """Return when all written so far is in the backends; raises `Timeout` (seconds).
@@ -264,7 +269,11 @@ class Engine:
             raise InvalidKey(text, at, "items are written under concrete keys, without wildcards and lists")
         if not session.keeper.member.registration.producer:
             raise NotAllowed(f"write({text!r}): init was not given the role PRODUCER")
-        outlet = self._outlets[text] = session.outlet(key)
+        retirements = session.retirements
+        outlet = session.outlet(key)
+        if session.retirements != retirements:
+            self._outlets = {}
+        self._outlets[text] = outlet
         return outlet
 
 

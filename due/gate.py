@@ -45,7 +45,7 @@ class Gate:
 
     def review(self, outlet: Outlet) -> None:
         """Apply the current permission; lets go what was held for it."""
-        if outlet.fast:
+        if outlet.fast or outlet.retired:
             return
         outlet.fast = True
         with self._keeper.lock:
@@ -146,7 +146,7 @@ class Gate:
 
 def _put(outlet: Outlet, item: Waiting) -> None:
     value, mode, no_wait, event_time, now = item
-    outlet.put(value, mode, event_time, now)
+    outlet.put(value, mode, event_time, now, stays=not no_wait)
     if no_wait:
         outlet.cut()
 

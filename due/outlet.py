@@ -61,13 +61,11 @@ class Outlet:
         self.sequence = 0
         """Of the newest item; items in the buffer have theirs already."""
         self.published = 0
+        self.retired = False
+        """Idle and put away: its numbers live on in its successor."""
         self.filled = 0
         """Frames that were sent because they were full."""
-        # the sender's notes
-        self.queued = False
-        self.due = 0.0
-        self.patience = 0.0
-        self.filled_before = 0
+        self.queued, self.due, self.patience, self.filled_before = False, 0.0, 0.0, 0  # the sender's notes
         self._identity = (key.text, app_id, instance_id)
         self._frame_bytes = frame_bytes
         self._single_bytes = single_bytes
@@ -79,12 +77,33 @@ class Outlet:
         self._times: list[int] = []
         self._events: list[int] | None = None
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits here."""
+        paced = self.pacer is not None and self.pacer.due() is not None
+        return not (self._values or self.held or self.queued or paced)
+
+    def retire(self) -> tuple[int, int] | None:
+        """Put it away if it is idle and nobody is writing: the numbers its successor begins with."""
+        if not self.lock.acquire(blocking=False):
+            return None
+        try:
+            if not self.idle:
+                return None
+            self.retired, self.fast = True, False
+            return self.sequence, self.published
+        finally:
+            self.lock.release()
+
     def dirty(self) -> None:
         """Ask for a visit of the sender."""
         self._dirty(self)
 
-    def put(self, value: Any, mode: int, event_time: int | None, now: int) -> None:
-        """Number one item and buffer it, or send it now if it is big; raises `UnsupportedValue`."""
+    def put(self, value: Any, mode: int, event_time: int | None, now: int, *, stays: bool = True) -> None:
+        """Number one item and buffer it, or send it now if it is big; raises `UnsupportedValue`.
+
+        `stays`: the caller does not `cut` at once, so somebody else will have to.
+        """
         if type(value) is bytes:
             size = len(value)
         else:
@@ -95,7 +114,7 @@ class Outlet:
         if mode != self._mode:
             self.cut()
             self._mode = mode
-        if not self._values:
+        if stays and not self._values:
             self._dirty(self)
         self.sequence += 1
         self._values.append(value)

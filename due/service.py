@@ -93,13 +93,9 @@ def run(
         chosen = read_struct(arguments.settings, settings)
         status = StatusServer(arguments.metrics) if arguments.metrics else None
         engine = Engine(_options(arguments))
-        engine.init(
-            app_id,
-            PRODUCER | CONSUMER,
-            interests=interests,
-            capabilities=capabilities,
-            instances=arguments.instances or instances,
-        )
+        chosen_instances = arguments.instances or instances
+        roles = PRODUCER | CONSUMER
+        engine.init(app_id, roles, interests=interests, capabilities=capabilities, instances=chosen_instances)
     except (DueError, OSError) as error:
         print(f"{app_id}: {error}", file=sys.stderr)
         if status is not None:

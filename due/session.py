@@ -27,6 +27,9 @@ from due.sender import Sender
 
 log = logging.getLogger("due")
 
+_MOST_OUTLETS = 10_000
+"""With so many keys being written, those that are idle are put away."""
+
 
 class Session:
     """The parts, their start and their end."""
@@ -50,17 +53,19 @@ class Session:
             handshake_timeout=options.handshake_timeout,
             coordinated=options.coordinated,
         )
-        pause = options.pause_limit or 3 * options.heartbeat
-        self.keeper = Keeper(
-            member, self._driver.receiver(app, me), self.publisher, self.dispatcher, pause=pause
-        )
-        self.keeper.say = self._say
-        self.keeper.changed = self._changed
-        self.keeper.written = lambda: sum(o.sequence for o in list(self.outlets.values()))
+        control, pause = self._driver.receiver(app, me), options.pause_limit or 3 * options.heartbeat
+        self.keeper = Keeper(member, control, self.publisher, self.dispatcher, pause=pause)
+        self.keeper.say, self.keeper.changed = self._say, self._changed
+        self.keeper.written = self._written
         self.gate = Gate(self.keeper, self.publisher, options.handshake_bytes)
         self.sender = Sender(options.linger, self.gate.service, self.gate.blocked)
         self.outlets: dict[str, Outlet] = {}
         """By canonical key."""
+        self.retirements = 0
+        """How often idle outlets were put away."""
+        self._retired: dict[str, tuple[int, int]] = {}
+        """By key: items numbered and items published by outlets that were put away."""
+        self._retired_items = 0
         self._said: dict[str, Outlet] = {}
         self._observed: list[Observation] = []
         self._declared = registration.interests
@@ -92,8 +97,26 @@ class Session:
         with self._lock:
             outlet = self.outlets.get(key.text)
             if outlet is None:
-                outlet = self.outlets[key.text] = self._new_outlet(key)
+                if len(self.outlets) >= _MOST_OUTLETS:
+                    self._retire_outlets()
+                outlet = self._new_outlet(key)
+                outlet.sequence, outlet.published = self._retired.pop(key.text, (0, 0))
+                self._retired_items -= outlet.sequence
+                self.outlets[key.text] = outlet
             return outlet
+
+    def _retire_outlets(self) -> None:
+        """Of many keys most are idle: only their numbers are kept, or a reader would take them for repeats."""
+        for text, outlet in list(self.outlets.items()):
+            numbers = outlet.retire()
+            if numbers is not None:
+                del self.outlets[text]
+                self._retired[text] = numbers
+                self._retired_items += numbers[0]
+        self.retirements += 1
+
+    def _written(self) -> int:
+        return self._retired_items + sum(outlet.sequence for outlet in list(self.outlets.values()))
 
     def flush_outlet(self, outlet: Outlet) -> bool:
         """Send what is buffered; False while items wait for permission or for their pace."""
@@ -234,7 +257,7 @@ class Session:
         if outlet is None:
             outlet = self._said[text] = self._new_outlet(Key(text))
         with outlet.lock:
-            outlet.put(value, PUBLISH, None, time.time_ns())
+            outlet.put(value, PUBLISH, None, time.time_ns(), stays=False)
             outlet.cut()
 
     def _changed(self) -> None:

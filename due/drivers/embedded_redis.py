@@ -23,7 +23,7 @@ from due.errors import UpdatesUnavailable
 _PR_SET_PDEATHSIG = 1
 _START_TIMEOUT = 10.0
 _LONGEST_SOCKET_PATH = 100
-_SUBSCRIBER_LIMIT = ("64mb", "32mb", "20")
+_SUBSCRIBER_LIMIT = ("128mb", "64mb", "20")
 """A subscriber that lets more pile up, or so much for so many seconds, is dropped by the server."""
 
 

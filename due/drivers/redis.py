@@ -27,6 +27,7 @@ _READ_REPLIES_AT = 16
 _MOST_OUTSTANDING = 1024
 _ASK_SECONDS = 0.02
 _POLL_SECONDS = 0.25
+_CHANNELS = 65536
 _RECONNECT_SECONDS = 0.05
 
 
@@ -169,6 +170,8 @@ class RedisPublisher:
                 self._wire = None
 
     def _channel(self, path: str) -> bytes:
+        if len(self._channels) >= _CHANNELS:
+            self._channels.clear()
         return self._channels.setdefault(path, channel_name(path))
 
     def _announce(self, path: str) -> StreamLedger:

@@ -31,7 +31,7 @@ _LOOK_SECONDS = 1.0
 _HOLD_SECONDS = 0.2
 _GONE_SECONDS = 30.0
 """Whoever has not renewed his lease for so long holds no group."""
-_WITHDRAWN_SECONDS = 2.0
+_WITHDRAWN_SECONDS = 10.0
 _FORGET_SECONDS = 3600.0
 _ASIDE_LENGTH = 1000
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from coordinator.selection import STRATEGIES, Candidate, at_random, least_busy, oldest
+from coordinator.selection import STRATEGIES, Candidate, at_random, find, least_busy, oldest
 from due.membership import Heartbeat, Registration
 
 
@@ -30,3 +30,16 @@ def test_by_what_each_chooses() -> None:
 @pytest.mark.parametrize("strategy", sorted(STRATEGIES))
 def test_one_candidate_is_the_choice(strategy: str) -> None:
     assert STRATEGIES[strategy](CANDIDATES[:1]) is CANDIDATES[0]
+
+
+def last(candidates: list[Candidate]) -> Candidate:
+    """A strategy of somebody else."""
+    return candidates[-1]
+
+
+def test_strategies_of_others_are_named_by_module_and_function() -> None:
+    assert name(find(f"{__name__}:last")(CANDIDATES)) == "z"
+    assert find("oldest") is oldest
+    for wrong in ("none", "no.such.module:pick", "math:no_such"):
+        with pytest.raises(ValueError, match=wrong):
+            find(wrong)

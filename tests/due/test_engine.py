@@ -287,3 +287,21 @@ def test_replay_from_a_time(make_engine):
     wait_for(lambda: len(all_of_it) == 6)
     assert late == [3, 4, 5]
     assert all_of_it == list(range(6))
+
+
+def test_idle_outlets_are_put_away_and_their_numbers_go_on(make_engine, monkeypatch):
+    monkeypatch.setattr("due.session._MOST_OUTLETS", 50)
+    engine = make_engine("many")
+    got = []
+    engine.observe("t.many.*").subscribe(lambda item: got.append((item.key, item.sequence, item.value)))
+    for round_ in range(3):
+        for number in range(200):
+            engine.write(f"t.many.k{number}", round_, [PUB_ONLY, NO_WAIT])
+    wait_for(lambda: len(got) == 600)
+    for number in range(200):
+        mine = [(sequence, value) for key, sequence, value in got if key == f"t.many.k{number}"]
+        assert mine == [(1, 0), (2, 1), (3, 2)]
+    health = engine.health()
+    assert health["outlets"] <= 60
+    assert health["written"] == 600
+    assert health["receiving"]["gaps"] == health["receiving"]["repeats"] == 0

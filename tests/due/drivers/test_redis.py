@@ -85,7 +85,8 @@ def test_instances_of_a_shared_app_divide_a_stream(make_engine):
     assert sorted(got["a"] + got["b"]) == list(range(number))
 
 
-def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path):
+def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path, monkeypatch):
+    monkeypatch.setattr("due.drivers.redis_reader._WITHDRAWN_SECONDS", 0.1)
     with EmbeddedServer(tmp_path / "u") as server:
         init = {"capabilities": [Capability("r.gone", delivery="reliable")]}
         producer = make_engine("producer", url=server.url, init=init)
