@@ -45,6 +45,7 @@ class Firewall:
         )
         self._engine = engine
         self._number = 0
+        wait_for(lambda: engine.wanted("network.block.firewall.ipv4"), _LONGEST_S)
 
     def decide(self, sources: range, action: str = "block") -> None:
         for source in sources:

@@ -5,14 +5,13 @@ Reading needs no rights over the switch: its controller stays in charge.
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdnator import running
 from sdnator.errors import BadInput, PipelineError
 from sdnator.plain_table import plain_table
+from sdnator.switch_place import DeviceId, Place, SwitchArgument, place_of
 
 if TYPE_CHECKING:
     from apps.p4runtime_ctrl.p4info import Program
@@ -20,21 +19,7 @@ if TYPE_CHECKING:
 _SECONDS = 10.0
 _ENTRY = ("packets", "bytes", "action", "entry")
 
-SwitchArgument = Annotated[
-    str,
-    typer.Argument(
-        help="Name in the running pipeline, or HOST:PORT; default: the pipeline's.", metavar="SWITCH"
-    ),
-]
-DeviceId = Annotated[int, typer.Option(help="P4Runtime device id, for HOST:PORT.", min=1)]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
-
-
-@dataclass(frozen=True)
-class _Place:
-    name: str
-    address: str
-    device_id: int
 
 
 def tables(
@@ -48,7 +33,7 @@ def tables(
 
     Example: sdnator tables s1 --table block_mac
     """
-    place = _place(switch, device_id)
+    place = place_of(switch, device_id)
     program, rows = _read(place, table)
     if as_json:
         print(json.dumps({"switch": place.name, "address": place.address, "entries": rows}))
@@ -65,7 +50,7 @@ def counters(switch: SwitchArgument = "", *, device_id: DeviceId = 1, as_json: J
 
     Example: sdnator counters s1
     """
-    place = _place(switch, device_id)
+    place = place_of(switch, device_id)
     counted = [row for row in _read(place, "")[1] if "packets" in row]
     if as_json:
         print(json.dumps({"switch": place.name, "address": place.address, "counters": counted}))
@@ -73,17 +58,7 @@ def counters(switch: SwitchArgument = "", *, device_id: DeviceId = 1, as_json: J
         print(plain_table(_ENTRY, map(_entry_cells, counted)))
 
 
-def _place(switch: str, device_id: int) -> _Place:
-    host, _, port = switch.rpartition(":")
-    if host and port.isdecimal():
-        return _Place(switch, switch, device_id)
-    known = running.need().switch
-    if switch not in ("", known["name"]):
-        raise BadInput(f"switch {switch}: the running pipeline has {known['name']}; or give HOST:PORT")
-    return _Place(known["name"], known["address"], known["device_id"])
-
-
-def _read(place: _Place, table: str) -> "tuple[Program, list[dict[str, Any]]]":
+def _read(place: Place, table: str) -> "tuple[Program, list[dict[str, Any]]]":
     """The program that runs there and its entries; raises PipelineError, BadInput for a table it lacks."""
     import grpc
 

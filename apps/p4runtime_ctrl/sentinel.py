@@ -33,7 +33,7 @@ _BYE: Final = b"bye\n"
 _PATIENCE_S: Final = 1.5
 """A backup controller takes the place of a lost primary within less."""
 _UNDER_CONTROL_S: Final = 3.0
-_GIVE_UP_S: Final = 20.0
+_GIVE_UP_S: Final = 60.0
 _DISMISS_S: Final = 5.0
 _LOG = logging.getLogger(__name__)
 
@@ -45,6 +45,11 @@ class Sentinel:
         self._settings = settings
         self._needed = bool(_closed(settings))
         self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def watches(self) -> bool:
+        """Whether it is there to close switches."""
+        return self._process is not None and self._process.poll() is None
 
     def start(self) -> None:
         """Nothing where no switch is to fail closed."""

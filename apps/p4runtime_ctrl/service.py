@@ -127,7 +127,10 @@ class P4RuntimeCtrlService:
         self._sentinel.dismiss()
 
     def health(self) -> dict[str, Any]:
-        return {"switches": [agent.health() for agent in self._agents.values()]}
+        return {
+            "switches": [agent.health() for agent in self._agents.values()],
+            "sentinel": self._sentinel.watches,
+        }
 
     def _on_decision(self, item: Item) -> None:
         decision = read(Decision, item)

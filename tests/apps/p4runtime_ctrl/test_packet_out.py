@@ -108,13 +108,16 @@ def test_cells_are_read_in_band(kind, tmp_path):
             engine, "network.cell.p4runtime_ctrl.*", STATE, "network.confirmation.p4runtime_ctrl.*",
             f"network.packets.p4runtime_ctrl.s1.q{BIT}",
         )  # fmt: skip
+        wanted = ("network.p4_command.sonata_adapter.s1", f"network.telemetry.sonata.q{BIT}", REQUEST)
+        wait_for(lambda: all(map(engine.wanted, wanted)), 90, why=stage.log)
         command = TableCommand(id="c1", updates=(counting(),))
         engine.write("network.p4_command.sonata_adapter.s1", command.to_value())
         offer = {"name": f"q{BIT}", "bit": BIT, "conditions": {"protocol": 17}}
         engine.write(f"network.telemetry.sonata.q{BIT}", offer)
-        wait_for(lambda: heard.values("confirmation"), why=stage.log)
+        engine.flush()
+        wait_for(lambda: heard.values("confirmation"), 90, why=stage.log)
         assert heard.values("confirmation")[0]["state"] == "installed"
-        wait_for(lambda: any(v["telemetry"] for v in heard.values("network.switch")), why=stage.log)
+        wait_for(lambda: any(v["telemetry"] for v in heard.values("network.switch")), 90, why=stage.log)
         assert heard.values("network.switch")[-1]["base_us"] == BASE_US
         send([frame(1 + number % 3) for number in range(8)])
         wait_for(lambda: sum(map(len, heard.values("network.packets"))) == 8, 60, why=stage.log)
@@ -156,8 +159,10 @@ def test_frames_leave_through_their_port(kind, tmp_path):
         wait_for(
             lambda: heard.values("network.switch")[-1:] and heard.values("network.switch")[-1]["primary"]
         )
+        wait_for(lambda: engine.wanted(FRAMES), 90, why=stage.log)
         engine.write(FRAMES, {**value, "frames": b"short"})
         engine.write(FRAMES, value)
+        engine.flush()
         got = []
         while len(got) < 3:
             data, address = wire.recvfrom(2000)

@@ -61,6 +61,7 @@ def test_a_controller_that_ends_by_itself_dismisses_it(switch, fail):
     mine = sentinel.Sentinel(settings(switch.address, fail))
     mine.start()
     mine.keep()
+    assert mine.watches == (fail == "closed")
     mine.dismiss()
     assert wires(switch) == 2
     other.connection.close()

@@ -97,13 +97,25 @@ def test_packets_of_one_port_are_a_key_of_their_own(stage):
     feed.close()
 
 
+CAPTURES = (
+    "kitsune/mirai2000",
+    "captures/ssh_guessing",
+    "captures/ftp_bruteforce",
+    "captures/synflood_one_source",
+)
+
+
 def real_frames():
-    """Times in us since the first second, lengths on the wire and bytes, of a real capture."""
-    reader = RawPcapReader(str(shared_data("kitsune/mirai2000.pcap")))
-    with reader:
-        found = [(m.sec * 1_000_000 + m.usec, m.wirelen, data) for data, m in reader]
-    first = found[0][0] // 1_000_000 * 1_000_000
-    return [t - first for t, _, _ in found], [length for _, length, _ in found], [f for _, _, f in found]
+    """Times in us since the first second, lengths on the wire and bytes, of real captures, one after the other."""
+    times, lengths, frames = [], [], []
+    for name in CAPTURES:
+        with RawPcapReader(str(shared_data(f"{name}.pcap"))) as reader:
+            found = [(m.sec * 1_000_000 + m.usec, m.wirelen, data) for data, m in reader]
+        first = found[0][0] - (times[-1] if times else 0)
+        times += [time - first for time, _, _ in found]
+        lengths += [length for _, length, _ in found]
+        frames += [frame for _, _, frame in found]
+    return times, lengths, frames
 
 
 def strange_frames():
@@ -239,6 +251,30 @@ def test_idle_entries_are_removed_by_the_capture_clock(stage):
     wait_for(lambda: any(v["state"] == "expired" for v in heard.values("confirmation")), why=stage.log)
     assert heard.values("confirmation")[-1]["handle"] == good["handle"]
     feed.close()
+
+
+def test_stations_are_learnt_and_forgotten_by_the_capture_clock(tmp_path):
+    with Stage(tmp_path, forward={}, learn={"ports": [1, 2], "age_s": 2.0}) as stage:
+        stage.controller(telemetry="digest")
+        heard = Heard(stage.engine("listener"), PACKETS, STATE, CONFIRMATIONS)
+        wait_for(lambda: any(v["telemetry"] == ["packets"] for v in heard.values("switch")), why=stage.log)
+        feed = stage.feed()
+
+        def stations():
+            return heard.values("network.switch")[-1]["stations"]
+
+        feed.send([1, 2], [60, 60], [frame(1), frame(2)])
+        wait_for(lambda: stations() == 2, 90, why=lambda: (heard.values("switch")[-1], stage.log()))
+        wait_for(lambda: len(heard.arrivals()) == 2, 90, why=stage.log)
+        sent = 2
+        while stations() == 2:
+            feed.send([sent * 1_000_000], [60], [frame(2)])
+            sent += 1
+            assert sent < 100_000
+            wait_for(lambda: len(heard.arrivals()) == sent, 90, why=stage.log)  # noqa: B023 - run at once
+        assert stations() == 1
+        assert not heard.values("confirmation"), "nobody asked for these entries"
+        feed.close()
 
 
 def test_two_switches_are_kept_apart(stage, tmp_path):
