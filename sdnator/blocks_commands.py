@@ -1,34 +1,34 @@
 """`sdnator blocks …` and `sdnator allow …`: what the firewall decided, why, and how people overrule it.
 
 Reading needs Data Archives only.  Instructions go to the running firewall through Data Updates; `panic`
-without it writes into Data Archives that everything is lifted, which controllers and firewall take up when
-they start.
+without it writes into Data Archives that everything is lifted, and clears the switch itself.
 """
 
 import json
+import os
 import threading
-import time
-from collections.abc import Iterable
-from datetime import UTC, datetime
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 from uuid import uuid4
 
 import typer
 
-from apps.firewall.history import DECISIONS, INSTRUCTIONS, allowed_by, decisions_in, in_force
-from apps.messages import Answer, Decision, Instruction
+from apps.firewall.history import INSTRUCTIONS, allowed_by, in_force, instructions_in
+from apps.messages import Answer, Instruction
 from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item
-from due.backends import default_archive, open_archive
 from due.config import Options
+from sdnator import running
+from sdnator.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
+from sdnator.blocks_direct import lift_in_switch
+from sdnator.blocks_nft import nft_sets
+from sdnator.blocks_why import as_text, decision_line, life_of
 from sdnator.errors import BadInput, PipelineError
 
 blocks = typer.Typer(help="Blocks and guards: list, add, remove, explain, lift all.", no_args_is_help=True)
 allow = typer.Typer(help="Addresses, prefixes and MACs that are never blocked.", no_args_is_help=True)
 
-_INSTRUCTION: Final = "network.instruction.operator.firewall"
 _ANSWER: Final = "network.answer.firewall.operator"
 _ANSWER_SECONDS: Final = 10.0
-_LIFTS: Final = {"block": "unblock", "protect": "unprotect"}
+_PANIC_SECONDS: Final = 3.0
 
 UpdatesOption = Annotated[str, typer.Option("--updates", help="Data Updates URL; default: $DUE_UPDATES.")]
 ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
@@ -50,7 +50,7 @@ def list_blocks(
 
     Example: sdnator blocks list
     """
-    decisions = decisions_in(item for key in DECISIONS for item in _find(archive, key))
+    decisions = all_decisions(archive)
     shown = decisions if every else in_force(decisions)
     if nft:
         typer.echo(nft_sets(shown))
@@ -60,7 +60,7 @@ def list_blocks(
         typer.echo("nothing is blocked or guarded")
     else:
         for decision in shown:
-            typer.echo(_line(decision))
+            typer.echo(decision_line(decision))
 
 
 @blocks.command("why")
@@ -68,36 +68,26 @@ def why(
     decision: Annotated[str, typer.Argument(metavar="ID", help="As `blocks list` shows it.")],
     *,
     archive: ArchiveOption = "",
+    as_json: JsonOption = False,
 ) -> None:
-    """A decision's life: reasons, evidence, and what the switches said.
+    """A decision's life: reasons, evidence, earlier offences, what the switches said and stopped.
 
     Example: sdnator blocks why 1f0c2a9be771
     """
-    found = [each for key in DECISIONS for each in _find(archive, {"dataKey": key, "value.id": decision})]
-    if not found:
-        raise BadInput(f"no decision has the id {decision}; see `sdnator blocks list --all`")
-    for made in (Decision.from_value(item.value) for item in found):
-        typer.echo(_line(made))
-        for evidence in made.evidence:
-            typer.echo(f"    {_time(evidence.timestamp)} {evidence.key}: {evidence.summary}")
-    query = {"dataKey": "network.confirmation.p4runtime_ctrl.*", "value.id": decision}
-    for item in _find(archive, query):
-        said = item.value
-        typer.echo(
-            f"  {_time(item.timestamp)} switch {said['switch']}: {said['state']} {said['handle']} {said['cause']}"
-        )
+    life = life_of(decision, archive)
+    typer.echo(json.dumps(life) if as_json else "\n".join(as_text(life)))
 
 
 @blocks.command("add")
 def add_block(
-    address: Annotated[str, typer.Argument(metavar="ADDRESS|MAC")],
+    address: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC|MAC@PORT")],
     *,
     reason: ReasonOption = "",
     seconds: Annotated[int, typer.Option(help="Length of the block.", min=1)] = 600,
     updates: UpdatesOption = "",
     archive: ArchiveOption = "",
 ) -> None:
-    """Block an address or a MAC on all switches; the allow-list wins.
+    """Block an address, a prefix or a MAC (on one port) on all switches; the allow-list wins.
 
     Example: sdnator blocks add 192.0.2.66 --reason "ticket 4711" --seconds 3600
     """
@@ -120,17 +110,59 @@ def remove_block(
 
 
 @blocks.command("panic")
-def panic(*, updates: UpdatesOption = "", archive: ArchiveOption = "") -> None:
+def panic(
+    *,
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+    direct: Annotated[
+        bool, typer.Option("--direct", help="Do not ask the firewall: archive and switch at once.")
+    ] = False,
+    switch: Annotated[
+        str,
+        typer.Option(help="P4Runtime switch to clear; default: the running pipeline's.", metavar="HOST:PORT"),
+    ] = "",
+    device_id: Annotated[int, typer.Option(help="P4Runtime device id of --switch.", min=1)] = 1,
+) -> None:
     """Lift everything at once, except the guards that the settings name.
+
+    Where the firewall does not answer, Data Archives are told, and the switch is cleared over P4Runtime:
+    its controller, if there is one, loses its place for a moment and takes it again.
 
     Example: sdnator blocks panic
     """
+    if not direct:
+        try:
+            _instruct("panic", "", "panic", updates, archive, patience=_PANIC_SECONDS)
+        except (DueError, PipelineError) as error:
+            typer.echo(f"the firewall does not answer ({error})", err=True)
+        else:
+            return
+    guards = _lift_in_archive(archive)
+    place = (switch, device_id) if switch else _running_switch()
+    address, number = place
+    count = lift_in_switch(address, number, guards)
+    typer.echo(f"{count} entries deleted in the switch at {address}")
+
+
+def _running_switch() -> tuple[str, int]:
+    found = running.find()
+    if found is None:
+        raise PipelineError(
+            "no switch is known: give --switch HOST:PORT; controllers carry it out when they are started again"
+        )
+    return str(found.switch["address"]), int(found.switch["device_id"])
+
+
+def _lift_in_archive(archive: str) -> list[tuple[str, int]]:
+    """The guards that were lifted; an archive that is away keeps nobody from clearing the switch."""
     try:
-        _instruct("panic", "", "panic", updates, archive)
-    except (DueError, PipelineError) as error:
-        typer.echo(f"the firewall does not answer ({error})", err=True)
-        count = lift_in_archive(archive)
-        typer.echo(f"{count} decisions are lifted in Data Archives; restart the controllers to carry it out")
+        lifted = lift_in_archive(archive)
+    except BadInput as error:
+        typer.echo(f"{error}; guards stay, and a controller may bring blocks back", err=True)
+        return []
+    typer.echo(f"{len(lifted)} decisions are lifted in Data Archives")
+    targets = (each.target for each in lifted if each.action == "protect")
+    return [(target.address, target.port or 0) for target in targets]
 
 
 @allow.command("add")
@@ -169,85 +201,31 @@ def allow_list(*, archive: ArchiveOption = "") -> None:
 
     Example: sdnator allow list
     """
-    instructions = [Instruction.from_value(item.value) for item in _find(archive, INSTRUCTIONS)]
+    instructions = instructions_in(find(archive, INSTRUCTIONS))
     typer.echo("\n".join(allowed_by(instructions)) or "nothing was allowed by hand")
-
-
-def nft_sets(decisions: Iterable[Decision]) -> str:
-    """Blocked addresses as an nftables table of their own, which replaces itself."""
-    found = [each.target for each in decisions if each.action == "block"]
-    families = {
-        "blocked4": (
-            "ipv4_addr",
-            [each.address for each in found if each.kind == "ip" and ":" not in each.address],
-        ),
-        "blocked6": (
-            "ipv6_addr",
-            [each.address for each in found if each.kind == "ip" and ":" in each.address],
-        ),
-        "blocked_mac": ("ether_addr", [each.address for each in found if each.kind == "mac"]),
-    }
-    lines = ["table inet sdnator", "delete table inet sdnator", "table inet sdnator {"]
-    for name, (kind, addresses) in families.items():
-        elements = f" elements = {{ {', '.join(sorted(set(addresses)))} }};" if addresses else ""
-        lines.append(f"  set {name} {{ type {kind};{elements} }}")
-    lines += ["  chain input {", "    type filter hook input priority -10;"]
-    lines += [
-        "    ip saddr @blocked4 drop",
-        "    ip6 saddr @blocked6 drop",
-        "    ether saddr @blocked_mac drop",
-    ]
-    return "\n".join([*lines, "  }", "}"])
-
-
-def lift_in_archive(archive: str) -> int:
-    """Write for every decision in force that it is lifted; how many.  Raises `BadInput`."""
-    standing = in_force(decisions_in(item for key in DECISIONS for item in _find(archive, key)))
-    now, instance = time.time_ns(), uuid4().hex[:16]
-    items = []
-    for number, decision in enumerate(standing, start=1):
-        value = decision.to_value() | {
-            "action": _LIFTS[decision.action],
-            "reason": "panic",
-            "event_time": now,
-        }
-        family = "ipv6" if ":" in decision.target.address else "ipv4"
-        kind = "mac" if decision.target.kind == "mac" else family
-        key = f"network.{decision.action}.firewall.{kind}"
-        items.append(Item(key, value, now + number, now, "firewall", instance, number))
-    if items:
-        open_archive(_archive_url(archive)).insert(items)
-    return len(items)
-
-
-def _archive_url(given: str) -> str:
-    return given or default_archive(Options())
-
-
-def _find(archive: str, query: str | dict[str, Any]) -> list[Item]:
-    url = _archive_url(archive)
-    try:
-        driver = open_archive(url)
-        try:
-            return driver.find({"dataKey": query} if isinstance(query, str) else query)
-        finally:
-            driver.close()
-    except DueError as error:
-        raise BadInput(f"{url}: {error}") from error
 
 
 Verb = Literal["block", "unblock", "allow", "disallow", "panic"]
 
 
 def _instruct(
-    verb: Verb, subject: str, reason: str, updates: str, archive: str, *, seconds: int = 600
+    verb: Verb,
+    subject: str,
+    reason: str,
+    updates: str,
+    archive: str,
+    *,
+    seconds: int = 600,
+    patience: float = _ANSWER_SECONDS,
 ) -> None:
     """Tell the firewall and wait for its answer; raises `BadInput` where it refuses."""
     instruction = Instruction(id=uuid4().hex[:12], verb=verb, subject=subject, reason=reason, seconds=seconds)
     engine = Engine(Options(connect_timeout=2.0))
-    if updates:
-        engine.set_pubsub(updates)
-    engine.set_db(_archive_url(archive))
+    found = None if updates or os.environ.get("DUE_UPDATES") else running.find()
+    url = updates or (found.updates if found is not None else "")
+    if url:
+        engine.set_pubsub(url)
+    engine.set_db(archive_url(archive))
     answers: list[Answer] = []
     answered = threading.Event()
 
@@ -257,27 +235,16 @@ def _instruct(
             answers.append(answer)
             answered.set()
 
-    told = Capability(_INSTRUCTION, delivery="reliable", archive="always")
+    told = Capability(INSTRUCTION, delivery="reliable", archive="always")
     engine.init("operator", PRODUCER | CONSUMER, capabilities=[told], instances="shared")
     try:
         engine.observe(_ANSWER).subscribe(on_answer)
-        engine.write(_INSTRUCTION, instruction.to_value())
-        engine.flush()
-        if not answered.wait(_ANSWER_SECONDS):
-            raise PipelineError(f"the firewall did not answer within {_ANSWER_SECONDS:.0f} s; is it running?")
+        engine.write(INSTRUCTION, instruction.to_value())
+        engine.flush(patience)
+        if not answered.wait(patience):
+            raise PipelineError(f"the firewall did not answer within {patience:.0f} s; is it running?")
     finally:
         engine.close()
     if not answers[0].done:
         raise BadInput(answers[0].text)
     typer.echo(answers[0].text)
-
-
-def _line(decision: Decision) -> str:
-    until = f"until {_time(decision.expires)}" if decision.expires else "without end"
-    target = decision.target
-    where = f"{target.address} port {target.port}" if target.port is not None else target.address
-    return f"{decision.id} {decision.action} {where} on {decision.switch} {until}: {decision.reason}"
-
-
-def _time(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S}Z"

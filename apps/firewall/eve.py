@@ -4,6 +4,7 @@ import json
 from datetime import UTC, datetime
 from typing import Any
 
+from apps.firewall.ledger import Notice
 from apps.messages import Alert, Decision
 
 _SECOND = 1_000_000_000
@@ -43,6 +44,18 @@ def decision_line(decision: Decision) -> str:
         "category": decision.action,
         "severity": 1 if decision.action in ("block", "protect") else 3,
         "metadata": {"id": [decision.id], "switch": [decision.switch]},
+    }
+    return json.dumps(event)
+
+
+def notice_line(notice: Notice) -> str:
+    """One line for something that people have to know at once, such as a cap that was reached."""
+    event = _event("alert", notice.event_time)
+    event["alert"] = {
+        "action": "allowed",
+        "signature": notice.text,
+        "category": notice.kind,
+        "severity": 1,
     }
     return json.dumps(event)
 

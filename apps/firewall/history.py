@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
+import msgspec
+
 from apps.messages import Decision, Instruction, Target
 from due import Item
 
@@ -10,7 +12,7 @@ from due import Item
 def offences_query(target: Target) -> dict[str, Any]:
     """The archive query for earlier blocks of a target."""
     return {
-        "dataKey": "network.block.firewall.*",
+        "dataKey": "network.block_prefix.firewall.*" if "/" in target.address else "network.block.firewall.*",
         "value.action": "block",
         "value.target.address": target.address,
     }
@@ -35,8 +37,30 @@ def count_offences(items: Iterable[Item], target: Target, before: int) -> int:
     return len(ids)
 
 
-DECISIONS: Final = ("network.block.firewall.*", "network.protect.firewall.*")
+DECISIONS: Final = (
+    "network.block.firewall.*",
+    "network.block_prefix.firewall.*",
+    "network.protect.firewall.*",
+)
+ANSWERS: Final = "network.answer.firewall"
+"""`<ANSWERS>.<who asked>`"""
 INSTRUCTIONS: Final = "network.instruction.*.firewall"
+
+
+def newer_than(key: str, timestamp: int) -> dict[str, Any]:
+    """The archive query for items of a key written after a time, ns."""
+    return {"dataKey": key, "timestamp": {"$gt": timestamp}}
+
+
+def instructions_in(items: Iterable[Item]) -> list[Instruction]:
+    """Archived instructions in order; what is none is left out, as it was when it came."""
+    found = []
+    for item in items:
+        try:
+            found.append(Instruction.from_value(item.value))
+        except msgspec.ValidationError:
+            continue
+    return found
 
 
 def decisions_in(items: Iterable[Item]) -> list[Decision]:

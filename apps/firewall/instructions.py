@@ -22,8 +22,8 @@ class Desk:
         self.allow = AllowList.parse(self.entries)
 
     def take_up(self, instructions: Iterable[Instruction]) -> None:
-        """The allow-list as it was before a restart."""
-        self._set_entries(allowed_by(instructions, self.entries))
+        """The allow-list as it was before a restart; instructions are kept also where they were refused."""
+        self._set_entries(tuple(filter(_is_entry, allowed_by(instructions, self.entries))))
 
     def carry_out(self, instruction: Instruction, evidence: Evidence, now: int) -> Outcome:
         """Decisions to publish and the answer; what cannot be done changes nothing."""
@@ -85,11 +85,24 @@ class Desk:
         self.entries = tuple(dict.fromkeys(entries))
 
 
-def target_in(text: str) -> Target:
-    """An address or MAC address as a target; raises ValueError that says what would do."""
-    if is_mac(text):
-        return Target(kind="mac", address=text.lower())
+def _is_entry(text: str) -> bool:
     try:
-        return Target(kind="ip", address=str(ipaddress.ip_address(text)))
+        AllowList.parse((text,))
     except ValueError:
-        raise ValueError(f"{text!r} is no IP address and no MAC address") from None
+        return False
+    return True
+
+
+def target_in(text: str) -> Target:
+    """An address, a prefix, MAC or MAC@PORT as a target; raises ValueError that says what would do."""
+    mac, _, port = text.partition("@")
+    if is_mac(mac) and (port.isdecimal() or text == mac):
+        return Target(kind="mac", address=mac.lower(), port=int(port) if port else None)
+    try:
+        if "/" not in text:
+            return Target(kind="ip", address=str(ipaddress.ip_address(text)))
+        network = ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        raise ValueError(f"{text!r} is no IP address, no prefix and no MAC address") from None
+    alone = network.num_addresses == 1
+    return Target(kind="ip", address=str(network.network_address if alone else network))

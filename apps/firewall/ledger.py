@@ -6,14 +6,17 @@ the sender is on probation, where one hot second blocks it again, a step higher.
 """
 
 import hashlib
+import ipaddress
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from apps.firewall.policy import Rules
 from apps.messages import Alert, Confirmation, Decision, Evidence, Sender, Target
 
 SECOND = 1_000_000_000
+MINUTE = 60 * SECOND
+NOTICES = 100
 PROBATION_S = 600
 STILL_GOING_RATIO = 3.0
 """A block is extended while its drops exceed the training rate this many times."""
@@ -32,6 +35,8 @@ class Block:
     readings: deque[tuple[int, int]] = field(default_factory=deque)
     """Capture time and drop counter of the last minute, oldest first."""
     state: str = "decided"
+    host: str = ""
+    """The address behind a blocked MAC, or the blocked address."""
 
     @property
     def drop_rate(self) -> float:
@@ -40,6 +45,16 @@ class Block:
             return 0.0
         (begun, first), (ended, last) = self.readings[0], self.readings[-1]
         return (last - first) * SECOND / (ended - begun)
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that people have to know at once."""
+
+    kind: str
+    """One word, the last segment of its key."""
+    text: str
+    event_time: int
 
 
 @dataclass
@@ -51,17 +66,19 @@ class Ledger:
     probation: dict[tuple[str, str, str], int] = field(default_factory=dict)
     refused: int = 0
     """Blocks that a cap prevented."""
+    known: Collection[str] = frozenset()
+    """Hosts known from handshakes."""
+    notices: deque[Notice] = field(default_factory=lambda: deque(maxlen=NOTICES))
+    """Not yet said."""
+    stopped: str = ""
+    """The cap that holds blocking up, empty while none does."""
     _recent: deque[int] = field(default_factory=deque)
+    _said: dict[str, int] = field(default_factory=dict)
 
     def covering(self, sender: Sender) -> Block | None:
         """The block in force that already stops this sender."""
         for block in self.blocks.values():
-            target = block.decision.target
-            if block.decision.switch not in (sender.switch, "*"):
-                continue
-            if target.kind == "mac" and (target.address, target.port) == (sender.mac, sender.port):
-                return block
-            if target.kind == "ip" and target.address == sender.ip:
+            if block.decision.switch in (sender.switch, "*") and _stops(block.decision.target, sender):
                 return block
         return None
 
@@ -72,15 +89,30 @@ class Ledger:
             for kind, address in (("mac", sender.mac), ("ip", sender.ip))
         )
 
-    def cap_reached(self, now: int) -> str | None:
-        """Why no further block may be made at this moment, or None."""
+    def cap_reached(self, now: int, host: str = "") -> str | None:
+        """Why no further block, of this host, may be made at this moment, or None."""
         while self._recent and self._recent[0] <= now - 60 * SECOND:
             self._recent.popleft()
         if len(self.blocks) >= self.rules.max_blocks:
             return f"{len(self.blocks)} blocks are in force (max_blocks)"
         if len(self._recent) >= self.rules.max_decisions_per_minute:
             return f"{len(self._recent)} blocks were decided within a minute (max_decisions_per_minute)"
+        if host in self.known:
+            blocked = sum(block.host in self.known for block in self.blocks.values())
+            if blocked >= max(1, int(self.rules.max_known_share * len(self.known))):
+                return f"{blocked} of {len(self.known)} known hosts are blocked (max_known_share)"
+        self.stopped = ""
         return None
+
+    def refuse(self, cap: str, who: str, now: int) -> None:
+        """A cap prevented a block: count it, and say so, once a minute for each cap."""
+        self.refused += 1
+        self.stopped = cap
+        name = cap[cap.rfind("(") :]
+        if now - self._said.get(name, now - MINUTE) >= MINUTE:
+            self._said[name] = now
+            text = f"BLOCKING STOPPED, {cap}: {who} stays unblocked, and others after it"
+            self.notices.append(Notice("cap", text, now))
 
     def block(
         self, alert: Alert, target: Target, reason: str, evidence: Iterable[Evidence], offences: int
@@ -95,6 +127,7 @@ class Ledger:
             offences=offences,
             first_packet=alert.first_packet,
             training_rate=alert.training_rate,
+            host=alert.sender.ip,
         )
 
     def open(
@@ -109,6 +142,7 @@ class Ledger:
         first_packet: int = 0,
         training_rate: float = 0.0,
         seconds: int | None = None,
+        host: str = "",
     ) -> Decision:
         """Open a block on a switch, or on all with `*`; a step longer for each earlier offence.
 
@@ -128,22 +162,29 @@ class Ledger:
             dry_run=self.rules.dry_run,
             first_packet=first_packet,
         )
-        self.blocks[decision.id] = Block(decision, training_rate, deque([(now, 0)]))
+        block = Block(decision, training_rate, deque([(now, 0)]), host=host or target.address)
+        self.blocks[decision.id] = block
         self._recent.append(now)
         return decision
 
     def blocks_address(self, address: str) -> bool:
-        """Whether a block of this address is in force."""
-        return any(
-            block.decision.target.kind == "ip" and block.decision.target.address == address
-            for block in self.blocks.values()
-        )
+        """Whether a block of this address, or of its prefix, is in force."""
+        targets = (block.decision.target for block in self.blocks.values())
+        exact = any(target.kind == "ip" and target.address == address for target in targets)
+        return exact or self.in_blocked_prefix(address)
+
+    def in_blocked_prefix(self, address: str) -> bool:
+        """Whether a prefix is blocked that this address lies in."""
+        targets = (block.decision.target.address for block in self.blocks.values())
+        return any(_has(target, address) for target in targets if "/" in target)
 
     def restore(self, decisions: Iterable[Decision]) -> None:
         """Take up blocks that are in force from before a restart."""
         for decision in decisions:
             if decision.action == "block":
-                self.blocks[decision.id] = Block(decision, 0.0, deque([(decision.event_time, 0)]), "restored")
+                readings = deque([(decision.event_time, 0)])
+                block = Block(decision, 0.0, readings, "restored", decision.target.address)
+                self.blocks[decision.id] = block
 
     def matching(self, subject: str) -> list[Decision]:
         """Blocks in force with this id or address."""
@@ -197,6 +238,19 @@ class Ledger:
         key = (old.switch, old.target.kind, old.target.address)
         self.probation[key] = now + PROBATION_S * SECOND
         return _changed(old, now, action="unblock", reason="the block ran out; on probation for ten minutes")
+
+
+def _stops(target: Target, sender: Sender) -> bool:
+    if target.kind == "mac":
+        return target.address == sender.mac and target.port in (None, sender.port)
+    return bool(sender.ip) and _has(target.address, sender.ip)
+
+
+def _has(target: str, address: str) -> bool:
+    """Whether a blocked address or prefix covers an address."""
+    if "/" not in target or "/" in address:
+        return target == address
+    return ipaddress.ip_address(address) in ipaddress.ip_network(target)
 
 
 def _changed(old: Decision, now: int, **changes: object) -> Decision:

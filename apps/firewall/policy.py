@@ -33,6 +33,16 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Blocks in force at a time; past that the firewall stops blocking and says so."""
     max_decisions_per_minute: int = 120
     """Blocks decided in a minute of capture time; past that the firewall stops blocking and says so."""
+    max_known_share: float = 0.25
+    """Of the hosts known from handshakes no more than this share may be blocked at a time (but always one)."""
+    block_known_addresses: bool = False
+    """Block also addresses known from handshakes, where a router stands before them; others can forge them."""
+    prefix_neighbours: int = 128
+    """So many misbehaving addresses of one prefix are blocked as that prefix; 0: never."""
+    prefix_v4: int = 24
+    """Length of such a prefix, IPv4."""
+    prefix_v6: int = 64
+    """The same, IPv6."""
     dry_run: bool = False
     """Decide and archive, but change nothing in the switch."""
 
@@ -73,9 +83,16 @@ class AllowList:
         return self.covers_address(target.address)
 
     def covers_address(self, text: str) -> bool:
-        """True if the address is an allowed one."""
+        """True if the address is an allowed one; of a prefix, if one of its addresses is."""
+        if "/" in text:
+            return self.touches(ipaddress.ip_network(text))
         address = ipaddress.ip_address(text)
         return any(address in network for network in self.networks)
+
+    def touches(self, prefix: ipaddress.IPv4Network | ipaddress.IPv6Network) -> bool:
+        """True if an allowed address lies in the prefix, or the prefix in an allowed one."""
+        # a network of the other IP version overlaps with nothing
+        return any(prefix.overlaps(network) for network in self.networks)
 
 
 def is_mac(text: str) -> bool:

@@ -11,6 +11,8 @@ import numpy as np
 
 from due import RecordBatch
 
+HOSTS = 65_536
+"""Counted in a window; who forges more destinations than that is counted anew."""
 _HALF = 64
 
 
@@ -54,6 +56,11 @@ class Surges:
         self._window = -1
         self._counts: Counter[tuple[int, int, int]] = Counter()
 
+    @property
+    def hosts(self) -> int:
+        """Destinations counted in the current window."""
+        return len(self._counts)
+
     def add(self, batch: RecordBatch) -> list[tuple[str, int]]:
         """Hosts that reach the threshold with this batch, each with the begin of the window, ns."""
         if not len(batch):
@@ -61,6 +68,8 @@ class Surges:
         window = int(batch["time_us"].max()) // self._window_us
         if window > self._window:
             self._window = window
+            self._counts.clear()
+        if len(self._counts) > HOSTS:
             self._counts.clear()
         now = batch["time_us"] // self._window_us == self._window
         names = ("ip_version", "ip_dst_hi", "ip_dst_lo")

@@ -1,9 +1,15 @@
-"""Addresses that this machine cannot do without: its own, its gateways, its DNS servers.  Pure parsers."""
+"""Addresses that this machine cannot do without: its own, its gateways, DNS servers and management peers.
+
+Pure parsers of what Linux tells.
+"""
 
 import ipaddress
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final
 
+MANAGEMENT_PORTS = frozenset({22, 6379, 9559, 27_017})
 _DEFAULT_ROUTE = "00000000"
+_ESTABLISHED = "01"
 
 
 def gateways(route_table: str) -> Iterator[str]:
@@ -41,6 +47,56 @@ def worth_allowing(addresses: Iterable[str]) -> tuple[str, ...]:
             address = ipaddress.ip_address(text)
         except ValueError:
             continue
-        if not address.is_loopback and not address.is_unspecified:
+        if not (address.is_loopback or address.is_unspecified or address.is_multicast):
             kept[str(address)] = None
     return tuple(kept)
+
+
+def gateways_v6(route_table: str) -> Iterator[str]:
+    """Default gateways in the text of /proc/net/ipv6_route."""
+    for line in route_table.splitlines():
+        fields = line.split()
+        if len(fields) > 4 and set(fields[0]) == {"0"} and fields[1] == "00" and set(fields[4]) != {"0"}:
+            yield str(ipaddress.IPv6Address(int(fields[4], 16)))
+
+
+def own_addresses_v6(address_table: str) -> Iterator[str]:
+    """Local IPv6 addresses in the text of /proc/net/if_inet6."""
+    for line in address_table.splitlines():
+        fields = line.split()
+        if fields and len(fields[0]) == 32:
+            yield str(ipaddress.IPv6Address(int(fields[0], 16)))
+
+
+def management_peers(connection_table: str) -> Iterator[str]:
+    """Who is connected to this machine's SSH, P4Runtime, Redis or MongoDB, or serves these to it.
+
+    The text is that of /proc/net/tcp or /proc/net/tcp6; only established connections count.
+    """
+    for line in connection_table.splitlines()[1:]:
+        fields = line.split()
+        if len(fields) < 4 or fields[3] != _ESTABLISHED:
+            continue
+        (_, near), (far, far_port) = (field.split(":") for field in fields[1:3])
+        if {int(near, 16), int(far_port, 16)} & MANAGEMENT_PORTS:
+            yield _from_kernel(far)
+
+
+def _from_kernel(text: str) -> str:
+    """An address as the kernel prints it: words of 32 bits, each in host order of a little-endian machine."""
+    words = [int(text[start : start + 8], 16).to_bytes(4, "little") for start in range(0, len(text), 8)]
+    address = ipaddress.ip_address(b"".join(words))
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return str(mapped or address)
+
+
+SOURCES: Final[tuple[tuple[str, Callable[[str], Iterator[str]]], ...]] = (
+    ("/proc/net/fib_trie", own_addresses),
+    ("/proc/net/if_inet6", own_addresses_v6),
+    ("/proc/net/route", gateways),
+    ("/proc/net/ipv6_route", gateways_v6),
+    ("/etc/resolv.conf", name_servers),
+    ("/proc/net/tcp", management_peers),
+    ("/proc/net/tcp6", management_peers),
+)
+"""Files of Linux, and what reads them."""

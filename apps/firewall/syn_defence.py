@@ -1,19 +1,22 @@
 """Defence against SYN floods: which services are guarded, which floods are looked at, what follows.
 
     switch seen ──► guard of the services that the settings name, and known sources
-    syn_flood result or surge ──► the SYNs that came towards that host ──► policy ──► block or protect
+    syn_flood result or surge ──► the SYNs that came towards that host ──► policy ──► guard, soon
+                                                             ... once more, later ──► block, surely
     handshake ──► known source
 
 Pure: decisions are handed out, the caller publishes them; times are capture time in ns.
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from apps.firewall.known_sources import KnownSources
 from apps.firewall.ledger import SECOND, Ledger, decision_id
+from apps.firewall.neighbours import Network, any_within, crowded
 from apps.firewall.policy import AllowList
 from apps.firewall.recent_syns import RecentSyns
 from apps.firewall.services import Service
@@ -21,6 +24,8 @@ from apps.firewall.syn_policy import Sample, SynRules, SynVerdict, judge_syns
 from apps.messages import Decision, Evidence, Target
 
 EVERY_SWITCH = "*"
+UNKNOWN_HISTORY = "history unknown: Data Archives do not answer"
+COLD_HISTORY = "nobody is known from handshakes yet, so everybody is challenged once"
 SERVICES_LEARNT = 4096
 SOURCES_SAMPLED = 4096
 
@@ -42,6 +47,8 @@ class Watch:
         self.host = host
         self.evidence = evidence
         self.now = now
+        self.unsure = False
+        """Sources would have been blocked, had they had more time to finish their handshakes."""
         self.syns: Counter[tuple[int, str]] = Counter()
         """By port and source."""
         self.total = 0
@@ -52,15 +59,16 @@ class Watch:
             self.syns[port, source] += 1
 
     def finished(self, port: int, source: str) -> None:
-        """A handshake: that SYN was meant well."""
-        if self.syns[port, source] > 1:
-            self.syns[port, source] -= 1
+        """A handshake: that SYN was meant well, and so was its repetition, if it needed one."""
+        if self.syns[port, source] > 2:
+            self.syns[port, source] -= 2
         else:
             del self.syns[port, source]  # a Counter takes this also where there is none
 
-    def repeating(self, often: int) -> list[str]:
-        """Sources with at least so many SYNs."""
-        return [source for (_, source), count in self.syns.items() if count >= often]
+    def often(self, rules: SynRules) -> list[str]:
+        """Sources that may come to be blocked."""
+        found = (source for (_, source), count in self.syns.items() if count >= rules.repeats)
+        return list(islice(found, rules.sources))
 
 
 class SynDefence:
@@ -84,7 +92,6 @@ class SynDefence:
         """Known from handshakes; the latest last."""
         self.recent = RecentSyns(rules.sample)
         self._finished: deque[tuple[int, str, Service]] = deque(maxlen=rules.sample)
-        self.refused = 0
 
     @property
     def guarded(self) -> list[Service]:
@@ -130,8 +137,14 @@ class SynDefence:
             del self.services[next(iter(self.services))]
         self._finished.append((at, source, service))
 
-    def conclude(self, watch: Watch, offences: Mapping[str, int]) -> list[Decision]:
-        """What follows from a watch; `offences` are earlier blocks by address."""
+    def conclude(
+        self, watch: Watch, offences: Mapping[str, int] | None, *, sure: bool = True
+    ) -> list[Decision]:
+        """What follows from a watch; `offences` are earlier blocks by address, None where nobody knows.
+
+        Unless the SYNs had time to be finished (`sure`) nobody is blocked: the service is guarded, and
+        the watch is marked as unsure.
+        """
         if not len(self.recent):  # the stream of SYNs does not reach us
             return self._guard_known_services(watch)
         by_port: dict[int, dict[str, int]] = {}
@@ -140,9 +153,34 @@ class SynDefence:
         decisions: list[Decision] = []
         for port, syns in sorted(by_port.items()):
             sample = Sample(Service(watch.host, port), syns)
-            verdict = judge_syns(sample, self.rules, self.allow, self.known)
-            decisions += self._carry_out(sample.service, verdict, watch, offences)
+            verdict = judge_syns(sample, self.rules, self.allow, self.known, self.gather)
+            if verdict.block and not sure:
+                watch.unsure = True
+                reason = f"{verdict.reason} unless they finish their handshakes soon; guarded meanwhile"
+                decisions += self._guard(sample.service, reason, watch)
+            else:
+                decisions += self._carry_out(sample.service, verdict, watch, offences)
         return decisions
+
+    def gather(self, addresses: Iterable[str]) -> dict[str, list[str]]:
+        """Prefixes that may be blocked instead of so many of the addresses."""
+        rules = self._ledger.rules
+        found = crowded(
+            addresses, rules.prefix_neighbours, rules.prefix_v4, rules.prefix_v6, self.is_inhabited
+        )
+        return {str(network): members for network, members in found.items()}
+
+    def is_inhabited(self, prefix: Network) -> bool:
+        """Whether somebody known or allowed lives there, or a service of ours is there."""
+        if self.allow.touches(prefix) or any_within(prefix, self.known):
+            return True
+        services = {each.address for each in (*self.services, *self._always, *self._guarded)}
+        return any_within(prefix, services)
+
+    def spared(self) -> Callable[[str], bool]:
+        """Whose half-open connections are left alone: who is known, allowed or has finished a handshake."""
+        finished = {source for _, source, _ in self._finished}
+        return lambda each: each in finished or each in self.known or self.allow.covers_address(each)
 
     def restore(self, decisions: Iterable[Decision]) -> None:
         """Take up guards that a flood led to before a restart; those of the settings come by themselves."""
@@ -170,26 +208,29 @@ class SynDefence:
         ]
 
     def _carry_out(
-        self, service: Service, verdict: SynVerdict, watch: Watch, offences: Mapping[str, int]
+        self, service: Service, verdict: SynVerdict, watch: Watch, offences: Mapping[str, int] | None
     ) -> list[Decision]:
         decisions: list[Decision] = []
         if verdict.protects:
             decisions += self._guard(service, verdict.reason, watch)
+        blocked = {block.decision.target.address for block in self._ledger.blocks.values()}
         for source in verdict.block:
-            if self._ledger.blocks_address(source):
+            if source in blocked or self._ledger.in_blocked_prefix(source):
                 continue
-            if self._ledger.cap_reached(watch.now) is not None:
-                self.refused += 1
+            cap = self._ledger.cap_reached(watch.now)
+            if cap is not None:
+                self._ledger.refuse(cap, source, watch.now)
                 continue
             target = Target(kind="ip", address=source)
+            note = "" if offences is not None else f" ({UNKNOWN_HISTORY})"
             decisions.append(
                 self._ledger.open(
                     EVERY_SWITCH,
                     target,
-                    verdict.reason,
+                    verdict.reason + note,
                     (watch.evidence,),
                     watch.now,
-                    offences=offences.get(source, 0),
+                    offences=(offences or {}).get(source, 0),
                 )
             )
         return decisions
@@ -198,6 +239,7 @@ class SynDefence:
         if service in self._always or service in self._guarded:
             return []
         expires = watch.now + self.rules.protect_s * SECOND
+        reason = reason if len(self.known) else f"{reason} ({COLD_HISTORY})"
         made = self._protect(service, EVERY_SWITCH, reason, (watch.evidence,), watch.now, expires=expires)
         self._guarded[service] = made
         return [made]

@@ -110,3 +110,9 @@ def test_targets():
     """Addresses get their one spelling; a MAC is blocked on any port."""
     assert target_in("2001:DB8::0:1") == Target(kind="ip", address="2001:db8::1")
     assert target_in("02:00:00:00:00:AA") == Target(kind="mac", address="02:00:00:00:00:aa")
+    assert target_in("02:00:00:00:00:AA@3") == Target(kind="mac", address="02:00:00:00:00:aa", port=3)
+    assert target_in("192.0.2.7/24") == Target(kind="ip", address="192.0.2.0/24")
+    assert target_in("192.0.2.7/32") == Target(kind="ip", address="192.0.2.7")
+    for wrong in ("02:00:00:00:00:AA@x", "192.0.2.7@3", "192.0.2.0/33"):
+        with pytest.raises(ValueError, match="no IP address"):
+            target_in(wrong)

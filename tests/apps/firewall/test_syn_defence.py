@@ -113,7 +113,7 @@ def test_caps_hold_for_floods():
     """Past them nothing is blocked, and it is counted."""
     made = defence(rules=Rules(max_decisions_per_minute=10))
     assert len(flood(made, 100, 6)) == 10
-    assert made.refused == 90
+    assert made._ledger.refused == 90
 
 
 def test_dry_run_marks_guards_and_blocks():

@@ -1,0 +1,160 @@
+"""Who has which IPv4 address: bindings of address, MAC and port, learnt from ARP; claims of another's.  Pure.
+
+A claim of an address that is bound to somebody else proves nothing by itself: hosts get new addresses, and
+a standby takes over from a dead router.  It is an attack when the owner, from its own port and MAC, speaks
+for the address after the claim: two cannot have it.  Then the claimant's port + MAC is blocked, never the
+address.
+
+Two cases are only told, and nobody is blocked: the owner was not there in training, so it may be the squatter
+itself; and the claimant lives behind a port with others, one of whom may have forged its MAC.
+"""
+
+import ipaddress
+from collections import OrderedDict, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+from due import RecordBatch
+
+ADDRESSES: Final = 16_384
+CLAIMS: Final = 1024
+STATIONS: Final = 256
+"""Per port; a port with more is a port with many."""
+_GROUP: Final = 1 << 40
+
+
+class Station(NamedTuple):
+    """A MAC address behind a port of a switch."""
+
+    port: int
+    mac: int
+
+    @classmethod
+    def of(cls, port: int, mac: str) -> Self:
+        """From a MAC address with colons."""
+        return cls(port, int(mac.replace(":", ""), 16))
+
+    @property
+    def text(self) -> str:
+        """The MAC address with colons."""
+        return ":".join(f"{byte:02x}" for byte in self.mac.to_bytes(6, "big"))
+
+
+@dataclass
+class _Binding:
+    station: Station
+    since: int
+    seen: int
+    trained: bool
+    """It was there in training, and nobody else claimed it."""
+
+
+@dataclass(frozen=True)
+class Theft:
+    """A station claims an address whose owner is there; times are capture time in ns."""
+
+    address: str
+    owner: Station
+    thief: Station
+    at: int
+    certain: bool
+    """Whether the thief may be blocked without harm to anybody else."""
+
+
+class Bindings:
+    """At most `ADDRESSES` addresses; the one heard of least recently is forgotten first.
+
+    Training lasts `training_s` from the first packet on; later bindings are settled after `settle_s` without
+    another claim.  A claim waits `contest_s` for the owner.
+    """
+
+    def __init__(self, *, training_s: float, settle_s: float, contest_s: float) -> None:
+        self._training = int(training_s * 1e9)
+        self._trained_at = 0
+        self._settle = int(settle_s * 1e9)
+        self._contest = int(contest_s * 1e9)
+        self._bound: OrderedDict[int, _Binding] = OrderedDict()
+        self._claims: OrderedDict[tuple[int, Station], int] = OrderedDict()
+        self._behind: defaultdict[int, set[int]] = defaultdict(set)
+
+    def __len__(self) -> int:
+        return len(self._bound)
+
+    @property
+    def claims(self) -> int:
+        """Claims that wait for the owner to speak."""
+        return len(self._claims)
+
+    def add(self, batch: RecordBatch) -> list[Theft]:
+        """ARP packets in order; columns time_us, port, arp_op, arp_src_mac, arp_src_ip and eth_src are used."""
+        names = ("time_us", "port", "arp_op", "eth_src", "arp_src_mac", "arp_src_ip")
+        found: list[Theft] = []
+        for at, port, operation, sender, mac, address in zip(
+            *(batch[name].tolist() for name in names), strict=True
+        ):
+            if operation not in (1, 2) or not address or mac & _GROUP or sender & _GROUP:
+                continue
+            self._trained_at = self._trained_at or at * 1000 + self._training
+            # a frame that says two things is judged by the MAC that a block would match
+            found += self._heard(address, Station(port, sender), at * 1000, honest=sender == mac)
+        return found
+
+    def _heard(self, address: int, station: Station, now: int, *, honest: bool) -> Iterator[Theft]:
+        neighbours = self._behind[station.port]
+        if len(neighbours) < STATIONS:
+            neighbours.add(station.mac)
+        bound = self._bound.get(address)
+        if bound is None:
+            if honest:
+                self._bind(address, station, now)
+        elif bound.station == station and honest:
+            bound.seen = now
+            self._bound.move_to_end(address)
+            yield from self._contested(address, bound, now)
+        elif not self._settled(bound, now) or bound.station.mac == station.mac:
+            # too fresh to be anybody's, or its owner was plugged in elsewhere
+            self._bind(address, station, now)
+        else:
+            self._claims[address, station] = now
+            if len(self._claims) > CLAIMS:
+                self._claims.popitem(last=False)
+            if now - bound.seen > self._settle:  # the owner is gone
+                self._bind(address, station, now)
+
+    def _settled(self, bound: _Binding, now: int) -> bool:
+        return (bound.trained and now >= self._trained_at) or now - bound.since >= self._settle
+
+    def forged(self, address: str, station: Station) -> bool:
+        """Whether an address is surely bound to another station than the one that uses it."""
+        if ":" in address or not address:
+            return False
+        bound = self._bound.get(int(ipaddress.IPv4Address(address)))
+        return bound is not None and bound.trained and bound.station != station
+
+    def addresses_of(self, station: Station) -> list[str]:
+        """What is bound to a station."""
+        found = (address for address, bound in self._bound.items() if bound.station == station)
+        return [str(ipaddress.IPv4Address(address)) for address in found]
+
+    def _bind(self, address: int, station: Station, now: int) -> None:
+        trained = now < self._trained_at and address not in self._bound
+        self._bound[address] = _Binding(station, now, now, trained)
+        self._bound.move_to_end(address)
+        self._claims.pop((address, station), None)
+        if len(self._bound) > ADDRESSES:
+            self._bound.popitem(last=False)
+
+    def _contested(self, address: int, bound: _Binding, now: int) -> Iterator[Theft]:
+        for key in [key for key in self._claims if key[0] == address]:
+            if now - self._claims.pop(key) <= self._contest:
+                thief = key[1]
+                text = str(ipaddress.IPv4Address(address))
+                certain = bound.trained and self.is_alone(thief)
+                yield Theft(text, bound.station, thief, now, certain)
+
+    def is_alone(self, station: Station) -> bool:
+        """Whether nobody else behind its port can be meant by this MAC."""
+        others = self._behind[station.port] - {station.mac}
+        lives_here = any(each.station == station for each in self._bound.values())
+        return not (others and lives_here)

@@ -1,0 +1,111 @@
+"""The firewall's service with an engine that is none: items are handed in, what it writes is kept."""
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+from reactivex import Subject
+
+from apps.firewall.service import FirewallService
+from apps.firewall.settings import Settings
+from apps.messages import Confirmation, Decision
+from due import Item
+from due.errors import ArchiveUnavailable
+
+NOW = 1_700_000_000_000_000_000
+SWITCH = "network.switch.p4runtime_ctrl.s1"
+SYNS = "network.traffic_capture.sonata.tcp:flag=syn"
+SYN_ACKS = "network.traffic_capture.sonata.tcp:flag=syn+ack"
+ARP = "network.traffic_capture.sonata.arp"
+HANDSHAKE = "network.handshake.sonata.tcp"
+ALERT = "network.anomaly.kitsune.alert"
+
+
+class FakeEngine:
+    """What the service uses of an engine."""
+
+    def __init__(self) -> None:
+        self.subjects: defaultdict[str, Subject[Item]] = defaultdict(Subject)
+        self.written: list[tuple[str, Any]] = []
+        self.archived: list[Item] = []
+        self.archive_hangs: threading.Event | None = None
+        self.archive_away = False
+
+    def observe(self, key: str) -> Subject[Item]:
+        return self.subjects[key]
+
+    def write(self, key: str, value: Any, *_: object, **__: object) -> bool:
+        self.written.append((key, value))
+        return True
+
+    def get(self, query: object) -> list[Item]:
+        if self.archive_hangs is not None:
+            self.archive_hangs.wait(60)
+        if self.archive_away:
+            raise ArchiveUnavailable("the archive is away")
+        wanted = query["dataKey"] if isinstance(query, dict) else query
+        after = query.get("timestamp", {}).get("$gt", 0) if isinstance(query, dict) else 0
+        return [item for item in self.archived if item.key == wanted and item.timestamp > after]
+
+
+class Desk:
+    """A started service; `switches` are under control from the start."""
+
+    def __init__(
+        self, *, switches: tuple[str, ...] = ("s1",), engine: FakeEngine | None = None, **settings: Any
+    ):
+        self.engine = engine or FakeEngine()
+        self.service = FirewallService(self.engine, Settings(**settings))  # type: ignore[arg-type]
+        self.service.start()
+        for switch in switches:
+            self.switch(switch)
+
+    def hand(self, key: str, value: Any, *, pattern: str = "", at: int = NOW, instance: str = "i1") -> None:
+        item = Item(key, value, at, at, "somebody", instance, 1)
+        self.engine.subjects[pattern or key].on_next(item)
+
+    def switch(self, name: str = "s1", *, primary: bool = True, instance: str = "i1", at: int = NOW) -> None:
+        value = {"switch": name, "primary": primary, "event_time": at}
+        key = f"network.switch.p4runtime_ctrl.{name}"
+        self.hand(key, value, pattern="network.switch.p4runtime_ctrl.*", instance=instance, at=at)
+
+    def confirm(self, decision: Decision, state: str = "installed") -> None:
+        said = Confirmation(
+            id=decision.id,
+            switch="s1",
+            state=state,
+            action=decision.action,
+            event_time=NOW,  # type: ignore[arg-type]
+        )
+        pattern = "network.confirmation.p4runtime_ctrl.*"
+        self.hand("network.confirmation.p4runtime_ctrl.s1", said.to_value(), pattern=pattern)
+
+    def written(self, start: str) -> list[Any]:
+        return [value for key, value in self.engine.written if key.startswith(start)]
+
+    @property
+    def decisions(self) -> list[Decision]:
+        families = ("network.block.", "network.block_prefix.", "network.protect.")
+        return [Decision.from_value(value) for key, value in self.engine.written if key.startswith(families)]
+
+    @property
+    def blocked(self) -> list[str]:
+        return [each.target.address for each in self.decisions if each.action == "block"]
+
+    @property
+    def guarded(self) -> list[str]:
+        return [each.target.address for each in self.decisions if each.action == "protect"]
+
+    @property
+    def events(self) -> list[str]:
+        return [value["text"] for value in self.written("network.event.")]
+
+    def tick_until(self, condition: Callable[[], object]) -> None:
+        """Ticks go on until it holds."""
+        for _ in range(6000):
+            self.service.tick()
+            if condition():
+                return
+            threading.Event().wait(0.01)
+        raise AssertionError("it did not come to pass within a minute")
