@@ -1,7 +1,9 @@
 """Two veth pairs and a switch between them: what it forwards, copies and digests, embedded and BMv2 alike.
 
 The sender raises its rate step by step; the figure is the highest rate that came through.  A step that
-loses more than a tenth is the last.
+loses more than a tenth is the last.  block_10k_ratio: forwarding with 10,000 block_src and 1,000 ternary block
+entries / with 10 of each; the sender may be slower than the embedded switch, whose own fall is measured without
+wires (switch_pipeline).
 """
 
 import os
@@ -14,9 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.switch_control import writes
+from benchmarks.switch_pipeline import block_entries
 from benchmarks.switch_stage import Count, Switch, every_packet, frame, primary, process, program
 from benchmarks.switch_streams import count_stream, digest_entry
 from dataplane.bmv2 import PROGRAM, Bmv2
+from dataplane.program import load
+from dataplane.schema import bind
+from dataplane.table_codec import TableCodec
+from p4rt import p4runtime
 from sdnator.wire import VethPair
 from tests.dataplane.controller import Controller, Names, insert
 
@@ -71,7 +78,7 @@ def send_process(pipe: Any, interface: str) -> None:
 def wire(kind: str, folder: Path, seconds: float) -> dict[str, float]:
     """forward_pps, packet_in_pps, digest_pps and entries_per_s of `kind`: embedded or bmv2."""
     figures: dict[str, float] = {}
-    for what in ("forward_pps", "packet_in_pps", "digest_pps"):
+    for what in ("forward_pps", "forward_pps_10k_blocks", "packet_in_pps", "digest_pps"):
         with ExitStack() as stack:
             entry, leave = VethPair.make(stack, "bi"), VethPair.make(stack, "bo")
             controller = _switch(kind, folder / what, entry.far, leave.near, stack)
@@ -81,6 +88,7 @@ def wire(kind: str, folder: Path, seconds: float) -> dict[str, float]:
             figures[what] = _highest(pipe, seen, seconds)
             if what == "digest_pps":
                 figures |= writes(controller, 10_000, 500, 3)
+    figures["block_10k_ratio"] = figures["forward_pps_10k_blocks"] / figures["forward_pps"]
     return figures
 
 
@@ -98,7 +106,8 @@ def _switch(kind: str, folder: Path, one: str, two: str, stack: ExitStack) -> Co
 
 def _prepare(what: str, controller: Controller, names: Names, out: str) -> Callable[[], int]:
     """Set the switch up; a counter of what has come through."""
-    if what == "forward_pps":
+    if what.startswith("forward_pps"):
+        _block(controller, *((10, 10) if what == "forward_pps" else (10_000, 1_000)))
         action = names.tables["ingress.forward_port"].action_refs[0].id
         name = next(a.preamble.name for a in names.info.actions if a.preamble.id == action)
         controller.write(insert(names.entry("ingress.forward_port", {"ingress_port": 1}, name, [2])))
@@ -110,6 +119,19 @@ def _prepare(what: str, controller: Controller, names: Names, out: str) -> Calla
     seen = Count()
     count_stream(controller, seen)
     return lambda: seen.total
+
+
+def _block(controller: Controller, blocks: int, ternary: int) -> None:
+    config = program()
+    schema = bind(config.p4info, load(bytes(config.p4_device_config)))
+    codecs = {name: TableCodec(schema.table_of(name)) for name in ("ingress.block_src", "ingress.block")}
+    updates = []
+    for name, entry in block_entries(blocks, ternary):
+        entity = p4runtime.Entity()
+        codecs[name].write(entry, entity.table_entry)
+        updates.append(insert(entity))
+    for first in range(0, len(updates), 500):
+        controller.write(*updates[first : first + 500])
 
 
 def _highest(pipe: Any, seen: Callable[[], int], seconds: float) -> float:

@@ -56,13 +56,13 @@ class TableEntities:
         codec, table = self._find(message.table_id)
         if message.is_default_action:
             return self._write_default(kind, message, codec, table)
-        _check_written(codec, message)
+        has_direct = _check_written(codec, message)
         if table.spec.is_const and (kind != MODIFY or message.HasField("action")):
             raise Denied(
                 f"table {codec.name} is constant; only its entries' counters and meters can be modified"
             )
         if kind == INSERT:
-            return self._insert(message, codec, table)
+            return self._insert(message, codec, table, has_direct=has_direct)
         if kind == MODIFY:
             return self._modify(message, codec, table)
         match, priority = codec.match(message.match), codec.priority(message)
@@ -70,11 +70,11 @@ class TableEntities:
         table.delete(match, priority)
         return lambda: _restore(table, old)
 
-    def _insert(self, message: Any, codec: TableCodec, table: Table) -> Undo:
+    def _insert(self, message: Any, codec: TableCodec, table: Table, *, has_direct: bool) -> Undo:
         entry = codec.entry(message)
         if entry.idle_timeout_ns:
             self._begin_to_age()
-        if message.HasField("meter_config") or message.HasField("counter_data"):
+        if has_direct:
             values = self._direct_values(message, codec)
             with self._switch.lock:
                 table.insert(entry)
@@ -290,15 +290,18 @@ def _restore_direct(table: Table, old: _Snapshot) -> None:
         table.set_meter(entry.match, entry.priority, meter)
 
 
-def _check_written(codec: TableCodec, message: Any) -> None:
+def _check_written(codec: TableCodec, message: Any) -> bool:
+    """Whether a counter or meter is written with the entry."""
+    has_meter, has_counter = message.HasField("meter_config"), message.HasField("counter_data")
     if message.HasField("time_since_last_hit"):
         raise InvalidArgument(f"table {codec.name}: time_since_last_hit cannot be written")
-    if message.HasField("meter_config") and not codec.table.spec.has_meter:
+    if has_meter and not codec.table.spec.has_meter:
         raise InvalidArgument(f"table {codec.name} has no direct meter")
-    if message.HasField("counter_data") and not codec.table.spec.has_counter:
+    if has_counter and not codec.table.spec.has_counter:
         raise InvalidArgument(f"table {codec.name} has no direct counter")
     if message.HasField("meter_counter_data"):
         raise Unimplemented(f"table {codec.name}: this target does not count by meter colour")
+    return bool(has_meter or has_counter)
 
 
 def _metadata_fits(asked: Any, entry: TableEntry) -> bool:

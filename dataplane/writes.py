@@ -27,6 +27,7 @@ class Writer:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._lock = pipeline.switch.lock
+        self._write_entry = pipeline.tables.write_entry
         self._handlers: Mapping[str, Handler] = {
             "table_entry": pipeline.tables.write_entry,
             "direct_counter_entry": pipeline.tables.write_counter,
@@ -85,6 +86,10 @@ class Writer:
         if kind not in _KINDS:
             raise InvalidArgument(f"update type {kind} is none of INSERT, MODIFY, DELETE")
         entity = update.entity
+        entry = entity.table_entry
+        if entry.table_id:
+            # an unset entry has no id: the common case need not ask which kind it is
+            return self._write_entry(kind, entry)
         name = entity.WhichOneof("entity")
         handler = self._handlers.get(name)
         if handler is None:

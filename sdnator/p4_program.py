@@ -1,7 +1,8 @@
 """The compiled switch program: where it is, and whether it still belongs to its source.
 
 `python -m sdnator.p4_program compile` runs p4c (where it is installed) and writes the record that
-`check` compares: the hashes of all sources and artefacts and the compiler's version.
+`check` compares: the hashes of all sources and artefacts and the compiler's version.  Other programs
+than the product's are named with their folder: `compile tests/dataplane/programs features`.
 
     P4ProgramError (RuntimeError)   artefacts missing, or no longer those of the source
 """
@@ -16,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 PROGRAM = "sdnator"
-RECORD = "sdnator.build.json"
 
 
 class P4ProgramError(RuntimeError):
@@ -52,29 +52,37 @@ def _hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def hashes(base: Path) -> dict[str, dict[str, str]]:
+def hashes(base: Path, name: str = PROGRAM) -> dict[str, dict[str, str]]:
     """SHA-256 of every source and artefact in a program folder."""
     sources = sorted(base.rglob("*.p4"))
-    artefacts = (base / f"{PROGRAM}.json", base / f"{PROGRAM}.p4info.txtpb")
+    artefacts = (base / f"{name}.json", base / f"{name}.p4info.txtpb")
     return {
         "sources": {str(path.relative_to(base)): _hash(path) for path in sources},
         "artefacts": {path.name: _hash(path) for path in artefacts},
     }
 
 
-def check(base: Path) -> None:
+def _record(base: Path, name: str) -> Path:
+    return base / f"{name}.build.json"
+
+
+def check(base: Path, name: str = PROGRAM) -> None:
     """Raise P4ProgramError where source and artefacts no longer belong together."""
-    record: dict[str, Any] = json.loads((base / RECORD).read_text(encoding="utf-8"))
-    now = hashes(base)
+    record: dict[str, Any] = json.loads(_record(base, name).read_text(encoding="utf-8"))
+    now = hashes(base, name)
     for part in ("sources", "artefacts"):
         changed = sorted(name for name, _ in set(record[part].items()) ^ set(now[part].items()))
         if changed:
             raise P4ProgramError(
-                f"{', '.join(changed)} changed since p4c ran: run `make p4` and commit all of {base}"
+                f"{', '.join(changed)} changed since p4c ran: run `{_again(base, name)}` and commit all of {base}"
             )
 
 
-def compile_program(base: Path) -> None:
+def _again(base: Path, name: str) -> str:
+    return "make p4" if name == PROGRAM else f"python -m sdnator.p4_program compile {base} {name}"
+
+
+def compile_program(base: Path, name: str = PROGRAM) -> None:
     """Run p4c on the source and write the artefacts and their record."""
     p4c = shutil.which("p4c-bm2-ss")
     if p4c is None:
@@ -83,27 +91,26 @@ def compile_program(base: Path) -> None:
         )
     command = [
         p4c, "--arch", "v1model", "--Werror",
-        "--p4runtime-files", f"{PROGRAM}.p4info.txtpb", "-o", f"{PROGRAM}.json", f"{PROGRAM}.p4",
+        "--p4runtime-files", f"{name}.p4info.txtpb", "-o", f"{name}.json", f"{name}.p4",
     ]  # fmt: skip
     subprocess.run(command, cwd=base, check=True)
     answer = subprocess.run([p4c, "--version"], capture_output=True, text=True, check=True)
     words = (answer.stdout + answer.stderr).split()
     number = next(word for word in words if word[0].isdigit())
-    record = {"p4c": number, "options": command[1:4], **hashes(base)}
-    (base / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    record = {"p4c": number, "options": command[1:4], **hashes(base, name)}
+    _record(base, name).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
 def main() -> int:
-    """`compile` or `check` the program of this checkout."""
+    """`compile` or `check` the program of this checkout, or another one."""
+    what, *where = sys.argv[1:] or ("",)
+    if what not in ("compile", "check") or len(where) not in (0, 2):
+        print("usage: python -m sdnator.p4_program compile|check [FOLDER PROGRAM]", file=sys.stderr)
+        return 2
+    base, name = (Path(where[0]), where[1]) if where else (folder(), PROGRAM)
     try:
-        if sys.argv[1:] == ["compile"]:
-            compile_program(folder())
-        elif sys.argv[1:] == ["check"]:
-            check(folder())
-        else:
-            print("usage: python -m sdnator.p4_program compile|check", file=sys.stderr)
-            return 2
-    except (P4ProgramError, subprocess.CalledProcessError) as error:
+        (compile_program if what == "compile" else check)(base, name)
+    except (P4ProgramError, OSError, subprocess.CalledProcessError) as error:
         print(f"sdnator: {error}", file=sys.stderr)
         return 1
     return 0

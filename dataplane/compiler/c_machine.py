@@ -81,6 +81,7 @@ class CTable:
         self._words, places = key_places(spec) if spec.keys else (0, ())
         self.place = KeyPlace(places)
         self._stride = stride
+        self._no_params = bytes(8 * stride)
         self._sizes: dict[int, tuple[int, ...]] = {-1: ()}
 
     def know_action(self, number: int, counts: tuple[int, ...]) -> None:
@@ -88,6 +89,8 @@ class CTable:
         self._sizes[number] = tuple(8 * count for count in counts)
 
     def _params(self, action: int, params: Sequence[int]) -> bytes:
+        if not params:
+            return self._no_params
         sizes = self._sizes[action]
         data = b"".join([v.to_bytes(size, "little") for v, size in zip(params, sizes, strict=True)])
         return data.ljust(8 * self._stride, b"\0")

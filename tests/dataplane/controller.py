@@ -17,7 +17,7 @@ _OPTIONS = (
     ("grpc.max_metadata_size", 16 << 20),
     ("grpc.absolute_max_metadata_size", 16 << 20),
 )
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 def program_config(program: Path) -> Any:
@@ -104,7 +104,7 @@ class Controller:
         request.action = getattr(p4runtime.SetForwardingPipelineConfigRequest, action)
         if config is not None:
             request.config.CopyFrom(config)
-        return self.stub.SetForwardingPipelineConfig(request, timeout=3 * TIMEOUT_S)
+        return self.stub.SetForwardingPipelineConfig(request, timeout=TIMEOUT_S)
 
     def get_pipeline(self, kind: str = "ALL") -> Any:
         kind_number = getattr(p4runtime.GetForwardingPipelineConfigRequest, kind)
@@ -120,7 +120,7 @@ class Controller:
         return request
 
     def write(self, *updates: Any, atomicity: str = "CONTINUE_ON_ERROR") -> Any:
-        return self.stub.Write(self.write_request(*updates, atomicity=atomicity), timeout=3 * TIMEOUT_S)
+        return self.stub.Write(self.write_request(*updates, atomicity=atomicity), timeout=TIMEOUT_S)
 
     def read(self, *entities: Any) -> list[Any]:
         request = p4runtime.ReadRequest(device_id=self.device_id, entities=entities)

@@ -31,7 +31,8 @@ _HERE = Path(__file__).resolve().parent
 _FRAMES = int(os.environ.get("SDNATOR_SAMENESS_FRAMES", "120"))
 _BURST = 12  # BMv2 drops where 64 frames wait for one port
 _UPDATES = 40
-_WAIT_S = 10.0
+_WAIT_S = 60.0
+_SETTLE_S = 1.0
 _PORTS = (1, 2, 3)
 _ids = itertools.count(10)
 _SESSIONS = {1: [Replica(510, 1)], 5: [Replica(4, 7), Replica(510, 1)], 6: [Replica(4, 7), Replica(510, 1)]}
@@ -258,7 +259,8 @@ class Pair:
 
     def finish(self) -> None:
         """Nothing more came, digests and direct counters are equal."""
-        time.sleep(0.2)
+        # what BMv2 still has in its queues would be run by the next case's program
+        time.sleep(_SETTLE_S)
         assert self.controller.packets.empty()
         assert all(q.empty() for q in self.target._frames.values())
         theirs: set[tuple[str, tuple[int, ...]]] = set()
