@@ -59,13 +59,21 @@ class SonataStage(Stage):
         bits = health[-1]["app"]["bits"] if health else 0  # type: ignore[index]
         return bool(bits) and len(self._telemetry) == bits
 
-    def play(self, frames: Iterable[Frame]) -> int:
-        """Send all frames, times from the first one's second; returns their number."""
+    def play(self, frames: Iterable[Frame], *, faster: float = 0.0, zero: int | None = None) -> int:
+        """Send all frames; returns their number.
+
+        `faster`: so many times as fast as they were captured, 0 = as fast as the switch takes them.
+        `zero`: the switch's clock zero, default the first frame's second.
+        """
         rest = iter(frames)
-        zero: int | None = None
         sent = done = 0
+        begin, first = time.monotonic(), None
         while part := list(islice(rest, _BLOCK)):
             zero = part[0].time_us // 10**6 * 10**6 if zero is None else zero
+            first = part[0].time_us if first is None else first
+            if faster:
+                ahead = (part[-1].time_us - first) / 1e6 / faster - (time.monotonic() - begin)
+                time.sleep(max(0.0, ahead))
             self._feed.send(
                 [f.time_us - zero for f in part], [f.length for f in part], [f.data for f in part]
             )
@@ -79,16 +87,21 @@ class SonataStage(Stage):
             done += len(self._feed.verdicts())
         return sent
 
-    def finish(self) -> dict[str, list[dict[str, Any]]]:
-        """Wait until all is quiet, end the adapter, and give the results by query."""
+    def settle(self) -> dict[str, int]:
+        """Wait until all is quiet; tuples that have reached the host, by query."""
         self._health.items.clear()
         wait_for(self._quiet, 120)
         last: Any = self._health.values("health")[-1]
         found = {key.partition(":")[0].rpartition(".")[2]: n for key, n in last["app"]["tuples"].items()}
         self.tuples = {name: found.get(name, 0) for name in CATALOGUE}
-        written = last["app"]["results"]
+        self._written = last["app"]["results"]
+        return dict(self.tuples)
+
+    def finish(self) -> dict[str, list[dict[str, Any]]]:
+        """Wait until all is quiet, end the adapter, and give the results by query."""
+        self.settle()
         end(self._adapter)
-        wait_for(lambda: len(self._results) >= written)
+        wait_for(lambda: len(self._results) >= self._written)
         time.sleep(1)
         results: dict[str, list[dict[str, Any]]] = {name: [] for name in CATALOGUE}
         for item in list(self._results):
@@ -106,12 +119,12 @@ class SonataStage(Stage):
         stop = threading.Event()
         self._sent = self._done = 0
         self._forwarded = 0
+        self._zero = time.monotonic()
 
         def run() -> None:
-            begin = time.monotonic()
             while not stop.wait(_PACE_S):
                 part = list(islice(frames, 10))
-                now = int((time.monotonic() - begin) * 1e6)
+                now = int((time.monotonic() - self._zero) * 1e6)
                 self._feed.send([now] * len(part), [60] * len(part), part)
                 self._sent += len(part)
                 self._count()
@@ -139,6 +152,20 @@ class SonataStage(Stage):
         subscription.dispose()
         wait_for(lambda: not self._telemetry, 30, self.log)
         return took
+
+    def delay_after_window(self, query: str, results: int) -> list[float]:
+        """Seconds from a window's end to its result, on the wall clock that `traffic` sends by."""
+        took: list[float] = []
+
+        def heard(item: Item) -> None:
+            end_s = (item.value["window_end"] - self.base_us * 1000) / 1e9
+            took.append(time.monotonic() - self._zero - end_s)
+
+        subscription = self._observer.observe(f"{PREFIX}.{query}").subscribe(heard)
+        wait_for(lambda: len(took) >= results, 60, self.log)
+        subscription.dispose()
+        wait_for(lambda: not self._telemetry, 30, self.log)
+        return took[1:]
 
     def lost_while_changing(self, queries: Iterable[str]) -> int:
         """Frames that were not forwarded while queries were added, one by one, and removed."""

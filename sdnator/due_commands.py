@@ -5,6 +5,7 @@ import math
 import os
 import queue
 import re
+import shutil
 import signal
 import sys
 import time
@@ -19,6 +20,7 @@ import typer
 
 from sdnator import running
 from sdnator.errors import BadInput, PipelineError
+from sdnator.item_rates import SECONDS, Rates, headline
 
 if TYPE_CHECKING:
     from due import Item
@@ -37,6 +39,7 @@ _WAITING = 10_000
 _LOOK_SECONDS = 0.1
 _WINDOWS_NS = (60 * 10**9, 3_600 * 10**9, 86_400 * 10**9)
 _TEXT_WIDTH = 200
+_PLOTTED = SECONDS
 
 KeyArgument = Annotated[
     str, typer.Argument(help="A key; * is one segment, ** any number at its end.", metavar="KEY")
@@ -62,30 +65,79 @@ def observe(
     count: Annotated[int, typer.Option(help="End after so many items; 0: never.", min=0)] = 0,
     updates: Updates = "",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line for each item.")] = False,
+    plot: Annotated[
+        bool, typer.Option("--plot", help="Rates with a sparkline each second, instead of the items.")
+    ] = False,
 ) -> None:
     """Show items as they come.  Data that is made on demand is made while this runs.
 
-    What comes faster than it can be shown is skipped, counted, and told on standard error.
+    What comes faster than it can be shown is skipped, counted, and told on standard error.  With --plot
+    and --json, one JSON object a second with the rates.
 
     Example: sdnator observe 'network.anomaly.kitsune.*' --for 30s --json
     """
     wanted = typed_key(key)
     seconds = duration_ns(duration, "--for") / 1e9 if duration else math.inf
     url = updates or running.need().updates
-    shown = missed = 0
     with _stopping() as stopped, _items(wanted, url) as (waiting, lost):
-        deadline = time.monotonic() + seconds
-        while not stopped() and (not count or shown < count) and (left := deadline - time.monotonic()) > 0:
+        begin = time.monotonic()
+        rates = Rates(begin)
+        shown = _Shown(as_json, plot, rates)
+        while not stopped() and (not count or rates.items < count):
+            now = time.monotonic()
+            if now - begin >= seconds:
+                break
+            if rates.pass_time(now):
+                shown.second()
             try:
-                item = waiting.get(timeout=min(left, _LOOK_SECONDS))
+                item = waiting.get(timeout=min(begin + seconds - now, _LOOK_SECONDS))
             except queue.Empty:
                 continue
-            print(_json_line(item) if as_json else text_line(item), flush=waiting.empty())
-            shown += 1
-        missed = lost()
+            rates.add(item.value)
+            shown.item(item, last=waiting.empty())
+        shown.end()
+        missed, mean = lost(), rates.mean(time.monotonic())
     more = f", {missed:,} missed: they came faster than they could be shown" if missed else ""
-    hint = "" if shown else "; `sdnator keys` shows what is made"
-    print(f"sdnator: {shown:,} items{more}{hint}", file=sys.stderr)
+    hint = "" if rates.items else "; `sdnator keys` shows what is made"
+    rows = f", {rates.records:,} records" if rates.records != rates.items else ""
+    print(f"sdnator: {rates.items:,} items{rows}, {mean:,.1f} a second{more}{hint}", file=sys.stderr)
+
+
+class _Shown:
+    """What `observe` prints: items, or a line of rates each second (in place, on a terminal)."""
+
+    def __init__(self, as_json: bool, plot: bool, rates: Rates) -> None:
+        self._as_json = as_json
+        self._plot = plot
+        self._rates = rates
+        self._newest = ""
+        self._in_place = plot and not as_json and sys.stdout.isatty()
+
+    def item(self, item: "Item", *, last: bool) -> None:
+        if not self._plot:
+            print(_json_line(item) if self._as_json else text_line(item), flush=last)
+        elif not self._as_json:
+            self._newest = headline(item.value)
+
+    def second(self) -> None:
+        if not self._plot:
+            return
+        rates = self._rates
+        if self._as_json:
+            now = {"items": rates.items, "records": rates.records, "records_per_s": rates.last}
+            print(json.dumps(now), flush=True)
+            return
+        text = f"{rates.last:>9,}/s  {rates.line():<{_PLOTTED}}  {self._newest}"
+        width = shutil.get_terminal_size().columns
+        print(f"\r{text[: width - 1]}\x1b[K" if self._in_place else text, end=self._ending, flush=True)
+
+    @property
+    def _ending(self) -> str:
+        return "" if self._in_place else "\n"
+
+    def end(self) -> None:
+        if self._in_place:
+            print()
 
 
 @contextmanager
@@ -153,7 +205,7 @@ def get(
     start = instant_ns(since, now, "--since") if since else 0
     end = instant_ns(until, now, "--until") if until else now + 1
     try:
-        items, more = _from_archive(archive or _known_archive(), wanted, start, end, limit)
+        items, more = _from_archive(archive or known_archive(), wanted, start, end, limit)
     except (InvalidOption, InvalidQuery) as error:
         raise BadInput(str(error)) from None
     except DueError as error:
@@ -166,7 +218,8 @@ def get(
         print(f"sdnator: nothing under {wanted['dataKey']} in that time", file=sys.stderr)
 
 
-def _known_archive() -> str:
+def known_archive() -> str:
+    """Data Archives of the running pipeline, or the file of the last one."""
     found = running.find()
     return found.archive if found is not None else running.default_archive()
 

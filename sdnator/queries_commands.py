@@ -4,20 +4,14 @@ Options here; the work is the Sonata adapter's, which the commands use as a libr
 """
 
 import json
-import time
-from collections.abc import Iterable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from apps.packets import read_frames
 from apps.sonata_adapter.catalogue import Template
-from apps.sonata_adapter.engine import HostEngine
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.explain import explain as explain_plan
 from apps.sonata_adapter.keys import (
@@ -29,21 +23,17 @@ from apps.sonata_adapter.keys import (
     request_of,
 )
 from apps.sonata_adapter.planner import plan
-from apps.sonata_adapter.results import Captured, Result
 from apps.sonata_adapter.templates import QueryFolder, own_queries
 from apps.sonata_adapter.text import parse_queries
-from due import DueError, RecordBatch
-from due.backends import open_archive
-from sdnator.captures import Capture, CaptureError
+from due import DueError
+from sdnator.captures import CaptureError
+from sdnator.due_commands import known_archive
 from sdnator.errors import BadInput
+from sdnator.queries_run import Past, archived, as_line, as_text, captured, engine_of
 
 queries = typer.Typer(
     help="Telemetry queries: list, explain, add your own, run over the past.", no_args_is_help=True
 )
-_WIDTH = 256
-_BATCH = 16_384
-_UNITS_NS = {"s": 10**9, "m": 60 * 10**9, "h": 3_600 * 10**9, "d": 86_400 * 10**9}
-_PACKETS = "network.packets.p4runtime_ctrl.*.all"
 
 KeyArgument = Annotated[
     str, typer.Argument(help="network.traffic_query.sonata.NAME:window=3s,…", metavar="KEY")
@@ -128,7 +118,16 @@ def run_query(
         list[Path] | None, typer.Option(help="pcap or pcapng; several are read one after the other.")
     ] = None,
     since: Annotated[str, typer.Option(help="Over archived packets instead: 30s, 10m, 1h, 7d.")] = "",
-    archive: Annotated[str, typer.Option(help="Data Archives URL, for --since.", envvar="DUE_ARCHIVE")] = "",
+    archive: Annotated[
+        str,
+        typer.Option(help="Data Archives URL, for --since; default: of the pipeline.", envvar="DUE_ARCHIVE"),
+    ] = "",
+    engine: Annotated[
+        str, typer.Option(help="What runs the operators: numpy, or spark (extra `spark`).")
+    ] = "numpy",
+    master: Annotated[
+        str, typer.Option(help="Where Spark runs: local[N] or spark://HOST:PORT.")
+    ] = "local[2]",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line for each result.")] = False,
 ) -> None:
     """Run a query over captures or over the archive: the results are those of a live run.
@@ -141,11 +140,14 @@ def run_query(
     if bool(capture) == bool(since):
         raise BadInput("give either --capture FILE or --since 1h")
     try:
-        batches = _captured(capture) if capture else _archived(archive, since)
-        for output in _run(request, batches):
-            typer.echo(json.dumps(_line(output)) if as_json else _text(output))
-    except (CaptureError, DueError) as error:
+        past = Past(request, engine_of(engine, master))
+        streams = captured(capture) if capture else archived(archive or known_archive(), since)
+        for output in past.run(streams):
+            typer.echo(json.dumps(as_line(output)) if as_json else as_text(output))
+    except (CaptureError, DueError, SonataError) as error:
         raise BadInput(str(error)) from None
+    if past.notes:
+        typer.echo(f"sdnator: {past.notes}", err=True)
 
 
 def _request(key: str, known: dict[str, Template]) -> Request:
@@ -186,78 +188,3 @@ def _streams() -> dict[str, Any]:
     }
     streams[HANDSHAKE] = {"meaning": "completed TCP handshakes", "parameters": []}
     return streams
-
-
-def _run(request: Request, batches: Iterable[tuple[int, RecordBatch]]) -> Iterator[Result | Captured]:
-    engine: HostEngine | None = None
-    for base_us, batch in batches:
-        if engine is None:
-            engine = HostEngine(base_us=base_us)
-            engine.add(request.query)
-        yield from engine.process(batch)
-    if engine is not None:
-        yield from engine.finish()
-
-
-def _captured(paths: list[Path]) -> Iterator[tuple[int, RecordBatch]]:
-    """Windows count from the second of the first packet, as in a replay."""
-    base_us, number = None, 0
-    for path in paths:
-        with Capture(path) as capture:
-            if base_us is None:
-                base_us = capture.first_time_ns // 10**9 * 10**6
-            frames = iter(capture)
-            while part := list(islice(frames, _BATCH)):
-                yield (
-                    base_us,
-                    _batch([f[0] // 1000 for f in part], [f[1] for f in part], [f[2] for f in part], number),
-                )
-                number += len(part)
-
-
-def _batch(times_us: list[int], lengths: list[int], frames: list[bytes], first: int) -> RecordBatch:
-    cut = [frame[:_WIDTH] for frame in frames]
-    numbers = np.arange(first, first + len(frames))
-    batch = read_frames(
-        cut,
-        lengths=lengths,
-        times_us=times_us,
-        ports=np.ones(len(frames), dtype=np.uint16),
-        sequence=numbers + 1,
-        arrival=numbers,
-    )
-    captured = np.array([len(frame) for frame in cut], dtype=np.uint16)
-    return RecordBatch({**batch, "frame": np.array(cut, dtype=f"V{_WIDTH}"), "captured": captured})
-
-
-def _archived(url: str, since: str) -> Iterator[tuple[int, RecordBatch]]:
-    if not url:
-        raise BadInput("--since needs --archive URL (or DUE_ARCHIVE), such as sqlite:///path/archive.db")
-    if since[-1:] not in _UNITS_NS or not since[:-1].isdecimal():
-        raise BadInput(f"--since {since}: write 30s, 10m, 1h or 7d")
-    begin = time.time_ns() - int(since[:-1]) * _UNITS_NS[since[-1]]
-    archive = open_archive(url)
-    try:
-        for item in archive.find({"dataKey": _PACKETS, "timestamp": {"$gte": begin}}):
-            yield 0, item.value
-    finally:
-        archive.close()
-
-
-def _line(output: Result | Captured) -> dict[str, Any]:
-    if isinstance(output, Captured):
-        return {"packets": len(output.batch), "until": output.last_us * 1000}
-    return {"query": output.query, **output.to_value()}
-
-
-def _text(output: Result | Captured) -> str:
-    if isinstance(output, Captured):
-        return f"{len(output.batch):,} packets until {_clock(output.last_us)}"
-    fields = "  ".join(f"{name} {value}" for name, value in sorted(output.fields.items()))
-    mark = "" if output.exact else f"  (estimate: {output.error})"
-    return f"{_clock(output.at_us)}  {fields}{mark}"
-
-
-def _clock(time_us: int) -> str:
-    second, fraction = divmod(time_us, 10**6)
-    return f"{time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(second))}.{fraction:06d}"

@@ -5,8 +5,8 @@ packets, frames ─► merge ─► host operators ─┐
 reports of counting stages ─────────────────┴─► outputs, each under the keys that asked for it
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import count
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -14,11 +14,11 @@ import msgspec
 from apps.messages import TableUpdate
 from apps.sonata_adapter.catalogue import Template
 from apps.sonata_adapter.dataflow import Table, compile_query
-from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine
+from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.handshake import Handshakes
 from apps.sonata_adapter.keys import HANDSHAKE, Request, request_of
-from apps.sonata_adapter.merge import Merger
+from apps.sonata_adapter.merge import Merger, patience
 from apps.sonata_adapter.placement import Entry, SwitchLimits
 from apps.sonata_adapter.planner import Plan, QueryPlan, plan
 from apps.sonata_adapter.reports import Reports
@@ -58,8 +58,8 @@ class Written(msgspec.Struct, frozen=True):
 class _Lane:
     """Host operators and the stream that they see; queries on bytes have a lane of their own."""
 
-    def __init__(self, limit: int, lateness_us: int) -> None:
-        self.host = HostEngine(limit=limit, lateness_us=lateness_us)
+    def __init__(self, host: WindowEngine) -> None:
+        self.host = host
         self.merger = Merger()
         self.names: set[str] = set()
         """Streams that bring its packets."""
@@ -70,13 +70,28 @@ class _Lane:
 class _Station:
     """What is kept for one switch."""
 
-    def __init__(self, limit: int, lateness_us: int) -> None:
-        self.headers = _Lane(limit, lateness_us)
-        self.frames = _Lane(limit, lateness_us)
+    def __init__(self, engine: Callable[[], WindowEngine], base_us: int) -> None:
+        self.headers = _Lane(engine())
+        self.frames = _Lane(engine())
         self.handshakes = Handshakes()
         self.reports: dict[str, Reports | Tallies] = {}
-        self.base_us = 0
+        self.base_us = base_us
+        for lane in self.lanes:
+            lane.host.base_us = base_us
         self.now_us: int | None = None
+        self._heard: float | None = None
+
+    def clock(self, now_us: int) -> None:
+        """The switch's clock has come to `now_us`."""
+        if self.now_us is None or now_us > self.now_us:
+            self.now_us = now_us
+            self._heard = None
+
+    def idle_s(self, now: float) -> float:
+        """Seconds since its clock was heard of, as far as calls of this tell."""
+        if self._heard is None:
+            self._heard = now
+        return now - self._heard
 
     @property
     def tallies(self) -> list[Tallies]:
@@ -97,17 +112,15 @@ class Control:
         limits: SwitchLimits | None = None,
         keys_limit: int = DEFAULT_LIMIT,
         lateness_us: int = DEFAULT_LATENESS_US,
+        engine: Callable[..., WindowEngine] = HostEngine,
     ) -> None:
         self._templates = templates
         self._limits = limits or SwitchLimits()
-        self._keys_limit = keys_limit
-        self._lateness_us = lateness_us
+        self._engine = partial(engine, limit=keys_limit, lateness_us=lateness_us)
         self._stations: dict[str, _Station] = {}
         self._requests: dict[str, Request] = {}
         self._outputs: dict[str, tuple[str, ...]] = {}
         self._refused: dict[str, str] = {}
-        self._numbers = count(1)
-        self._questions: dict[int, tuple[Tallies, int]] = {}
         self.plan = Plan((), ())
 
     @property
@@ -159,7 +172,7 @@ class Control:
     def switch(self, name: str, base_us: int) -> bool:
         """A switch is there; returns whether it is new."""
         new = name not in self._stations
-        station = self._station(name)
+        station = self._station(name, base_us)
         station.base_us = base_us
         for lane in station.lanes:
             lane.host.base_us = base_us
@@ -186,7 +199,7 @@ class Control:
         bit = int(name[1:])
         written: list[Written] = []
         if len(batch):
-            station.now_us = max(int(batch["time_us"].max()), station.now_us or 0)
+            station.clock(int(batch["time_us"].max()))
         for found in self.plan.queries:
             if any(entry.bit == bit for entry in found.entries) and found.identity in station.reports:
                 written += self._addressed(station, station.reports[found.identity].take(bit, batch))
@@ -196,12 +209,24 @@ class Control:
         """Questions to the switches about cells of windows that are over, by switch."""
         found: dict[str, list[CellRead]] = {}
         for name, station in self._stations.items():
+            idle_s = station.idle_s(now)
             for tallies in station.tallies:
                 if station.now_us is not None:
-                    found.setdefault(name, []).extend(
-                        self._numbered(tallies, tallies.due(station.now_us, now))
-                    )
+                    found.setdefault(name, []).extend(tallies.due(station.now_us, now, idle_s=idle_s))
         return {name: reads for name, reads in found.items() if reads}
+
+    def last_reads(self, now: float) -> dict[str, list[CellRead]]:
+        """Questions about all windows that are open, by switch: no more packets will come."""
+        found = {
+            name: [read for tallies in station.tallies for read in tallies.finish(now)]
+            for name, station in self._stations.items()
+        }
+        return {name: reads for name, reads in found.items() if reads}
+
+    @property
+    def waits_for_cells(self) -> bool:
+        """Whether an answer is outstanding."""
+        return any(tallies.waiting for station in self._stations.values() for tallies in station.tallies)
 
     @property
     def needs_cells(self) -> bool:
@@ -213,20 +238,10 @@ class Control:
         station = self._station(switch)
         written: list[Written] = []
         for number, counted in zip(numbers, counts, strict=True):
-            tallies, question = self._questions.pop(number, (None, 0))
-            if tallies is not None:
-                results = tallies.answer(question, counted, station.now_us or 0)
-                written += self._addressed(station, results)
+            for tallies in station.tallies:
+                if tallies.waits_for(number):
+                    written += self._addressed(station, tallies.answer(number, counted, station.now_us or 0))
         return written
-
-    def _numbered(self, tallies: Tallies, reads: list[CellRead]) -> list[CellRead]:
-        """Numbers that are unlike for all queries."""
-        found = []
-        for read in reads:
-            number = next(self._numbers)
-            self._questions[number] = (tallies, read.id)
-            found.append(msgspec.structs.replace(read, id=number))
-        return found
 
     def tick(self, now: float) -> list[Written]:
         """Let go what has waited long enough."""
@@ -242,8 +257,7 @@ class Control:
 
     def advance(self, switch: str, now_us: int) -> None:
         """Capture time of a switch has come to `now_us`, though no packet may have come here."""
-        station = self._station(switch)
-        station.now_us = max(now_us, station.now_us or 0)
+        self._station(switch).clock(now_us)
 
     def finish(self) -> list[Written]:
         """No more packets will come."""
@@ -253,6 +267,12 @@ class Control:
                 written += self._processed(station, lane, lane.merger.flush(), None)
                 written += self._addressed(station, lane.host.finish())
         return written
+
+    def close(self) -> None:
+        """Give back what the engines hold."""
+        for station in self._stations.values():
+            for lane in station.lanes:
+                lane.host.close()
 
     def health(self) -> dict[str, Any]:
         """Counters for people."""
@@ -270,6 +290,8 @@ class Control:
             "disordered": sum(lane.merger.disordered for lane in lanes),
             "without_payload": sum(lane.host.without_payload for lane in lanes),
             "reports": sum(report.tuples for station in stations for report in station.reports.values()),
+            "late_reads": sum(each.missed for station in stations for each in station.tallies),
+            "open_windows": sum(each.open for station in stations for each in station.tallies),
             "refused": len(self._refused),
         }
 
@@ -298,10 +320,10 @@ class Control:
                 outputs.setdefault(request.identity, set()).add(request.output)
         return requests, outputs, refused
 
-    def _station(self, name: str) -> _Station:
+    def _station(self, name: str, base_us: int = 0) -> _Station:
         station = self._stations.get(name)
         if station is None:
-            station = self._stations[name] = _Station(self._keys_limit, self._lateness_us)
+            station = self._stations[name] = _Station(self._engine, base_us)
             self._refit(station, {})
         return station
 
@@ -320,6 +342,9 @@ class Control:
                 lane.host.add(self._requests[identity].query)
             lane.names = {_name(copy.bit) for one in mine for copy in one.copies}
             lane.merger.expect(lane.names)
+            asked = [self._requests[one.identity] for one in mine]
+            windows = [request.query.window_us for request in asked if request.kind == "query"]
+            lane.merger.hurry(patience(min(windows, default=None)))
         reports: dict[str, Reports | Tallies] = {}
         for one in self.plan.queries:
             if one.in_switch:

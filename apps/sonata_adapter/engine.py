@@ -3,12 +3,12 @@
     batch ─► windows [n·W, (n+1)·W) ─► operators, shared among queries ─► crossings at once
                                                                       └─► tables when the window closes
 
-A window closes when a packet is `lateness_us` beyond its end (at most one window), or on `advance` or
-`finish`.  Packets of a closed window are left out and counted in `late`.
+A window closes when a packet is `lateness_us` beyond its end (at most a quarter of the window), or on
+`advance` or `finish`.  Packets of a closed window are left out and counted in `late`.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -121,6 +121,25 @@ class _Window:
         yield from self._errors(node.source)
 
 
+class WindowEngine(Protocol):
+    """What runs queries over batches: `HostEngine`, or Spark in its place."""
+
+    base_us: int
+    watermark_us: int | None
+    packets: int
+    late: int
+    without_payload: int
+
+    @property
+    def names(self) -> set[str]: ...
+    def add(self, query: Query) -> None: ...
+    def remove(self, name: str) -> None: ...
+    def process(self, batch: RecordBatch, *, horizon_us: int | None = None) -> list[Result | Captured]: ...
+    def advance(self, now_us: int) -> list[Result | Captured]: ...
+    def finish(self) -> list[Result | Captured]: ...
+    def close(self) -> None: ...
+
+
 class HostEngine:
     """Runs queries over batches; pure: time comes with the packets.
 
@@ -184,13 +203,16 @@ class HostEngine:
         over = [
             key
             for key in self._windows
-            if self.base_us + (key[1] + 1) * key[0] + min(self._lateness_us, key[0]) <= self.watermark_us
+            if self.base_us + (key[1] + 1) * key[0] + min(self._lateness_us, key[0] // 4) <= self.watermark_us
         ]
         return self._close(over)
 
     def finish(self) -> list[Result | Captured]:
         """No more packets will come: close all windows."""
         return self._close(list(self._windows))
+
+    def close(self) -> None:
+        """Nothing to give back."""
 
     def _by_length(self) -> dict[int, list[_Running]]:
         found: dict[int, list[_Running]] = {}

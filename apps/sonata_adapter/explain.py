@@ -23,8 +23,11 @@ def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
         what = "frames" if copy.payload else "headers"
         lines.append(f"    bit {copy.bit:<3} copies {what} of {match_text(copy.match)}")
     lines.append("  on the host")
-    if one.in_switch:
+    if any(entry.role == "clock" for entry in one.entries):
+        lines.append("    keys that may become results; their other counts are read when the window is over")
+    elif one.in_switch:
         lines.append("    keys that reached the threshold, reported once in a window; keys without a cell")
+    if one.in_switch:
         lines.append(f"    saves about {one.saved_per_second:,.0f} copies a second of 10,000 packets")
     else:
         lines.append(
@@ -35,6 +38,12 @@ def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
 
 
 def _entry_lines(entry: Entry) -> list[str]:
+    if entry.role == "clock":
+        period = duration_text(entry.window_us // 1000)
+        return [
+            f"    bit {entry.bit:<3} {match_text(entry.match)}",
+            f"      stage {entry.stage}: says every {period} how far time has come, by which windows end",
+        ]
     key = ", ".join(name.removesuffix("_mask") for name, _ in entry.masks)
     unit = "bytes" if entry.by_bytes else "frames"
     what = (

@@ -19,8 +19,8 @@ ARITHMETIC: Final = ("+", "-", "*", "/", "%", "&", "|")
 COMPARISONS: Final = ("==", "!=", "<", "<=", ">", ">=")
 
 
-class Node(msgspec.Struct, frozen=True):
-    """Base of all nodes; hashable."""
+class Node(msgspec.Struct, frozen=True, tag=True):
+    """Base of all nodes; hashable, and fit to be written down (msgspec)."""
 
 
 class Field(Node, frozen=True):

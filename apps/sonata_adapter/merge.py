@@ -2,7 +2,8 @@
 
 The controller publishes what it copies under one key for each condition; a packet that meets two
 conditions comes twice.  Packets wait until every stream has come as far, until nothing has come for
-`hold_s` of the caller's clock; streams that stay silent while others bring much are not waited for.
+a tenth of a second of the caller's clock; streams that stay silent while others bring much are not
+waited for.  All of that is shorter where results are due sooner: `patience`.
 """
 
 from typing import Final
@@ -13,10 +14,21 @@ from due import RecordBatch
 
 DEFAULT_HOLD_S: Final = 0.1
 LONGEST_WAIT_S: Final = 1.0
+SHORTEST_WAIT_S: Final = 0.04
+"""What one round of the controller's batches and of DUE's takes on a busy machine."""
 _MOST_ROWS: Final = 1 << 18
 _REMEMBERED: Final = 1 << 20
 _TURNS: Final = 64
-"""A stream that brought nothing while others did so often, and for `LONGEST_WAIT_S`, is silent."""
+"""A stream that brought nothing while others did so often, and for a second, is silent."""
+_SHARE: Final = 4
+"""Of the shortest window, this part may be spent on waiting for silent streams."""
+
+
+def patience(window_us: int | None) -> float:
+    """Seconds to wait for silent streams, where the shortest window in force is this long."""
+    if window_us is None:
+        return LONGEST_WAIT_S
+    return min(LONGEST_WAIT_S, max(SHORTEST_WAIT_S, window_us / 1e6 / _SHARE))
 
 
 class _Stream:
@@ -32,8 +44,10 @@ class _Stream:
 class Merger:
     """Merges by the column `arrival`.  Pure: the caller brings the time, in seconds."""
 
-    def __init__(self, hold_s: float = DEFAULT_HOLD_S) -> None:
-        self._hold_s = hold_s
+    def __init__(self) -> None:
+        self._hold_s = DEFAULT_HOLD_S
+        self._wait_s = LONGEST_WAIT_S
+        self._silent_turns = _TURNS
         self._waiting: list[tuple[float, RecordBatch]] = []
         self._streams: dict[str, _Stream] = {}
         self._turn = 0
@@ -49,6 +63,12 @@ class Merger:
     def expect(self, names: set[str]) -> None:
         """These streams there are from now on."""
         self._streams = {name: self._streams.get(name) or _Stream() for name in names}
+
+    def hurry(self, wait_s: float) -> None:
+        """From now on a silent stream is waited for so long at most; see `patience`."""
+        self._wait_s = wait_s
+        self._hold_s = min(DEFAULT_HOLD_S, wait_s)
+        self._silent_turns = max(1, round(_TURNS * wait_s / LONGEST_WAIT_S))
 
     def put(self, name: str, batch: RecordBatch, now: float) -> RecordBatch | None:
         """Take a batch of a stream; returns what can be let go."""
@@ -75,7 +95,7 @@ class Merger:
 
     def _is_silent(self, stream: _Stream, now: float) -> bool:
         waited = 0.0 if stream.heard is None else now - stream.heard
-        return self._turn - stream.turn >= _TURNS and waited >= LONGEST_WAIT_S
+        return self._turn - stream.turn >= self._silent_turns and waited >= self._wait_s
 
     def busy(self, now: float) -> None:
         """Until `now` the caller had no time to bring more."""
@@ -93,7 +113,7 @@ class Merger:
 
     def is_quiet(self, now: float) -> bool:
         """Nothing waits, and nothing has come for so long that nothing is on its way."""
-        return not self._waiting and now - self._heard >= LONGEST_WAIT_S
+        return not self._waiting and now - self._heard >= self._wait_s
 
     def flush(self) -> RecordBatch | None:
         """All that waits."""

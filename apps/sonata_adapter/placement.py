@@ -18,11 +18,13 @@ _SHORT: Final = (1 << 16) - 1
 _KEY_PARTS: Final = {
     "ip.src": ("source_mask", _ADDRESS),
     "ip.dst": ("destination_mask", _ADDRESS),
+    "tcp.sport": ("source_port_mask", _SHORT),
+    "udp.sport": ("source_port_mask", _SHORT),
     "tcp.dport": ("port_mask", _SHORT),
     "udp.dport": ("port_mask", _SHORT),
     "length": ("length_mask", _SHORT),
 }
-Role = Literal["distinct", "reduce"]
+Role = Literal["distinct", "reduce", "clock"]
 
 
 class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,11 +37,14 @@ class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Entries of a stage."""
     cells: int = 32_768
     """Cells of a stage in one bank."""
-    distinct_cells: int = 16_384
-    """What an entry for a distinct takes, if there is room; never less than a quarter."""
+    distinct_cells: int = 32_768
+    """What the entries for one distinct take together, if there is room; none less than a quarter."""
     reduce_cells: int = 8_192
-    reads: bool = False
+    """What an entry for a reduce takes, if there is room, or a quarter."""
+    reads: bool = True
     """Whether the controller answers requests for cells: then differences are counted in the switch, too."""
+    read_window_ms: int = 1_000
+    """Shortest window of queries that need cells read, and how often the switch says what time it has."""
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -70,6 +75,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
             "destination_mask": 0,
             "port_mask": 0,
             "length_mask": 0,
+            "source_port_mask": 0,
             **dict(self.masks),
             "threshold": self.threshold,
             "by_bytes": self.by_bytes,
@@ -159,7 +165,9 @@ class Space:
             self._bits.add(free)
         return free
 
-    def distinct(self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int) -> Entry:
+    def distinct(
+        self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int, alternatives: int
+    ) -> Entry:
         """An entry for a distinct: one that is there already, with room behind it, or a new one."""
         for number, held in enumerate(self._stages):
             for entry in held:
@@ -178,7 +186,28 @@ class Space:
             threshold=0,
             by_bytes=0,
         )
-        return self.place(new, after=-1)
+        return self.place(new, after=-1, cells=self._limits.distinct_cells // alternatives)
+
+    def clock(self) -> Entry:
+        """The entry by which the switch says how far its time has come; raises `NotPlaced`.
+
+        The first frame of each period is reported, whatever frame that is: it needs a stage of its own.
+        """
+        for held in self._stages:
+            for entry in held:
+                if entry.role == "clock":
+                    return entry
+        new = Entry(
+            role="clock",
+            bit=0,
+            stage=0,
+            match={},
+            masks=(),
+            window_us=self._limits.read_window_ms * 1000,
+            threshold=1,
+            by_bytes=0,
+        )
+        return self.place(new, after=-1, cells=1)
 
     def _room_behind(self, stage: int, match: Match) -> bool:
         return any(
@@ -186,9 +215,9 @@ class Space:
             for held in self._stages[stage + 1 :]
         )
 
-    def place(self, wanted: Entry, *, after: int) -> Entry:
+    def place(self, wanted: Entry, *, after: int, cells: int = 0) -> Entry:
         """The entry in the first stage behind `after` that has room; raises `NotPlaced`."""
-        wish = self._limits.distinct_cells if wanted.role == "distinct" else self._limits.reduce_cells
+        wish = cells or self._limits.reduce_cells
         for number in range(after + 1, self._limits.stages):
             held = self._stages[number]
             if len(held) >= self._limits.entries:
@@ -215,4 +244,4 @@ class Space:
         if large is not None:
             return large
         base, size = max(gaps, key=lambda gap: gap[1])
-        return (base, size) if size >= wish // 4 else None
+        return (base, size) if size >= max(1, wish // 4) else None

@@ -31,6 +31,7 @@ from apps.sonata_adapter.estimates import packets_per_second
 from apps.sonata_adapter.expressions import PAYLOAD_FIELDS, Expression, fields_of, text_of
 from apps.sonata_adapter.keys import Request
 from apps.sonata_adapter.placement import Copy, Entry, Space, SwitchLimits, by_bytes, masks_of
+from apps.sonata_adapter.query import duration_text
 
 
 class QueryPlan(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,7 +95,7 @@ def plan(
             kept[old.identity] = old
             space.hold(old.entries)
     fresh = [request for request in wanted.values() if request.identity not in kept]
-    ordered = sorted(fresh, key=lambda request: (-_saving(request), request.identity))
+    ordered = sorted(fresh, key=lambda request: (-_saving(request, limits), request.identity))
     found = dict(kept)
     for request in ordered:
         found[request.identity] = _counted(request, space, limits)
@@ -114,12 +115,13 @@ def plan(
     return Plan(tuple(plans), tuple(copies))
 
 
-def _saving(request: Request) -> float:
-    """Copies a second that counting in the switch saves, for each stage that it takes."""
-    outcome = compile_query(request.query)
-    node = outcome.node
-    stages = 2 if isinstance(node, ReduceNode) and isinstance(node.source, DistinctNode) else 1
-    return packets_per_second(match for match, _ in _needed(request)) / stages
+def _saving(request: Request, limits: SwitchLimits) -> float:
+    """Copies a second that counting in the switch saves, for each stage that it takes; 0: it cannot."""
+    try:
+        stages = {entry.stage for entry in _entries(request, Space(limits), limits)}
+    except NotPlaced:
+        return 0.0
+    return packets_per_second(match for match, _ in _needed(request)) / len(stages)
 
 
 def _needed(request: Request) -> list[tuple[Match, bool]]:
@@ -187,11 +189,13 @@ def _entries(request: Request, space: Space, limits: SwitchLimits) -> list[Entry
         return _count_entries(outcome.node, space, window_us, outcome.threshold)
     if not isinstance(outcome, Table) or not limits.reads:
         raise NotPlaced("its result is known at the window's end only, and the values of cells are not read")
+    if request.query.window_ms < limits.read_window_ms:
+        raise NotPlaced(
+            f"its result is known at the window's end only, and cells of windows shorter than "
+            f"{duration_text(limits.read_window_ms)} are not read: they would come late"
+        )
     nodes = sources(outcome)
-    for node in nodes:
-        if not isinstance(node, ReduceNode) or not isinstance(node.source, PacketSource):
-            raise NotPlaced("what is read at the window's end are counts of packets, one for each key")
-    found: list[Entry] = []
+    found: list[Entry] = [space.clock()]
     for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):
         found += _count_entries(node, space, window_us, threshold, source=place)
     return found
@@ -215,7 +219,9 @@ def _count_entries(
     for match in conditions.alternatives:
         first: Entry | None = None
         if isinstance(node.source, DistinctNode):
-            first = space.distinct(match, masks_of(node.source.values), window_us)
+            first = space.distinct(
+                match, masks_of(node.source.values), window_us, len(conditions.alternatives)
+            )
             found.append(first)
         last = Entry(
             role="reduce",

@@ -11,10 +11,11 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 import numpy as np
@@ -24,7 +25,7 @@ from apps.messages import TableCommand, TableUpdate
 from apps.packets import read_frames
 from apps.sonata_adapter.catalogue import CATALOGUE, Template
 from apps.sonata_adapter.control import Changes, Control, Source, Written, leftovers
-from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
+from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
 from apps.sonata_adapter.placement import SwitchLimits
@@ -72,6 +73,8 @@ CAPABILITIES = (
 
 _LOG = logging.getLogger(__name__)
 _WIDTH: Final = 256
+_LAST_ANSWERS_S: Final = 1.0
+_LOOK_S: Final = 0.01
 _MY_KEYS: Final = (QUERY_PREFIX, CAPTURE_PREFIX, HANDSHAKE)
 
 
@@ -83,9 +86,13 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     keys: int = DEFAULT_LIMIT
     """Keys that one operator keeps exactly in a window; beyond, results are estimates and say so."""
     lateness_us: int = DEFAULT_LATENESS_US
-    """How long after its end a window waits for late packets, capture time; a window at most."""
+    """How long after its end a window waits for late packets, capture time; a quarter of it at most."""
     base_us: dict[str, int] = {}
     """Absolute time of a switch's clock zero, where the controller does not say it: switch to us."""
+    engine: Literal["numpy", "spark"] = "numpy"
+    """What runs the host's operators: numpy in this process, or Spark Structured Streaming (extra `spark`)."""
+    spark_master: str = "local[2]"
+    """Where Spark runs: `local[N]`, `spark://host:7077`."""
     queries: str = ""
     """Folder of people's own queries; empty: `$SDNATOR_QUERIES`, or one in the home folder."""
 
@@ -102,6 +109,7 @@ class SonataAdapterService:
             limits=settings.limits,
             keys_limit=settings.keys,
             lateness_us=settings.lateness_us,
+            engine=_engine(settings),
         )
         self._lock = threading.RLock()
         self._observed: dict[Source, Any] = {}
@@ -130,8 +138,14 @@ class SonataAdapterService:
     def stop(self) -> None:
         """Report what is open, and take everything out of the switch."""
         with self._lock:
+            self._ask(self._control.last_reads(time.monotonic()))
+        deadline = time.monotonic() + _LAST_ANSWERS_S
+        while self._control.waits_for_cells and time.monotonic() < deadline:
+            time.sleep(_LOOK_S)
+        with self._lock:
             self._write(self._control.finish())
             self._apply(self._control.want(()))
+            self._control.close()
 
     def health(self) -> dict[str, Any]:
         """Counters for people."""
@@ -236,7 +250,10 @@ class SonataAdapterService:
             self._write(self._control.cells(switch, item.value["id"].tolist(), item.value["count"].tolist()))
 
     def _read_cells(self) -> None:
-        for switch, reads in self._control.reads(time.monotonic()).items():
+        self._ask(self._control.reads(time.monotonic()))
+
+    def _ask(self, questions: dict[str, list[CellRead]]) -> None:
+        for switch, reads in questions.items():
             self._engine.write(f"{CELL_REQUEST}.{switch}", cell_request(reads), [NO_WAIT])
 
     def _write(self, written: Iterable[Written]) -> None:
@@ -247,6 +264,16 @@ class SonataAdapterService:
             for key in one.keys:
                 self._written += 1
                 self._engine.write(key, value, [NO_WAIT], event_time=at_us * 1000)
+
+
+def _engine(settings: Settings) -> Callable[..., WindowEngine]:
+    """Makes engines; raises `SparkMissing` where Spark is asked for and cannot be had."""
+    if settings.engine == "numpy":
+        return HostEngine
+    from apps.sonata_adapter.spark import SparkEngine, spark_session
+
+    spark_session(settings.spark_master)
+    return partial(SparkEngine, master=settings.spark_master)
 
 
 def with_frames(value: dict[str, Any]) -> RecordBatch:
@@ -278,6 +305,7 @@ def cell_request(reads: Sequence[CellRead]) -> RecordBatch:
             "dst_lo": np.array([read.destination & low for read in reads], dtype=np.uint64),
             "port": np.array([read.port for read in reads], dtype=np.uint16),
             "length": np.array([read.length for read in reads], dtype=np.uint16),
+            "source_port": np.array([read.source_port for read in reads], dtype=np.uint16),
             "time_us": np.array([read.time_us for read in reads], dtype=np.int64),
         }
     )

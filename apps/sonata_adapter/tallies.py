@@ -3,6 +3,9 @@
 report: a key reached its candidate count ─► when the window is over, read its cells of all sources
 report: a key has no cell                 ─► counted here, exactly
 answers ─► the query's own steps over these keys ─► results
+
+When a window is over is known from the switch's clock, that is, from what it sends.  Where it sends
+nothing for a whole window and a while, this machine's clock decides, and the results say so.
 """
 
 from collections.abc import Iterator
@@ -13,28 +16,44 @@ import msgspec
 import numpy as np
 
 from apps.sonata_adapter.columns import Packets, Tuples, address_number, column_of, plain_value
-from apps.sonata_adapter.dataflow import VALUE, ReduceNode, Table, compile_query, kinds_of, sources
-from apps.sonata_adapter.expressions import Field, Number, text_of
+from apps.sonata_adapter.dataflow import (
+    VALUE,
+    DistinctNode,
+    ReduceNode,
+    Table,
+    compile_query,
+    kinds_of,
+    sources,
+)
+from apps.sonata_adapter.expressions import Expression, Field, Number, text_of
+from apps.sonata_adapter.placement import Entry
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import Query
 from apps.sonata_adapter.relations import relation_of
 from apps.sonata_adapter.results import Result
 from due import RecordBatch
 
-TIMEOUT_S: Final = 2.0
+TIMEOUT_S: Final = 10.0
+PATIENCE_S: Final = 10.0
+"""A switch that is silent for a window and so long is taken to have nothing to say, not to be slow."""
+MOST_KEYS: Final = 16_384
+"""Keys of one window that are asked for; a result that would need more says that it is an estimate."""
 _Key = tuple[tuple[int, ...], ...]
 """Parts of each key column, in the order of their names under the query."""
+_NUMBERS: Final = count(1)
 
 
 class CellRead(msgspec.Struct, frozen=True, kw_only=True):
     """A question to the switch: the count of a key in a window."""
 
     id: int
+    """Unlike that of any other question of this process."""
     bit: int
     source: int
     destination: int
     port: int
     length: int
+    source_port: int
     time_us: int
 
 
@@ -43,10 +62,15 @@ class _Window:
 
     def __init__(self) -> None:
         self.candidates: dict[_Key, None] = {}
+        self.beyond = 0
         self.counts: dict[tuple[int, _Key], int] = {}
+        """By bit of the reduce: frames or bytes of keys without a cell, or the cell's value."""
+        self.tuples: dict[tuple[int, _Key], set[_Key]] = {}
+        """By bit of the reduce: new tuples of the distinct before it that had no cell."""
+        self.reported: set[tuple[int, _Key]] = set()
         self.waiting: set[int] = set()
         self.asked: float | None = None
-        self.error = ""
+        self.errors: dict[str, None] = {}
 
 
 class Tallies:
@@ -63,76 +87,141 @@ class Tallies:
         self._since_us = since_us
         self._nodes = [node for node in sources(outcome) if isinstance(node, ReduceNode)]
         self._keys = [_key_names(table) for table in _tables(outcome)]
-        self._entries = {entry.bit: entry for entry in found.entries}
+        self._reduces = {entry.bit: entry for entry in found.entries if entry.role == "reduce"}
         self._windows: dict[int, _Window] = {}
         self._questions: dict[int, tuple[int, int, _Key]] = {}
-        self._numbers = count(1)
         self.tuples = 0
+        self.missed = 0
+        """Cells that were read too late: a later window had overwritten them."""
 
     def take(self, bit: int, batch: RecordBatch) -> list[Result]:
         """Note candidates and keys without a cell; results come with the answers."""
         self.tuples += len(batch)
-        entry = self._entries[bit]
         packets = Packets(batch)
-        columns = [column_of(Field(name), packets) for _, name in self._keys[entry.source]]
-        times = ((batch["time_us"] - self._base_us) // self._query.window_us).tolist()
-        over = batch["overflow"].tolist()
-        amounts = batch["length"].tolist() if entry.by_bytes else [1] * len(batch)
-        for row, number in enumerate(times):
-            key = tuple(tuple(int(part[row]) for part in column) for column in columns)
-            window = self._windows.setdefault(number, _Window())
-            window.candidates[key] = None
-            if over[row]:
-                place = (entry.source, key)
-                window.counts[place] = window.counts.get(place, 0) + amounts[row]
+        numbers = ((batch["time_us"] - self._base_us) // self._query.window_us).tolist()
+        entry = self._reduces.get(bit)
+        if entry is not None:
+            self._counted(entry, packets, numbers, batch)
+        for behind in [each for each in self._reduces.values() if each.behind == bit]:
+            self._distinct(behind, packets, numbers)
         return []
 
-    def due(self, now_us: int, now: float) -> list[CellRead]:
-        """Questions about windows that are over at capture time `now_us`."""
+    def _counted(self, entry: Entry, packets: Packets, numbers: list[int], batch: RecordBatch) -> None:
+        """Keys that reached the candidate count, and frames whose key has no cell."""
+        over = batch["overflow"].tolist()
+        amounts = batch["length"].tolist() if entry.by_bytes else [1] * len(batch)
+        fields = [Field(name) for _, name in self._keys[entry.source]]
+        for number, key, without_cell, amount in zip(
+            numbers, _rows(fields, packets), over, amounts, strict=True
+        ):
+            window = self._windows.setdefault(number, _Window())
+            place = (entry.bit, key)
+            if without_cell:
+                window.counts[place] = window.counts.get(place, 0) + amount
+            else:
+                window.reported.add(place)
+            if entry.threshold and window.counts.get(place, entry.threshold) >= entry.threshold:
+                _remember(window, key)
+
+    def _distinct(self, entry: Entry, packets: Packets, numbers: list[int]) -> None:
+        """Tuples that found no cell in the stage of the distinct: they are told apart here."""
+        node = self._nodes[entry.source].source
+        assert isinstance(node, DistinctNode)  # noqa: S101 - else nothing would stand behind a distinct
+        keys = _rows([Field(name) for _, name in self._keys[entry.source]], packets)
+        for number, key, values in zip(numbers, keys, _rows(node.values, packets), strict=True):
+            window = self._windows.setdefault(number, _Window())
+            if entry.threshold:
+                _remember(window, key)
+            held = window.tuples.setdefault((entry.bit, key), set())
+            if len(held) < MOST_KEYS:
+                held.add(values)
+            elif values not in held:
+                window.errors["a key had too many tuples without a cell in the switch"] = None
+
+    def due(self, now_us: int, now: float, *, idle_s: float = 0.0) -> list[CellRead]:
+        """Questions about windows that are over at capture time `now_us`.
+
+        `idle_s`: so long the switch's clock has not been heard of.
+        """
         asked: list[CellRead] = []
         for number, window in self._windows.items():
-            if window.asked is None and self._end(number) <= now_us:
-                window.asked = now
-                asked += self._ask(number, window)
+            is_over = self._end(number) <= now_us
+            if not is_over and idle_s >= self._query.window_us / 1e6 + PATIENCE_S:
+                is_over = True
+                window.errors["the switch sent nothing; the end was taken from this machine's clock"] = None
+            if window.asked is None and is_over:
+                asked += self._begin(number, window, now)
         return asked
+
+    def finish(self, now: float) -> list[CellRead]:
+        """Questions about all windows: nothing more will come."""
+        return [
+            read
+            for number, window in self._windows.items()
+            if window.asked is None
+            for read in self._begin(number, window, now)
+        ]
+
+    def waits_for(self, question: int) -> bool:
+        return question in self._questions
+
+    @property
+    def waiting(self) -> bool:
+        """Whether an answer is outstanding."""
+        return bool(self._questions)
+
+    @property
+    def open(self) -> int:
+        """Windows that results may still come of."""
+        return len(self._windows)
 
     def answer(self, question: int, counted: int, now_us: int) -> list[Result]:
         """The count of a key; results once all of its window are there."""
-        number, source, key = self._questions.pop(question, (None, 0, ()))
+        number, bit, key = self._questions.pop(question, (None, 0, ()))
         window = None if number is None else self._windows.get(number)
         if number is None or window is None:
             return []
         self.tuples += 1
-        window.counts[source, key] = counted
+        window.counts[bit, key] = counted
         window.waiting.discard(question)
-        if now_us >= self._end(number + 1):
-            window.error = "cells were read when a later window had begun to overwrite them"
+        missed = (bit, key) in window.reported and counted < self._reduces[bit].threshold
+        self.missed += missed
+        if missed or now_us >= self._end(number + 1):
+            window.errors["cells were read when a later window had begun to overwrite them"] = None
         return self._finished(number, window)
 
     def expire(self, now: float) -> list[Result]:
-        """Results of windows whose answers are overdue, as estimates."""
+        """Results of windows that have nothing to wait for, or whose answers are overdue: as estimates."""
         found: list[Result] = []
         for number, window in list(self._windows.items()):
-            if window.asked is not None and now - window.asked >= TIMEOUT_S:
-                window.error = f"{len(window.waiting)} cells could not be read"
+            overdue = window.asked is not None and now - window.asked >= TIMEOUT_S
+            if overdue and window.waiting:
+                window.errors[f"{len(window.waiting)} cells could not be read"] = None
                 for question in window.waiting:
                     self._questions.pop(question, None)
                 window.waiting.clear()
+            if window.asked is not None and not window.waiting:
                 found += self._finished(number, window)
         return found
 
     def _end(self, number: int) -> int:
         return self._base_us + (number + 1) * self._query.window_us
 
+    def _begin(self, number: int, window: _Window, now: float) -> list[CellRead]:
+        window.asked = now
+        if window.beyond:
+            window.errors[f"{window.beyond} keys beyond the bound of {MOST_KEYS} were not looked at"] = None
+        return list(self._ask(number, window))
+
     def _ask(self, number: int, window: _Window) -> Iterator[CellRead]:
         for key in window.candidates:
-            for entry in self._entries.values():
-                if (entry.source, key) in window.counts:
+            for entry in self._reduces.values():
+                if (entry.bit, key) in window.counts:
                     continue
-                question = next(self._numbers)
-                self._questions[question] = (number, entry.source, key)
+                question = next(_NUMBERS)
+                self._questions[question] = (number, entry.bit, key)
                 window.waiting.add(question)
-                parts = dict.fromkeys(("source", "destination", "port", "length"), 0)
+                parts = dict.fromkeys(_PART.values(), 0)
                 for (_, name), value in zip(self._keys[entry.source], key, strict=True):
                     parts[_PART[name]] = address_number(value) if len(value) == 2 else value[0]
                 yield CellRead(
@@ -159,9 +248,9 @@ class Tallies:
                     name: plain_value(kinds[name], column, row)
                     for name, column in sorted(relation.columns.items())
                 },
-                exact=not window.error,
+                exact=not window.errors,
                 partial=self._since_us is not None and self._since_us > start,
-                error=window.error,
+                error="; ".join(window.errors),
             )
             for row in range(relation.size)
         ]
@@ -169,7 +258,13 @@ class Tallies:
     def _tuples(self, node: object, window: _Window) -> Tuples:
         """The candidates' counts in one source, as its operator would hold them."""
         place = next(place for place, other in enumerate(self._nodes) if other == node)
-        held = [(key, n) for (source, key), n in window.counts.items() if source == place and n > 0]
+        bits = [entry.bit for entry in self._reduces.values() if entry.source == place]
+        held: list[tuple[_Key, int]] = []
+        for key in window.candidates:
+            value = sum(window.counts.get((bit, key), 0) for bit in bits)
+            value += sum(len(window.tuples.get((bit, key), ())) for bit in bits)
+            if value:
+                held.append((key, value))
         inner = kinds_of(self._nodes[place])
         columns: dict[str, tuple[np.ndarray, ...]] = {}
         for column, (_, name) in enumerate(self._keys[place]):
@@ -185,10 +280,28 @@ class Tallies:
 _PART: Final = {
     "ip.src": "source",
     "ip.dst": "destination",
+    "tcp.sport": "source_port",
+    "udp.sport": "source_port",
     "tcp.dport": "port",
     "udp.dport": "port",
     "length": "length",
 }
+
+
+def _remember(window: _Window, key: _Key) -> None:
+    if key in window.candidates:
+        return
+    if len(window.candidates) < MOST_KEYS:
+        window.candidates[key] = None
+    else:
+        window.beyond += 1
+
+
+def _rows(values: "list[Field] | tuple[Expression, ...]", packets: Packets) -> list[_Key]:
+    """The values of each packet, plain."""
+    columns = [column_of(value, packets) for value in values]
+    parts = [list(zip(*(part.tolist() for part in column), strict=True)) for column in columns]
+    return list(zip(*parts, strict=True))
 
 
 def _tables(table: Table) -> Iterator[Table]:

@@ -71,7 +71,7 @@ class SwitchModel:
 
     def read(self, question):
         """The count of a cell, 0 where the key has none in the window."""
-        packet = (question.source, question.destination, question.port, question.length)
+        packet = (question.source, question.destination, question.port, question.length, question.source_port)
         for stage, cells in zip(self.stages, self.cells, strict=True):
             if 1 << question.bit in stage:
                 p = stage[1 << question.bit]
@@ -84,11 +84,16 @@ class SwitchModel:
     def _slot(self, key, epoch, p):
         if not self.shrink:
             return key, epoch & 1
-        return p["base"] + crc32(repr(key).encode()) % (p["size"] // self.shrink) + CELLS // 2 * (epoch & 1)
+        return (
+            p["base"]
+            + crc32(repr(key).encode()) % max(1, p["size"] // self.shrink)
+            + CELLS // 2 * (epoch & 1)
+        )
 
     def _count(self, matched, packet):
         crossed, overflow = set(), set()
         source, destination, port, length, now = numbers(packet, self.base_us)
+        source_port = max(int(packet["tcp_sport"]), int(packet["udp_sport"]), 0)
         for stage, cells in zip(self.stages, self.cells, strict=True):
             hit = [params for bit, params in stage.items() if bit.bit_length() - 1 in matched]
             assert len(hit) <= 1, "two entries of one stage match one frame"
@@ -101,6 +106,7 @@ class SwitchModel:
                 destination & p["destination_mask"],
                 port & p["port_mask"],
                 length & p["length_mask"],
+                source_port & p["source_port_mask"],
             )
             epoch = now * p["reciprocal"] >> 64
             slot = self._slot(key, epoch, p)

@@ -6,11 +6,10 @@ import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.control import Changes, Control, leftovers
-from apps.sonata_adapter.placement import SwitchLimits
 from apps.sonata_adapter.results import Captured, Result
 from tests.apps.sonata_adapter.switch_model import SwitchModel
 from tests.apps.sonata_adapter.test_catalogue import expect, same
-from tests.apps.sonata_adapter.traffic import Frame, batch_of, batches, mixed, office, tcp
+from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, batches, mixed, office, tcp
 from tests.naive import sonata
 
 PREFIX = "network.traffic_query.sonata"
@@ -31,10 +30,14 @@ def play(keys, frames, *, shrink=0, size=512, limits=None):
                 written += control.digests("s1", name, sent)
             else:
                 written += control.packets("s1", name, sent, now)
+        control.advance("s1", int(batch["time_us"][-1]))
         for reads in control.reads(now).values():
             tuples += len(reads)
             written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
         written += control.tick(now + 0.5)
+    for reads in control.last_reads(now).values():
+        tuples += len(reads)
+        written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
     written += control.finish()
     found: dict[str, list[Any]] = {}
     for one in written:
@@ -191,23 +194,49 @@ def test_windows_follow_the_clock_of_the_switch():
 
 
 @pytest.mark.parametrize("shrink", [0, 1, 2048])
-@pytest.mark.parametrize("name", ["syn_flood", "incomplete_flows"])
-def test_differences_are_read_at_the_end_of_the_window(name, shrink, everything):
+@pytest.mark.parametrize(
+    ("name", "threshold"), [("syn_flood", 4), ("incomplete_flows", 4), ("slowloris", 90)]
+)
+def test_differences_are_read_at_the_end_of_the_window(name, threshold, shrink, everything):
     """Exact, also for keys without a cell, with candidates and their cells as the only tuples."""
-    key = f"{PREFIX}.{name}:threshold=4,window=2s"
-    frames = ending(everything)
-    found, tuples = play([key], frames, size=64, limits=SwitchLimits(reads=True), shrink=shrink)
-    truth = [
-        f for f in expect(name, frames, {"threshold": 4, "window": 2000}) if f.at_us < frames[-1].time_us
-    ]
-    same(rows(found[next(iter(found))]), truth)
+    key = f"{PREFIX}.{name}:threshold={threshold},window=2s"
+    found, tuples = play([key], everything, size=64, shrink=shrink)
+    results = found[next(iter(found))]
+    same(rows(results), expect(name, everything, {"threshold": threshold, "window": 2000}))
+    assert all(result.exact for result in results)
     if not shrink:
         assert tuples < len(everything) / 15
 
 
+def test_short_windows_stay_on_the_host(everything):
+    """What would have to be asked for within moments is not; results are as exact."""
+    found, _ = play([f"{PREFIX}.syn_flood:window=200ms"], everything, size=32)
+    (results,) = found.values()
+    same(rows(results), expect("syn_flood", everything, {"window": 200}))
+
+
+def test_a_window_is_over_when_the_switch_has_been_silent_for_one(everything):
+    """No clock of the switch: this machine's has to do, and the results say so."""
+    control, switch = Control(CATALOGUE), SwitchModel()
+    control.switch("s1", 0)
+    switch.change(control.want([f"{PREFIX}.syn_flood"]))
+    flood = [frame for frame in everything if frame.time_us < BASE_US + 8_500_000]
+    for (_, name), sent in switch.process(batch_of(flood)).items():
+        control.digests("s1", name, sent)
+    asked = [control.reads(now).get("s1", []) for now in (0.0, 12.9, 13.1)]
+    written = [
+        one
+        for reads in asked
+        for one in control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
+    ]
+    assert asked[0]
+    assert not asked[1]
+    assert "this machine's clock" in written[-1].output.error
+
+
 def test_missing_answers_make_estimates(everything):
     """A controller that does not answer: what is known is reported as an estimate, or not at all."""
-    control, switch = Control(CATALOGUE, limits=SwitchLimits(reads=True)), SwitchModel()
+    control, switch = Control(CATALOGUE), SwitchModel()
     control.switch("s1", 0)
     switch.change(control.want([f"{PREFIX}.syn_flood"]))
     written = []
@@ -216,7 +245,7 @@ def test_missing_answers_make_estimates(everything):
             written += control.digests("s1", name, sent)
         control.reads(now)
         written += control.tick(now)
-    written += control.tick(now + 10)
+    written += control.tick(now + 20)
     for one in written:
         assert isinstance(one.output, Result)
         assert "could not be read" in one.output.error

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.sonata_adapter.merge import LONGEST_WAIT_S, Merger
+from apps.sonata_adapter.merge import LONGEST_WAIT_S, SHORTEST_WAIT_S, Merger, patience
 from due import RecordBatch
 
 
@@ -79,3 +79,19 @@ def test_packets_behind_are_passed_on_once():
     assert numbers(merger.put("b", batch([4, 5]), 1.0)) == [4]
     assert merger.disordered == 1
     assert merger.twice == 1
+
+
+def test_short_windows_do_not_wait_long():
+    """What silent streams may hold up is a part of the shortest window."""
+    assert patience(None) == patience(60_000_000) == LONGEST_WAIT_S
+    assert patience(200_000) == 0.05
+    assert patience(100_000) == SHORTEST_WAIT_S
+    merger = Merger()
+    merger.expect({"a", "b"})
+    merger.hurry(patience(200_000))
+    out, now = [], 0.0
+    for number in range(20):
+        now += 0.01
+        out += numbers(merger.put("a", batch([number]), now))
+    assert out == list(range(20))
+    assert merger.horizon_us(now) == 19_000
