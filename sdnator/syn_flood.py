@@ -1,12 +1,12 @@
 """`sdnator demo syn-flood`: a real SYN flood against a real TCP service, without the product and with it.
 
-    1. client connects, flood starts, nobody protects       success must fall below 10 %, or all is void
-    2. firewall and Sonata adapter start, the client becomes known, the same flood starts again
+    1. clients connect, the flood starts, nobody protects     success must fall below 10 %, or all is void
+    2. firewall and Sonata adapter start, clients become known, the same flood goes to a second address
+       of the victim: with a backlog of its own, so that the first flood's is no excuse
 
 Everything happens in network namespaces that are removed at the end, also after Ctrl-C.
 """
 
-import json
 import signal
 import statistics
 import tempfile
@@ -18,24 +18,18 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from sdnator import p4_program
-from sdnator.errors import PipelineError
-from sdnator.process import Child
 from sdnator.syn_flood_frames import Sources
-from sdnator.syn_flood_lab import BACKLOG, HALF_OPEN_S, PORT, Lab, mac
-from sdnator.syn_flood_stage import Stage, begin
+from sdnator.syn_flood_lab import HALF_OPEN_S, PLANS, PORT, Lab
+from sdnator.syn_flood_stage import SWITCH, Stage
+from sdnator.syn_flood_trial import BUDGET_S, Field, Outcome, Trial
 
-BUDGET_S: Final = 3.5
-"""An attempt is one connect() of at most this long."""
 VOID_FROM: Final = 0.1
 """Without the product the flood must leave fewer than this share of the attempts."""
-_LATE_S: Final = 5.0
-_CLEAR_S: Final = float(HALF_OPEN_S)
-"""After a rule came into force the backlog is full for so long: nothing resets its half-open connections."""
-_KNOWN: Final = 20
-_LATENESS_US: Final = 20_000
+LATENESS_US: Final = 20_000
 """One switch's packets come in order: windows need not wait long for late ones."""
-_FIRST_NEW: Final = (4096, 20_480)
+_LINEAR: Final = 3
+_LEARNING, _UNPROTECTED, _PROTECTED = 1, 2, 3
+"""Services of the victim."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,24 +45,15 @@ class SynFloodOptions:
     rate: int = 5000
     """SYNs a second."""
     seconds: float = 12.0
-    unprotected_seconds: float = 6.0
-    learning_seconds: float = 6.0
+    unprotected_seconds: float = 5.0
     known_rate: float = 10.0
     """Attempts a second of clients with a history."""
     new_rate: float = 3.0
     """Attempts a second, each from an address never seen before."""
+    capture: str = ""
+    """Capture file of SYNs to send instead."""
     keep: Path | None = None
     """Folder for logs and reports; None: they are deleted."""
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One connect()."""
-
-    at: float
-    kind: str
-    ok: bool
-    ms: float
 
 
 @dataclass(kw_only=True)
@@ -85,6 +70,10 @@ class SynFloodResult:
     challenged: int = 0
     sent: int = 0
     decisions: list[str] = field(default_factory=list)
+    memory_mb: dict[str, float] = field(default_factory=dict)
+    """Resident memory of the product's parts at the end."""
+    kernel: dict[str, int] = field(default_factory=dict)
+    """Settings of victim and client that decide how a flood hurts, as their kernel has them."""
     void: str = ""
     """Why the figures say nothing; empty for a valid run."""
 
@@ -92,7 +81,7 @@ class SynFloodResult:
         return asdict(self)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Second:
     """One line of the table."""
 
@@ -102,236 +91,193 @@ class Second:
     succeeded: int
     half_open: int
     challenged: int
+    rule: str = ""
+    """What the switch has confirmed since the line before."""
 
 
-Show = Callable[[Second], None]
+@dataclass
+class Told:
+    """Who is told of what, as it happens."""
+
+    kernel: Callable[[dict[str, int]], None] = lambda _: None
+    second: Callable[[Second], None] = lambda _: None
+    ended: Callable[[Field, list[Outcome]], None] = lambda _field, _outcomes: None
+    """With all records, before they go."""
 
 
-def run_syn_flood(options: SynFloodOptions, show: Show = lambda _: None) -> SynFloodResult:
+def run_syn_flood(options: SynFloodOptions, told: Told | None = None) -> SynFloodResult:
     """Both phases.  Raises `BadInput` where the machine lacks something, `PipelineError` after a fault."""
-    guard = {"reflected": {"rate": 4 * options.rate, "burst": options.rate}}
-    with _terminable(), tempfile.TemporaryDirectory(prefix="sdnator-syn-flood-") as made:
+    with terminable(), tempfile.TemporaryDirectory(prefix="sdnator-syn-flood-") as made:
         folder = options.keep or Path(made)
-        with Lab(options.version) as lab, Stage(lab, folder, switch=options.switch, guard=guard) as stage:
-            return _Run(options, lab, stage, show).run()
+        with Lab() as lab, Stage(lab, folder, switch=options.switch, guard=guard(options.rate)) as stage:
+            plan = PLANS[options.version]
+            services = [plan.service(each) for each in (_LEARNING, _UNPROTECTED, _PROTECTED)]
+            return _Run(options, Field(stage, services), told or Told()).run()
+
+
+def guard(rate: int) -> dict[str, Any]:
+    """Settings of the controller's guard: cookies are not capped below the flood."""
+    return {"reflected": {"rate": 4 * rate, "burst": rate}}
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM unwinds like Ctrl-C: namespaces outlive a process that just dies."""
+def terminable() -> Iterator[None]:
+    """SIGTERM unwinds like Ctrl-C, and a second of either does not stop the unwinding.
+
+    Namespaces outlive a process that just dies.
+    """
+    signals = (signal.SIGINT, signal.SIGTERM)
 
     def leave(number: int, _: object) -> None:
+        for each in signals:
+            signal.signal(each, signal.SIG_IGN)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
         raise SystemExit(128 + number)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, leave)
+    before = [signal.signal(each, leave) for each in signals]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in zip(signals, before, strict=True):
+            signal.signal(each, handler)
+
+
+def start_product(stage: Stage, guarded: list[str], **firewall: Any) -> None:
+    """Start adapter and firewall; services as ADDRESS:PORT are guarded from the start."""
+    settings = {"guard": guarded, **firewall}
+    adapter = stage.app("sonata_adapter", "apps.sonata_adapter.service", {"lateness_us": LATENESS_US})
+    wall = stage.app("firewall", "apps.firewall.service", settings)
+    adapter.wait_ready()
+    wall.wait_ready()
+
+
+def named(address: str) -> str:
+    """A service as the firewall's settings name it."""
+    return f"[{address}]:{PORT}" if ":" in address else f"{address}:{PORT}"
 
 
 class _Run:
-    def __init__(self, options: SynFloodOptions, lab: Lab, stage: Stage, show: Show) -> None:
+    def __init__(self, options: SynFloodOptions, field: Field, told: Told) -> None:
         self._options = options
-        self._lab = lab
-        self._stage = stage
-        self._show = show
-        self._result = SynFloodResult()
-        self._counters = stage.report_path("counters")
-        self._phase = ""
+        self._field = field
+        self._told = told
+        self._result = SynFloodResult(kernel=field.stage.lab.settings())
+        self._outcomes: list[Outcome] = []
+        told.kernel(self._result.kernel)
 
     def run(self) -> SynFloodResult:
-        self._stage.host(
-            "switch",
-            "counters",
-            {
-                "grpc": self._stage.grpc,
-                "device_id": 1,
-                "p4info": str(p4_program.find().p4info),
-                "every": 0.05,
-                "entries_every": 20,
-                "report": str(self._counters),
-            },
-        )
-        self._unprotected()
-        if self._result.void:
-            return self._result
-        self._protected()
-        return self._result
-
-    def _unprotected(self) -> None:
-        self._phase = "without"
-        victim, client, attempts = self._hosts(0)
-        self._watch(2.0, attempts)
-        first = self._flood(self._options.unprotected_seconds, attempts)
-        self._watch(BUDGET_S, attempts)
-        during = [
-            each
-            for each in _attempts(attempts)
-            if first + 0.5 <= each.at <= first + self._options.unprotected_seconds - BUDGET_S
-        ]
-        self._result.client_success_unprotected = share = _success(during)
+        outcome = self._flood("without the product", _UNPROTECTED, self._options.unprotected_seconds, "none")
+        shares = [each for each in (outcome.known_success, outcome.new_success) if each is not None]
+        self._result.client_success_unprotected = share = max(shares, default=None)
         if share is None or share >= VOID_FROM:
             what = "nothing was tried" if share is None else f"{share:.0%} of the attempts succeeded"
             self._result.void = f"without the product {what}: this flood harms nobody, the run is void"
-        self._stage.release(client)
-        self._stage.release(victim)
+        else:
+            self._protected()
+        self._told.ended(self._field, self._outcomes)
+        return self._result
 
     def _protected(self) -> None:
-        self._phase = "with"
-        self._lab.flush_metrics()
+        options, stage, result = self._options, self._field.stage, self._result
+        plan = PLANS[options.version]
+        stage.lab.flush_metrics()
+        guarded = [named(plan.service(_PROTECTED))] if options.armed else []
+        start_product(stage, guarded)
+        self._field.wait_guarded(len(guarded))
+        self._field.learn([options.version], lambda _: plan.service(_LEARNING))
+        protection = "armed" if options.armed else "found"
+        outcome = self._flood("with the product", _PROTECTED, options.seconds, protection)
+        records = self._field.records
+        result.known_client_success = outcome.known_success
+        result.new_client_success = outcome.new_success
+        result.new_connect_ms_p50 = outcome.new_connect_ms_p50
+        result.half_open_peak = outcome.half_open_peak
+        result.time_to_mitigate_ms = outcome.challenged_ms if options.armed else outcome.mitigated_ms
+        result.entries_peak = max((sum(each.values()) for each in records.entries()), default=0)
+        result.challenged = records.counter("challenged")
+        result.memory_mb = stage.memory()
+        result.decisions = [f"{each.action} {each.target.address}: {each.reason}" for each in stage.decisions]
+
+    def _flood(self, phase: str, service: int, seconds: float, protection: str) -> Outcome:
         options = self._options
-        service = (
-            f"[{self._lab.plan.victim}]:{PORT}" if options.version == 6 else f"{self._lab.plan.victim}:{PORT}"
+        trial = Trial(
+            sources=options.sources,
+            version=options.version,
+            service=service,
+            seconds=seconds,
+            rate=options.rate,
+            known_rate=options.known_rate,
+            new_rate=options.new_rate,
+            capture=options.capture,
+            protection=protection,
         )
-        self._stage.app(
-            "sonata_adapter", "apps.sonata_adapter.service", {"lateness_us": _LATENESS_US}
-        ).wait_ready()
-        self._stage.app(
-            "firewall", "apps.firewall.service", {"guard": [service] if options.armed else []}
-        ).wait_ready()
-        _, _, attempts = self._hosts(1)
-        self._watch(options.learning_seconds, attempts)
-        first = self._flood(options.seconds, attempts)
-        self._watch(BUDGET_S, attempts)
-        self._judge(_attempts(attempts), first)
+        outcome = self._field.run(trial, _Lines(phase, trial.address, self._field, self._told.second).tell)
+        self._result.sent += outcome.sent
+        self._outcomes.append(outcome)
+        return outcome
 
-    def _judge(self, attempts: list[Attempt], first: float) -> None:
-        result, end = self._result, first + self._options.seconds
-        mitigated = self._mitigated(first)
-        result.time_to_mitigate_ms = None if mitigated is None else round((mitigated - first) * 1000, 1)
-        begun = first if self._options.armed else (mitigated or end) + _CLEAR_S
-        counted = [each for each in attempts if begun <= each.at <= end]
-        new = [each for each in counted if each.kind == "new"]
-        result.known_client_success = _success([each for each in counted if each.kind == "known"])
-        result.new_client_success = _success(new)
-        result.new_connect_ms_p50 = (
-            statistics.median(each.ms for each in new if each.ok) if _success(new) else None
+
+class _Lines:
+    """Lines of the table, of one flood."""
+
+    def __init__(self, phase: str, address: str, field: Field, tell: Callable[[Second], None]) -> None:
+        self._phase = phase
+        self._address = address
+        self._field = field
+        self._tell = tell
+        self._second = 0
+        self._since = time.time()
+        self._confirmed = len(field.stage.confirmed)
+
+    def tell(self) -> None:
+        """The line of the last second."""
+        records, now = self._field.records, time.time()
+        attempts = records.towards(self._address)
+        ended = [each for each in attempts if each.ok is not None and each.ended >= self._since]
+        half_open = records.half_open[-1][1].get(self._address, 0) if records.half_open else 0
+        line = Second(
+            self._phase,
+            self._second,
+            len(ended),
+            sum(bool(each.ok) for each in ended),
+            half_open,
+            records.counter("challenged"),
+            self._rules(),
         )
-        result.entries_peak = max((line.get("entries", 0) for line in _lines(self._counters)), default=0)
-        result.challenged = self._challenged()
-        result.decisions = [
-            f"{each.action} {each.target.address}: {each.reason}" for each in self._stage.decisions
+        self._tell(line)
+        self._second += 1
+        self._since = now
+
+    def _rules(self) -> str:
+        said = self._field.stage.confirmed[self._confirmed :]
+        self._confirmed += len(said)
+        rules = [
+            f"{each.action} {each.target.address}"
+            for _, each in said
+            if each.target is not None and each.state == "installed"
         ]
-
-    def _mitigated(self, first: float) -> float | None:
-        """When the rule that helps was active: the first challenge, or the first confirmed decision."""
-        if self._options.armed:
-            return next(
-                (line["at"] for line in _lines(self._counters) if line["at"] > first and _stopped(line)), None
-            )
-        return next(
-            (
-                at
-                for at, said in self._stage.confirmed
-                if at > first
-                and said.action in ("block", "protect")
-                and said.state in ("installed", "exists")
-            ),
-            None,
-        )
-
-    def _hosts(self, number: int) -> tuple[Child, Child, Path]:
-        plan, options = self._lab.plan, self._options
-        service = {"address": plan.victim, "port": PORT}
-        victim = self._stage.host("victim", "victim", {**service, "backlog": BACKLOG})
-        attempts = self._stage.report_path("attempts")
-        client = self._stage.host(
-            "client",
-            "client",
-            {
-                **service,
-                "prefix": plan.clients,
-                "known": _KNOWN,
-                "known_rate": options.known_rate,
-                "new_rate": options.new_rate,
-                "first_new": _FIRST_NEW[number],
-                "budget": BUDGET_S,
-                "report": str(attempts),
-            },
-        )
-        return victim, client, attempts
-
-    def _flood(self, seconds: float, attempts: Path) -> float:
-        """Send for so long; the wall time of the first frame."""
-        plan, report = self._lab.plan, self._stage.report_path("flood")
-        flood = self._stage.host(
-            "attacker",
-            "flood",
-            {
-                "sources": self._options.sources,
-                "rate": self._options.rate,
-                "seconds": seconds,
-                "victim": plan.victim,
-                "victim_mac": mac("victim"),
-                "attacker_mac": mac("attacker"),
-                "port": PORT,
-                "prefix": plan.attackers,
-                "report": str(report),
-            },
-        )
-        begin(flood)
-        self._watch(seconds, attempts, flooding=True)
-        said = self._flood_report(report)
-        self._stage.release(flood)
-        self._result.sent += said.get("sent", 0)
-        return float(said["first"])
-
-    def _flood_report(self, report: Path) -> dict[str, Any]:
-        """When it began and what was sent; a flood may be late on a busy machine."""
-        deadline = time.monotonic() + _LATE_S
-        while True:
-            lines = _lines(report)
-            if lines and ("sent" in lines[-1] or time.monotonic() > deadline):
-                return lines[-1]
-            if time.monotonic() > deadline:
-                raise PipelineError("the flood did not start")
-            self._stage.wait(0.1)
-
-    def _watch(self, seconds: float, attempts: Path, *, flooding: bool = False) -> None:
-        begun = time.monotonic()
-        phase = f"{self._phase} product, flood" if flooding else f"{self._phase} product"
-        second = 0
-        while (left := begun + seconds - time.monotonic()) > 0:
-            since = time.time()
-            self._stage.wait(min(1.0, left))
-            half_open = self._lab.half_open()
-            if flooding and self._phase == "with":
-                self._result.half_open_peak = max(self._result.half_open_peak, half_open)
-            ended = [each for each in _attempts(attempts) if each.at + each.ms / 1000 >= since]
-            succeeded = sum(each.ok for each in ended)
-            self._show(Second(phase, second, len(ended), succeeded, half_open, self._challenged()))
-            second += 1
-
-    def _challenged(self) -> int:
-        lines = _lines(self._counters)
-        return int(lines[-1].get("challenged", 0)) if lines else 0
+        return rules[0] + (f" and {len(rules) - 1} more" if len(rules) > 1 else "") if rules else ""
 
 
-def _stopped(line: dict[str, Any]) -> bool:
-    return any(line.get(name, 0) > 0 for name in ("challenged", "cookie_sent", "over_last_meter"))
+def note(kernel: dict[str, int]) -> str:
+    """What decides how the flood hurts, for people."""
+    repeats = "1, 2 and 3 s" if kernel.get("tcp_syn_linear_timeouts", 0) >= _LINEAR else "1 and 3 s"
+    return (
+        f"backlog {kernel['tcp_max_syn_backlog']}, somaxconn {kernel['somaxconn']}, "
+        f"SYN cookies {kernel['tcp_syncookies']}, tcp_no_metrics_save {kernel['tcp_no_metrics_save']}, "
+        f"SYN-ACK retries {kernel['tcp_synack_retries']} (half-open for {HALF_OPEN_S} s), "
+        f"clients repeat their SYN after {repeats}, an attempt is one connect() of {BUDGET_S} s at most"
+    )
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """Whole lines only: the writer may be in the middle of the last one."""
-    if not path.exists():
-        return []
-    text = path.read_text(encoding="utf-8")
-    return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+def median(values: Any) -> float | None:
+    """Of what is known."""
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
 
 
-def _attempts(path: Path) -> list[Attempt]:
-    return [Attempt(**line) for line in _lines(path)]
-
-
-def _success(attempts: list[Attempt]) -> float | None:
-    return round(sum(each.ok for each in attempts) / len(attempts), 4) if attempts else None
-
-
-NOTE: Final = (
-    f"backlog and somaxconn {BACKLOG}, SYN cookies off, half-open connections live {HALF_OPEN_S} s, "
-    f"tcp_no_metrics_save=1, an attempt is one connect() with {BUDGET_S} s"
-)
+__all__ = ["SWITCH", "SynFloodOptions", "SynFloodResult", "Told", "run_syn_flood"]

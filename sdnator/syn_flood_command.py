@@ -1,13 +1,22 @@
 """What `sdnator demo syn-flood` shows: a line a second, then the outcome."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from sdnator.errors import BadInput, PipelineError
-from sdnator.syn_flood import NOTE, Second, SynFloodOptions, SynFloodResult, run_syn_flood
+from sdnator.syn_flood import Second, SynFloodOptions, SynFloodResult, Told, note, run_syn_flood
+from sdnator.syn_flood_report import Panel, panel, write_report
+from sdnator.syn_flood_trial import Field, Outcome
+
+_SOURCES = {
+    "one": "one source",
+    "hundred": "a hundred sources",
+    "spoofed": "a new source for each SYN",
+}
 
 
 def syn_flood_command(
@@ -25,6 +34,9 @@ def syn_flood_command(
     ] = 12.0,
     keep: Annotated[
         Path | None, typer.Option(help="Folder to keep logs and reports in.", metavar="DIR")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Folder for a picture and the figures.", metavar="DIR")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
@@ -45,25 +57,46 @@ def syn_flood_command(
         seconds=seconds,
         keep=keep,
     )
-    _run(options, as_json=as_json)
+    _run(options, report, as_json=as_json)
 
 
-def _run(options: SynFloodOptions, *, as_json: bool) -> None:
-    if not as_json:
-        print(f"{options.sources} source(s), {options.rate:,} SYN/s; {NOTE}")
-        print(f"{'':24}{'second':>7}{'tried':>7}{'connected':>11}{'half-open':>11}{'challenged':>12}")
-    result = run_syn_flood(options, (lambda _: None) if as_json else _show)
+def _run(options: SynFloodOptions, report: Path | None, *, as_json: bool) -> None:
+    panels: list[Panel] = []
+
+    def ended(field: Field, outcomes: list[Outcome]) -> None:
+        titles = ("without the product", "with the product")
+        if report is not None:
+            confirmed = field.stage.confirmed
+            panels.extend(
+                panel(title, outcome, field.records, confirmed)
+                for title, outcome in zip(titles, outcomes, strict=False)
+            )
+
+    told = Told(ended=ended) if as_json else Told(_begin(options), _show, ended)
+    result = run_syn_flood(options, told)
+    picture = None if report is None else write_report(report, result.to_json(), panels)
     if as_json:
         print(json.dumps(result.to_json()))
     else:
         _conclude(result)
+        if picture is not None:
+            print(f"\nthe picture is {picture}")
     if result.void:
         raise PipelineError(result.void)
 
 
+def _begin(options: SynFloodOptions) -> Callable[[dict[str, int]], None]:
+    def begin(kernel: dict[str, int]) -> None:
+        what = f"{_SOURCES[options.sources]}, {options.rate:,} SYN/s, IPv{options.version}"
+        print(f"{what}, {options.switch} switch\n{note(kernel)}\n")
+        print(f"{'':20}{'second':>7}{'tried':>7}{'connected':>11}{'half-open':>11}{'challenged':>12}  rule")
+
+    return begin
+
+
 def _show(line: Second) -> None:
     numbers = f"{line.second:>7}{line.tried:>7}{line.succeeded:>11}{line.half_open:>11}{line.challenged:>12,}"
-    print(f"{line.phase:24}{numbers}", flush=True)
+    print(f"{line.phase:20}{numbers}  {line.rule}".rstrip(), flush=True)
 
 
 def _conclude(result: SynFloodResult) -> None:

@@ -1,18 +1,24 @@
-"""Frames of a SYN flood: a template built by scapy, and sources, ports, numbers and checksums by numpy."""
+"""Frames of a SYN flood: a template, and sources, ports, numbers and checksums by numpy; or those of a capture."""
 
 import ipaddress
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-Sources = Literal["one", "hundred", "spoofed", "repeating"]
+Sources = Literal["one", "hundred", "spoofed", "repeating", "capture"]
 Bytes = npt.NDArray[np.uint8]
 
-_ETHERNET = 14
-_REPEATED_AFTER_S = 1.0
+_ETHERNET: Final = 14
+_SYN: Final = 0x02
+_MSS: Final = bytes([2, 4, 1460 >> 8, 1460 & 255])
+_REPEATED_AFTER_S: Final = 1.0
+_TRANSLATED: Final = bytes.fromhex("0064ff9b") + bytes(8)
+"""RFC 6052: where IPv4 addresses of a capture lie in IPv6."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,49 +35,111 @@ class FloodPlan:
     prefix: str
     """Where the sources of the unspoofed floods lie."""
     seed: int = 1
+    capture: str = ""
+    """Capture file of IPv4 SYNs: theirs are sources, ports, numbers and flags, over and over."""
+    as_recorded: bool = False
+    """Once, at the times of the capture; `rate` and `seconds` do not count."""
 
 
-def make_frames(plan: FloodPlan) -> Bytes:
-    """One frame a row, in the order of sending."""
-    count = int(plan.rate * plan.seconds)
+@dataclass(frozen=True)
+class Flood:
+    """Frames in the order of sending, one a row, and when each is due, seconds from the first."""
+
+    frames: Bytes
+    due: npt.NDArray[np.float64]
+
+
+def make_flood(plan: FloodPlan) -> Flood:
+    """The frames of a plan and their times; raises `OSError` where its capture cannot be read."""
+    if plan.sources != "capture":
+        count = int(plan.rate * plan.seconds)
+        return Flood(_finish(_made_up(plan, count), plan), np.arange(count) / plan.rate)
+    recorded, times = read_syns(Path(plan.capture))
+    rows = np.arange(len(recorded) if plan.as_recorded else int(plan.rate * plan.seconds))
+    frames = _finish(_rewritten(plan, recorded)[rows % len(recorded)], plan)
+    return Flood(frames, times if plan.as_recorded else rows / plan.rate)
+
+
+def flood_sources(plan: FloodPlan) -> list[str]:
+    """The addresses that an unspoofed flood comes from; nothing for others."""
+    number = {"one": 1, "hundred": 100}.get(plan.sources, 0)
+    first = ipaddress.ip_network(plan.prefix)[10]
+    return [str(first + each) for each in range(number)]
+
+
+def read_syns(path: Path) -> tuple[Bytes, npt.NDArray[np.float64]]:
+    """Ethernet, IPv4 without options and TCP headers of a capture's SYNs, a row each; and their times, s from 0."""
+    from sdnator.captures import Capture
+
+    rows, times = [], []
+    with Capture(path) as capture:
+        for frame in capture:
+            data = frame.data
+            if data[12:15] == b"\x08\x00\x45" and data[23] == 6 and data[47] & 0x17 == _SYN:
+                rows.append(data[: _ETHERNET + 40])
+                times.append(frame.time_ns / 1e9)
+    when = np.array(times)
+    return np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1), when - when[:1]
+
+
+def _made_up(plan: FloodPlan, count: int) -> Bytes:
     frames = np.tile(np.frombuffer(_template(plan), np.uint8), (count, 1))
     random = np.random.default_rng(plan.seed)
-    version = ipaddress.ip_address(plan.victim).version
-    place, width = (_ETHERNET + 12, 4) if version == 4 else (_ETHERNET + 8, 16)
-    tcp = _ETHERNET + (20 if version == 4 else 40)
+    place, width, tcp = _places(plan)
     frames[:, place : place + width] = _SOURCES[plan.sources](plan, random, count)
     ports = random.integers(1024, 65_536, count, dtype=np.uint16)
     frames[:, tcp : tcp + 2] = ports.astype(">u2").view(np.uint8).reshape(-1, 2)
     frames[:, tcp + 4 : tcp + 8] = random.integers(0, 256, (count, 4), dtype=np.uint8)
     if plan.sources == "repeating":
         frames = _repeat(frames, int(plan.rate * _REPEATED_AFTER_S))
-    if version == 4:
-        _checksum(frames, _ETHERNET, _ETHERNET + 20, _ETHERNET + 10, 0)
-    length = frames.shape[1] - tcp
-    _checksum(frames, place, frames.shape[1], tcp + 16, 6 + length)
     return frames
 
 
-def _template(plan: FloodPlan) -> bytes:
-    from scapy.layers.inet import IP, TCP
-    from scapy.layers.inet6 import IPv6
-    from scapy.layers.l2 import Ether
+def _rewritten(plan: FloodPlan, recorded: Bytes) -> Bytes:
+    """The recorded SYNs towards our victim: source, source port, number, flags and window are theirs."""
+    frames = np.tile(np.frombuffer(_template(plan), np.uint8), (len(recorded), 1))
+    place, width, tcp = _places(plan)
+    if width == 16:
+        frames[:, place : place + 12] = np.frombuffer(_TRANSLATED, np.uint8)
+    frames[:, place + width - 4 : place + width] = recorded[:, 26:30]
+    frames[:, tcp : tcp + 2] = recorded[:, 34:36]
+    frames[:, tcp + 4 : tcp + 8] = recorded[:, 38:42]
+    frames[:, tcp + 13 : tcp + 16] = recorded[:, 47:50]
+    return frames
 
+
+def _places(plan: FloodPlan) -> tuple[int, int, int]:
+    """Where the source address begins, its width, and where TCP begins."""
     if ipaddress.ip_address(plan.victim).version == 4:
-        network: Any = IP(src="0.0.0.0", dst=plan.victim)  # noqa: S104 - filled in for each frame
+        return _ETHERNET + 12, 4, _ETHERNET + 20
+    return _ETHERNET + 8, 16, _ETHERNET + 40
+
+
+def _template(plan: FloodPlan) -> bytes:
+    victim = ipaddress.ip_address(plan.victim)
+    segment = struct.pack("!HHLLBBHHH", 1024, plan.port, 0, 0, 6 << 4, _SYN, 8192, 0, 0) + _MSS
+    if victim.version == 4:
+        header = struct.pack("!BBHHHBBHLL", 0x45, 0, 20 + len(segment), 1, 0, 64, 6, 0, 0, int(victim))
     else:
-        network = IPv6(src="::", dst=plan.victim)
-    segment = TCP(sport=1024, dport=plan.port, flags="S", options=[("MSS", 1460)])
-    return bytes(Ether(src=plan.attacker_mac, dst=plan.victim_mac) / network / segment)
+        header = struct.pack("!LHBB16x16s", 6 << 28, len(segment), 6, 64, victim.packed)
+    macs = f"{plan.victim_mac}{plan.attacker_mac}".replace(":", "")
+    ether_type = b"\x08\x00" if victim.version == 4 else b"\x86\xdd"
+    return bytes.fromhex(macs) + ether_type + header + segment
 
 
-def _fixed(number: int) -> Callable[[FloodPlan, np.random.Generator, int], Bytes]:
-    def sources(plan: FloodPlan, _: np.random.Generator, count: int) -> Bytes:
-        first = ipaddress.ip_network(plan.prefix)[10]
-        addresses = np.array([list((first + each).packed) for each in range(number)], np.uint8)
-        return addresses[np.arange(count) % number]
+def _finish(frames: Bytes, plan: FloodPlan) -> Bytes:
+    """Fill in the checksums."""
+    place, width, tcp = _places(plan)
+    if width == 4:
+        _checksum(frames, _ETHERNET, _ETHERNET + 20, _ETHERNET + 10, 0)
+    _checksum(frames, place, frames.shape[1], tcp + 16, 6 + frames.shape[1] - tcp)
+    return frames
 
-    return sources
+
+def _fixed(plan: FloodPlan, _: np.random.Generator, count: int) -> Bytes:
+    sources = flood_sources(plan)
+    addresses = np.array([list(ipaddress.ip_address(each).packed) for each in sources], np.uint8)
+    return addresses[np.arange(count) % len(sources)]
 
 
 def _spoofed(plan: FloodPlan, random: np.random.Generator, count: int) -> Bytes:
@@ -84,9 +152,9 @@ def _spoofed(plan: FloodPlan, random: np.random.Generator, count: int) -> Bytes:
     return addresses
 
 
-_SOURCES: dict[Sources, Callable[[FloodPlan, np.random.Generator, int], Bytes]] = {
-    "one": _fixed(1),
-    "hundred": _fixed(100),
+_SOURCES: Final[dict[str, Callable[[FloodPlan, np.random.Generator, int], Bytes]]] = {
+    "one": _fixed,
+    "hundred": _fixed,
     "spoofed": _spoofed,
     "repeating": _spoofed,
 }

@@ -1,38 +1,47 @@
 """What runs in the namespaces of the SYN flood demo: `python -m sdnator.syn_flood_hosts ROLE OPTIONS.json`.
 
-victim    a TCP service that accepts and closes
-client    keeps connecting, from known and from ever new addresses; one JSON line an attempt
-flood     sends SYNs from its SIGUSR1 on
-counters  reads the guard's counters and the number of entries out of the switch; one JSON line a reading
+victim    TCP services that accept and close; counts their half-open connections
+client    keeps connecting, from known and from ever new addresses
+flood     sends the SYNs of a plan
+counters  reads the guard's counters and the number of entries out of the switch
 
-Each prints one JSON line when ready, and ends at SIGTERM or with its parent.
+Each prints one JSON line when ready, reports in JSON lines, takes orders in JSON lines out of a FIFO
+where it takes any, and ends at SIGTERM or with its parent.
 """
 
 import asyncio
 import contextlib
 import ipaddress
 import json
+import os
+import select
+import selectors
 import signal
 import socket
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Final, TextIO
 
 from due.drivers.embedded_redis import die_with_parent
-from sdnator.syn_flood_frames import FloodPlan, make_frames
 
-_BURST_S = 0.002
-_OUTCOMES = "ingress.guard_outcomes"
-_DYNAMIC = (
+_LOOK_S: Final = 0.05
+_SYN_RECV: Final = "03"
+_MOST_ORDERS: Final = 65_536
+_OUTCOMES: Final = "ingress.guard_outcomes"
+_DYNAMIC: Final = (
     "ingress.known_sources",
     "ingress.block_src",
     "ingress.block_mac",
     "ingress.block",
     "ingress.protect",
+    "ingress.protected_hosts",
 )
-OUTCOMES = (
+OUTCOMES: Final = (
     "known",
     "unchallenged",
     "challenged",
@@ -49,105 +58,168 @@ def _ready() -> None:
     print(json.dumps({"ready": True}), flush=True)
 
 
+def _report(options: dict[str, Any]) -> TextIO:
+    return Path(options["report"]).open("a", encoding="utf-8", buffering=1)
+
+
+def _orders(options: dict[str, Any]) -> TextIO:
+    """The FIFO; opened for writing too, so that it never ends."""
+    return os.fdopen(os.open(options["orders"], os.O_RDWR), encoding="utf-8", buffering=1)
+
+
 def victim(options: dict[str, Any]) -> None:
-    """Accept and close."""
-    family = socket.AF_INET6 if ":" in options["address"] else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as service:
-        service.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        service.bind((options["address"], options["port"]))
-        service.listen(options["backlog"])
+    """Accept and close; tell the half-open connections of each service that has any."""
+    services = options["services"]
+    with contextlib.ExitStack() as stack, selectors.DefaultSelector() as ready, _report(options) as report:
+        for address in services:
+            family = socket.AF_INET6 if ":" in address else socket.AF_INET
+            service = stack.enter_context(socket.socket(family, socket.SOCK_STREAM))
+            service.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            service.bind((address, options["port"]))
+            service.listen(options["backlog"])
+            service.setblocking(False)
+            ready.register(service, selectors.EVENT_READ)
         _ready()
+        look = time.monotonic()
         while True:
-            connection, _ = service.accept()
-            connection.close()
+            for key, _ in ready.select(max(0.0, look - time.monotonic())):
+                with contextlib.suppress(OSError):  # gone before it was accepted
+                    key.fileobj.accept()[0].close()  # type: ignore[union-attr]
+            if time.monotonic() >= look:
+                report.write(json.dumps({"at": time.time(), "half_open": half_open(options["port"])}) + "\n")
+                look = time.monotonic() + _LOOK_S
+
+
+def half_open(port: int) -> dict[str, int]:
+    """Half-open connections by local address, in this network namespace."""
+    found: Counter[str] = Counter()
+    for name in ("tcp", "tcp6"):
+        for line in Path("/proc/self/net", name).read_text(encoding="ascii").splitlines()[1:]:
+            fields = line.split(None, 4)
+            address, _, local_port = fields[1].partition(":")
+            if fields[3] == _SYN_RECV and int(local_port, 16) == port:
+                found[address] += 1
+    return {_address(text): number for text, number in found.items()}
+
+
+def _address(text: str) -> str:
+    """An address of /proc/net/tcp: words of 32 bits in the machine's order."""
+    words = (int(text[place : place + 8], 16).to_bytes(4, sys.byteorder) for place in range(0, len(text), 8))
+    return str(ipaddress.ip_address(b"".join(words)))
+
+
+@dataclass
+class _Target:
+    """Where a client connects to, and how often; changed by orders."""
+
+    address: str = ""
+    port: int = 0
+    known_rate: float = 0.0
+    new_rate: float = 0.0
+
+
+class _Client:
+    def __init__(self, options: dict[str, Any], report: TextIO) -> None:
+        self._options = options
+        self._report = report
+        self._target = _Target()
+        self._number = count()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def run(self, orders: TextIO) -> None:
+        asyncio.get_running_loop().add_reader(
+            orders, lambda: self._obey(os.read(orders.fileno(), _MOST_ORDERS))
+        )
+        await asyncio.gather(*(self._keep_connecting(kind) for kind in ("known", "new")))
+
+    def _obey(self, lines: bytes) -> None:
+        self._target = _Target(**json.loads(lines.splitlines()[-1]))
+
+    def _sources(self, kind: str) -> Iterator[str]:
+        """Known clients come back again and again; a new one is never seen a second time."""
+        families = [ipaddress.ip_network(each) for each in self._options["prefixes"]]
+        known = self._options["known"]
+        for number in count():
+            place = 10 + number % known if kind == "known" else self._options["first_new"] + number
+            version = 6 if ":" in self._target.address else 4
+            yield next(str(network[place]) for network in families if network.version == version)
+
+    async def _keep_connecting(self, kind: str) -> None:
+        sources = self._sources(kind)
+        due = time.monotonic()
+        while True:
+            rate = getattr(self._target, f"{kind}_rate")
+            due = max(due, time.monotonic() - 1.0)  # what was missed is not made up for in one go
+            await asyncio.sleep(max(0.0, due - time.monotonic()))
+            due += 1 / rate if rate else _LOOK_S
+            if rate:
+                task = asyncio.create_task(self._attempt(kind, next(sources)))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+
+    async def _attempt(self, kind: str, source: str) -> None:
+        """One connect() with a budget."""
+        target = (self._target.address, self._target.port)
+        number, begun = next(self._number), time.monotonic()
+        self._tell({"number": number, "at": time.time(), "kind": kind, "to": target[0]})
+        with socket.socket(
+            socket.AF_INET6 if ":" in source else socket.AF_INET, socket.SOCK_STREAM
+        ) as attempt:
+            attempt.setblocking(False)
+            attempt.bind((source, 0))
+            try:
+                connect = asyncio.get_running_loop().sock_connect(attempt, target)
+                await asyncio.wait_for(connect, self._options["budget"])
+                succeeded = True
+            except OSError:  # TimeoutError is one
+                succeeded = False
+        self._tell({"number": number, "ok": succeeded, "ms": round((time.monotonic() - begun) * 1000, 1)})
+
+    def _tell(self, line: dict[str, Any]) -> None:
+        self._report.write(json.dumps(line) + "\n")
 
 
 def client(options: dict[str, Any]) -> None:
-    """Connect at fixed rates until killed."""
-    with Path(options["report"]).open("a", encoding="utf-8", buffering=1) as report:
+    """Connect at the rates of the last order: a line for an attempt's begin, one for its end."""
+    with _report(options) as report, _orders(options) as orders:
         _ready()
-        asyncio.run(_attempts(options, report))
-
-
-async def _attempts(options: dict[str, Any], report: TextIO) -> None:
-    network = ipaddress.ip_network(options["prefix"])
-    known = [str(network[10 + each]) for each in range(options["known"])]
-    fresh = (str(network[number]) for number in range(options["first_new"], network.num_addresses))
-    await asyncio.gather(
-        _keep_connecting("known", _cycle(known), options["known_rate"], options, report),
-        _keep_connecting("new", fresh, options["new_rate"], options, report),
-    )
-
-
-def _cycle(addresses: list[str]) -> Iterator[str]:
-    while True:
-        yield from addresses
-
-
-async def _keep_connecting(
-    kind: str, sources: Iterator[str], rate: float, options: dict[str, Any], report: TextIO
-) -> None:
-    tasks: set[asyncio.Task[None]] = set()
-    begun = time.monotonic()
-    for number, source in enumerate(sources if rate else ()):
-        await asyncio.sleep(max(0.0, begun + number / rate - time.monotonic()))
-        task = asyncio.create_task(_attempt(kind, source, options, report))
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
-
-
-async def _attempt(kind: str, source: str, options: dict[str, Any], report: TextIO) -> None:
-    """One connect() with a budget."""
-    family = socket.AF_INET6 if ":" in source else socket.AF_INET
-    at, begun = time.time(), time.monotonic()
-    with socket.socket(family, socket.SOCK_STREAM) as attempt:
-        attempt.setblocking(False)
-        attempt.bind((source, 0))
-        try:
-            target = (options["address"], options["port"])
-            await asyncio.wait_for(
-                asyncio.get_running_loop().sock_connect(attempt, target), options["budget"]
-            )
-            succeeded = True
-        except OSError:  # TimeoutError is one
-            succeeded = False
-    spent = (time.monotonic() - begun) * 1000
-    report.write(json.dumps({"at": at, "kind": kind, "ok": succeeded, "ms": round(spent, 1)}) + "\n")
+        asyncio.run(_Client(options, report).run(orders))
 
 
 def flood(options: dict[str, Any]) -> None:
-    """Send the frames at a steady rate; a report with the time of the first and the number sent."""
-    report = Path(options.pop("report"))
-    plan = FloodPlan(**options)
-    frames = [row.tobytes() for row in make_frames(plan)]
-    told: list[int] = []
-    # a handler, not a mask: numpy's threads exist already and would take the signal; a list, not an
-    # Event, which its own waiter may hold when the handler interrupts it
-    signal.signal(signal.SIGUSR1, lambda number, _: told.append(number))
-    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as wire:
+    """Send each plan that is ordered: a line with the time of the first frame, one at the end.
+
+    An empty order, or any other, ends a flood before its time.
+    """
+    from sdnator.syn_flood_frames import FloodPlan, make_flood
+    from sdnator.syn_flood_sender import send_flood
+
+    with (
+        _report(options) as report,
+        _orders(options) as orders,
+        socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as wire,
+    ):
         wire.bind(("eth0", 0))
         _ready()
-        while not told:
-            time.sleep(_BURST_S)
-        first, begun, sent, failed = time.time(), time.monotonic(), 0, 0
-        report.write_text(json.dumps({"first": first}) + "\n", encoding="utf-8")
-        while sent < len(frames):
-            due = min(len(frames), int((time.monotonic() - begun) * plan.rate) + 1)
-            for frame in frames[sent:due]:
-                try:
-                    wire.send(frame)
-                except OSError:  # the interface's queue is full
-                    failed += 1
-            sent = due
-            time.sleep(_BURST_S)
-    seconds = time.monotonic() - begun
-    text = json.dumps({"first": first, "sent": sent - failed, "failed": failed, "seconds": seconds})
-    report.write_text(text + "\n", encoding="utf-8")
-    signal.pause()
+
+        def begun(first: float) -> None:
+            report.write(json.dumps({"to": plan.victim, "first": first}) + "\n")
+
+        while True:
+            order = json.loads(orders.readline())
+            if not order:  # to end what has ended by itself
+                continue
+            plan = FloodPlan(**order)
+            sent = send_flood(wire, make_flood(plan), begun, lambda: _waiting(orders))
+            report.write(json.dumps({"to": plan.victim, **sent.to_json()}) + "\n")
+
+
+def _waiting(orders: TextIO) -> bool:
+    return bool(select.select([orders], [], [], 0)[0])
 
 
 def counters(options: dict[str, Any]) -> None:
-    """Read the switch's counters every so often."""
+    """Read the switch's counters every so often, and now and then the number of entries by table."""
     import grpc
 
     from apps.p4runtime_ctrl.p4info import Program
@@ -155,9 +227,9 @@ def counters(options: dict[str, Any]) -> None:
 
     program = Program.from_text(Path(options["p4info"]).read_text(encoding="utf-8"))
     outcomes = next(each.preamble.id for each in program.message.counters if each.preamble.name == _OUTCOMES)
-    tables = [program.table(name).id for name in _DYNAMIC]
+    tables = {name: program.table(name).id for name in _DYNAMIC}
     limits = [("grpc.max_receive_message_length", -1)]
-    with grpc.insecure_channel(options["grpc"], options=limits) as channel:
+    with grpc.insecure_channel(options["grpc"], options=limits) as channel, _report(options) as report:
         stub = P4RuntimeStub(channel)
 
         def read(entity: Any) -> list[Any]:
@@ -165,28 +237,26 @@ def counters(options: dict[str, Any]) -> None:
             return [each for answer in stub.Read(request) for each in answer.entities]
 
         _ready()
-        with Path(options["report"]).open("a", encoding="utf-8", buffering=1) as report:
-            for number in range(sys.maxsize):
-                line: dict[str, Any] = {"at": time.time()}
-                with contextlib.suppress(grpc.RpcError):  # the switch has no program yet
-                    counted = read(
-                        p4runtime.Entity(counter_entry=p4runtime.CounterEntry(counter_id=outcomes))
-                    )
-                    values = {
-                        each.counter_entry.index.index: each.counter_entry.data.packet_count
-                        for each in counted
-                    }
-                    line |= {name: values.get(index, 0) for index, name in enumerate(OUTCOMES)}
-                    if number % options["entries_every"] == 0:
-                        entries = (p4runtime.TableEntry(table_id=table) for table in tables)
-                        line["entries"] = sum(
-                            len(read(p4runtime.Entity(table_entry=each))) for each in entries
+        for number in count():
+            line: dict[str, Any] = {"at": time.time()}
+            with contextlib.suppress(grpc.RpcError):  # the switch has no program yet
+                counted = read(p4runtime.Entity(counter_entry=p4runtime.CounterEntry(counter_id=outcomes)))
+                values = {
+                    each.counter_entry.index.index: each.counter_entry.data.packet_count for each in counted
+                }
+                line |= {name: values.get(index, 0) for index, name in enumerate(OUTCOMES)}
+                if number % options["entries_every"] == 0:
+                    line["entries"] = {
+                        name.rpartition(".")[2]: len(
+                            read(p4runtime.Entity(table_entry=p4runtime.TableEntry(table_id=table)))
                         )
-                    report.write(json.dumps(line) + "\n")
-                time.sleep(options["every"])
+                        for name, table in tables.items()
+                    }
+                report.write(json.dumps(line) + "\n")
+            time.sleep(options["every"])
 
 
-ROLES: dict[str, Callable[[dict[str, Any]], None]] = {
+ROLES: Final[dict[str, Callable[[dict[str, Any]], None]]] = {
     "victim": victim,
     "client": client,
     "flood": flood,

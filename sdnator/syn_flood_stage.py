@@ -6,29 +6,32 @@ socket; switch and controller live in the switch's namespace.
 
 import json
 import os
-import signal
 import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
 from apps.messages import Confirmation, Decision, TableCommand, TableUpdate
-from dataplane.bmv2 import Bmv2
+from dataplane.bmv2 import Bmv2, Bmv2Error
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
-from sdnator.errors import PipelineError
+from sdnator.errors import BadInput, PipelineError
 from sdnator.held_signals import held_signals
 from sdnator.process import Child
 from sdnator.syn_flood_lab import HOSTS, Lab, mac
 
 SWITCH: Final = "s1"
+PARTS: Final = ("switch", "coordinator", "p4runtime_ctrl", "sonata_adapter", "firewall")
 _DEVICE: Final = 1
 _COMMAND: Final = f"network.p4_command.demo.{SWITCH}"
 _SECONDS: Final = 30.0
+_AGAIN_S: Final = 0.5
+_IDLE_LOOK_S, _IDLE_SHARE = 0.3, 0.25
 _HEARD: Final = (
     "network.confirmation.p4runtime_ctrl.*",
     "network.block.firewall.*",
@@ -76,27 +79,36 @@ class Stage:
 
     def _start(self) -> None:
         (self.folder / "logs").mkdir(parents=True, exist_ok=True)
-        run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-syn-")))
+        archive = self.folder / "archive.db"
+        if archive.exists():
+            raise BadInput(f"{self.folder} holds another run: name a folder that is new or empty")
+        self._run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-syn-")))
         with held_signals():
-            self._updates = self._stack.enter_context(EmbeddedServer(run)).url
-        self._archive = f"sqlite:///{self.folder / 'archive.db'}"
+            self._updates = self._stack.enter_context(EmbeddedServer(self._run)).url
+        self._archive = f"sqlite:///{archive}"
         coordinator = self.app("coordinator", "coordinator.service", {})
-        base_us = time.time_ns() // 1000
         with self.lab.inside("switch"):
-            self.grpc = self._start_switch()
+            base_us = self._start_switch()
             coordinator.wait_ready()
             self.app("p4runtime_ctrl", "apps.p4runtime_ctrl.service", self._controller(base_us)).wait_ready()
         self._engine = self._connect()
         self._forward()
 
-    def _start_switch(self) -> str:
+    def _start_switch(self) -> int:
+        """Its address is noted; returns the absolute time of its clock's zero, µs."""
         ports = {number: f"p{number}" for number in range(1, len(HOSTS) + 1)}
         if self._kind == "bmv2":
-            with held_signals():
-                return self._stack.enter_context(Bmv2(ports, device_id=_DEVICE)).address
+            began_us = time.time_ns() // 1000
+            try:
+                with held_signals():
+                    self.grpc = self._stack.enter_context(Bmv2(ports, device_id=_DEVICE)).address
+            except Bmv2Error as error:
+                raise PipelineError(str(error)) from None
+            return began_us
         options = [option for number, name in ports.items() for option in ("--port", f"{number}=veth:{name}")]
         state = ("--state-json", str(self.folder / "switch.json"))
-        return str(self._child("switch", "dataplane", *options, *state).wait_ready()["grpc"])
+        self.grpc = str(self._child("switch", "dataplane", *options, *state).wait_ready()["grpc"])
+        return time.time_ns() // 1000
 
     def _controller(self, base_us: int) -> dict[str, Any]:
         program = p4_program.find()
@@ -141,21 +153,23 @@ class Stage:
         updates = tuple(
             TableUpdate(
                 kind="insert",
-                table="ingress.l2_forward",
+                table="ingress.dmac",
                 match={"vid": 0, "eth_dst": mac(host)},
-                action="to_station",
+                action="set_egress",
                 params={"port": port},
             )
             for port, host in enumerate(HOSTS, start=1)
         )
-        deadline = time.monotonic() + _SECONDS
+        deadline, again = time.monotonic() + _SECONDS, 0.0
         while not any(said.state in ("installed", "exists") for _, said in self.confirmed):
             if time.monotonic() > deadline:
                 said = self.confirmed[-1][1].cause if self.confirmed else "nothing"
                 raise PipelineError(f"switch {SWITCH} did not take its forwarding entries; it said: {said}")
-            command = TableCommand(id=f"forward-{time.monotonic_ns()}", updates=updates)
-            self._engine.write(_COMMAND, command.to_value(), [NO_WAIT])
-            self.wait(0.5)
+            if time.monotonic() > again:
+                command = TableCommand(id=f"forward-{time.monotonic_ns()}", updates=updates)
+                self._engine.write(_COMMAND, command.to_value(), [NO_WAIT])
+                again = time.monotonic() + _AGAIN_S
+            self.wait(0.05)
 
     def app(self, name: str, module: str, settings: Mapping[str, Any]) -> Child:
         """Start an app of the product."""
@@ -164,28 +178,45 @@ class Stage:
             name, module, "--updates", self._updates, "--archive", self._archive, "--settings", path
         )
 
-    def host(self, host: str, role: str, options: Mapping[str, Any]) -> Child:
+    def host(self, host: str, role: str, options: Mapping[str, Any]) -> "Host":
         """Start a role of `syn_flood_hosts` in a host's namespace."""
+        report, orders = self._path(role, "jsonl"), self._run / f"{host}-{role}.orders"
+        os.mkfifo(orders)
+        told = {**options, "report": str(report), "orders": str(orders)}
         with self.lab.inside(host):
-            child = self._child(f"{host}-{role}", "sdnator.syn_flood_hosts", role, self._write(role, options))
+            child = self._child(f"{host}-{role}", "sdnator.syn_flood_hosts", role, self._write(role, told))
         child.wait_ready()
-        return child
+        return Host(child, report, orders)
 
-    def release(self, child: Child) -> None:
-        """Stop one child."""
-        self._children.remove(child)
-        child.stop()
+    def settle(self, seconds: float) -> bool:
+        """Wait until no part is busy with what came before; False where one still is after so long."""
+        deadline = time.monotonic() + seconds
+        parts = [child.pid for child in self._children if child.name in PARTS]
+        before = [_used(pid) for pid in parts]
+        while time.monotonic() < deadline:
+            self.wait(_IDLE_LOOK_S)
+            now = [_used(pid) for pid in parts]
+            if all(
+                after - earlier <= _IDLE_SHARE * _IDLE_LOOK_S
+                for earlier, after in zip(before, now, strict=True)
+            ):
+                return True
+            before = now
+        return False
 
-    def report_path(self, name: str) -> Path:
-        """A new file for what a host reports."""
-        self._made += 1
-        return self.folder / f"{name}-{self._made}.jsonl"
+    def memory(self) -> dict[str, float]:
+        """Resident memory of each part of the product, MB."""
+        parts = [child for child in self._children if child.name in PARTS]
+        return {child.name: _resident(child.pid) for child in parts}
 
     def _write(self, name: str, settings: Mapping[str, Any]) -> str:
-        self._made += 1
-        path = self.folder / f"{name}-{self._made}.settings.json"
+        path = self._path(name, "settings.json")
         path.write_text(json.dumps(settings, indent=2), encoding="utf-8")
         return str(path)
+
+    def _path(self, name: str, kind: str) -> Path:
+        self._made += 1
+        return self.folder / f"{name}-{self._made}.{kind}"
 
     def _child(self, name: str, *arguments: str) -> Child:
         with held_signals():
@@ -200,6 +231,35 @@ class Stage:
             child.check()
 
 
-def begin(child: Child) -> None:
-    """Tell a flood to start."""
-    os.kill(child.pid, signal.SIGUSR1)
+@dataclass(frozen=True)
+class Host:
+    """A role at work in a host's namespace."""
+
+    child: Child
+    report: Path
+    """JSON lines."""
+    _orders: Path
+
+    def order(self, order: Mapping[str, Any]) -> None:
+        """Tell it what to do; raises `PipelineError` where it has ended."""
+        line = json.dumps(order).encode() + b"\n"
+        try:
+            descriptor = os.open(self._orders, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError as error:
+            self.child.check()
+            raise PipelineError(f"{self.child.name} takes no orders: {error.strerror}") from error
+        try:
+            os.write(descriptor, line)
+        finally:
+            os.close(descriptor)
+
+
+def _used(pid: int) -> float:
+    """Processor time of a process, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _resident(pid: int) -> float:
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    return round(pages * os.sysconf("SC_PAGESIZE") / 1e6, 1)
