@@ -1,13 +1,22 @@
-"""Builds the optional C kernel; everything else is declared in pyproject.toml.
+"""Builds what pyproject.toml cannot declare: the optional C kernel and the switch program's place.
 
 The kernel is a plain shared object loaded with cffi (ABI mode): it includes no Python header, so a
 compiler is all it needs.  Without one the installation still succeeds and the Python twin is used.
+
+The switch program lives in `p4/`, which is no package (a package of that name would hide `p4.v1` of the
+P4Runtime wheel).  In a wheel its sources, artefacts and record are data of `sdnator`, in
+`sdnator/program/`; a checkout and an editable installation read `p4/` itself.
 """
 
+import shutil
 from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.command.build_py import build_py
+
+PROGRAM = Path("p4")
+KINDS = (".p4", ".json", ".txtpb")
 
 
 class BuildKernel(build_ext):
@@ -15,6 +24,27 @@ class BuildKernel(build_ext):
 
     def get_ext_filename(self, fullname: str) -> str:
         return str(Path(*fullname.split(".")).with_suffix(".so"))
+
+
+class BuildWithProgram(build_py):
+    """Adds the switch program, where `sdnator.p4_program` looks for it."""
+
+    def run(self) -> None:
+        super().run()
+        if not self.editable_mode:
+            for source, target in self._program():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, target)
+
+    def get_outputs(self, include_bytecode: bool = True) -> list[str]:
+        """Also the program's files: what is named here is what an installation holds."""
+        own = [] if self.editable_mode else [str(target) for _, target in self._program()]
+        return [*super().get_outputs(include_bytecode), *own]
+
+    def _program(self) -> list[tuple[Path, Path]]:
+        base = Path(self.build_lib) / "sdnator" / "program"
+        files = sorted(path for path in PROGRAM.rglob("*") if path.suffix in KINDS)
+        return [(path, base / path.relative_to(PROGRAM)) for path in files]
 
 
 setup(
@@ -30,6 +60,6 @@ setup(
             optional=True,
         )
     ],
-    cmdclass={"build_ext": BuildKernel},
+    cmdclass={"build_ext": BuildKernel, "build_py": BuildWithProgram},
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
 )

@@ -1,0 +1,259 @@
+"""What lies in `deploy/` fits the product: options, settings, addresses and metrics exist.
+
+No container engine and no running systemd is needed: files are read, and checked against the code.
+"""
+
+import json
+import os
+import re
+import shlex
+import stat
+import subprocess
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from coordinator import metrics as coordinator_metrics
+from coordinator.registry import Registry
+from dataplane.__main__ import options as switch_options
+from due import Engine
+from due import metrics as due_metrics
+from due import service as due_service
+from sdnator.p4_program import find
+from tests.requirements import optional_program
+
+yaml = pytest.importorskip("yaml", reason="PyYAML, which comes with mkdocs, is not installed")
+
+ROOT = Path(__file__).resolve().parent.parent
+DEPLOY = ROOT / "deploy"
+APPS = {
+    "coordinator": ("coordinator.service", "CoordinatorService"),
+    "kitsune": ("apps.kitsune.service", "KitsuneService"),
+    "sonata_adapter": ("apps.sonata_adapter.service", "SonataAdapterService"),
+    "firewall": ("apps.firewall.service", "FirewallService"),
+    "p4runtime_ctrl": ("apps.p4runtime_ctrl.service", "P4RuntimeCtrlService"),
+    "dashboard": ("sdnator.dashboard.service", "DashboardService"),
+}
+PREFIXES = "|".join(("sdnator", "due", *APPS))
+UNIT_VARIABLES = {"%i": "kitsune", "${METRICS}": "127.0.0.1:9472", "$SWITCH_PORTS": "--port 1=null"}
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+
+
+def compose():
+    """compose.yaml as data, anchors and merges resolved."""
+    return yaml.safe_load((DEPLOY / "compose.yaml").read_text(encoding="utf-8"))
+
+
+def settings(app):
+    """The settings of one app as `deploy/settings` has them."""
+    kind = import_module(APPS[app][0]).Settings
+    return msgspec.json.decode((DEPLOY / "settings" / f"{app}.json").read_bytes(), type=kind)
+
+
+def app_commands():
+    """(where, words) of every command that starts an app of ours, in compose.yaml and the units."""
+    found = [
+        (name, [str(word) for word in service["command"]])
+        for name, service in compose()["services"].items()
+        if service.get("image") == "sdnator"
+    ]
+    for unit in UNITS:
+        for line in re.findall(r"^ExecStart=(.*)$", unit.read_text(encoding="utf-8"), re.MULTILINE):
+            words = line.replace("/opt/sdnator/bin/", "")
+            for variable, value in UNIT_VARIABLES.items():
+                words = words.replace(variable, value)
+            found.append((unit.name, shlex.split(words)))
+    return found
+
+
+@pytest.mark.parametrize("app", APPS)
+def test_settings_are_those_of_the_app(app):
+    """Every option in `deploy/settings` exists and has a value that the app takes."""
+    settings(app)
+
+
+@pytest.mark.parametrize(("where", "words"), app_commands(), ids=lambda value: str(value)[:40])
+def test_commands_have_only_options_that_exist(where, words):
+    """Modules can be found and their options parse; addresses to listen on are loopback."""
+    program, rest = words[0], words[1:]
+    if program == "sdnator":
+        assert rest == ["up"]
+        return
+    if program == "start-switch":
+        arguments = switch_options().parse_args(rest)
+        assert arguments.grpc.startswith("127.0.0.1:")
+        return
+    if program == "python":
+        assert rest[0] == "-m"
+        assert find_spec(rest[1])
+        rest = rest[2:]
+    else:
+        assert program == "start-controller"
+    arguments = due_service._parser(where).parse_args(rest)
+    assert arguments.metrics.startswith("127.0.0.1:")
+
+
+def test_compose_names_only_what_exists():
+    """Mounted files exist, named volumes are declared, and whom a part waits for is there."""
+    document = compose()
+    for name, service in document["services"].items():
+        for volume in service.get("volumes", []):
+            source = volume.split(":")[0]
+            assert (DEPLOY / source).exists() if source.startswith(".") else source in document["volumes"], (
+                name
+            )
+        assert set(service.get("depends_on", {})) <= set(document["services"]), name
+    built = document["services"]["kitsune"]["build"]
+    assert (DEPLOY / built["context"] / built["dockerfile"]).is_file()
+
+
+def test_compose_keeps_everything_on_loopback():
+    """Nothing is published, and every part of others is told to listen on 127.0.0.1."""
+    services = compose()["services"]
+    assert all(service["network_mode"] == "host" and "ports" not in service for service in services.values())
+    for name in ("updates", "archive", "bmv2", "prometheus"):
+        assert "127.0.0.1" in " ".join(services[name]["command"]), name
+    assert services["grafana"]["environment"]["GF_SERVER_HTTP_ADDR"] == "127.0.0.1"
+    assert settings("coordinator").http_host == "127.0.0.1"
+
+
+def test_every_variable_of_compose_has_an_example():
+    """What compose.yaml expects of `.env` stands in env.example."""
+    wanted = set(re.findall(r"(?<!\$)\$\{([A-Z_]+)", (DEPLOY / "compose.yaml").read_text(encoding="utf-8")))
+    given = re.findall(r"^([A-Z_]+)=", (DEPLOY / "env.example").read_text(encoding="utf-8"), re.MULTILINE)
+    assert wanted <= set(given)
+
+
+def test_docker_build_takes_what_it_copies():
+    """Every COPY has its source in the checkout, and the ignore file lets it through."""
+    text = (DEPLOY / "Dockerfile").read_text(encoding="utf-8")
+    sources = [
+        source
+        for line in re.findall(r"^COPY (?!--from)(.*)$", text, re.MULTILINE)
+        for source in line.split()[:-1]
+    ]
+    ignore = (DEPLOY / "Dockerfile.dockerignore").read_text(encoding="utf-8").split()
+    for source in sources:
+        assert (ROOT / source).exists()
+        assert f"!{source}" in ignore
+    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests", "benchmarks"}
+    assert packages <= set(sources)
+
+
+def test_prometheus_scrapes_every_part():
+    """Its targets are the metrics addresses of compose.yaml and the Coordinator's API."""
+    told = {words[words.index("--metrics") + 1] for _, words in app_commands() if "--metrics" in words}
+    chosen = settings("coordinator")
+    told.add(f"{chosen.http_host}:{chosen.http_port}")
+    read = yaml.safe_load((DEPLOY / "prometheus.yml").read_text(encoding="utf-8"))
+    targets = {
+        target
+        for job in read["scrape_configs"]
+        for config in job["static_configs"]
+        for target in config["targets"]
+    }
+    assert targets == told
+    assert all((DEPLOY / name).is_file() for name in read["rule_files"])
+
+
+@pytest.fixture(scope="module")
+def exported():
+    """Names of all metrics that the Coordinator's API, the engine and each app export."""
+    registry, counters = Registry("here"), dict.fromkeys(coordinator_metrics._COUNTERS, 0)
+    text, _ = coordinator_metrics.render(registry, {"leading": True, **counters}, 0.0)
+    names = set(re.findall(r"^# TYPE (\S+)", text.decode(), re.MULTILINE))
+    names |= {f"{name}_total" for name in names}
+    names |= {family.name for family in due_metrics._ENGINE.values()}
+    program = find()
+    for app, (module, service) in APPS.items():
+        if app in {"coordinator", "dashboard"}:
+            continue  # the one is above, of the other no figure is drawn
+        own = import_module(module)
+        chosen = settings(app)
+        if app == "p4runtime_ctrl":
+            paths = {"program": str(program.bmv2_json), "p4info": str(program.p4info)}
+            chosen = msgspec.structs.replace(chosen, **paths)
+        health = getattr(own, service)(Engine(), chosen).health()
+        names |= set(re.findall(r"^# TYPE (\S+)", due_metrics.render(app, {}, health), re.MULTILINE))
+    return names
+
+
+def expressions():
+    """(where, PromQL) of every panel, every alerting rule, and what the operations page names."""
+    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    for name in re.findall(rf"`((?:{PREFIXES})_[a-z_]+)`", page):
+        if name not in APPS:
+            yield "operations.md", name
+    dashboard = json.loads((DEPLOY / "grafana/dashboards/sdnator.json").read_text(encoding="utf-8"))
+    for panel in dashboard["panels"]:
+        for target in panel.get("targets", []):
+            yield panel["title"], target["expr"]
+    rules = yaml.safe_load((DEPLOY / "alerts.yml").read_text(encoding="utf-8"))
+    for group in rules["groups"]:
+        for rule in group["rules"]:
+            yield rule["alert"], rule["expr"]
+
+
+@pytest.mark.parametrize(("where", "expression"), list(expressions()), ids=lambda value: str(value)[:60])
+def test_metrics_of_dashboard_and_alerts_exist(exported, where, expression):
+    """Every metric that a panel or a rule names is exported."""
+    named = re.findall(rf"\b(?:{PREFIXES})_\w+", re.sub(r'"[^"]*"', "", expression))
+    assert named
+    assert set(named) <= exported
+
+
+def test_dashboard_uses_the_provisioned_data_source():
+    """Panels ask the data source that the provisioning file makes, and none overlaps another."""
+    dashboard = json.loads((DEPLOY / "grafana/dashboards/sdnator.json").read_text(encoding="utf-8"))
+    source = yaml.safe_load((DEPLOY / "grafana/provisioning/datasources/prometheus.yaml").read_text("utf-8"))
+    uids = {one["uid"] for one in source["datasources"]}
+    cells: set[tuple[int, int]] = set()
+    for panel in dashboard["panels"]:
+        place = panel["gridPos"]
+        own = {
+            (x, y)
+            for x in range(place["x"], place["x"] + place["w"])
+            for y in range(place["y"], place["y"] + place["h"])
+        }
+        assert not cells & own, panel["title"]
+        cells |= own
+        assert {target["datasource"]["uid"] for target in panel.get("targets", [])} <= uids
+
+
+def test_controller_learns_when_the_clock_of_the_switch_began(tmp_path):
+    """start-switch notes the time, start-controller puts it into the settings."""
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\necho "$@" >> said\n[ -t 0 ] || cat > given\n', encoding="utf-8")
+    python.chmod(python.stat().st_mode | stat.S_IXUSR)
+    folders = {"SDNATOR_RUN": str(tmp_path), "SDNATOR_ETC": str(DEPLOY / "settings")}
+    environment = os.environ | folders | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    for script, option in (("start-switch", "--grpc=127.0.0.1:0"), ("start-controller", "--stay")):
+        subprocess.run(
+            [DEPLOY / script, option],
+            env=environment, cwd=tmp_path, stdin=subprocess.DEVNULL, check=True, timeout=60,
+        )  # fmt: skip
+    said = (tmp_path / "said").read_text(encoding="utf-8").splitlines()
+    assert said[0] == "-m dataplane --grpc=127.0.0.1:0"
+    assert said[1] == "-m apps.p4runtime_ctrl.service --stay --settings /dev/stdin"
+    given = json.loads((tmp_path / "given").read_text(encoding="utf-8"))
+    noted = int((tmp_path / "base_us").read_text(encoding="utf-8"))
+    assert given["switches"][0]["base_us"] == noted > 1_500_000_000_000_000
+
+
+def test_units_are_what_systemd_understands(tmp_path):
+    """`systemd-analyze verify` finds nothing to say, with our programs where they are here."""
+    analyze = optional_program("systemd-analyze")
+    programs = str(Path(sys.executable).parent)
+    for unit in UNITS:
+        text = unit.read_text(encoding="utf-8").replace("/opt/sdnator/bin/start-", f"{DEPLOY}/start-")
+        (tmp_path / unit.name).write_text(text.replace("=/opt/sdnator/bin", f"={programs}"), encoding="utf-8")
+    names = [f"{tmp_path}/{unit.name}" for unit in UNITS]
+    done = subprocess.run(
+        [analyze, "verify", *names], capture_output=True, text=True, check=False, timeout=120
+    )
+    ours = [line for line in done.stderr.splitlines() if "sdnator" in line]
+    assert not ours
