@@ -7,41 +7,97 @@ Exit codes: 0 done, 1 a part of the pipeline failed, 2 bad input or misuse, 130 
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, ClassVar, NoReturn
 
 import typer
 
 from sdnator import __version__
-from sdnator.blocks_commands import allow, blocks
-from sdnator.coordinator_commands import apps, flow, keys
-from sdnator.dataset_commands import dataset
-from sdnator.detect_command import detect_command
-from sdnator.doctor import doctor
-from sdnator.due_commands import get, observe
 from sdnator.errors import SdnatorError
-from sdnator.queries_commands import queries
-from sdnator.switch_commands import counters, tables
-from sdnator.syn_flood_command import syn_flood_command
-from sdnator.up_command import down, status, up
+from sdnator.late_commands import LateGroup, register
+
+COMMANDS = {
+    "allow": ("sdnator.blocks_commands:allow", "Addresses, prefixes and MACs that are never blocked."),
+    "apps": (
+        "sdnator.coordinator_commands:apps",
+        "Apps and their instances: state, process, items written and received.",
+    ),
+    "backup": (
+        "sdnator.backup_commands:backup",
+        "Write archive, configuration and trained models into one file.",
+    ),
+    "blocks": ("sdnator.blocks_commands:blocks", "Blocks and guards: list, add, remove, explain, lift all."),
+    "config": (
+        "sdnator.config_commands:config",
+        "The configuration: check it, show what holds, print an example.",
+    ),
+    "counters": (
+        "sdnator.switch_commands:counters",
+        "What the entries of a switch have counted: blocked packets above all.",
+    ),
+    "dataset": ("sdnator.dataset_commands:dataset", "Captures to replay: generate, splice, rebuild, fetch."),
+    "demo": (
+        "sdnator.demo_commands:demos",
+        "Make a capture of an infected home network, replay it, and see the attack blocked.",
+    ),
+    "detect": (
+        "sdnator.detect_command:detect_command",
+        "Score every packet of a capture or an interface with Kitsune, without switch or blocking.",
+    ),
+    "doctor": (
+        "sdnator.doctor:doctor",
+        "Look at what is installed, reachable and allowed here, and say what to do about the rest.",
+    ),
+    "down": ("sdnator.status_command:down", "Stop the pipeline of `sdnator up` and wait until it has ended."),
+    "flow": ("sdnator.coordinator_commands:flow", "Draw who gets what from whom."),
+    "get": ("sdnator.due_commands:get", "Show items of the past, oldest first; no pipeline needs to run."),
+    "keys": (
+        "sdnator.coordinator_commands:keys",
+        "All keys: who can make them, who wants them, and how they travel.",
+    ),
+    "logs": ("sdnator.logs_command:logs", "Show what the parts of the pipeline have logged."),
+    "observe": ("sdnator.due_commands:observe", "Show items as they come."),
+    "queries": (
+        "sdnator.queries_commands:queries",
+        "Telemetry queries: list, explain, add your own, run over the past.",
+    ),
+    "restore": ("sdnator.backup_commands:restore", "Put back what `sdnator backup` has written."),
+    "shell": (
+        "sdnator.shell_command:shell",
+        "Look into a running switch with p4runtime-shell; its controller stays in charge.",
+    ),
+    "status": (
+        "sdnator.status_command:status",
+        "What runs: parts, addresses, and what the Coordinator says of the apps.",
+    ),
+    "switch": (
+        "sdnator.switch_run_command:switch",
+        "Run one embedded switch until Ctrl-C; a controller gives it its program.",
+    ),
+    "tables": (
+        "sdnator.switch_commands:tables",
+        "Tables of a switch: size, entries, default actions; with --table every entry with its counter.",
+    ),
+    "up": ("sdnator.up_command:up", "Run the whole pipeline until Ctrl-C, SIGTERM or `sdnator down`."),
+}
+"""Name to place and first line of help."""
+
+
+class _Commands(LateGroup):
+    PLACES: ClassVar[Mapping[str, str]] = {name: place for name, (place, _) in COMMANDS.items()}
+
 
 app = typer.Typer(
     name="sdnator",
+    cls=_Commands,
     help="A network security pipeline: P4 switches, Kitsune, Sonata queries and a firewall.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.add_typer(dataset, name="dataset")
-app.add_typer(blocks, name="blocks")
-app.add_typer(allow, name="allow")
-app.add_typer(queries, name="queries")
-demos = typer.Typer()
-app.add_typer(demos, name="demo")
-demos.command("syn-flood")(syn_flood_command)
-app.command("detect")(detect_command)
-for command in (up, status, down, observe, get, apps, keys, flow, tables, counters, doctor):
-    app.command(command.__name__)(command)
+for _name, (_, _text) in COMMANDS.items():
+    register(app, _name, _text)
 
 
 def _show_version(wanted: bool) -> None:
@@ -82,6 +138,9 @@ def replay(
     ad_grace: Annotated[int | None, typer.Option(help="Packets for the autoencoders.", min=1)] = None,
     pace: Annotated[str, typer.Option(help="max, or a multiple of real time: 1x, 10x.")] = "max",
     window: Annotated[int, typer.Option(help="Packets in flight, at most.", min=1, max=65_536)] = 128,
+    telemetry: Annotated[
+        str, typer.Option(help="How headers come from the switch: packet-in or digest.")
+    ] = "packet-in",
     report: Annotated[Path | None, typer.Option(help="Folder for the report.", metavar="DIR")] = None,
     keep: Annotated[
         Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")
@@ -91,6 +150,7 @@ def replay(
     """Replay a capture through switch, controller, Kitsune and firewall.
 
     With labels or a report there are two passes: Kitsune alone, then with blocking.
+    Exit codes: 0 replayed, 1 a part of the pipeline failed, 2 bad input or misuse.
 
     Example: sdnator replay mirai.pcap --labels mirai.labels.csv --report report
     """
@@ -108,27 +168,12 @@ def replay(
             ad_grace=ad_grace,
             pace=pace,
             window=window,
+            telemetry=telemetry,
             report=report,
             keep=keep,
             as_json=as_json,
         )
     )
-
-
-@demos.callback(invoke_without_command=True)
-def demo(
-    context: typer.Context,
-    *,
-    folder: Annotated[Path, typer.Option(help="Where capture and report go.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(help="Of the generated capture.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
-) -> None:
-    """Make a capture of an infected home network, replay it, and see the attack blocked."""
-    if context.invoked_subcommand is not None:
-        return
-    from sdnator.replay_command import run_demo
-
-    run_demo(folder, seed, as_json=as_json)
 
 
 class _Interrupted(BaseException):

@@ -76,6 +76,8 @@ def look(updates: str = "", archive: str = "", switch: str = "") -> Iterator[Che
     yield check_veth()
     yield check_installed("BMv2", "simple_switch_grpc", "`--switch bmv2`; the embedded switch needs nothing")
     yield check_installed("p4c", "p4c-bm2-ss", "changing the switch program; it comes compiled")
+    yield check_configuration()
+    yield check_dashboard()
     yield check_pipeline()
     if updates:
         yield check_updates(updates)
@@ -223,6 +225,31 @@ def check_installed(name: str, program: str, needed_for: str) -> Check:
     if found is None:
         return Check(name, "optional", f"no {program} on the PATH", f"only for {needed_for}")
     return Check(name, "ok", found)
+
+
+def check_configuration() -> Check:
+    """The configuration that `sdnator up` would take."""
+    from sdnator import config_file
+
+    path = config_file.find()
+    try:
+        config_file.load(path)
+    except BadInput as error:
+        found, _, more = str(error).partition("\n")
+        return Check(
+            "configuration", "missing", found + (" (and more)" if more else ""), "sdnator config check"
+        )
+    return Check("configuration", "ok", str(path) if path else "none: all options have their defaults")
+
+
+def check_dashboard() -> Check:
+    """The library that draws the pages."""
+    from importlib.util import find_spec
+
+    if find_spec("nicegui") is None:
+        remedy = "pip install nicegui, or run `sdnator up --no-dashboard`"
+        return Check("dashboard", "optional", "nicegui is not installed", remedy)
+    return Check("dashboard", "ok", "nicegui is installed")
 
 
 def check_pipeline() -> Check:

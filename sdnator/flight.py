@@ -35,10 +35,12 @@ class FlightLog:
     Args:
         packets: how many packets the capture has.
         verdicts: False for a switch that gives none: overtaken packets count as dropped.
+        by_digest: True where headers come by digest: a packet that made no copy may be scored all the same.
     """
 
-    def __init__(self, packets: int, *, verdicts: bool = True) -> None:
+    def __init__(self, packets: int, *, verdicts: bool = True, by_digest: bool = False) -> None:
         self._verdicts = verdicts
+        self._by_digest = by_digest
         self._first_arrival: int | None = 0 if verdicts else None
         self._overtaken = 0
         self.state: NDArray[np.uint8] = np.zeros(packets, np.uint8)
@@ -70,7 +72,7 @@ class FlightLog:
         # A score may overtake its verdict: it stands.
         undecided = states == PacketState.IN_FLIGHT
         dropped = undecided & ((given & (COPIED | FORWARDED)) == 0)
-        not_copied = undecided & ((given & COPIED) == 0) & ~dropped
+        not_copied = undecided & ((given & COPIED) == 0) & ~dropped & (not self._by_digest)
         states[dropped] = PacketState.DROPPED
         states[not_copied] = PacketState.NOT_COPIED
         self.judged += len(given)

@@ -46,6 +46,8 @@ class PipelinePlan:
     first: "Callable[[Pipeline], None] | None" = None
     """Called when Data Updates and the Coordinator run, before any app starts: data is made on demand,
     so whoever must miss nothing makes his interests known here."""
+    telemetry: str = "packet-in"
+    """How headers come from the switch: packet-in, or digest."""
     kitsune: Mapping[str, Any] = field(default_factory=dict)
     firewall: Mapping[str, Any] = field(default_factory=dict)
 
@@ -70,6 +72,7 @@ class Pipeline:
         self._stack = ExitStack()
         self._children: list[Child] = []
         self._bmv2: Bmv2 | None = None
+        self._begun_ns = time.time_ns()
         self.updates = ""
         """URL of Data Updates."""
         self.archive = f"sqlite:///{plan.folder / 'archive.db'}"
@@ -158,6 +161,9 @@ class Pipeline:
         return {
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
+            "telemetry": self._plan.telemetry,
+            # the archive of a folder that was used before holds an earlier run's blocks
+            "restore_since": self._begun_ns,
             "switches": [
                 {
                     "name": SWITCH_NAME,

@@ -13,7 +13,8 @@ from typing import Any
 
 from sdnator.errors import PipelineError
 
-START_SECONDS = 30.0
+START_SECONDS = 180.0
+"""A part that lives is starting, however slowly: on a busy machine that took over half a minute."""
 STOP_SECONDS = 10.0
 _PARENT_VARIABLE = "DUE_PARENT"
 """`due.service.PARENT_VARIABLE`; importing that takes longer than `sdnator --help` may."""

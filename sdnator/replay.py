@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from apps.messages import Alert, Confirmation, Decision
 from dataplane.capture_port import CaptureError
@@ -57,6 +57,9 @@ INTERESTS = (
 )
 
 
+Telemetry = Literal["packet-in", "digest"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions:
     """How a capture is replayed."""
@@ -72,6 +75,8 @@ class ReplayOptions:
     """Capture seconds a wall second; None = as fast as the loop goes."""
     window: int = 128
     """Packets in flight, at most."""
+    telemetry: Telemetry = "packet-in"
+    """How headers come from the switch."""
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
 
@@ -175,7 +180,12 @@ class ReplayPass:
         self._survey = survey
         self._options = options
         self._watch = watch
-        self._result = PassResult(FlightLog(survey.packets, verdicts=options.switch == "embedded"), mitigate)
+        flight = FlightLog(
+            survey.packets,
+            verdicts=options.switch == "embedded",
+            by_digest=options.telemetry == "digest",
+        )
+        self._result = PassResult(flight, mitigate)
         self._observer = _Observer(self._result)
         self._drops: DropCounters | None = None
         self._looked = 0.0
@@ -193,6 +203,7 @@ class ReplayPass:
                 switch=options.switch,
                 inject=options.inject,
                 base_us=self._survey.base_us,
+                telemetry=options.telemetry,
                 first=partial(self._join, engine),
                 kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},
                 firewall={"rules": {"dry_run": not self._result.mitigate}},

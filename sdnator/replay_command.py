@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,7 +17,7 @@ from rich.table import Table
 from sdnator import replay_run
 from sdnator.errors import BadInput
 from sdnator.flight import FlightLog
-from sdnator.replay import ReplayOptions
+from sdnator.replay import ReplayOptions, Telemetry
 from sdnator.report import check_folder
 
 TRAIN_SHARE = 11
@@ -40,6 +40,7 @@ class ReplayRequest:
     ad_grace: int | None
     pace: str
     window: int
+    telemetry: str = "packet-in"
     report: Path | None
     keep: Path | None
     as_json: bool
@@ -61,6 +62,7 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
         ad_grace=ad_grace,
         pace=_pace(request.pace),
         window=request.window,
+        telemetry=_telemetry(request.telemetry),
         keep=request.keep,
     )
 
@@ -82,6 +84,12 @@ def check_switch(switch: str, inject: str | None) -> None:
         raise BadInput(f"--switch {switch}: give embedded, bmv2 or HOST:PORT")
     if inject is None:
         raise BadInput(f"--switch {switch}: frames need a way into it; add --inject IFACE")
+
+
+def _telemetry(text: str) -> Telemetry:
+    if text not in get_args(Telemetry):
+        raise BadInput(f"--telemetry {text}: give {' or '.join(get_args(Telemetry))}")
+    return cast("Telemetry", text)
 
 
 def _pace(text: str) -> float | None:

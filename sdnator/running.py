@@ -2,6 +2,7 @@
 
     $XDG_STATE_HOME/sdnator   run.json, run.lock (with the process id), logs, settings of the parts, spools
     $XDG_DATA_HOME/sdnator    archive.db
+    $XDG_CONFIG_HOME/sdnator  sdnator.toml
 
 Who holds `run.lock` runs; the kernel lets it go even after kill -9, so a run file left behind deceives nobody.
 """
@@ -10,7 +11,7 @@ import fcntl
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +20,7 @@ from urllib.parse import quote
 
 from sdnator.errors import BadInput, PipelineError
 
-SCHEMA = 1
+SCHEMA = 2
 """Of the run file; grows when a reader of the old one would misunderstand it."""
 _CLAIM_SECONDS = 1.0
 
@@ -37,11 +38,26 @@ class Running:
     coordinator: str
     """URL of the HTTP API."""
     switch: Mapping[str, Any] = field(default_factory=dict)
-    """name, address, device_id, target, ports, forward."""
+    """The first: name, address, device_id, target, ports, forward."""
+    switches: Sequence[Mapping[str, Any]] = field(default_factory=list)
+    """All, each with the same."""
     parts: Mapping[str, int] = field(default_factory=dict)
     """Process ids by name."""
     logs: str = ""
+    dashboard: str = ""
+    """URL of the page; empty: there is none."""
+    token_file: str = ""
+    """File with the token that signs in there."""
+    metrics: Mapping[str, str] = field(default_factory=dict)
+    """HOST:PORT of Prometheus endpoints, by part."""
+    config: str = ""
+    """File that was read."""
     schema: int = SCHEMA
+
+
+def shown(found: Running) -> dict[str, Any]:
+    """The run file's content for people's programs."""
+    return {name: getattr(found, name) for name in found.__dataclass_fields__ if name != "schema"}
 
 
 def state_folder() -> Path:

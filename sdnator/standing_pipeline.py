@@ -1,12 +1,13 @@
 """The pipeline that `sdnator up` keeps running: started in order, parts that die started again.
 
-    Valkey, or a given server ─ coordinator ─┬─ switch ◄─ P4Runtime ─ p4runtime_ctrl
+    Valkey, or a given server ─ coordinator ─┬─ switches ◄─ P4Runtime ─ p4runtime_ctrl
     SQLite, or a given archive               ├─ kitsune
                                              ├─ sonata_adapter
-                                             └─ firewall
+                                             ├─ firewall
+                                             └─ dashboard
 
 Coordinator and apps rebuild their state from the others and from the archive, so each may be started
-again alone.  The switch may not: its clock begins anew, and every timer with it.
+again alone.  A switch may not: its clock begins anew, and every timer with it.
 """
 
 import json
@@ -16,8 +17,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -28,34 +27,15 @@ from due.errors import DueError, InvalidOption, UpdatesUnavailable
 from sdnator import p4_program
 from sdnator.errors import BadInput, PipelineError
 from sdnator.held_signals import held_signals
+from sdnator.planned_switches import PlannedSwitch
 from sdnator.process import Child
+from sdnator.standing_plan import APPS, StandingPlan, changes, taken_up
 
-SWITCH_NAME = "s1"
-APPS = ("p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall")
 DEATHS, DEATHS_SECONDS = 3, 60.0
 """A part that dies more often than so many times in so many seconds ends the pipeline."""
+READY_SECONDS = 180.0
+"""A part that lives is starting, however slowly: on a busy machine that took over half a minute."""
 _UPDATES_SECONDS = 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class StandingPlan:
-    """What to keep running."""
-
-    state: Path
-    """Folder for logs, settings, spools and the embedded Data Updates server."""
-    updates: str = ""
-    """Data Updates URL; empty: an embedded server."""
-    archive: str
-    """Data Archives URL."""
-    switch: str = "embedded"
-    """embedded, bmv2, or HOST:PORT of a P4Runtime switch that runs already."""
-    device_id: int = 1
-    ports: Mapping[int, str] = field(default_factory=dict)
-    """Port number to `veth:INTERFACE` or `null`, for a switch that we start."""
-    forward: Mapping[int, int] = field(default_factory=dict)
-    """Ingress port to egress port."""
-    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Of coordinator, kitsune, sonata_adapter and firewall, by name."""
 
 
 class StandingPipeline:
@@ -67,19 +47,23 @@ class StandingPipeline:
     """
 
     def __init__(self, plan: StandingPlan, tell: Callable[[str], None]) -> None:
-        self._plan = plan
+        self.plan = plan
         self._tell = tell
         self._stack = ExitStack()
         self._logs = plan.state / "logs"
         self._children: dict[str, Child] = {}
         self._commands: dict[str, tuple[str, ...]] = {}
+        self._ready: dict[str, dict[str, Any]] = {}
         self._deaths: dict[str, deque[float]] = {}
         self._server: EmbeddedServer | None = None
         self._looked = time.monotonic()
+        self._address_file = plan.state / "coordinator.url"
+        self._bases: dict[str, int] = {}
         self.updates = plan.updates
         self.coordinator = ""
         """URL of the Coordinator's HTTP API."""
-        self.switch_address = ""
+        self.switch_addresses: dict[str, str] = {}
+        """Of the P4Runtime servers, by switch."""
 
     def __enter__(self) -> Self:
         try:
@@ -94,36 +78,39 @@ class StandingPipeline:
     ) -> None:
         self.stop()
 
-    @property
-    def logs(self) -> Path:
-        """Where each part writes its log; the last run's are kept beside them."""
-        return self._logs
-
     def pids(self) -> dict[str, int]:
         """Process ids by name."""
         found = {name: child.pid for name, child in self._children.items()}
         return ({"updates": self._server.pid} if self._server is not None else {}) | found
 
+    def endpoints(self, what: str) -> dict[str, str]:
+        """Addresses that parts told when they were ready, by part: `metrics`, `http`."""
+        return {name: str(said[what]) for name, said in self._ready.items() if said.get(what)}
+
+    @property
+    def dashboard(self) -> str:
+        """URL of the page; empty where there is none."""
+        return self.endpoints("dashboard").get("dashboard", "")
+
     def _start(self) -> None:
         self._logs.mkdir(mode=0o700, parents=True, exist_ok=True)
         for log in self._logs.glob("*.log"):
             log.replace(log.with_suffix(".log.1"))
+        self._address_file.unlink(missing_ok=True)
         self._start_updates()
-        address_file = self._plan.state / "coordinator.url"
-        address_file.unlink(missing_ok=True)
-        coordinator = self._app(
-            "coordinator",
-            "coordinator.service",
-            {**self._settings("coordinator"), "address_file": str(address_file)},
-        )
-        base_us = self._start_switch()
-        coordinator.wait_ready()
-        self.coordinator = address_file.read_text(encoding="utf-8")
-        started = [
-            self._app(name, f"apps.{name}.service", self._app_settings(name, base_us)) for name in APPS
-        ]
-        for app in started:
-            app.wait_ready()
+        self._app("coordinator")
+        for switch in self.plan.switches:
+            self._start_switch(switch)
+        for switch in self.plan.switches:
+            self._note_switch(switch)
+        self._wait_ready("coordinator")
+        for name in APPS:
+            self._app(name)
+        for name in APPS:
+            self._wait_ready(name)
+        if self.plan.dashboard is not None:
+            self._app("dashboard")
+            self._wait_ready("dashboard")
 
     def _start_updates(self) -> None:
         try:
@@ -131,83 +118,117 @@ class StandingPipeline:
                 Wire(self.updates).close()
             else:
                 with held_signals():
-                    self._server = self._stack.enter_context(EmbeddedServer(self._fresh_folder()))
+                    folder = self._fresh_folder()
+                    self._server = self._stack.enter_context(EmbeddedServer(folder))
                 self.updates = self._server.url
         except InvalidOption as error:
             raise BadInput(f"--updates: {error}") from None
         except DueError as error:
             raise PipelineError(str(error)) from None
 
-    def _fresh_folder(self) -> Path:
+    def _fresh_folder(self) -> Any:
         """Another one for each run: what a killed run left behind, still ending, must not find our server."""
-        for old in self._plan.state.glob("updates-*"):
+        for old in self.plan.state.glob("updates-*"):
             shutil.rmtree(old, ignore_errors=True)
-        return self._plan.state / f"updates-{os.getpid()}"
+        return self.plan.state / f"updates-{os.getpid()}"
 
-    def _start_switch(self) -> int:
-        """Its address is noted; returns the absolute time of its clock's zero, µs."""
-        if self._plan.switch == "embedded":
-            ports = [
-                part for number, kind in self._plan.ports.items() for part in ("--port", f"{number}={kind}")
-            ]
-            switch = self._child(
-                "switch",
-                "dataplane",
-                "--grpc",
-                "127.0.0.1:0",
-                "--device-id",
-                str(self._plan.device_id),
-                *ports,
-            )
-            self.switch_address = str(switch.wait_ready()["grpc"])
-        elif self._plan.switch == "bmv2":
-            began_us = time.time_ns() // 1_000
-            interfaces = {number: kind.removeprefix("veth:") for number, kind in self._plan.ports.items()}
+    def _switch_part(self, switch: PlannedSwitch) -> str:
+        return "switch" if len(self.plan.switches) == 1 else f"switch-{switch.name}"
+
+    def _start_switch(self, switch: PlannedSwitch) -> None:
+        self._bases[switch.name] = time.time_ns() // 1_000
+        if switch.kind == "embedded":
+            ports = [part for number, kind in switch.ports.items() for part in ("--port", f"{number}={kind}")]
+            number = str(switch.device_id)
+            places = ("--grpc", "127.0.0.1:0", "--device-id", number)
+            self._child(self._switch_part(switch), "dataplane", *places, *ports)
+        elif switch.kind == "bmv2":
+            interfaces = {number: kind.removeprefix("veth:") for number, kind in switch.ports.items()}
             try:
                 with held_signals():
-                    bmv2 = self._stack.enter_context(Bmv2(interfaces, device_id=self._plan.device_id))
+                    bmv2 = self._stack.enter_context(Bmv2(interfaces, device_id=switch.device_id))
             except Bmv2Error as error:
                 raise PipelineError(str(error)) from None
-            self.switch_address = bmv2.address
-            return began_us
+            self.switch_addresses[switch.name] = bmv2.address
         else:
-            self.switch_address = self._plan.switch
-        return time.time_ns() // 1_000
+            self.switch_addresses[switch.name] = switch.kind
 
-    def _app_settings(self, name: str, base_us: int) -> Mapping[str, Any]:
-        if name != "p4runtime_ctrl":
-            return self._settings(name)
+    def _note_switch(self, switch: PlannedSwitch) -> None:
+        """Its address, and the absolute time of its clock's zero."""
+        if switch.kind == "embedded":
+            self.switch_addresses[switch.name] = str(self._wait_ready(self._switch_part(switch))["grpc"])
+        if switch.kind != "bmv2":
+            self._bases[switch.name] = time.time_ns() // 1_000
+
+    def _settings(self, name: str) -> Mapping[str, Any]:
+        own = self.plan.settings_of(name)
+        if name == "coordinator":
+            return {**own, "address_file": str(self._address_file)}
+        if name == "dashboard":
+            return {**(self.plan.dashboard or {}), **self._dashboard_places()}
+        if name == "p4runtime_ctrl":
+            return {**own, **self._controller_places()}
+        return own
+
+    def _controller_places(self) -> Mapping[str, Any]:
         program = p4_program.find()
         return {
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
             "switches": [
                 {
-                    "name": SWITCH_NAME,
-                    "address": self.switch_address,
-                    "device_id": self._plan.device_id,
-                    "base_us": base_us,
-                    "target": self._plan.switch,
-                    "forward": {str(number): egress for number, egress in self._plan.forward.items()},
+                    "name": switch.name,
+                    "address": self.switch_addresses[switch.name],
+                    "device_id": switch.device_id,
+                    "base_us": self._bases[switch.name],
+                    "target": switch.kind,
+                    "forward": {str(number): egress for number, egress in switch.forward.items()},
+                    "fail": switch.fail,
                 }
+                for switch in self.plan.switches
             ],
         }
 
-    def _settings(self, name: str) -> Mapping[str, Any]:
-        return self._plan.settings.get(name, {})
+    def _dashboard_places(self) -> Mapping[str, Any]:
+        return {
+            "coordinator_file": str(self._address_file),
+            "switches": [
+                {"name": one.name, "address": self.switch_addresses[one.name], "device_id": one.device_id}
+                for one in self.plan.switches
+            ],
+        }
 
-    def _app(self, name: str, module: str, settings: Mapping[str, Any]) -> Child:
-        path = self._plan.state / f"{name}.settings.json"
-        path.write_text(json.dumps(settings, indent=2), encoding="utf-8")
-        directory = str(self._plan.state / "due" / name)
-        places = ("--updates", self.updates, "--archive", self._plan.archive, "--directory", directory)
-        return self._child(name, module, *places, "--settings", str(path))
+    def _app(self, name: str) -> None:
+        """Start an app of DUE with what the plan has for it."""
+        module = {"coordinator": "coordinator.service", "dashboard": "sdnator.dashboard"}
+        path = self._written(f"{name}.settings.json", self._settings(name))
+        directory = str(self.plan.state / "due" / name)
+        options = ["--updates", self.updates, "--archive", self.plan.archive, "--directory", directory]
+        options += ["--settings", path, "--log", self.plan.log_level]
+        if self.plan.engine:
+            options += ["--engine", self._written("engine.json", self.plan.engine)]
+        if self.plan.log_format != "console":
+            options += ["--log-format", self.plan.log_format]
+        if self.plan.metrics_host and name != "coordinator":
+            options += ["--metrics", f"{self.plan.metrics_host}:0"]
+        self._child(name, module.get(name, f"apps.{name}.service"), *options)
+
+    def _written(self, name: str, values: Mapping[str, Any]) -> str:
+        path = self.plan.state / name
+        path.write_text(json.dumps(values, indent=2), encoding="utf-8")
+        return str(path)
 
     def _child(self, name: str, *arguments: str) -> Child:
         self._commands[name] = arguments
         with held_signals():
             child = self._children[name] = Child(name, arguments, self._logs)
         return child
+
+    def _wait_ready(self, name: str) -> dict[str, Any]:
+        said = self._ready[name] = self._children[name].wait_ready(READY_SECONDS)
+        if name == "coordinator":
+            self.coordinator = self._address_file.read_text(encoding="utf-8")
+        return said
 
     def watch(self) -> bool:
         """Start again what has died; True where that happened.  To be called every now and then."""
@@ -220,18 +241,37 @@ class StandingPipeline:
                 restarted = True
         return restarted
 
+    def reload(self, plan: StandingPlan) -> None:
+        """Take up what can be taken up of another plan, and tell the rest."""
+        found = changes(self.plan, plan)
+        self.plan = taken_up(self.plan, plan, found.again)
+        for name in found.again:
+            self._children[name].stop()
+            self._app(name)
+            self._wait_ready(name)
+        for text in found.waits:
+            self._tell(text)
+        self._tell(f"started again with new settings: {', '.join(found.again) or 'nothing'}")
+
     def _start_again(self, name: str, error: PipelineError) -> None:
-        if name == "switch":
+        if name.startswith("switch"):
             raise error
-        self._count_death(name, error)
+        try:
+            self._count_death(name, error)
+        except PipelineError:
+            if name != "dashboard":
+                raise
+            self._children.pop(name).stop()
+            del self._ready[name]
+            self._tell(f"{_first_line(error)}: again and again, so there is no dashboard any more")
+            return
         self._children[name].stop()
         # it may have taken the server along, and needs one to start
         self._looked = float("-inf")
         self._watch_updates()
-        self._child(name, *self._commands[name]).wait_ready()
-        if name == "coordinator":
-            self.coordinator = (self._plan.state / "coordinator.url").read_text(encoding="utf-8")
-        self._tell(f"{str(error).partition(chr(10))[0].removesuffix('; its last words:')}: started again")
+        self._child(name, *self._commands[name])
+        self._wait_ready(name)
+        self._tell(f"{_first_line(error)}: started again")
 
     def _count_death(self, name: str, error: PipelineError) -> None:
         now = time.monotonic()
@@ -265,3 +305,7 @@ class StandingPipeline:
         while self._children:
             self._children.popitem()[1].stop()
         self._stack.close()
+
+
+def _first_line(error: PipelineError) -> str:
+    return str(error).partition("\n")[0].removesuffix("; its last words:")

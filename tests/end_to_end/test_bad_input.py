@@ -67,6 +67,7 @@ def test_capture_shorter_than_training_names_the_options(capture):
     [
         (("--fm-grace", "100"), "--ad-grace"),
         (("--pace", "fast"), "--pace"),
+        (("--telemetry", "netflow"), "packet-in or digest"),
         (("--switch", "somewhere"), "--switch"),
         (("--switch", "127.0.0.1:9"), "--inject"),
         (("--report", "/proc/report"), "--report"),

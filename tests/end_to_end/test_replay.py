@@ -58,11 +58,12 @@ def scores_csv(folder):
     return score, [row["state"] for row in rows]
 
 
-def test_scores_of_the_real_packets_are_the_published_detectors(real_capture, tmp_path):
+@pytest.mark.parametrize("telemetry", ["packet-in", "digest"])
+def test_scores_of_the_real_packets_are_the_published_detectors(real_capture, tmp_path, telemetry):
     """Through switch, gRPC, Redis and back, every score is that of Kitsune-py, and nothing is lost."""
     report = tmp_path / "report"
-    training = ("--fm-grace", "2000", "--ad-grace", "10000")
-    found = figures("replay", real_capture, *training, "--no-mitigate", "--report", report)
+    how = ("--fm-grace", "2000", "--ad-grace", "10000", "--telemetry", telemetry)
+    found = figures("replay", real_capture, *how, "--no-mitigate", "--report", report)
     assert (found["packets_in"], found["packets_lost"], found["packets_dropped"]) == (REAL_PACKETS, 0, 0)
     assert found["training_packets"] == 12_001
     score, state = scores_csv(report)

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 import uuid
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -31,6 +32,7 @@ class Operator:
         self.environment = os.environ | {
             "XDG_STATE_HOME": str(folder / "state"),
             "XDG_DATA_HOME": str(folder / "data"),
+            "XDG_CONFIG_HOME": str(folder / "config"),
             MARK: self.mark,
         }
 
@@ -53,14 +55,15 @@ class Operator:
         return json.loads(done.stdout)
 
     @contextmanager
-    def up(self, *words: str):
-        """A running pipeline and what it said of itself."""
+    def up(self, *words: str, page: tuple[str, ...] = ("--no-dashboard",)):
+        """A running pipeline and what it said of itself; without a terminal, as a service runs."""
         process = subprocess.Popen(
-            self.command("up", "--json", *words),
+            self.command("up", "--json", *page, *words),
             env=self.environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            start_new_session=True,
         )
         try:
             assert process.stdout is not None
@@ -207,6 +210,64 @@ def test_signals_end_it_in_order(operator, number):
         _, error = process.communicate(timeout=SECONDS)
         assert process.returncode == 0
         assert "Traceback" not in error
+    assert processes_of(operator.mark) == []
+
+
+CONFIGURATION = """
+[up]
+quota = 0.5
+[log]
+format = "json"
+[metrics]
+targets = "TARGETS"
+[firewall]
+rules.hot_seconds = HOT
+[kitsune]
+threshold = THRESHOLD
+[[switches]]
+name = "left"
+[[switches]]
+name = "right"
+device_id = 2
+"""
+
+
+def test_a_configuration_holds_and_hangup_takes_up_what_it_can(operator, tmp_path):
+    """Two switches, structured logs, metrics for Prometheus; then new rules for the firewall, without an end."""
+    file, targets = tmp_path / "sdnator.toml", tmp_path / "targets.json"
+
+    def write(hot, line):
+        text = CONFIGURATION.replace("TARGETS", str(targets)).replace("HOT", str(hot))
+        file.write_text(text.replace("THRESHOLD", str(line)))
+
+    write(7, 1.5)
+    with operator.up("--config", str(file)) as (process, said):
+        assert [one["name"] for one in said["switches"]] == ["left", "right"]
+        assert said["parts"].keys() >= {"switch-left", "switch-right"}
+        parts = {group["labels"]["part"]: group["targets"] for group in json.loads(targets.read_text())}
+        assert parts.keys() == APPS
+        assert b"kitsune_" in urllib.request.urlopen(f"http://{parts['kitsune'][0]}/metrics").read()
+        state = tmp_path / "state" / "sdnator"
+        assert json.loads((state / "kitsune.settings.json").read_text())["threshold"] == 1.5
+        line = operator.run("logs", "p4runtime_ctrl", "--json").stdout.splitlines()[0]
+        assert "level" in json.loads(line)["line"]
+        write(8, 2.5)
+        process.send_signal(signal.SIGHUP)
+
+        def firewall_now():
+            return json.loads(operator.run("status", "--json").stdout)["parts"]["firewall"]["pid"]
+
+        until(lambda: firewall_now() != said["parts"]["firewall"])
+        assert json.loads((state / "firewall.settings.json").read_text())["rules"]["hot_seconds"] == 8
+        file.write_text("[kitsune]\nthresold = 1")
+        process.send_signal(signal.SIGHUP)
+        assert process.stderr is not None
+        heard = ""
+        while "not taken up" not in heard:
+            heard += process.stderr.readline()
+        assert "kitsune: it would train anew" in heard
+        assert "did you mean threshold?" in heard
+        assert process.poll() is None
     assert processes_of(operator.mark) == []
 
 

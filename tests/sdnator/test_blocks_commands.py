@@ -6,8 +6,12 @@ import time
 import pytest
 from typer.testing import CliRunner
 
+from apps.messages import Confirmation, Evidence
+from due import Item
+from due.backends import open_archive
 from due.drivers.embedded_redis import EmbeddedServer
-from sdnator.blocks_commands import allow, blocks, lift_in_archive, nft_sets
+from sdnator.blocks_archive import lift_in_archive
+from sdnator.blocks_commands import allow, blocks
 from sdnator.errors import BadInput
 from sdnator.process import Child
 from tests.apps.firewall.test_eve import decision
@@ -39,7 +43,7 @@ def run(group, *arguments: str) -> str:
 
 def listed(text: str, archive: list[str]) -> str:
     """`blocks list`, as soon as the archive has it: the firewall answers before the archive is written."""
-    for _ in range(200):
+    for _ in range(3000):
         shown = run(blocks, "list", *archive)
         if text in shown:
             return shown
@@ -54,7 +58,12 @@ def test_life_of_a_block_by_hand(firewall):
     assert "of 192.0.2.66 for 600 s" in answer
     assert "192.0.2.66" in listed("ticket 4711", archive)
     (shown,) = json.loads(run(blocks, "list", "--json", *archive))
-    assert "network.instruction.operator.firewall" in run(blocks, "why", shown["id"], *archive)
+    why = run(blocks, "why", shown["id"], *archive)
+    assert "network.instruction.operator.firewall: block 192.0.2.66: ticket 4711" in why
+    assert "blocked before: never" in why
+    life = json.loads(run(blocks, "why", shown["id"], "--json", *archive))
+    assert [step["action"] for step in life["steps"]] == ["block"]
+    assert life["evidence"][0]["reason_given"] == "ticket 4711"
     assert "elements = { 192.0.2.66 }" in run(blocks, "list", "--nft", *archive)
     with pytest.raises(BadInput, match="allow-list"):
         run(blocks, "add", "10.0.0.1", *both)
@@ -62,10 +71,17 @@ def test_life_of_a_block_by_hand(firewall):
     listed("nothing is blocked", archive)
     assert run(allow, "list", *archive) == "192.0.2.0/24\n"
     run(blocks, "add", "198.51.100.1", *both)
-    assert "1 lifted" in run(blocks, "panic", *both)
+    run(blocks, "add", "203.0.113.77/24", *both)
+    assert "203.0.113.0/24" in listed("203.0.113.0/24", archive)
+    assert "2 lifted" in run(blocks, "panic", *both)
     listed("nothing is blocked", archive)
-    events = [json.loads(line)["alert"]["category"] for line in eve.read_text().splitlines()]
-    assert events == ["block", "unblock", "block", "unblock"]
+    categories = ["block", "unblock", "block", "block", "unblock", "unblock"]
+    for _ in range(3000):  # lines are written by a thread of their own
+        events = [json.loads(line)["alert"]["category"] for line in eve.read_text().splitlines()]
+        if len(events) == len(categories):
+            break
+        time.sleep(0.02)
+    assert events == categories
 
 
 def test_unknown_id_is_named(tmp_path):
@@ -76,11 +92,48 @@ def test_unknown_id_is_named(tmp_path):
 
 def test_empty_archive_has_nothing_to_lift(tmp_path):
     """Panic without a firewall is no error."""
-    assert lift_in_archive(f"sqlite:///{tmp_path / 'archive.db'}") == 0
+    assert lift_in_archive(f"sqlite:///{tmp_path / 'archive.db'}") == []
 
 
-def test_nft_sets_by_family():
-    """Guards are no blocks."""
-    text = nft_sets([decision(), decision(action="protect")])
-    assert "set blocked4 { type ipv4_addr; elements = { 192.0.2.1 }; }" in text
-    assert "set blocked6 { type ipv6_addr; }" in text
+def test_why_tells_what_switches_did(tmp_path):
+    """Confirmations, drop counters, earlier offences and events, in the order of time."""
+    url = f"sqlite://{tmp_path / 'archive.db'}"
+    evidence = Evidence(key="network.anomaly.kitsune.alert", timestamp=5, summary="hot")
+    before = decision(id="d0", event_time=1)
+    made = decision(evidence=(evidence,))
+    said = Confirmation(
+        id="d1", switch="s1", state="installed", action="block", handle="ingress.x[]", event_time=1
+    )
+    state = {"switch": "s1", "blocks": [{"id": "d1", "packets": 1234, "bytes": 5}, {"id": "x", "packets": 1}]}
+    notice = {"kind": "resets", "text": "d1: half-open connections", "event_time": 1}
+    values = [
+        ("network.block.firewall.ipv4", before.to_value()),
+        ("network.block.firewall.ipv4", made.to_value()),
+        ("network.confirmation.p4runtime_ctrl.s1", said.to_value()),
+        ("network.switch.p4runtime_ctrl.s1", state),
+        ("network.event.firewall.resets", notice),
+        ("network.block.firewall.ipv4", decision(action="unblock", reason="over").to_value()),
+    ]
+    driver = open_archive(url)
+    driver.insert([Item(key, value, n, n, "a", "i", n) for n, (key, value) in enumerate(values, 10)])
+    driver.close()
+    lines = run(blocks, "why", "d1", "--archive", url).splitlines()
+    words = [
+        "d1 block 192.0.2.1",
+        "switch s1: installed",
+        "half-open",
+        "d1 unblock",
+        "before: 1 times",
+        "evidence:",
+    ]
+    words += ["hot (not kept in the archive)", "stopped by s1: 1,234 packets"]
+    assert [word in line for word, line in zip(words, lines, strict=True)] == [True] * len(words)
+
+
+def test_archive_of_a_machine_where_nothing_ran(monkeypatch, tmp_path):
+    """Nothing is blocked, and no file is made."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.delenv("DUE_ARCHIVE", raising=False)
+    assert run(blocks, "list") == "nothing is blocked or guarded\n"
+    assert list(tmp_path.iterdir()) == []

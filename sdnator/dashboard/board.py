@@ -1,0 +1,186 @@
+"""What the pages show: the newest of everything, bounded, whatever comes in.  Pure; thread-safe.
+
+Each topic has a number that grows with every change, so that a page sends only what is new to it, and
+any number of items between two frames costs one update.
+"""
+
+import threading
+from collections import Counter, OrderedDict, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from apps.messages import Alert, Confirmation, Decision
+
+ALERTS_KEPT: Final = 200
+DECISIONS_KEPT: Final = 500
+NAMES_KEPT: Final = 64
+BINS: Final = 240
+PARTS: Final = ("coordinator", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "dashboard")
+"""Apps whose absence is news; others come and go."""
+STANDING: Final = ("block", "protect")
+
+
+@dataclass(slots=True)
+class Bin:
+    """Scores that came in a slice of time."""
+
+    start: float
+    count: int = 0
+    over: int = 0
+    total: float = 0.0
+    highest: float = 0.0
+
+
+class Scores:
+    """Highest and mean score by slices of wall time; old slices fall out."""
+
+    def __init__(self, history_s: float) -> None:
+        self.width = history_s / BINS
+        self.bins: deque[Bin] = deque(maxlen=BINS)
+        self.packets = 0
+
+    def add(self, value: Mapping[str, Any], now: float) -> None:
+        """One summary of Kitsune, come at `now` (s)."""
+        start = now - now % self.width
+        if not self.bins or self.bins[-1].start != start:
+            self.bins.append(Bin(start))
+        slot, count = self.bins[-1], int(value["count"])
+        scores = value.get("score")
+        slot.count += count
+        slot.over += int(value["over"])
+        slot.total += float(scores.sum()) if scores is not None else float(value["max"]) * count
+        slot.highest = max(slot.highest, float(value["max"]))
+        self.packets += count
+
+    def rate(self, now: float, seconds: float = 5.0) -> float:
+        """Packets scored a second, of late."""
+        recent = [each for each in self.bins if each.start >= now - seconds]
+        return sum(each.count for each in recent) / seconds
+
+
+class Board:
+    """The state of the pipeline as pages show it."""
+
+    def __init__(self, history_s: float = 120.0) -> None:
+        self.lock = threading.Lock()
+        self.scores = Scores(history_s)
+        self.alerts: deque[Alert] = deque(maxlen=ALERTS_KEPT)
+        self.decisions: OrderedDict[tuple[str, str, str, int | None], Decision] = OrderedDict()
+        self.answers: OrderedDict[str, str] = OrderedDict()
+        """What switches said of decisions, by decision and switch."""
+        self.switches: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
+        self.health: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
+        self.apps: list[dict[str, Any]] = []
+        self.instances: list[dict[str, Any]] = []
+        self.flow: list[dict[str, Any]] = []
+        self.rates: dict[str, tuple[float, float]] = {}
+        """Items written and received a second, by app."""
+        self.coordinator = ""
+        """What is wrong with the Coordinator; empty: nothing."""
+        self.counts: Counter[str] = Counter()
+        self.versions: Counter[str] = Counter()
+        self._written: dict[str, tuple[float, int, int]] = {}
+
+    def score(self, value: Mapping[str, Any], now: float) -> None:
+        """A score summary."""
+        with self.lock:
+            self.scores.add(value, now)
+            self._changed("scores")
+
+    def alert(self, alert: Alert) -> None:
+        """An alert."""
+        with self.lock:
+            self.alerts.append(alert)
+            self._changed("alerts")
+
+    def decide(self, decisions: Iterable[Decision]) -> None:
+        """Decisions, in the order they were made: the latest of a target on a switch holds."""
+        with self.lock:
+            for each in decisions:
+                key = (each.switch, each.target.kind, each.target.address, each.target.port)
+                self.decisions.pop(key, None)
+                self.decisions[key] = each
+                while len(self.decisions) > DECISIONS_KEPT:
+                    self.decisions.popitem(last=False)
+                self._changed("decisions")
+
+    def confirm(self, confirmation: Confirmation) -> None:
+        """What a switch said."""
+        with self.lock:
+            name = f"{confirmation.id} {confirmation.switch}"
+            text = confirmation.state + (f": {confirmation.cause}" if confirmation.cause else "")
+            self.answers.pop(name, None)
+            self.answers[name] = text
+            while len(self.answers) > DECISIONS_KEPT:
+                self.answers.popitem(last=False)
+            self._changed("decisions")
+
+    def switch(self, value: Mapping[str, Any]) -> None:
+        """The state of a switch."""
+        with self.lock:
+            self._keep(self.switches, str(value["switch"]), value)
+            self._changed("switches")
+
+    def healthy(self, app: str, value: Mapping[str, Any]) -> None:
+        """What an app says of itself."""
+        with self.lock:
+            self._keep(self.health, app, value)
+            self._changed("health")
+
+    def coordinated(
+        self,
+        apps: list[dict[str, Any]],
+        instances: list[dict[str, Any]],
+        flow: list[dict[str, Any]],
+        now: float,
+    ) -> None:
+        """What the Coordinator says, at `now` (s)."""
+        with self.lock:
+            self.apps, self.instances, self.flow, self.coordinator = apps, instances, flow, ""
+            self._rate(now)
+            self._changed("apps")
+
+    def uncoordinated(self, why: str) -> None:
+        """The Coordinator does not answer."""
+        with self.lock:
+            self.coordinator = why
+            self._changed("apps")
+
+    def standing(self) -> list[Decision]:
+        """Blocks and guards in force, the newest first."""
+        return [each for each in reversed(self.decisions.values()) if each.action in STANDING]
+
+    def present(self) -> list[dict[str, Any]]:
+        """Apps that are here, and parts of the product that ought to be."""
+        return [app for app in self.apps if set(app["states"]) != {"offline"} or app["app_id"] in PARTS]
+
+    def line(self) -> float | None:
+        """The score from which Kitsune calls a packet anomalous."""
+        value = self.health.get("kitsune", {}).get("app", {}).get("line")
+        return float(value) if isinstance(value, int | float) else None
+
+    def _rate(self, now: float) -> None:
+        totals: dict[str, tuple[int, int]] = {}
+        for one in self.instances:
+            written, received = totals.get(one["app_id"], (0, 0))
+            totals[one["app_id"]] = (written + int(one["written"]), received + int(one["received"]))
+        for app, (written, received) in totals.items():
+            before = self._written.get(app)
+            if before is not None and now > before[0]:
+                seconds = now - before[0]
+                # a new instance begins at 0
+                rates = (written - before[1]) / seconds, (received - before[2]) / seconds
+                self.rates[app] = max(0.0, rates[0]), max(0.0, rates[1])
+        self._written = {app: (now, *both) for app, both in totals.items()}
+        self.rates = {app: rate for app, rate in self.rates.items() if app in totals}
+
+    def _keep(self, kept: OrderedDict[str, Mapping[str, Any]], name: str, value: Mapping[str, Any]) -> None:
+        kept[name] = value
+        kept.move_to_end(name)
+        while len(kept) > NAMES_KEPT:
+            kept.popitem(last=False)
+
+    def _changed(self, topic: str) -> None:
+        self.versions[topic] += 1
+        self.counts[topic] += 1

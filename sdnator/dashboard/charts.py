@@ -1,0 +1,136 @@
+"""Options of the two charts.  Pure; the colours do for light and dark."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sdnator.dashboard.board import Bin
+from sdnator.dashboard.texts import number
+
+GREY, BLUE, RED, AMBER = "#8a8f98", "#3b82d6", "#d9534f", "#e0a030"
+_LEAST_SCORE = 0.001
+_GRID = "rgba(128,128,128,0.18)"
+_PLACES = {
+    "p4runtime_ctrl": (12, 52),
+    "kitsune": (38, 88),
+    "sonata_adapter": (38, 18),
+    "firewall": (66, 52),
+    "dashboard": (90, 88),
+    "coordinator": (90, 18),
+}
+
+
+def score_chart() -> dict[str, Any]:
+    """Highest and mean score over time, and the line between normal and not."""
+    axis = {"axisLabel": {"color": GREY, "hideOverlap": True}, "splitLine": {"lineStyle": {"color": _GRID}}}
+    line = {"type": "line", "showSymbol": False, "data": []}
+    return {
+        "animation": False,
+        "grid": {"left": 48, "right": 16, "top": 34, "bottom": 26},
+        "legend": {"top": 0, "left": 40, "textStyle": {"color": GREY}, "itemHeight": 8},
+        "tooltip": {"trigger": "axis"},
+        "xAxis": {"type": "time", **axis},
+        "yAxis": {"type": "log", "min": _LEAST_SCORE, **axis},
+        "series": [
+            {
+                **line,
+                "name": "highest score",
+                "lineStyle": {"color": RED, "width": 1.5},
+                "itemStyle": {"color": RED},
+                "markLine": threshold(None),
+            },
+            {
+                **line,
+                "name": "mean score",
+                "lineStyle": {"color": BLUE, "width": 1.5},
+                "itemStyle": {"color": BLUE},
+                "areaStyle": {"color": BLUE, "opacity": 0.12},
+            },
+        ],
+    }
+
+
+def threshold(value: float | None) -> dict[str, Any]:
+    """The line over which a packet is anomalous; none while it is not known."""
+    return {
+        "silent": True,
+        "symbol": "none",
+        "lineStyle": {"color": AMBER, "type": "dashed", "width": 1.5},
+        "label": {"formatter": "threshold {c}", "position": "insideEndTop", "color": AMBER},
+        "data": [] if value is None else [{"yAxis": value}],
+    }
+
+
+def score_points(bins: Iterable[Bin]) -> tuple[list[list[float]], list[list[float]]]:
+    """Points of both series: time in ms, score."""
+    highest, mean = [], []
+    for each in bins:
+        if each.count:
+            at = round(each.start * 1e3)
+            highest.append([at, max(_LEAST_SCORE, round(each.highest, 4))])
+            mean.append([at, max(_LEAST_SCORE, round(each.total / each.count, 4))])
+    return highest, mean
+
+
+def flow_chart(
+    apps: Iterable[Mapping[str, Any]],
+    flow: Iterable[Mapping[str, Any]],
+    rates: Mapping[str, tuple[float, float]],
+) -> dict[str, Any]:
+    """Apps as nodes with what they write and receive a second; who gets what from whom as edges."""
+    keys: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
+    for one in flow:
+        if one["producer"] != one["consumer"]:
+            keys[one["producer"], one["consumer"]].add(str(one["interest"]).partition(":")[0])
+    names = sorted({str(app["app_id"]) for app in apps} | {name for pair in keys for name in pair})
+    strangers = [name for name in names if name not in _PLACES]
+    hidden = {"show": False, "min": 0, "max": 100}
+    return {
+        "animation": False,
+        "tooltip": {"confine": True},
+        "grid": {"left": 30, "right": 30, "top": 10, "bottom": 50},
+        "xAxis": hidden,
+        "yAxis": hidden,
+        "series": [
+            {
+                "type": "graph",
+                "coordinateSystem": "cartesian2d",
+                "symbolSize": 24,
+                "edgeSymbol": ["none", "arrow"],
+                "edgeSymbolSize": 8,
+                "label": {
+                    "show": True,
+                    "position": "bottom",
+                    "color": GREY,
+                    "lineHeight": 15,
+                    "align": "center",
+                },
+                "lineStyle": {"color": GREY, "opacity": 0.7},
+                "data": [_node(name, rates, strangers) for name in names],
+                "links": [_edge(pair, sorted(found), rates) for pair, found in sorted(keys.items())],
+            }
+        ],
+    }
+
+
+def _node(name: str, rates: Mapping[str, tuple[float, float]], strangers: list[str]) -> dict[str, Any]:
+    written, received = rates.get(name, (0.0, 0.0))
+    text = f"{name}: writes {number(written)}, receives {number(received)} items a second"
+    return {
+        "name": name,
+        "value": _PLACES.get(name) or (8 + 14 * (strangers.index(name) % 7), 0),
+        "itemStyle": {"color": BLUE if name in _PLACES else AMBER},
+        "label": {"formatter": f"{name}\n▲ {number(written)}/s  ▼ {number(received)}/s"},
+        "tooltip": {"formatter": text},
+    }
+
+
+def _edge(pair: tuple[str, str], keys: list[str], rates: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    producer, consumer = pair
+    written = rates.get(producer, (0.0, 0.0))[0]
+    return {
+        "source": producer,
+        "target": consumer,
+        "lineStyle": {"width": 1 + min(4.0, len(str(int(written))) * 0.7), "curveness": 0.16},
+        "tooltip": {"formatter": "<br>".join([f"{producer} → {consumer}", *keys[:12]])},
+    }

@@ -1,0 +1,70 @@
+"""The page: header, tabs, and the clock that brings them up to date."""
+
+from typing import TYPE_CHECKING
+
+from nicegui import app, ui
+
+from sdnator.dashboard.acting import Acting
+from sdnator.dashboard.apps_panel import AppsPanel
+from sdnator.dashboard.archive_panel import ArchivePanel
+from sdnator.dashboard.live_panel import LivePanel
+from sdnator.dashboard.style import STYLE
+from sdnator.dashboard.switches_panel import SwitchesPanel
+
+if TYPE_CHECKING:
+    from sdnator.dashboard.service import DashboardService
+
+
+def build(service: "DashboardService") -> None:
+    """One browser's page."""
+    ui.add_css(STYLE)
+    ui.colors(primary="#2f6fb3")
+    session = str(app.storage.browser["id"])
+    acting = Acting(service, session)
+    with ui.header(elevated=False).classes("items-center bar"):
+        ui.label("SDNator").classes("text-weight-medium text-subtitle1")
+        ui.space()
+        _dark_button()
+        acting.sign_in_button()
+    with ui.tabs().props("dense align=left no-caps inline-label").classes("w-full") as tabs:
+        names = {"Live": "monitor_heart", "Apps": "hub", "Switches": "lan", "Archive": "manage_search"}
+        places = {name: ui.tab(name, icon=icon) for name, icon in names.items()}
+    tabs.set_value("Live")
+    with ui.tab_panels(tabs, value="Live", animated=False).classes("w-full").props("keep-alive"):
+        with ui.tab_panel(places["Live"]).classes("q-pa-none"):
+            live = LivePanel(service, acting)
+        with ui.tab_panel(places["Apps"]).classes("q-pa-none"):
+            apps = AppsPanel(service.board)
+        with ui.tab_panel(places["Switches"]).classes("q-pa-none"):
+            switches = SwitchesPanel(service)
+        with ui.tab_panel(places["Archive"]).classes("q-pa-none"):
+            ArchivePanel(service)
+
+    def refresh() -> None:
+        """Only what is on show costs anything."""
+        if tabs.value == "Live":
+            live.refresh()
+        elif tabs.value == "Apps":
+            apps.refresh()
+
+    async def refresh_switches() -> None:
+        if tabs.value == "Switches":
+            await switches.refresh()
+
+    ui.timer(1 / service.settings.frames, refresh)
+    ui.timer(3.0, refresh_switches)
+    tabs.on_value_change(refresh_switches)
+
+
+def _dark_button() -> None:
+    """Follows the browser until it is pressed."""
+    dark = ui.dark_mode(None)
+
+    async def turn() -> None:
+        now = dark.value
+        if now is None:
+            now = await ui.run_javascript("matchMedia('(prefers-color-scheme: dark)').matches", timeout=5)
+        dark.set_value(not now)
+
+    button = ui.button(icon="contrast", on_click=turn).props("flat dense round color=white")
+    button.props('aria-label="light or dark"')

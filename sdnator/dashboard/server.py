@@ -1,0 +1,105 @@
+"""Serves the pages: which browsers are answered, and the web server around NiceGUI, in a thread of its own."""
+
+import asyncio
+import ipaddress
+import secrets
+import socket
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+if TYPE_CHECKING:
+    from sdnator.dashboard.service import DashboardService
+
+_HISTORY = 100
+"""Messages kept for a browser whose connection breaks; the next frame makes up for the others."""
+_RECONNECT_SECONDS = 30.0
+"""How long a browser may be away without its page being loaded anew."""
+_HEADERS = {
+    b"x-content-type-options": b"nosniff",
+    b"x-frame-options": b"DENY",
+    b"referrer-policy": b"no-referrer",
+}
+
+
+def named_well(host: str, names: Iterable[str]) -> bool:
+    """Whether a Host header may be answered: a foreign name that leads to us would be another site's trick."""
+    name = urlsplit(f"//{host}").hostname or ""
+    if name == "localhost" or name in names:
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+class Guard:
+    """Refuses requests under foreign names or from pages of other sites; adds headers that browsers heed."""
+
+    def __init__(self, app: Any, names: Iterable[str]) -> None:
+        self._app = app
+        self._names = frozenset(names)
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """ASGI."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = dict(scope["headers"])
+        host = headers.get(b"host", b"").decode("latin-1")
+        origin = headers.get(b"origin", b"").decode("latin-1")
+        if named_well(host, self._names) and (not origin or urlsplit(origin).netloc == host):
+            await self._app(scope, receive, _with_headers(send))
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            text = b"refused: this name is not among dashboard.names\n"
+            await send({"type": "http.response.start", "status": 403, "headers": []})
+            await send({"type": "http.response.body", "body": text})
+
+
+def _with_headers(send: Any) -> Any:
+    async def answer(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [*message.get("headers", ()), *_HEADERS.items()]
+        await send(message)
+
+    return answer
+
+
+def serve(
+    service: "DashboardService", listener: socket.socket, started: Callable[[Callable[[], None]], None]
+) -> None:
+    """Run until stopped; `started` gets the function that stops it."""
+    import uvicorn
+    from fastapi import FastAPI
+    from nicegui import ui
+
+    from sdnator.dashboard.page import build
+
+    app = FastAPI(openapi_url=None)
+    ui.run_with(
+        app,
+        root=lambda: build(service),
+        title="SDNator",
+        dark=None,
+        tailwind=False,
+        binding_refresh_interval=None,
+        message_history_length=_HISTORY,
+        reconnect_timeout=_RECONNECT_SECONDS,
+        show_welcome_message=False,
+        # forgotten with the process: who was signed in signs in again
+        storage_secret=secrets.token_urlsafe(32),
+        session_middleware_kwargs={"session_cookie": "sdnator", "same_site": "strict"},
+    )
+    guarded: Any = Guard(app, service.settings.names)
+    config = uvicorn.Config(guarded, log_level="warning", access_log=False, lifespan="on")
+    server = uvicorn.Server(config)
+
+    def stop() -> None:
+        server.should_exit = True
+        server.force_exit = True
+
+    started(stop)
+    asyncio.run(server.serve(sockets=[listener]))

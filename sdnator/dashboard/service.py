@@ -1,0 +1,215 @@
+"""The dashboard as a DUE app: data in, pages out, instructions of people to the firewall.
+
+Callbacks run in the engine's thread and only note what came; pages are served in a thread of their own
+and look at the board a few times a second.
+"""
+
+import logging
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import due.service
+from apps.messages import Alert, Answer, Confirmation, Decision, Instruction
+from due import NO_WAIT, Capability, Engine, Interest, Item
+from due.errors import DueError, InvalidOption
+from sdnator.dashboard.board import Board
+from sdnator.dashboard.settings import Settings
+from sdnator.dashboard.sign_in import Sessions, WeakToken, token_from
+from sdnator.errors import SdnatorError
+
+ANSWERS = "network.answer.firewall.dashboard"
+INSTRUCTION = "network.instruction.dashboard.firewall"
+DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*")
+
+INTERESTS = (
+    Interest("network.anomaly.kitsune.score"),
+    Interest("network.anomaly.kitsune.alert"),
+    *(Interest(key) for key in DECISIONS),
+    Interest("network.confirmation.p4runtime_ctrl.*"),
+    Interest("network.switch.p4runtime_ctrl.*"),
+    Interest("due.health.*"),
+    Interest(ANSWERS),
+)
+CAPABILITIES = (Capability(INSTRUCTION, delivery="reliable", archive="always"),)
+
+_POLL_SECONDS = 2.0
+_ANSWER_SECONDS = 10.0
+_WAITING = 64
+
+log = logging.getLogger(__name__)
+
+
+class DashboardService:
+    """Fills the board; `instruct` and `find` are what pages ask for."""
+
+    def __init__(self, engine: Engine, settings: Settings) -> None:
+        self.settings = settings
+        self.board = Board(settings.history_s)
+        self.sessions = Sessions("")
+        self._engine = engine
+        self._waiting: dict[str, Callable[[Answer], None]] = {}
+        self._misunderstood = 0
+        self._stopping = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._socket: socket.socket | None = None
+        self._stop_server: Callable[[], None] = lambda: None
+
+    def start(self) -> None:
+        """Subscribe, listen, and serve as soon as the page's library is loaded.  Raises InvalidOption."""
+        try:
+            self.sessions = Sessions(token_from(self.settings.token_file, os.environ))
+        except (WeakToken, OSError) as error:
+            raise InvalidOption(f"dashboard.token_file: {error}") from None
+        self._socket = listening(self.settings.host, self.settings.port)
+        self._subscribe()
+        self._take_up_history()
+        for work, name in ((self._serve, "pages"), (self._poll, "coordinator")):
+            thread = threading.Thread(target=work, name=f"dashboard {name}", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def ready(self) -> dict[str, Any]:
+        """For the ready line."""
+        return {"dashboard": self.url}
+
+    @property
+    def url(self) -> str:
+        """Of the page."""
+        if self._socket is None:
+            return ""
+        host, port = self._socket.getsockname()[:2]
+        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
+        return f"http://{shown}:{port}/"
+
+    def tick(self) -> None:
+        """All work is done in threads of its own."""
+
+    def stop(self) -> None:
+        """Close the pages."""
+        self._stopping.set()
+        self._stop_server()
+        for thread in self._threads:
+            thread.join(5)
+
+    def health(self) -> dict[str, Any]:
+        """Counters for people."""
+        with self.board.lock:
+            return {**self.board.counts, "misunderstood": self._misunderstood}
+
+    def _subscribe(self) -> None:
+        observe = self._engine.observe
+        board = self.board
+        handlers: dict[str, Callable[[Item], None]] = {
+            "network.anomaly.kitsune.score": lambda item: board.score(item.value, time.time()),
+            "network.anomaly.kitsune.alert": lambda item: board.alert(Alert.from_value(item.value)),
+            **dict.fromkeys(DECISIONS, lambda item: board.decide([Decision.from_value(item.value)])),
+            "network.confirmation.p4runtime_ctrl.*": lambda item: board.confirm(
+                Confirmation.from_value(item.value)
+            ),
+            "network.switch.p4runtime_ctrl.*": lambda item: board.switch(item.value),
+            "due.health.*": lambda item: board.healthy(item.app_id, item.value),
+            ANSWERS: self._on_answer,
+        }
+        for key, handler in handlers.items():
+            observe(key).subscribe(self._tolerant(handler))
+
+    def _tolerant(self, handler: Callable[[Item], None]) -> Callable[[Item], None]:
+        """A value that is not understood is counted: a viewer must not have reliable items sent again."""
+
+        def handle(item: Item) -> None:
+            try:
+                handler(item)
+            except (ValueError, TypeError, KeyError, AttributeError) as error:
+                self._misunderstood += 1
+                log.warning("%s: not understood: %s", item.key, error)
+
+        return handle
+
+    def _take_up_history(self) -> None:
+        """Decisions in force and the last alerts, from the archive."""
+        try:
+            items = [item for key in DECISIONS for item in self._engine.get(key)]
+        except DueError as error:
+            log.warning("Data Archives do not answer, showing no history: %s", error)
+            return
+        ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
+        self.board.decide(Decision.from_value(item.value) for item in ordered)
+        since = time.time_ns() - 86_400 * 10**9
+        query = {"dataKey": "network.anomaly.kitsune.alert", "timestamp": {"$gte": since}}
+        for item in self._engine.get(query)[-200:]:
+            self.board.alert(Alert.from_value(item.value))
+
+    def instruct(self, verb: Any, subject: str, answered: Callable[[Answer], None]) -> str:
+        """Tell the firewall; `answered` is called in the engine's thread.  Returns the instruction's id."""
+        instruction = Instruction(id=uuid4().hex[:12], verb=verb, subject=subject, reason="by the dashboard")
+        while len(self._waiting) >= _WAITING:
+            self._waiting.pop(next(iter(self._waiting)))
+        self._waiting[instruction.id] = answered
+        self._engine.write(INSTRUCTION, instruction.to_value(), [NO_WAIT])
+        log.info("%s %s, by somebody who has signed in", verb, subject)
+        return instruction.id
+
+    def forget(self, instruction: str) -> None:
+        """Nobody waits for this answer any more."""
+        self._waiting.pop(instruction, None)
+
+    def _on_answer(self, item: Item) -> None:
+        answer = Answer.from_value(item.value)
+        waiting = self._waiting.pop(answer.id, None)
+        if waiting is not None:
+            waiting(answer)
+
+    def find(self, key: str, start: int, end: int, limit: int) -> tuple[list[Item], bool]:
+        """The youngest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
+        from sdnator.due_commands import youngest
+
+        return youngest(self._engine.get, {"dataKey": key}, start, end, limit)
+
+    def _poll(self) -> None:
+        from sdnator.coordinator_commands import ask
+
+        while not self._stopping.wait(_POLL_SECONDS if self.board.versions["apps"] else 0.2):
+            try:
+                url = Path(self.settings.coordinator_file).read_text(encoding="utf-8").strip()
+                apps, instances, flow = (ask(url, path) for path in ("/apps", "/instances", "/flow"))
+            except (OSError, SdnatorError) as error:
+                self.board.uncoordinated(str(error))
+            else:
+                self.board.coordinated(apps, instances, flow, time.monotonic())
+
+    def _serve(self) -> None:
+        from sdnator.dashboard.server import serve
+
+        assert self._socket is not None  # noqa: S101 - opened by start
+        try:
+            serve(self, self._socket, self._server_started)
+        except Exception:
+            # a thread's end is silent, and a dashboard without pages is none
+            log.exception("the pages cannot be served")
+            os._exit(1)
+
+    def _server_started(self, stop: Callable[[], None]) -> None:
+        self._stop_server = stop
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A socket that listens; where the port is taken, on a free one.  Raises OSError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if not port:
+            raise
+        log.warning("port %d: %s; a free one is taken", port, error.strerror)
+        return socket.create_server((host, 0), family=family)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the dashboard until it is told to stop."""
+    return due.service.run("dashboard", DashboardService, Settings, INTERESTS, CAPABILITIES, argv)

@@ -1,0 +1,45 @@
+"""The look of the pages, beyond what NiceGUI brings.  Colours with alpha do for light and dark."""
+
+STYLE = """
+body { font-variant-numeric: tabular-nums; }
+.w-full { width: 100%; }
+.bar { padding: 2px 16px; display: flex; align-items: center; }
+.q-tab-panels { background: transparent !important; overflow: visible; }
+.nicegui-content { padding: 12px; gap: 12px; max-width: 1500px; margin: 0 auto; width: 100%; }
+.board { display: grid; gap: 12px; width: 100%; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); }
+.board > .wide { grid-column: 1 / -1; }
+.figures { display: grid; gap: 8px; width: 100%; grid-template-columns: repeat(auto-fit, minmax(120px, 1fr)); }
+.figure { border: 1px solid rgba(128, 128, 128, .25); border-radius: 8px; padding: 8px 12px; }
+.figure .number { font-size: 1.45rem; font-weight: 500; line-height: 1.3; }
+.figure .name { font-size: .75rem; opacity: .7; }
+.panel { border: 1px solid rgba(128, 128, 128, .25); border-radius: 8px; padding: 12px; min-width: 0; }
+.panel-title { font-weight: 500; font-size: .95rem; margin-bottom: 4px; }
+.quiet { opacity: .7; font-size: .8rem; }
+.fault { color: #c62828; }
+.body--dark .fault { color: #ef9a9a; }
+.feed { width: 100%; }
+.feed .q-table__top, .feed thead { display: none; }
+.feed td { white-space: normal !important; padding: 6px 4px !important; height: auto !important; }
+.entry { display: flex; gap: 10px; align-items: flex-start; width: 100%; }
+.entry .text { flex: 1 1 auto; min-width: 0; overflow-wrap: anywhere; line-height: 1.35; }
+.entry .text .second { opacity: .75; font-size: .8rem; }
+.entry .side { flex: 0 0 auto; display: flex; gap: 4px; flex-wrap: wrap; justify-content: flex-end; }
+.mark { flex: 0 0 auto; width: 4px; align-self: stretch; border-radius: 2px; background: #8884; }
+.mark.block { background: #d32f2f; } .mark.protect { background: #1976d2; } .mark.alert { background: #f9a825; }
+.plain { width: 100%; }
+.plain td { white-space: normal !important; overflow-wrap: break-word; }
+.found td:last-child { overflow-wrap: anywhere; }
+.plain td:first-child { white-space: nowrap !important; }
+.q-table__card { background: transparent !important; }
+.choice { min-width: 150px; }
+.nothing { padding: 8px 4px; opacity: .7; }
+.form { display: flex; gap: 8px; flex-wrap: wrap; align-items: center; width: 100%; }
+@media (max-width: 900px) {
+  .board { grid-template-columns: minmax(0, 1fr); }
+  .figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
+  .nicegui-content { padding: 8px; gap: 8px; }
+  .q-tab__icon { display: none; }
+  .entry { flex-wrap: wrap; } .entry .text { flex-basis: 70%; }
+  .entry .side { margin-left: 14px; }
+}
+"""

@@ -1,0 +1,57 @@
+"""How times, rates and things are written on the pages.  Pure."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from apps.messages import Alert, Decision, Target
+
+
+def clock(time_ns: int) -> str:
+    """A UTC time of day, with the date where that is not today's."""
+    when = datetime.fromtimestamp(time_ns / 1e9, UTC)
+    today = datetime.now(UTC).date() == when.date()
+    return f"{when:%H:%M:%S}" if today else f"{when:%Y-%m-%d %H:%M:%S}"
+
+
+def number(value: float) -> str:
+    """Short: 12, 4.1 k, 2.3 M."""
+    for least, unit in ((1e6, " M"), (1e4, " k")):
+        if value >= least:
+            return f"{value / least:.1f}{unit}" if unit == " M" else f"{value / 1e3:.1f}{unit}"
+    return f"{value:,.0f}" if value >= 10 or value == int(value) else f"{value:.1f}"
+
+
+def target(one: Target) -> str:
+    """What a decision is about."""
+    return f"{one.address} port {one.port}" if one.port is not None else one.address
+
+
+def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
+    """A decision for the list."""
+    until = f"until {clock(one.expires)}" if one.expires else "without end"
+    said = ", ".join(f"{switch}: {text}" for switch, text in answers.items())
+    where = "all switches" if one.switch in ("", "*") else one.switch
+    return {
+        "id": one.id,
+        "action": one.action,
+        "target": target(one.target),
+        "address": one.target.address,
+        "where": f"{'dry run · ' if one.dry_run else ''}{where} · {until}",
+        "reason": one.reason,
+        "said": said,
+        "undo": one.action == "block",
+    }
+
+
+def alert_row(one: Alert, number: int) -> dict[str, Any]:
+    """An alert for the list."""
+    sender = one.sender
+    who = f"{sender.ip or sender.mac}" + (f" ({sender.mac})" if sender.ip else "")
+    return {
+        "id": number,
+        "target": who,
+        "address": sender.ip or sender.mac,
+        "where": f"{clock(one.event_time)} · {sender.switch} port {sender.port} · score {one.peak_score:.1f} "
+        f"· {one.over} of {one.packets} packets over the line",
+        "reason": one.reason,
+    }

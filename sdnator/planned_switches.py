@@ -1,0 +1,95 @@
+"""Switches as people write them: ports and wires, checked before anything starts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from sdnator.errors import BadInput
+from sdnator.up_settings import SwitchPlan
+
+_PORTS = range(511)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedSwitch:
+    """A switch to start, or to use."""
+
+    name: str = "s1"
+    kind: str = "embedded"
+    """embedded, bmv2, or HOST:PORT of a P4Runtime switch that runs already."""
+    device_id: int = 1
+    ports: Mapping[int, str] = field(default_factory=dict)
+    """Port number to `veth:INTERFACE` or `null`, for a switch that we start."""
+    forward: Mapping[int, int] = field(default_factory=dict)
+    """Ingress port to egress port."""
+    fail: Literal["open", "closed"] = "open"
+
+
+def planned(plan: SwitchPlan, *, look: bool = True) -> PlannedSwitch:
+    """Ports and wires read; raises BadInput naming the wrong one.  `look`: are the interfaces there?"""
+    ports = parse_ports(plan.ports, plan.kind, look=look)
+    return PlannedSwitch(
+        name=plan.name,
+        kind=plan.kind,
+        device_id=plan.device_id,
+        ports=ports,
+        forward=parse_wires(plan.wires, ports, plan.kind),
+        fail=plan.fail,
+    )
+
+
+def parse_ports(options: Sequence[str], switch: str, *, look: bool = True) -> dict[int, str]:
+    """`N=veth:NAME` or `N=null`, by number; raises BadInput naming the wrong one."""
+    if switch not in ("embedded", "bmv2"):
+        host, _, number = switch.rpartition(":")
+        if not host or not number.isdecimal():
+            raise BadInput(f"--switch {switch}: give embedded, bmv2 or HOST:PORT")
+        if options:
+            raise BadInput(f"--port: the ports of the switch at {switch} are its own; leave --port out")
+    ports: dict[int, str] = {}
+    for option in options:
+        number, _, kind = option.partition("=")
+        place = _port_number(number, f"--port {option}")
+        if place in ports:
+            raise BadInput(f"--port {option}: port {place} is given twice")
+        ports[place] = _port_kind(option, kind, switch, look=look)
+    return ports
+
+
+def _port_kind(option: str, kind: str, switch: str, *, look: bool) -> str:
+    name = kind.removeprefix("veth:")
+    if kind != "null" and (name == kind or not name):
+        raise BadInput(f"--port {option}: give N=veth:INTERFACE or N=null (captures: `sdnator replay`)")
+    if kind == "null" and switch == "bmv2":
+        raise BadInput(f"--port {option}: BMv2 has interfaces only; give N=veth:INTERFACE")
+    if look and kind != "null" and not Path("/sys/class/net", name).exists():
+        raise BadInput(f"--port {option}: there is no interface {name}; see `ip link`")
+    return kind
+
+
+def parse_wires(options: Sequence[str] | None, ports: Mapping[int, str], switch: str) -> dict[int, int]:
+    """Ingress port to egress port, both ways; raises BadInput naming the wrong wire."""
+    if not options:
+        first, second, *more = [*ports, 0, 0]
+        return {first: second, second: first} if len(more) == len(ports) == 2 else {}
+    if list(options) == ["none"]:
+        return {}
+    forward: dict[int, int] = {}
+    for option in options:
+        ends = [_port_number(end, f"--wire {option}") for end in option.split("-")]
+        if len(ends) != 2 or ends[0] == ends[1]:
+            raise BadInput(f"--wire {option}: give two ports, such as 1-2, or none")
+        for near, far in (ends, ends[::-1]):
+            if near in forward:
+                raise BadInput(f"--wire {option}: port {near} has a wire already")
+            if switch in ("embedded", "bmv2") and near not in ports:
+                raise BadInput(f"--wire {option}: there is no port {near}; add --port {near}=veth:INTERFACE")
+            forward[near] = far
+    return forward
+
+
+def _port_number(text: str, option: str) -> int:
+    if not text.isascii() or not text.isdecimal() or int(text) not in _PORTS[1:-1]:
+        raise BadInput(f"{option}: ports are numbered from 1 to 509")
+    return int(text)

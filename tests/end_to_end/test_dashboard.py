@@ -1,0 +1,181 @@
+"""The dashboard as people use it: a real browser signs in, undoes a block, and the switch has no rule any more."""
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.test_bad_input import processes_of
+from tests.end_to_end.test_up import Operator, until
+from tests.requirements import missing, require_program
+
+ADDRESS = "198.51.100.66"
+
+
+def browser():
+    """A headless Chromium under the driver's hand."""
+    chromium, driver = require_program("chromium"), require_program("chromedriver")
+    try:
+        from selenium import webdriver
+    except ImportError:
+        missing("selenium is not installed")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(word)
+    options.add_argument("--window-size=1280,900")
+    return webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+
+
+def soon(condition):
+    """Whether it comes about in a while; if not, the step before it is done again."""
+    deadline = time.monotonic() + 15
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+class Page:
+    """What a person does with the page."""
+
+    def __init__(self, driver, url):
+        self.driver = driver
+        driver.get(url)
+
+    def seen(self, selector, text=""):
+        """The first visible element, None where there is none now; a page may change under one's eyes."""
+        from selenium.common.exceptions import StaleElementReferenceException
+        from selenium.webdriver.common.by import By
+
+        try:
+            for found in self.driver.find_elements(By.CSS_SELECTOR, selector):
+                if found.is_displayed() and text in found.text:
+                    return found
+        except StaleElementReferenceException:
+            pass
+        return None
+
+    def find(self, selector, text=""):
+        """The first visible element, waited for."""
+        return until(lambda: self.seen(selector, text))
+
+    def click_now(self, selector, text=""):
+        """Whether it was there to be clicked."""
+        from selenium.common.exceptions import WebDriverException
+
+        found = self.seen(selector, text)
+        try:
+            if found is not None:
+                found.click()
+        except WebDriverException:  # something lies before it, or it is gone
+            return False
+        return found is not None
+
+    def click(self, selector, text=""):
+        until(lambda: self.click_now(selector, text))
+
+    def type_now(self, selector, text):
+        """Over what is there; whether the field says so: the page may bring it up to date meanwhile."""
+        from selenium.common.exceptions import WebDriverException
+        from selenium.webdriver.common.keys import Keys
+
+        field = self.seen(selector)
+        try:
+            if field is None:
+                return False
+            field.send_keys(Keys.CONTROL, "a")
+            field.send_keys(text)
+            return field.get_attribute("value") == text
+        except WebDriverException:
+            return False
+
+    def sign_in(self, token, done):
+        """Open the dialog, give the token; once more where a slow machine had the page loaded anew."""
+
+        def attempt():
+            if done():
+                return True
+            if not self.seen(".token input"):
+                self.click_now(".sign-in")
+                soon(lambda: self.seen(".token input") or done())
+            if self.type_now(".token input", token):
+                self.click_now(".sign-in-now")
+                soon(done)
+            return done()
+
+        until(attempt)
+
+    def shows(self, selector):
+        from selenium.webdriver.common.by import By
+
+        return bool(self.driver.find_elements(By.CSS_SELECTOR, selector))
+
+    def text(self):
+        return self.driver.execute_script("return document.body.innerText")
+
+
+@pytest.fixture
+def running(tmp_path):
+    """An operator's pipeline with the page on a free port."""
+    operator = Operator(tmp_path)
+    operator.environment["SDNATOR_DASHBOARD_PORT"] = "0"
+    with operator.up(page=()) as (_, said):
+        yield operator, said
+    assert processes_of(operator.mark) == []
+
+
+def blocked(operator):
+    entries = operator.figures("tables", "s1", "--table", "block_src")["entries"]
+    return any(ADDRESS in one["entry"] for one in entries)
+
+
+@pytest.mark.timeout(480)
+def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
+    operator, said = running
+    token = Path(said["token_file"]).read_text().strip()
+    until(lambda: operator.figures("status")["apps"].get("firewall") == "active")
+    backends = ("--updates", said["updates"], "--archive", said["archive"])
+
+    def told():
+        done = operator.run("blocks", "add", ADDRESS, "--reason", "a test", *backends)
+        return done.returncode == 0 or "blocked already" in done.stderr
+
+    until(told)
+    until(lambda: blocked(operator))
+    driver = browser()
+    try:
+        page = Page(driver, said["dashboard"])
+        page.find(".decisions", ADDRESS)
+        assert not page.shows(".undo"), "who has not signed in may only look"
+        page.sign_in("not the token, but as long", lambda: page.seen(".fault", "not the token"))
+        page.sign_in(token, lambda: page.seen(".sign-out"))
+
+        def gone():
+            return page.seen(".decisions", "nothing is blocked")
+
+        until(lambda: gone() or (page.click_now(".undo") and soon(gone)))
+        until(lambda: not blocked(operator))
+        look_around(page)
+    finally:
+        driver.quit()
+
+
+def look_around(page):
+    """The other tabs show the parts, the switch, the archive; nothing comes from elsewhere."""
+    page.click(".q-tab", "Apps")
+    until(lambda: all(name in page.text() for name in ("kitsune", "sonata_adapter", "active")))
+    page.click(".q-tab", "Switches")
+    page.find(".tables", "block_src")
+    page.click(".q-tab", "Archive")
+    until(lambda: page.type_now(".search-key input", "network.block.firewall.*"))
+    page.click(".search-now")
+    page.find(".found", ADDRESS)
+    names = page.driver.execute_script("return performance.getEntriesByType('resource').map(one => one.name)")
+    origin = page.driver.execute_script("return location.origin")
+    assert names
+    assert [name for name in names if not name.startswith((origin, "data:", "blob:"))] == []
+    faults = [one for one in page.driver.get_log("browser") if one["level"] == "SEVERE"]
+    assert faults == [], json.dumps(faults)[:2000]

@@ -1,0 +1,105 @@
+"""Whatever comes in, the board keeps the newest, bounded, and counts what it saw."""
+
+import numpy as np
+
+from apps.messages import Alert, Confirmation, Decision, Sender, Target
+from sdnator.dashboard.board import ALERTS_KEPT, BINS, DECISIONS_KEPT, NAMES_KEPT, Board
+
+
+def scored(*scores):
+    values = np.array(scores)
+    return {
+        "count": len(scores),
+        "over": int((values >= 1).sum()),
+        "max": float(values.max()),
+        "score": values,
+    }
+
+
+def decision(number, action="block", address="192.0.2.1"):
+    return Decision(
+        id=str(number), action=action, switch="s1", target=Target(kind="ip", address=address),
+        reason="", event_time=number, expires=0,
+    )  # fmt: skip
+
+
+def alert(number):
+    return Alert(
+        id=str(number), sender=Sender(switch="s1", port=1, mac="02:00:00:00:00:01"), event_time=number,
+        first_packet=0, packets=1, over=1, peak_score=2.0, hot_seconds=1, rate=1.0, training_rate=1.0,
+        mac_addresses=1, reason="",
+    )  # fmt: skip
+
+
+def test_scores_are_gathered_in_slices_of_time():
+    board = Board(history_s=240.0)
+    board.score(scored(0.1, 0.3), 100.0)
+    board.score(scored(2.0), 100.5)
+    board.score(scored(0.5), 101.5)
+    first, second = board.scores.bins
+    assert (first.count, first.over, first.highest, round(first.total, 3)) == (3, 1, 2.0, 2.4)
+    assert (second.count, second.over) == (1, 0)
+    assert board.scores.rate(101.6, 2.0) == 2.0
+
+
+def test_everything_is_bounded():
+    board = Board(history_s=24.0)
+    for number in range(2_000):
+        board.score(scored(0.1), number * 0.2)
+        board.alert(alert(number))
+        board.decide([decision(number, address=f"10.0.{number // 250}.{number % 250}")])
+        board.confirm(
+            Confirmation(id=str(number), switch="s1", state="installed", action="block", event_time=0)
+        )
+        board.switch({"switch": f"s{number}"})
+        board.healthy(f"app{number}", {})
+    assert len(board.scores.bins) == BINS
+    assert len(board.alerts) == ALERTS_KEPT
+    assert len(board.decisions) == len(board.answers) == DECISIONS_KEPT
+    assert len(board.switches) == len(board.health) == NAMES_KEPT
+    assert board.counts["alerts"] == 2_000
+
+
+def test_the_latest_decision_of_a_target_holds():
+    board = Board()
+    board.decide([decision(1), decision(2, address="192.0.2.2"), decision(3, "unblock")])
+    assert [each.id for each in board.standing()] == ["2"]
+    board.decide([decision(4)])
+    assert [each.id for each in board.standing()] == ["4", "2"]
+
+
+def test_rates_follow_from_two_looks_and_a_new_instance_begins_at_none():
+    board = Board()
+
+    def look(written, now):
+        instances = [{"app_id": "a", "written": written, "received": 0}]
+        board.coordinated([{"app_id": "a", "states": {"active": 1}}], instances, [], now)
+
+    look(100, 10.0)
+    assert board.rates == {}
+    look(150, 12.0)
+    assert board.rates == {"a": (25.0, 0.0)}
+    look(0, 14.0)
+    assert board.rates == {"a": (0.0, 0.0)}
+
+
+def test_apps_that_came_and_went_are_no_news_but_missing_parts_are():
+    board = Board()
+    apps = [{"app_id": name, "states": {"offline": 1}} for name in ("observe-1", "kitsune")]
+    board.coordinated(apps, [], [], 1.0)
+    assert [app["app_id"] for app in board.present()] == ["kitsune"]
+
+
+def test_the_line_is_kitsunes_own():
+    board = Board()
+    assert board.line() is None
+    board.healthy("kitsune", {"app": {"line": 1.25}})
+    assert board.line() == 1.25
+
+
+def test_a_topic_that_changes_gets_another_number():
+    board = Board()
+    before = board.versions["alerts"]
+    board.alert(alert(1))
+    assert board.versions["alerts"] != before
+    assert board.versions["scores"] == 0
