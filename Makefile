@@ -3,6 +3,8 @@
 # make venv   set up .venv alone
 # make check  ruff, mypy, import rules
 # make docs   the documentation as a site, in site/
+# make reference   the pages and the picture of the documentation that are made from the code
+# make coverage    the tests, and which lines they do not reach
 # make p4     compile p4/sdnator.p4 again (needs p4c)
 
 PYTHON ?= python3
@@ -15,7 +17,7 @@ BASE := $(VENV)/.set-up
 STAMP := $(BASE)-$(subst $(comma),-,$(EXTRAS))
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: venv demo test check docs p4 clean
+.PHONY: venv demo test check docs reference coverage p4 clean
 .DEFAULT_GOAL := test
 
 venv: $(STAMP)
@@ -50,6 +52,14 @@ check: venv
 
 docs: venv
 	$(BIN)/mkdocs build --strict
+
+reference: venv
+	$(BIN)/python -m sdnator.reference docs
+
+coverage: venv
+	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m coverage run -m pytest
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage report --skip-covered
 
 p4: venv
 	$(BIN)/python -m sdnator.p4_program compile

@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     table(names, [[case[name] for name in names] for case in cases])
     shown = {"DUE p50": head["p50_us"], "raw p50": head["raw_p50_us"], "DUE p99": head["p99_us"]}
     bars("one way, 1 KB, Unix socket, microseconds", {k: float(str(v)) for k, v in shown.items()})
-    print(f"os-ken p50: {os_ken if os_ken is None else round(os_ken, 1)} (in one process)")
+    print(osken.ABSENT if os_ken is None else f"os-ken p50: {os_ken:.1f} (in one process)")
     fields = ("p50_us", "p99_us", "raw_p50_us", "raw_p99_us", "ratio_vs_raw")
     figures = {name: head[name] for name in fields}
     write_json(options.json, {"machine": machine(), **figures, "osken_p50_us": os_ken, "cases": cases})

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.updates --json FILE`.  All peers use one embedded server over a Unix socket and take
 turns.  os-ken's event API hands objects from app to app inside one process, so it is the bound that a
-controller without distribution sets; it is measured where `os_ken` can be imported.
+controller without distribution sets; `benchmarks.osken` says how to have it.
 """
 
 import sys
@@ -106,6 +106,8 @@ def _show(
         ],
     )
     print(f"\n{WHY_NOT_RAW}")
+    if os_ken is None:
+        print(osken.ABSENT)
     bars("messages/s of 100 bytes", {name: rates[name]["100"] for name in RUNNERS})
     print(f"three consumers cost the producer {figures['producer_cost_of_three_consumers']:+.1%} CPU")
     bars("records/s", {"record batches": float(str(figures["records_per_s"]))})
