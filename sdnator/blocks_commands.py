@@ -6,7 +6,10 @@ without it writes into Data Archives that everything is lifted, and clears the s
 
 import json
 import os
-import threading
+import queue
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Final, Literal
 from uuid import uuid4
 
@@ -27,6 +30,8 @@ blocks = typer.Typer(help="Blocks and guards: list, add, remove, explain, lift a
 allow = typer.Typer(help="Addresses, prefixes and MACs that are never blocked.", no_args_is_help=True)
 
 _ANSWER: Final = "network.answer.firewall.operator"
+_LOOK_SECONDS: Final = 0.5
+_CLOCKS_DIFFER_NS: Final = 60 * 10**9
 _ANSWER_SECONDS: Final = 10.0
 _PANIC_SECONDS: Final = 3.0
 
@@ -226,14 +231,12 @@ def _instruct(
     if url:
         engine.set_pubsub(url)
     engine.set_db(archive_url(archive))
-    answers: list[Answer] = []
-    answered = threading.Event()
+    answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
 
     def on_answer(item: Item) -> None:
         answer = Answer.from_value(item.value)
         if answer.id == instruction.id:
-            answers.append(answer)
-            answered.set()
+            answers.put(answer)
 
     told = Capability(INSTRUCTION, delivery="reliable", archive="always")
     engine.init("operator", PRODUCER | CONSUMER, capabilities=[told], instances="shared")
@@ -241,10 +244,27 @@ def _instruct(
         engine.observe(_ANSWER).subscribe(on_answer)
         engine.write(INSTRUCTION, instruction.to_value())
         engine.flush(patience)
-        if not answered.wait(patience):
-            raise PipelineError(f"the firewall did not answer within {patience:.0f} s; is it running?")
+        answer = _answer(engine, answers, on_answer, patience)
     finally:
         engine.close()
-    if not answers[0].done:
-        raise BadInput(answers[0].text)
-    typer.echo(answers[0].text)
+    if not answer.done:
+        raise BadInput(answer.text)
+    typer.echo(answer.text)
+
+
+def _answer(
+    engine: Engine, answers: "queue.SimpleQueue[Answer]", look: Callable[[Item], None], patience: float
+) -> Answer:
+    """What comes in `answers`; raises PipelineError after `patience` seconds.
+
+    The firewall may answer before it has heard that somebody wants that: then only the archive has it.
+    """
+    begun, deadline = time.time_ns() - _CLOCKS_DIFFER_NS, time.monotonic() + patience
+    while time.monotonic() < deadline:
+        try:
+            return answers.get(timeout=_LOOK_SECONDS)
+        except queue.Empty:
+            with suppress(DueError):
+                for item in engine.get({"dataKey": _ANSWER, "timestamp": {"$gte": begun}}):
+                    look(item)
+    raise PipelineError(f"the firewall did not answer within {patience:.0f} s; is it running?")

@@ -1,6 +1,6 @@
 """Half-open connections that a flood left at a server, and when they are reset.
 
-    SYN-ACKs of servers ──► Answers (the last ones, as the batches they came in)
+    SYN-ACKs of servers ──► Answers (the last ones)
     guard or block decided ──► Resets: wait for the switch's confirmation, then RST what is old enough
 
 Pure; `now` is the time of the reader's monotonic clock in seconds.  A server's backlog holds exactly what it
@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from apps.firewall.recent_rows import Columns, RecentRows
 from apps.firewall.services import Service
 from apps.firewall.tcp_reset import HalfOpen, reset_frame
 from due import RecordBatch
@@ -35,35 +36,29 @@ _FRAMES: Final = 512
 
 
 class Answers:
-    """At least the last `rows` SYN-ACKs, whole batches only."""
+    """At least the last `rows` SYN-ACKs."""
 
     def __init__(self, rows: int) -> None:
-        self._rows = rows
-        self._batches: deque[tuple[float, RecordBatch]] = deque()
-        self._kept = 0
+        self._recent = RecentRows((*_COLUMNS, "time_us"), rows)
         self.missing = ""
         """Columns that a reset needs and the records lack."""
 
     def __len__(self) -> int:
-        return self._kept
+        return len(self._recent)
 
     def add(self, batch: RecordBatch, now: float) -> None:
         """SYN-ACKs that came just now."""
         self.missing = ", ".join(name for name in (*_COLUMNS, "time_us") if name not in batch)
-        if self.missing or not len(batch):
-            return
-        self._batches.append((now, batch))
-        self._kept += len(batch)
-        while self._kept - len(self._batches[0][1]) >= self._rows:
-            self._kept -= len(self._batches.popleft()[1])
+        if not self.missing:
+            self._recent.add(batch, now)
 
     def find(self, wanted: "Wanted", before: float) -> Iterator[HalfOpen]:
         """Answers that came before a time and are wanted; a connection may come more than once."""
-        for came, batch in self._batches:
+        for came, block in self._recent.blocks():
             if came > before:
                 return
-            rows = np.flatnonzero(wanted.rows(batch))
-            columns = (batch[name][rows].tolist() for name in _COLUMNS)
+            rows = np.flatnonzero(wanted.rows(block))
+            columns = (block[name][rows].tolist() for name in _COLUMNS)
             for version, to_hi, to_lo, to_port, from_hi, from_lo, from_port, *rest in zip(
                 *columns, strict=True
             ):
@@ -79,7 +74,7 @@ class Wanted:
     source: str = ""
     since: int = 0
 
-    def rows(self, batch: RecordBatch) -> Any:
+    def rows(self, batch: Columns) -> Any:
         """Which rows of a batch these are."""
         found = batch["time_us"] >= self.since // 1000
         if self.service is not None:
@@ -92,7 +87,7 @@ class Wanted:
         return " ".join(parts + ([f"at {self.service}"] if self.service else []))
 
 
-def _is(batch: RecordBatch, name: str, text: str) -> Any:
+def _is(batch: Columns, name: str, text: str) -> Any:
     address = ipaddress.ip_address(text)
     high, low = int(address) >> _HALF, int(address) & ((1 << _HALF) - 1)
     same = (batch[f"{name}_hi"] == np.uint64(high)) & (batch[f"{name}_lo"] == np.uint64(low))

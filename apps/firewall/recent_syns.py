@@ -1,48 +1,45 @@
-"""The SYNs of the last moments, as the batches they came in, and hosts towards which they surge.
+"""The SYNs of the last moments, and hosts towards which they surge.
 
 Who sent them is looked into only when a flood is suspected.
 """
 
 import ipaddress
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
 
+from apps.firewall.recent_rows import RecentRows
 from due import RecordBatch
 
 HOSTS = 65_536
 """Counted in a window; who forges more destinations than that is counted anew."""
 _HALF = 64
+_COLUMNS = ("time_us", "ip_version", "ip_src_hi", "ip_src_lo", "ip_dst_hi", "ip_dst_lo", "tcp_dport")
 
 
 class RecentSyns:
-    """Keeps at least the last `rows` SYNs, whole batches only."""
+    """Keeps at least the last `rows` SYNs."""
 
     def __init__(self, rows: int) -> None:
-        self._rows = rows
-        self._batches: deque[RecordBatch] = deque()
-        self._kept = 0
+        self._recent = RecentRows(_COLUMNS, rows)
 
     def __len__(self) -> int:
-        return self._kept
+        return len(self._recent)
 
-    def add(self, batch: RecordBatch) -> None:
-        """The columns time_us, ip_version, ip_src_*, ip_dst_* and tcp_dport are used."""
-        self._batches.append(batch)
-        self._kept += len(batch)
-        while self._kept - len(self._batches[0]) >= self._rows:
-            self._kept -= len(self._batches.popleft())
+    def add(self, batch: RecordBatch, now: float = 0.0) -> None:
+        """SYNs that came at `now`, s; raises KeyError where a column is missing."""
+        self._recent.add(batch, now)
 
     def towards(self, host: str, since: int) -> Iterator[tuple[int, str]]:
         """Destination port and source address of SYNs to a host since a capture time in ns."""
         address = ipaddress.ip_address(host)
         high, low = int(address) >> _HALF, int(address) & ((1 << _HALF) - 1)
         make = ipaddress.IPv4Address if address.version == 4 else ipaddress.IPv6Address
-        for batch in self._batches:
-            wanted = (batch["ip_version"] == address.version) & (batch["time_us"] >= since // 1000)
-            wanted &= (batch["ip_dst_hi"] == np.uint64(high)) & (batch["ip_dst_lo"] == np.uint64(low))
-            columns = (batch[name][wanted].tolist() for name in ("ip_src_hi", "ip_src_lo", "tcp_dport"))
+        for _, block in self._recent.blocks():
+            wanted = (block["ip_version"] == address.version) & (block["time_us"] >= since // 1000)
+            wanted &= (block["ip_dst_hi"] == np.uint64(high)) & (block["ip_dst_lo"] == np.uint64(low))
+            columns = (block[name][wanted].tolist() for name in ("ip_src_hi", "ip_src_lo", "tcp_dport"))
             for source_high, source_low, port in zip(*columns, strict=True):
                 yield port, str(make(source_high << _HALF | source_low))
 

@@ -6,7 +6,7 @@ a tenth of a second of the caller's clock; streams that stay silent while others
 waited for.  All of that is shorter where results are due sooner: `patience`.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,12 @@ class _Stream:
         self.heard: float | None = None
 
 
+class _Waiting(NamedTuple):
+    first: int
+    """Lowest arrival number."""
+    batch: RecordBatch
+
+
 class Merger:
     """Merges by the column `arrival`.  Pure: the caller brings the time, in seconds."""
 
@@ -48,7 +54,8 @@ class Merger:
         self._hold_s = DEFAULT_HOLD_S
         self._wait_s = LONGEST_WAIT_S
         self._silent_turns = _TURNS
-        self._waiting: list[tuple[float, RecordBatch]] = []
+        self._waiting: list[_Waiting] = []
+        self._rows = 0
         self._streams: dict[str, _Stream] = {}
         self._turn = 0
         self._heard = 0.0
@@ -82,7 +89,7 @@ class Merger:
             stream.time_us = int(batch["time_us"].max())
             stream.turn, stream.heard = self._turn, now
             self._newest_us = max(stream.time_us, self._newest_us or stream.time_us)
-            self._waiting.append((now, batch))
+            self._wait(batch)
         return self.release(now)
 
     def horizon_us(self, now: float) -> int | None:
@@ -105,8 +112,7 @@ class Merger:
         """What no stream can precede any more, and what has waited long enough."""
         if not self._waiting:
             return None
-        rows = sum(len(batch) for _, batch in self._waiting)
-        if now - self._heard >= self._hold_s or rows > _MOST_ROWS:
+        if now - self._heard >= self._hold_s or self._rows > _MOST_ROWS:
             return self._up_to(None)
         live = [stream.arrival for stream in self._streams.values() if not self._is_silent(stream, now)]
         return self._up_to(min(live) if live else None)
@@ -119,16 +125,24 @@ class Merger:
         """All that waits."""
         return self._up_to(None) if self._waiting else None
 
+    def _wait(self, batch: RecordBatch) -> None:
+        self._waiting.append(_Waiting(int(batch["arrival"].min()), batch))
+        self._rows += len(batch)
+
     def _up_to(self, limit: int | None) -> RecordBatch | None:
-        oldest = self._waiting[0][0]
-        whole = _joined([batch for _, batch in self._waiting])
+        # batches that are wholly too new are not touched: they may be many, and this is called for each
+        ripe = [each.batch for each in self._waiting if limit is None or each.first <= limit]
+        if not ripe:
+            return None
+        self._waiting = [each for each in self._waiting if limit is not None and each.first > limit]
+        whole = _joined(ripe)
+        self._rows -= len(whole)
         order = np.argsort(whole["arrival"], kind="stable")
         ordered = whole["arrival"][order].astype(np.int64)
         ready = np.full(len(ordered), True) if limit is None else ordered <= limit
-        self._waiting = [] if ready.all() else [(oldest, whole.take(order[~ready]))]
+        if not ready.all():
+            self._wait(whole.take(order[~ready]))
         order, ordered = order[ready], ordered[ready]
-        if not len(order):
-            return None
         place = ordered & (_REMEMBERED - 1)
         fresh = np.concatenate(([True], ordered[1:] != ordered[:-1])) & (self._seen[place] != ordered)
         self.twice += int((~fresh).sum())

@@ -105,9 +105,11 @@ def test_cells_are_read_in_band(kind, tmp_path):
         stage.controller()
         engine = stage.engine("sonata_adapter", capabilities=CAPABILITIES)
         heard = Heard(
-            engine, "network.cell.p4runtime_ctrl.*", STATE, "network.confirmation.p4runtime_ctrl.*",
-            f"network.packets.p4runtime_ctrl.s1.q{BIT}",
+            engine, "network.cell.p4runtime_ctrl.*", "network.confirmation.p4runtime_ctrl.*",
+            f"network.packets.p4runtime_ctrl.s1.q{BIT}", STATE,
         )  # fmt: skip
+        # the state was asked for last: when it comes, the controller knows that all the others are wanted
+        wait_for(lambda: heard.values("network.switch"), 90, why=stage.log)
         wanted = ("network.p4_command.sonata_adapter.s1", f"network.telemetry.sonata.q{BIT}", REQUEST)
         wait_for(lambda: all(map(engine.wanted, wanted)), 90, why=stage.log)
         command = TableCommand(id="c1", updates=(counting(),))
