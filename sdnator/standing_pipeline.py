@@ -33,8 +33,6 @@ from sdnator.standing_plan import APPS, StandingPlan, changes, taken_up
 
 DEATHS, DEATHS_SECONDS = 3, 60.0
 """A part that dies more often than so many times in so many seconds ends the pipeline."""
-READY_SECONDS = 180.0
-"""A part that lives is starting, however slowly: on a busy machine that took over half a minute."""
 _UPDATES_SECONDS = 1.0
 
 
@@ -225,7 +223,7 @@ class StandingPipeline:
         return child
 
     def _wait_ready(self, name: str) -> dict[str, Any]:
-        said = self._ready[name] = self._children[name].wait_ready(READY_SECONDS)
+        said = self._ready[name] = self._children[name].wait_ready()
         if name == "coordinator":
             self.coordinator = self._address_file.read_text(encoding="utf-8")
         return said

@@ -1,13 +1,13 @@
 """Frames that come in through a real interface reach DUE whole and in order, from either kind of switch."""
 
-import os
 import socket
-import subprocess
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
 from apps.packets import PACKET_COLUMNS, read_frames
+from sdnator.wire import VethPair
 from tests.apps.p4runtime_ctrl.stage import PACKETS, Heard, Stage, frame, wait_for
 from tests.apps.p4runtime_ctrl.targets import KINDS
 from tests.requirements import optional_program, require_netns
@@ -21,15 +21,9 @@ WINDOW = 25
 def veth():
     """Two ends of a cable; nobody else talks on it."""
     require_netns()
-    near, far = f"sdn{os.getpid() % 100_000}a", f"sdn{os.getpid() % 100_000}b"
-    subprocess.run(["ip", "link", "add", near, "type", "veth", "peer", "name", far], check=True)
-    try:
-        for end in (near, far):
-            subprocess.run(["sysctl", "-qw", f"net.ipv6.conf.{end}.disable_ipv6=1"], check=False)
-            subprocess.run(["ip", "link", "set", end, "up"], check=True)
-        yield near, far
-    finally:
-        subprocess.run(["ip", "link", "delete", near], check=True)
+    with ExitStack() as stack:
+        cable = VethPair.make(stack, "live")
+        yield cable.near, cable.far
 
 
 @pytest.mark.parametrize("telemetry", ["packet-in", "digest"])

@@ -1,9 +1,7 @@
 """Apps' frames leave through the switch; what its counting stages have counted is told to who asks."""
 
-import os
 import socket
-import subprocess
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from apps.messages import TableCommand, TableUpdate
 from apps.p4runtime_ctrl.errors import EntryError
 from apps.p4runtime_ctrl.packet_out import PacketOuts, question_of
 from due import Capability, RecordBatch
+from sdnator.wire import VethPair
 from tests.apps.p4runtime_ctrl.programs import program
 from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, frame, wait_for
 from tests.apps.p4runtime_ctrl.targets import KINDS
@@ -65,21 +64,13 @@ def wired(kind, folder):
 def cabled(kind, folder):
     """A stage whose switch has one end of a cable, and a socket at the other."""
     require_netns()
-    near, far = f"sdn{os.getpid() % 100_000}c", f"sdn{os.getpid() % 100_000}d"
-    subprocess.run(["ip", "link", "add", near, "type", "veth", "peer", "name", far], check=True)
-    try:
-        for end in (near, far):
-            subprocess.run(["sysctl", "-qw", f"net.ipv6.conf.{end}.disable_ipv6=1"], check=False)
-            subprocess.run(["ip", "link", "set", end, "up"], check=True)
-        with (
-            Stage(folder, kind=kind, veth=far, forward={}) as stage,
-            socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY)) as wire,
-        ):
-            wire.bind((near, 0))
-            wire.settimeout(90)
-            yield stage, wire
-    finally:
-        subprocess.run(["ip", "link", "delete", near], check=True)
+    with ExitStack() as held:
+        cable = VethPair.make(held, "out")
+        stage = held.enter_context(Stage(folder, kind=kind, veth=cable.far, forward={}))
+        wire = held.enter_context(socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY)))
+        wire.bind((cable.near, 0))
+        wire.settimeout(90)
+        yield stage, wire
 
 
 def request(numbers, sources, time_us=BASE_US + 5_000_000):

@@ -1,8 +1,6 @@
 """A switch that learns sends frames where their station is, follows one that moves, and forgets silent ones."""
 
-import os
 import socket
-import subprocess
 from contextlib import ExitStack, contextmanager
 
 import msgspec
@@ -15,6 +13,7 @@ from apps.p4runtime_ctrl.stations import DIGEST, LearnSettings, Stations
 from apps.p4runtime_ctrl.switch import Switch
 from apps.p4runtime_ctrl.values import canonical
 from p4rt import p4runtime
+from sdnator.wire import VethPair
 from tests.apps.p4runtime_ctrl.fake_switch import FakeSwitch
 from tests.apps.p4runtime_ctrl.programs import program
 from tests.apps.p4runtime_ctrl.stage import wait_for
@@ -114,18 +113,13 @@ def cables(count):
     with ExitStack() as stack:
         sockets, far_ends = [], []
         for number in range(count):
-            near, far = (f"sdn{os.getpid() % 100_000}{side}{number}" for side in "ef")
-            subprocess.run(["ip", "link", "add", near, "type", "veth", "peer", "name", far], check=True)
-            stack.callback(subprocess.run, ["ip", "link", "delete", near], check=True)
-            for end in (near, far):
-                subprocess.run(["sysctl", "-qw", f"net.ipv6.conf.{end}.disable_ipv6=1"], check=False)
-                subprocess.run(["ip", "link", "set", end, "up"], check=True)
+            cable = VethPair.make(stack, f"l{'abcdefgh'[number]}")
             wire = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY))
             stack.callback(wire.close)
-            wire.bind((near, 0))
+            wire.bind((cable.near, 0))
             wire.setblocking(False)
             sockets.append(wire)
-            far_ends.append(far)
+            far_ends.append(cable.far)
         yield sockets, far_ends
 
 
