@@ -40,7 +40,7 @@ def cache_directory() -> Path:
     return directory
 
 
-def library(text: str, declarations: str) -> tuple[Any, Any]:
+def compiled_library(text: str, declarations: str) -> tuple[Any, Any]:
     """(ffi, library) of a unit of C; compiles it unless the cache has it.
 
     Raises CompilerError where there is no compiler or it refuses the text.

@@ -8,7 +8,7 @@ from typing import Any
 
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
-from dataplane.compiler.c_build import library
+from dataplane.compiler.c_build import compiled_library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
 from dataplane.compiler.machine import Batch, Digest, KeyPlace, Replicas, Row
@@ -50,7 +50,7 @@ class _Native:
     """The library's handle, shared by the parts of one machine; freed by close() or with the last of them."""
 
     def __init__(self, text: str, cpu_port: int) -> None:
-        self.ffi, self.lib = library(text, _DECLARATIONS)
+        self.ffi, self.lib = compiled_library(text, _DECLARATIONS)
         handle = self.lib.dp_new(cpu_port)
         if handle == self.ffi.NULL:
             raise MemoryError("no memory for the switch's state")

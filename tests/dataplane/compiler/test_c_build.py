@@ -17,12 +17,12 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_a_text_is_compiled_once(cache):
-    _, first = c_build.library(_TEXT, "int answer(void);")
+    _, first = c_build.compiled_library(_TEXT, "int answer(void);")
     assert first.answer() == 42
     files = list(cache.iterdir())
     assert [f.suffix for f in files] == [".so"], "nothing else is left"
     made = files[0].stat().st_mtime_ns
-    c_build.library(_TEXT, "int answer(void);")
+    c_build.compiled_library(_TEXT, "int answer(void);")
     assert files[0].stat().st_mtime_ns == made
     assert cache.stat().st_mode & 0o077 == 0
 
@@ -30,20 +30,20 @@ def test_a_text_is_compiled_once(cache):
 def test_an_open_cache_is_closed_to_others(cache):
     cache.mkdir(parents=True)
     cache.chmod(0o777)
-    c_build.library(_TEXT, "int answer(void);")
+    c_build.compiled_library(_TEXT, "int answer(void);")
     assert cache.stat().st_mode & 0o077 == 0
 
 
 def test_without_a_place_to_keep_it_the_library_still_runs(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/no-such-place")
-    _, made = c_build.library(_TEXT, "int answer(void);")
+    _, made = c_build.compiled_library(_TEXT, "int answer(void);")
     assert made.answer() == 42
 
 
 @pytest.mark.usefixtures("cache")
 def test_refused_text_is_reported():
     with pytest.raises(CompilerError, match="refused the generated C"):
-        c_build.library("no C at all", "int answer(void);")
+        c_build.compiled_library("no C at all", "int answer(void);")
 
 
 def test_without_a_compiler_auto_takes_python(monkeypatch):
