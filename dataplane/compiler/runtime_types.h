@@ -242,6 +242,8 @@ PLAIN u64 meter_run(meter *m, u64 cost, u64 now) {
 /* -- tables: tuple-space search -------------------------------------------------------------------
  * Entries with one mask form a group: a hash table of chains, each chain best first.  Groups are asked in
  * the order of their best entry, and no further than an entry that no later group can beat.
+ * Nearly all frames match no entry of a big table.  A Bloom filter with one hash, 8 bits for each chain, says
+ * so out of the nearest cache; without it every other frame would fetch an entry to compare with.
  */
 
 #define NONE 0xFFFFFFFFu
@@ -259,7 +261,8 @@ typedef struct {
 
 typedef struct {
     i64 best;
-    u32 *heads, size, count, used, place;
+    u64 *seen; /* the filter: 8 * size bits; those of removed entries stay until it is made again */
+    u32 *heads, size, count, used, place, removed;
     /* the key words that this mask looks at, and the bits of them in which all entries agree */
     u32 n, at[KEY_WORDS];
     u64 mask[KEY_WORDS], agreed[KEY_WORDS], value[KEY_WORDS];
@@ -290,6 +293,9 @@ INLINE u64 key_hash(const u64 *k, const group *g) {
     return h;
 }
 
+/* the bit of a hash in the filter: not of those that choose the chain */
+INLINE u64 seen_bit(u64 hash, const group *g) { return hash >> 32 & (8ull * g->size - 1); }
+
 /* could any entry of the group have these bits? */
 INLINE int group_may(const group *g, const u64 *k) {
     u64 d = 0;
@@ -314,7 +320,9 @@ INLINE entry *table_find(const table *t, const u64 *k, u32 words) {
         if (found && p->best > found->order) break;
         const group *g = &t->group[p->group];
         if (!group_may(g, k)) continue;
-        u32 at = g->heads[key_hash(k, g) & (g->size - 1)];
+        u64 hash = key_hash(k, g), bit = seen_bit(hash, g);
+        if (!(g->seen[bit / 64] >> bit % 64 & 1)) continue;
+        u32 at = g->heads[hash & (g->size - 1)];
         for (; at != NONE; at = t->entries[at].next) {
             entry *e = &t->entries[at];
             if (found && e->order > found->order) break;
@@ -343,7 +351,9 @@ static void table_grow(table *t, u32 slot) {
 
 static void group_link(table *t, group *g, u32 slot) {
     entry *e = &t->entries[slot];
-    u32 *at = &g->heads[key_hash(t->keys + (u64)slot * t->words, g) & (g->size - 1)];
+    u64 hash = key_hash(t->keys + (u64)slot * t->words, g), bit = seen_bit(hash, g);
+    g->seen[bit / 64] |= 1ull << bit % 64;
+    u32 *at = &g->heads[hash & (g->size - 1)];
     while (*at != NONE && t->entries[*at].order < e->order) at = &t->entries[*at].next;
     e->next = *at;
     *at = slot;
@@ -352,7 +362,10 @@ static void group_link(table *t, group *g, u32 slot) {
 static void group_resize(table *t, u32 number, u32 size) {
     group *g = &t->group[number];
     g->heads = realloc(g->heads, size * sizeof(u32));
+    g->seen = realloc(g->seen, size);
+    memset(g->seen, 0, size);
     g->size = size;
+    g->removed = 0;
     for (u32 i = 0; i < size; i++) g->heads[i] = NONE;
     for (u32 slot = 0; slot < t->slots; slot++)
         if (t->entries[slot].used && t->entries[slot].group == number) group_link(t, g, slot);
@@ -472,6 +485,7 @@ PLAIN void table_remove(table *t, u32 slot) {
     e->range = 0;
     g->count--;
     if (!g->count) g->used = 0;
+    else if (++g->removed > g->size) group_resize(t, e->group, g->size);
     /* a bound that is too good is still right: it only makes a search look here in vain */
     if (g->count && (e->order != g->best || g->size > 64)) return;
     g->best = INT64_MAX;
@@ -485,7 +499,10 @@ PLAIN void table_free(table *t) {
         if (t->entries[i].used) free(t->entries[i].range);
         free(t->entries[i].meter);
     }
-    for (u32 i = 0; i < t->groups; i++) free(t->group[i].heads);
+    for (u32 i = 0; i < t->groups; i++) {
+        free(t->group[i].heads);
+        free(t->group[i].seen);
+    }
     free(t->entries);
     free(t->keys);
     free(t->params);
