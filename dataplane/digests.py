@@ -6,9 +6,11 @@
 
 Lists are written as protobuf bytes directly, for the reason given in packet_io.py; their samples come
 from the switch as they travel (compiler/samples.py).  Pure but for the
-time stamp of a list: times are arguments.
+time stamp of a list: times are arguments.  The packet loop fills lists while controllers acknowledge and
+configure in threads of their own, so one lock is held for each of these.
 """
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -54,6 +56,7 @@ class DigestLists:
         self._digests = schema.digests
         self._by_name: dict[str, _Stream] = {}
         self._wall_ns = wall_ns
+        self._lock = threading.Lock()
         self._list_id = 0
         self.unconfigured = 0
         self.suppressed = 0
@@ -71,19 +74,21 @@ class DigestLists:
         config = message.config
         if min(config.max_timeout_ns, config.max_list_size, config.ack_timeout_ns) < 0:
             raise InvalidArgument(f"digest {digest.name}: time-outs and list size cannot be negative")
-        if kind == DELETE:
-            del self._by_name[digest.name]
-        else:
-            stream = old or _Stream(digest, None)
-            self._by_name[digest.name] = _Stream(
-                digest, _copy(config), stream.buffer, stream.since_ns, stream.cache, stream.cached
-            )
-
-        def undo() -> None:
-            if old is None:
+        with self._lock:
+            if kind == DELETE:
                 del self._by_name[digest.name]
             else:
-                self._by_name[digest.name] = old
+                stream = old or _Stream(digest, None)
+                self._by_name[digest.name] = _Stream(
+                    digest, _copy(config), stream.buffer, stream.since_ns, stream.cache, stream.cached
+                )
+
+        def undo() -> None:
+            with self._lock:
+                if old is None:
+                    del self._by_name[digest.name]
+                else:
+                    self._by_name[digest.name] = old
 
         return undo
 
@@ -115,47 +120,52 @@ class DigestLists:
         """
         ready: list[bytes] = []
         streams = self._by_name
-        for digest in digests:
-            stream = streams.get(digest.name)
-            if stream is None:
-                self.unconfigured += 1
-                continue
-            sample, buffer = digest.sample, stream.buffer
-            if sample in buffer or sample in stream.cached:
-                self.suppressed += 1
-                continue
-            if not buffer:
-                stream.since_ns = now_ns
-            buffer[sample] = None
-            if len(buffer) >= stream.list_size:
-                ready.append(self._list(stream, now_ns))
+        with self._lock:
+            for digest in digests:
+                stream = streams.get(digest.name)
+                if stream is None:
+                    self.unconfigured += 1
+                    continue
+                sample, buffer = digest.sample, stream.buffer
+                if sample in buffer or sample in stream.cached:
+                    self.suppressed += 1
+                    continue
+                if not buffer:
+                    stream.since_ns = now_ns
+                buffer[sample] = None
+                if len(buffer) >= stream.list_size:
+                    ready.append(self._list(stream, now_ns))
         return ready
 
     def due(self, now_ns: int) -> list[bytes]:
         """Lists whose time-out has passed; also forgets what was not acknowledged in time."""
         ready = []
-        for stream in self._by_name.values():
-            self._forget(stream, now_ns - stream.config.ack_timeout_ns)
-            if stream.buffer and now_ns - stream.since_ns >= stream.config.max_timeout_ns:
-                ready.append(self._list(stream, now_ns))
+        with self._lock:
+            for stream in self._by_name.values():
+                self._forget(stream, now_ns - stream.config.ack_timeout_ns)
+                if stream.buffer and now_ns - stream.since_ns >= stream.config.max_timeout_ns:
+                    ready.append(self._list(stream, now_ns))
         return ready
 
     def next_due_ns(self) -> int | None:
         """When the next list will be due, on the clock of `add`; None = nothing waits."""
-        times = [s.since_ns + s.config.max_timeout_ns for s in self._by_name.values() if s.buffer]
+        with self._lock:
+            times = [s.since_ns + s.config.max_timeout_ns for s in self._by_name.values() if s.buffer]
         return min(times, default=None)
 
     def acknowledge(self, digest_id: int, list_id: int) -> None:
         """The controller has acted on a list.  Raises InvalidArgument for an unknown digest id."""
         stream = self._by_name.get(self._known(digest_id).name)
-        if stream is not None and list_id in stream.cache:
-            stream.cached.difference_update(stream.cache.pop(list_id)[1])
+        with self._lock:
+            if stream is not None and list_id in stream.cache:
+                stream.cached.difference_update(stream.cache.pop(list_id)[1])
 
     def forget_sent(self) -> None:
         """The controller has changed: samples may be sent again."""
-        for stream in self._by_name.values():
-            stream.cache.clear()
-            stream.cached.clear()
+        with self._lock:
+            for stream in self._by_name.values():
+                stream.cache.clear()
+                stream.cached.clear()
 
     @staticmethod
     def _forget(stream: _Stream, before_ns: int) -> None:

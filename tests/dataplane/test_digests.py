@@ -1,5 +1,8 @@
 """Digest lists: distinct samples, complete by size or time, silent until acknowledged."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -97,6 +100,21 @@ def test_sent_samples_stay_away_until_acknowledged_or_forgotten():
     assert firsts(made.add(samples(1), 13)) == [[1]]
     made.forget_sent()
     assert firsts(made.add(samples(1), 14)) == [[1]]
+
+
+def test_lists_are_acknowledged_in_another_thread_while_they_are_made():
+    made = lists(size=1, ack=10**9)
+    made.add(samples(*range(400)), 0)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(1) as other:
+            done = other.submit(lambda: [made.acknowledge(77, number) for number in range(1, 401)])
+            while not done.done():
+                assert made.due(1) == []
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(made.add(samples(*range(400)), 2)) == 400, "all were acknowledged"
 
 
 def test_without_an_ack_time_out_samples_repeat():

@@ -86,8 +86,9 @@ def test_frames_pass_both_ways(cable):
     assert received(port, 50) == frames
     port.send(frames[0])
     assert other.recv(2000) == frames[0]
-    assert received(port, 1) == [], "a frame we sent was seen again"
-    assert (port.counters.received, port.counters.sent) == (50, 1)
+    other.send(frames[1])
+    assert received(port, 1) == [frames[1]], "a frame we sent was seen again"
+    assert (port.counters.received, port.counters.sent) == (51, 1)
 
 
 def test_tagged_frames_arrive_tagged(cable):
