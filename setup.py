@@ -9,6 +9,7 @@ P4Runtime wheel).  In a wheel its sources, artefacts and record are data of `sdn
 """
 
 import shutil
+import warnings
 from pathlib import Path
 
 from setuptools import Extension, setup
@@ -17,6 +18,9 @@ from setuptools.command.build_py import build_py
 
 PROGRAM = Path("p4")
 KINDS = (".p4", ".json", ".txtpb")
+
+# pip shows setuptools' general remark on editable installations as if something of ours were wrong
+warnings.filterwarnings("ignore", message="Editable installation")
 
 
 class BuildKernel(build_ext):
