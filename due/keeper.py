@@ -26,6 +26,8 @@ log = logging.getLogger("due")
 
 _TICK = 0.1
 _SLOW_TICK = 0.01
+_LATE = 0.01
+"""Who wakes up later than this has to wait for a core."""
 _RENEW_SECONDS = 1.0
 _SLOW_CALLBACK = 0.02
 
@@ -55,6 +57,7 @@ class Keeper:
         self._seen = -1
         self._renew_at = 0.0
         self._poll_again = 0.0
+        self._tick = _TICK
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="due-keeper", daemon=True)
 
@@ -107,10 +110,13 @@ class Keeper:
     def _listen(self) -> None:
         busy = self._dispatcher.busy_since
         slow = busy is not None and time.monotonic() - busy > _SLOW_CALLBACK
-        tick = _SLOW_TICK if slow else _TICK if self._dispatcher.observing else self._pause / 4
+        tick = _SLOW_TICK if slow else self._tick if self._dispatcher.observing else self._pause / 4
         tick = min(tick, self._poll_again)
-        wait = min(tick, max(0.0, self.member.next_tick() - time.monotonic()))
-        for delivery in self._control.receive(wait):
+        began = time.monotonic()
+        wait = min(tick, max(0.0, self.member.next_tick() - began))
+        deliveries = self._control.receive(wait)
+        self._adapt(late=time.monotonic() - began - wait > _LATE)
+        for delivery in deliveries:
             try:
                 message = Assignments.from_value(decode_frame(delivery.payload).values[-1])
             except (DueError, msgspec.ValidationError, IndexError) as error:
@@ -118,6 +124,10 @@ class Keeper:
                 continue
             with self.lock:
                 self.member.assigned(message, time.monotonic())
+
+    def _adapt(self, *, late: bool) -> None:
+        """Where cores are short, look at the callbacks more rarely: they need them more."""
+        self._tick = min(2 * self._tick, max(_TICK, self._pause / 4)) if late else max(_TICK, self._tick / 2)
 
     def _turn(self) -> None:
         now = time.monotonic()

@@ -22,6 +22,9 @@ log = logging.getLogger("due")
 _BUSY_LINGER = 0.005
 """How long a batch lingers at most while its writer fills frames faster than that."""
 _LONGEST_WAIT = 0.05
+_PRESSED_WAIT = 0.2
+"""The same where cores are so short that a visit comes late by more than handing over the interpreter takes."""
+_HANDOVER = 0.01
 
 Service = Callable[[Outlet, int], float | None]
 
@@ -90,14 +93,17 @@ class Sender:
     def _visit(self, outlet: Outlet, late: float) -> float | None:
         """Seconds until the next visit.  Never waits for a writer that waits for readers.
 
-        Where cores are so short that we come `late`, we come more rarely: the writers need them more.
+        Where cores are so short that we come `late`, we come more rarely: the writers need them more, and
+        each visit to a process that waits for a core costs several wake-ups.
         """
+        pressure = min(_PRESSED_WAIT, 8 * max(0.0, late - _HANDOVER))
         if outlet.filled != outlet.filled_before:
             outlet.filled_before = outlet.filled
             outlet.patience = self._linger
-            return max(self._linger, min(_BUSY_LINGER, 3 * self._linger), min(late, _LONGEST_WAIT))
+            soon = max(self._linger, min(_BUSY_LINGER, 3 * self._linger))
+            return max(soon, min(late, _LONGEST_WAIT), pressure)
         if self._blocked(outlet) or not outlet.lock.acquire(blocking=False):
-            outlet.patience = min(max(2 * outlet.patience, self._linger, late), _LONGEST_WAIT)
+            outlet.patience = max(min(max(2 * outlet.patience, self._linger, late), _LONGEST_WAIT), pressure)
             return outlet.patience
         try:
             outlet.patience = self._linger

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,7 @@ from due.sender import Sender
 
 log = logging.getLogger("due")
 
+_KEYS_SHOWN = 32
 _MOST_OUTLETS = 10_000
 """With so many keys being written, those that are idle are put away."""
 
@@ -118,6 +120,13 @@ class Session:
     def _written(self) -> int:
         return self._retired_items + sum(outlet.sequence for outlet in list(self.outlets.values()))
 
+    def _busiest(self) -> dict[str, int]:
+        """Items by key without specs, of the keys that were written to most and not put away."""
+        counts: Counter[str] = Counter()
+        for outlet in list(self.outlets.values()):
+            counts[outlet.key.path] += outlet.sequence
+        return dict(counts.most_common(_KEYS_SHOWN))
+
     def flush_outlet(self, outlet: Outlet) -> bool:
         """Send what is buffered; False while items wait for permission or for their pace."""
         with outlet.lock:
@@ -181,6 +190,7 @@ class Session:
             "written": self.keeper.written(),
             "unpublished": self._unpublished,
             "outlets": len(self.outlets),
+            "keys": self._busiest(),
             **self.gate.counts,
             "updates": self.publisher.statistics(),
             "receiving": self.dispatcher.statistics(),

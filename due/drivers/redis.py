@@ -234,8 +234,11 @@ class RedisPublisher:
                 return
             if not ledger.asked:
                 self._ask(ledger)
+            if self._wire is None:  # lost while asking
+                return
+            number = wire.fileno()  # taken here: another thread may close the connection while we wait
         poll = select.poll()
-        poll.register(wire, select.POLLIN)
+        poll.register(number, select.POLLIN)
         poll.poll(1000 * _ASK_SECONDS)
         with self._lock:
             if self._wire is wire:  # nobody reconnected meanwhile

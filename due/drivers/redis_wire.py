@@ -6,6 +6,7 @@ parsing (RESP3, its default, formats each push into a log line).
 """
 
 import socket
+import ssl
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -15,6 +16,8 @@ import redis
 from due.errors import InvalidOption, UpdatesUnavailable
 
 _READ = 1 << 18
+_PARSER_KEEPS = 1 << 20
+"""Spare bytes that the parser does not give back after each message, to ask for them again at the next."""
 _JOIN_BELOW = 1 << 14
 
 
@@ -49,7 +52,10 @@ class Wire:
             raise UpdatesUnavailable(f"Data Updates at {url} cannot be reached: {error}") from None
         # redis-py has no public way to wait on several connections
         self._socket: socket.socket = self._connection._sock  # noqa: SLF001
-        self._reader = hiredis.Reader()
+        self._reader = cast("Any", hiredis.Reader())  # its stub knows no buffer but bytes
+        self._reader.setmaxbuf(_PARSER_KEEPS)
+        # kept, because the allocator would map and unmap a new one for each read
+        self._buffer = bytearray(_READ)
 
     def fileno(self) -> int:
         """For select."""
@@ -91,20 +97,18 @@ class Wire:
     def replies(self) -> Iterator[Any]:
         """Replies that have arrived; does not wait.  Error replies come as `hiredis.ReplyError`s."""
         try:
-            data = self._socket.recv(_READ, socket.MSG_DONTWAIT)
-        except BlockingIOError:
+            size = self._receive_now()
+        except (BlockingIOError, ssl.SSLWantReadError):
             return
-        except ValueError:  # TLS sockets take no flags
-            data = self._receive_tls()
         except OSError as error:
             raise UpdatesUnavailable(f"connection lost: {error}") from None
-        yield from self._parsed(data)
+        yield from self._parsed(size)
 
     def wait(self, timeout: float | None = None) -> Iterator[Any]:
         """Like `replies`, but waits for the first bytes, at most `timeout` seconds."""
         try:
             self._socket.settimeout(timeout)
-            data = self._socket.recv(_READ)
+            size = self._socket.recv_into(self._buffer)
         except TimeoutError:
             return
         except OSError as error:
@@ -112,7 +116,7 @@ class Wire:
         finally:
             if self._socket.fileno() >= 0:
                 self._socket.settimeout(None)
-        yield from self._parsed(data)
+        yield from self._parsed(size)
 
     def call(self, *arguments: bytes | str | int) -> Any:
         """Send one command and wait for its reply; only while nothing else is outstanding."""
@@ -125,10 +129,11 @@ class Wire:
         """Close the socket."""
         self._connection.disconnect()
 
-    def _parsed(self, data: bytes) -> Iterator[Any]:
-        if not data:
+    def _parsed(self, size: int) -> Iterator[Any]:
+        """Replies that are complete with the first `size` bytes of the buffer."""
+        if not size:
             raise UpdatesUnavailable("connection closed by the server")
-        self._reader.feed(data)
+        self._reader.feed(self._buffer, 0, size)
         while (reply := self._next()) is not False:
             yield reply
 
@@ -138,14 +143,15 @@ class Wire:
         except hiredis.ProtocolError as error:
             raise UpdatesUnavailable(f"the server does not speak the Redis protocol: {error}") from None
 
-    def _receive_tls(self) -> bytes:
-        self._socket.settimeout(0.0)
+    def _receive_now(self) -> int:
         try:
-            return self._socket.recv(_READ)
-        except OSError as error:
-            raise UpdatesUnavailable(f"connection lost: {error}") from None
-        finally:
-            self._socket.settimeout(None)
+            return self._socket.recv_into(self._buffer, 0, socket.MSG_DONTWAIT)
+        except ValueError:  # TLS sockets take no flags
+            self._socket.settimeout(0.0)
+            try:
+                return self._socket.recv_into(self._buffer)
+            finally:
+                self._socket.settimeout(None)
 
 
 def pack(arguments: tuple[bytes | str | int, ...]) -> bytes:

@@ -34,6 +34,13 @@ def test_items_arrive_in_order_with_types_and_times(make_engine, init):
     assert consumer.health()["receiving"]["gaps"] == 0
 
 
+def test_health_counts_items_by_key_without_specs(make_engine):
+    producer = make_engine("counted")
+    for key in ("t.a.counted:n=1", "t.a.counted:n=2", "t.b.counted"):
+        producer.write(key, 1)
+    assert producer.health()["keys"] == {"t.a.counted": 2, "t.b.counted": 1}
+
+
 @pytest.mark.parametrize("init", [{}, RELIABLE], ids=["best_effort", "reliable"])
 def test_a_record_batch_travels_whole(make_engine, init):
     producer, consumer = make_engine("batcher", init=init), make_engine("batch_reader")
