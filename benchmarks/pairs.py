@@ -5,6 +5,8 @@ last callback in the other process.
 """
 
 import multiprocessing
+import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,6 +18,9 @@ import redis
 
 from due import CONSUMER, PRODUCER, PUB_ONLY, Engine, Item, Options, RecordBatch
 
+FRAME = 860
+"""Messages of 100 bytes in a frame of DUE."""
+_MOST_FRAMES = 8
 KEY = "bench.pairs.app.message"
 CHANNEL = "bench"
 _spawn = multiprocessing.get_context("spawn")
@@ -215,3 +220,63 @@ def _listen(pipe: Connection, url: str, messages: int, callback: Callable[[bytes
             messages -= 1
     subscriber.close()
     client.close()
+
+
+def raw_stream_producer(pipe: Connection, url: str, number: int, seconds: float) -> None:
+    """redis-py: frames of 100-byte messages on a stream, held back while more than a few are unread."""
+    client: Any = raw_client(url)
+    name, payload, encoder = f"bench:{number}", bytes(100), msgspec.msgpack.Encoder()
+    pipe.send(0)
+    start = pipe.recv()
+    time.sleep(max(0.0, start - time.time() - 0.3))
+    end = start + seconds + 0.3
+    while time.time() < end:
+        pipeline = client.pipeline(transaction=False)
+        for _ in range(_MOST_FRAMES // 2):
+            messages = []
+            for _ in range(FRAME):
+                messages.append(payload)  # noqa: PERF401 - one by one, as an app writes
+            pipeline.xadd(name, {b"f": encoder.encode(messages)})
+        pipeline.xlen(name)
+        unread = pipeline.execute()[-1]
+        while unread > _MOST_FRAMES and time.time() < end:
+            time.sleep(0.003)
+            unread = client.xlen(name)
+    os._exit(0)
+
+
+def raw_stream_consumer(pipe: Connection, url: str, number: int, seconds: float) -> None:
+    """redis-py: a group's only reader; a callback for each message, frames acknowledged and removed."""
+    client: Any = raw_client(url)
+    name, count = f"bench:{number}", [0]
+    client.delete(name)
+    client.xgroup_create(name, "readers", "0", mkstream=True)
+
+    def callback(_message: bytes) -> None:
+        count[0] += 1
+
+    threading.Thread(target=_read_stream, args=(client, name, callback), daemon=True).start()
+    pipe.send(0)
+    start = pipe.recv()
+    time.sleep(max(0.0, start - time.time()))
+    began, before = time.time(), count[0]
+    time.sleep(max(0.1, start + seconds - time.time()))
+    pipe.send((count[0] - before) / (time.time() - began))
+    os._exit(0)
+
+
+def _read_stream(client: Any, name: str, callback: Callable[[bytes], None]) -> None:
+    decoder = msgspec.msgpack.Decoder(list[bytes])
+    done: list[bytes] = []
+    while True:
+        pipeline = client.pipeline(transaction=False)
+        if done:
+            pipeline.xack(name, "readers", *done)
+            pipeline.xdel(name, *done)
+        pipeline.xreadgroup("readers", "reader", {name: ">"}, count=16, block=1000)
+        done = []
+        for _, entries in pipeline.execute()[-1] or ():
+            for token, fields in entries:
+                for message in decoder.decode(fields[b"f"]):
+                    callback(message)
+                done.append(token)

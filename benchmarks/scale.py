@@ -1,7 +1,9 @@
 """How many pairs fit on one machine, how fairly, and what 100 apps cost the Coordinator.
 
 `python -m benchmarks.scale --json FILE`.  Each pair is two processes with a reliable key of its own, writing
-as fast as the consumer takes it.  The Coordinator hears 100 apps beating at 10 Hz.
+as fast as the consumer takes it.  In between the same layout runs with redis-py alone: what it loses with many
+pairs is lost to the machine, for which each switch between processes costs a cold cache.  The Coordinator hears
+100 apps beating at 10 Hz.
 """
 
 import json
@@ -11,13 +13,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import median
 
 from benchmarks.measure import arguments, bars, machine, table, write_json
-from benchmarks.pairs import _spawn
+from benchmarks.pairs import _spawn, raw_stream_consumer, raw_stream_producer
 from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Interest, Item, Options
 from due.codec import Frame, decode_frame, encode_frame, freeze
 from due.drivers.embedded_redis import EmbeddedServer
@@ -25,6 +27,7 @@ from due.drivers.redis import RedisUpdates
 from due.membership import Assignments, Heartbeat, Member, Registration
 
 PAIRS = (1, 2, 5, 10, 20, 30)
+RAW_PAIRS = (1, 2, 30)
 SECONDS = 4.0
 SECONDS_PER_PAIR = 0.4
 """The more pairs share the cores, the longer it takes until each had the same number of turns."""
@@ -32,36 +35,52 @@ SIZE = 100
 APPS, BEAT = 100, 0.1
 _WINDOW = 1 << 20
 
+Side = Callable[[Connection, str, int, float], None]
+"""A producer or a consumer: its pipe, the server, the number of its pair, seconds."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
     options = arguments("scale", __doc__, rounds=3).parse_args(argv)
     aggregate: dict[str, float] = {}
+    raw: dict[str, float] = {}
     fairness: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder, EmbeddedServer(folder) as server:
         for pairs in PAIRS:
             seconds = max(1.0, max(SECONDS, SECONDS_PER_PAIR * pairs) * options.scale)
-            rounds = [_run(server.url, pairs, seconds) for _ in range(options.rounds)]
+            rounds, raw_rounds = [], []
+            for _ in range(options.rounds):
+                rounds.append(_run(server.url, pairs, seconds, _consumer, _producer))
+                if pairs in RAW_PAIRS:
+                    raw_rounds.append(
+                        _run(server.url, pairs, seconds, raw_stream_consumer, raw_stream_producer)
+                    )
             aggregate[str(pairs)] = median(map(sum, rounds))
+            if raw_rounds:
+                raw[str(pairs)] = median(map(sum, raw_rounds))
             fairness[str(pairs)] = median(min(rates) / max(rates) for rates in rounds)
         share = coordinator_share(server.url, folder, max(2.0, 2 * SECONDS * options.scale))
     table(
-        ["pairs", "messages/s", "share of the best", "min / max"],
-        [[p, aggregate[p], aggregate[p] / max(aggregate.values()), fairness[p]] for p in aggregate],
+        ["pairs", "messages/s", "share of the best", "min / max", "redis-py", "share of its best"],
+        [
+            [p, total, total / max(aggregate.values()), fairness[p]]
+            + ([raw[p], raw[p] / max(raw.values())] if p in raw else ["-", "-"])
+            for p, total in aggregate.items()
+        ],
     )
     bars("messages/s of all pairs together", aggregate)
     print(f"Coordinator with {APPS} apps at {1 / BEAT:.0f} Hz: {share:.1%} of a core")
-    figures = {"aggregate_by_pairs": aggregate, "fairness_by_pairs": fairness}
+    figures = {"aggregate_by_pairs": aggregate, "fairness_by_pairs": fairness, "raw_aggregate_by_pairs": raw}
     write_json(options.json, {"machine": machine(), **figures, "coordinator_cpu_share": share})
     return 0
 
 
-def _run(url: str, pairs: int, seconds: float) -> list[float]:
+def _run(url: str, pairs: int, seconds: float, consumer: Side, producer: Side) -> list[float]:
     """Messages a second of each pair, counted by the consumers in one common span of time."""
     pipes: list[Connection] = []
     processes = []
     for number in range(pairs):
-        for target in (_consumer, _producer):
+        for target in (consumer, producer):
             here, there = _spawn.Pipe()
             processes.append(_spawn.Process(target=target, args=(there, url, number, seconds), daemon=True))
             processes[-1].start()
@@ -73,6 +92,7 @@ def _run(url: str, pairs: int, seconds: float) -> list[float]:
         pipe.send(start)
     rates = [float(_answer(pipe)) for pipe in pipes[::2]]
     for process in processes:
+        process.kill()  # a producer may be held back by its reader, which has left without a word
         process.join()
     return rates
 
