@@ -9,14 +9,18 @@ or block.  For each kind of flood and both IP versions
     new_connect_ms_p50           count that begin 2 s before its end or earlier, as successes only if they
     half_open_peak               connected before its end
     time_to_mitigate_ms          nobody guards the service: first packet to the rule confirmed by the switch
-                                 (all sources blocked, or the service guarded)
+                                 (all sources blocked, or the service guarded); a flood that was not
+                                 mitigated counts as endless
     found                        such a round's success from 2 s after the rule
 
 Medians of the rounds.  real_capture is the capture of the tests' data, re-timed to the same rate and
-looped; `as_recorded` is one run at its own times.
+looped; `as_recorded` is one run at its own times.  After 555 s no round is begun any more, so that all ends
+within 10 minutes; `rounds` and `found_rounds` say how many there were.
 """
 
 import contextlib
+import math
+import statistics
 import sys
 import tempfile
 import time
@@ -60,12 +64,13 @@ ARMED_S: Final[dict[Sources, float]] = {
     "capture": 10.5,
 }
 """The repeating flood has no repeats for its first second; the capture begins again after 7.6 s."""
-FOUND_S: Final = 12.0
-"""At most."""
+FOUND_S: Final = 4.0
+"""At most, until the rule."""
 AFTER_RULE_S: Final[dict[Sources, float]] = {"one": 5.2, "hundred": 5.2}
 """Others end with the rule: clients of a service that was not guarded beforehand are no figure of theirs."""
 LOOPED_S: Final = 30.0
-SETTLE_S: Final = 15.0
+SETTLE_S: Final = 3.0
+_LAST_ROUND_S: Final = 555.0
 CROWD_RATE, CROWD_S = 250.0, 4.0
 LEARNING, CROWD, RECORDED, UNPROTECTED, ARMED, FOUND = 1, 2, 3, 5, 20, 120
 """Numbers of the victim's services; rounds count on from theirs."""
@@ -91,7 +96,7 @@ class Kind:
             "new_client_success": median(each.new_success for each in armed),
             "new_connect_ms_p50": median(each.new_connect_ms_p50 for each in armed),
             "half_open_peak": max((each.half_open_peak for each in armed), default=None),
-            "time_to_mitigate_ms": median(each.mitigated_ms for each in found),
+            "time_to_mitigate_ms": median_or_endless([each.mitigated_ms for each in found]),
             "entries_peak": self.entries_peak,
             "known_client_success_worst": min((each.known_success or 0.0 for each in armed), default=None),
             "new_client_success_worst": min((each.new_success or 0.0 for each in armed), default=None),
@@ -104,15 +109,27 @@ class Kind:
             },
             "attempts": sum(each.tried for each in armed),
             "rounds": len(armed),
+            "found_rounds": len(found),
             "syn_late_ms": max((each.latest_ms for each in armed + found), default=None),
         }
 
 
-class Bench:
-    """The rounds, on a running stage."""
+def median_or_endless(values: Sequence[float | None]) -> float | None:
+    """The median where None is endless; None for that, or for no values.
 
-    def __init__(self, field: Field, names: Sequence[str], rounds: int, data: Path) -> None:
+    >>> median_or_endless([300, None, 400]), median_or_endless([300, None, None])
+    (400, None)
+    """
+    found = statistics.median([math.inf if value is None else value for value in values] or [math.inf])
+    return found if found < math.inf else None
+
+
+class Bench:
+    """The rounds, on a running stage; none begins after `last`, monotonic seconds."""
+
+    def __init__(self, field: Field, names: Sequence[str], rounds: int, data: Path, last: float) -> None:
         self._field = field
+        self._last = last
         self._names = names
         self._rounds = {4: rounds, 6: min(rounds, ROUNDS_IPV6)}
         self._capture = str(data / "captures" / "synflood_spoofed.pcap")
@@ -132,26 +149,31 @@ class Bench:
 
     def armed(self) -> None:
         """All rounds against guarded services."""
-        for (version, name), kind in self.kinds.items():
-            for number in range(self._rounds[version]):
-                seconds = ARMED_S[KINDS[name]]
-                if (version, name, number) == (4, "real_capture", 0):
-                    seconds = LOOPED_S
-                outcome = self._run(self._trial(name, version, ARMED, number, seconds))
-                kind.armed.append(outcome)
-                self._count_entries(kind)
-                if seconds == LOOPED_S:
-                    self.looped = outcome
+        for number, version, name, kind in self._each_round():
+            seconds = ARMED_S[KINDS[name]]
+            if (version, name, number) == (4, "real_capture", 0):
+                seconds = LOOPED_S
+            outcome = self._run(self._trial(name, version, ARMED, number, seconds))
+            kind.armed.append(outcome)
+            self._count_entries(kind)
+            if seconds == LOOPED_S:
+                self.looped = outcome
 
     def found(self) -> None:
         """All rounds against services that nobody guards."""
-        for (version, name), kind in self.kinds.items():
-            for number in range(self._rounds[version]):
-                trial = self._trial(name, version, FOUND, number, FOUND_S)
-                trial = replace(trial, after_rule=AFTER_RULE_S.get(KINDS[name], 0.0))
-                self.settled += self._field.stage.settle(SETTLE_S)
-                kind.found.append(self._run(replace(trial, protection="found")))
-                self._count_entries(kind)
+        for number, version, name, kind in self._each_round():
+            after = AFTER_RULE_S.get(KINDS[name], 0.0)
+            trial = self._trial(name, version, FOUND, number, FOUND_S + after)
+            self.settled += self._field.stage.settle(SETTLE_S)
+            kind.found.append(self._run(replace(trial, after_rule=after, protection="found")))
+            self._count_entries(kind)
+
+    def _each_round(self) -> Iterator[tuple[int, int, str, Kind]]:
+        """The first of every kind, then the second: where time is short the last ones are missing."""
+        for number in range(max(self._rounds.values())):
+            for (version, name), kind in self.kinds.items():
+                if number < self._rounds[version] and time.monotonic() < self._last:
+                    yield number, version, name, kind
 
     def as_recorded(self) -> None:
         """The real flood at its own times."""
@@ -228,7 +250,7 @@ def measure(names: Sequence[str], rounds: int, data: Path, keep: Path | None) ->
     ):
         services = [plan.service(number) for plan in PLANS.values() for number in range(1, 200)]
         field = Field(stage, services)
-        bench = Bench(field, names, rounds, data)
+        bench = Bench(field, names, rounds, data, begun + _LAST_ROUND_S)
         bench.unprotected()
         stage.lab.flush_metrics()
         # several attacks in the time of one: the cap on decisions a minute is for people's real days
@@ -238,10 +260,10 @@ def measure(names: Sequence[str], rounds: int, data: Path, keep: Path | None) ->
         memory = [stage.memory()]
         crowd, crowd_success = bench.crowd()
         bench.armed()
-        memory.append(stage.memory())
-        bench.found()
         if "real_capture" in names:
             bench.as_recorded()
+        memory.append(stage.memory())
+        bench.found()
         memory.append(stage.memory())
         kernel, firewall = stage.lab.settings(), stage.firewall
     innocent = {**_innocent(data), "flash_crowd": crowd, "clients": bench.innocent_blocked()}
@@ -291,6 +313,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for title, part in (("IPv4", figures), ("IPv6", figures["ipv6"])):
         print(title)
         table(("flood", *FIELDS), [(name, *(part[name][each] for each in FIELDS)) for name in names])
+    memory = figures["memory_mb"]
+    print("resident memory, MB: at the start", memory[0], "at the end", memory[-1])
     shares = [
         part[name]["client_success_unprotected"] for part in (figures, figures["ipv6"]) for name in names
     ]

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from apps.firewall.recent_rows import Columns, RecentRows
+from apps.firewall.recent_rows import AGED_S, Columns, RecentRows
 from apps.firewall.services import Service
 from apps.firewall.tcp_reset import HalfOpen, reset_frame
 from due import RecordBatch
@@ -36,10 +36,10 @@ _FRAMES: Final = 512
 
 
 class Answers:
-    """At least the last `rows` SYN-ACKs."""
+    """At least the last `rows` SYN-ACKs; those of the last `exact_s` can be told apart by when they came."""
 
-    def __init__(self, rows: int) -> None:
-        self._recent = RecentRows((*_COLUMNS, "time_us"), rows)
+    def __init__(self, rows: int, exact_s: float = AGED_S) -> None:
+        self._recent = RecentRows((*_COLUMNS, "time_us"), rows, aged_s=exact_s)
         self.missing = ""
         """Columns that a reset needs and the records lack."""
 

@@ -49,11 +49,13 @@ class Desk:
 
     def _unblock(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
         found = self._ledger.matching(instruction.subject)
-        if not found:
+        guards = self._syn.release(instruction.subject, now, "by hand")
+        if not found and not guards:
             raise ValueError(
-                f"no block has the id or address {instruction.subject}; see `sdnator blocks list`"
+                f"no block or guard has the id or address {instruction.subject}; see `sdnator blocks list`; "
+                "guards that the settings name stay"
             )
-        return self._lift(found, now, "by hand"), f"{len(found)} lifted"
+        return self._lift(found, now, "by hand") + guards, f"{len(found) + len(guards)} lifted"
 
     def _panic(self, _: Instruction, __: Evidence, now: int) -> tuple[list[Decision], str]:
         blocks = [block.decision for block in self._ledger.blocks.values()]

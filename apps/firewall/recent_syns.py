@@ -69,11 +69,9 @@ class Surges:
         if len(self._counts) > HOSTS:
             self._counts.clear()
         now = batch["time_us"] // self._window_us == self._window
-        names = ("ip_version", "ip_dst_hi", "ip_dst_lo")
-        rows = np.stack([batch[name][now].astype(np.uint64) for name in names])
-        hosts, counts = np.unique(rows, axis=1, return_counts=True)
+        columns = (batch[name][now].tolist() for name in ("ip_version", "ip_dst_hi", "ip_dst_lo"))
         surging = []
-        for version, high, low, count in zip(*hosts.tolist(), counts.tolist(), strict=True):
+        for (version, high, low), count in Counter(zip(*columns, strict=True)).items():
             before = self._counts[version, high, low]
             self._counts[version, high, low] = before + count
             if before < self._threshold <= before + count and version:

@@ -38,6 +38,7 @@ from apps.firewall.ledger import Ledger, Notice
 from apps.firewall.neighbours import gather_blocks
 from apps.firewall.outlets import outlets_of
 from apps.firewall.policy import AllowList, Verdict, judge
+from apps.firewall.recent_rows import AGED_S
 from apps.firewall.recent_syns import Surges
 from apps.firewall.services import Service
 from apps.firewall.settings import Settings
@@ -124,10 +125,9 @@ class FirewallService:
         """By host: when to look, wall clock, and at what."""
         self._undecided: dict[str, tuple[float, Suspicion]] = {}
         """The same for the second look, after which sources are blocked."""
-        self._answers = Answers(settings.syn.sample)
-        self._resets = Resets(
-            self._answers, after_s=settings.syn.reset_after_ms / 1000, limit=settings.syn.resets
-        )
+        after_s = settings.syn.reset_after_ms / 1000
+        self._answers = Answers(settings.syn.sample, AGED_S + after_s)
+        self._resets = Resets(self._answers, after_s=after_s, limit=settings.syn.resets)
         self._bindings = _bindings(settings)
         self._archive = Archive(engine, settings.archive_patience_s)
         self._announcer = Announcer(engine, *outlets_of(settings))

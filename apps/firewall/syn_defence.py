@@ -189,6 +189,14 @@ class SynDefence:
             if decision.action == "protect" and decision.expires and port is not None:
                 self._guarded[Service(decision.target.address, port)] = decision
 
+    def release(self, which: str, now: int, reason: str) -> list[Decision]:
+        """Lift the guards with this id or address that floods led to; a flood that goes on brings them back."""
+        found = [service for service, each in self._guarded.items() if which in (each.id, service.address)]
+        return [
+            _changed(self._guarded.pop(service), action="unprotect", reason=reason, event_time=now)
+            for service in found
+        ]
+
     def release_all(self, now: int, reason: str) -> list[Decision]:
         """Lift all guards that floods led to."""
         lifted = [

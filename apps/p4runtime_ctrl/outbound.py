@@ -79,8 +79,9 @@ class Outbound:
             self._write(f"network.cell.{APP}.{self._name}", packets.cells, self.progress.time_us * 1000)
         if self._by_digest:
             self._write_records(self._unison.packets(_rows(packets)))
-        else:
-            self._publish_copies(packets)
+        elif self._routes.get("packets") and len(packets):
+            # headers are read once for all keys: under a flood most packets are wanted under several
+            self._write_records([_rows(packets)])
         for key, bit in self._routes.get("frames", ()):
             chosen = packets.matching(bit)
             if len(chosen):
@@ -103,12 +104,6 @@ class Outbound:
         if waits and waits == self._waited:
             self._write_records(self._unison.flush())
         self._waited = waits
-
-    def _publish_copies(self, packets: Packets) -> None:
-        for key, bit in self._routes.get("packets", ()):
-            chosen = packets.matching(bit)
-            if len(chosen):
-                self._write(key, chosen.batch(read_frames), int(chosen.time_us[-1]) * 1000)
 
     def _write_records(self, told: list[Rows]) -> None:
         for rows in told:

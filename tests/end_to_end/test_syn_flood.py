@@ -38,7 +38,7 @@ class Ground:
     field: Field
     unprotected: Outcome
 
-    def flood(self, sources, service: int, *, seconds: float = 5.0, **changes) -> Outcome:
+    def flood(self, sources, service: int, *, seconds: float = 4.2, **changes) -> Outcome:
         return self.field.run(Trial(sources=sources, service=service, seconds=seconds, **changes))
 
 
@@ -49,7 +49,7 @@ def ground(tmp_path_factory) -> Iterator[Ground]:
     folder = tmp_path_factory.mktemp("syn-flood")
     with Lab() as lab, Stage(lab, folder, switch="embedded", guard=guard(5000)) as stage:
         field = Field(stage, [plan.service(each) for plan in PLANS.values() for each in range(1, 50)])
-        trial = Trial(sources="spoofed", service=UNPROTECTED, seconds=5.5, protection="none")
+        trial = Trial(sources="spoofed", service=UNPROTECTED, seconds=4.7, protection="none")
         outcome = field.run(trial)
         lab.flush_metrics()
         guarded = [

@@ -26,6 +26,7 @@ from tests.requirements import shared_data
 
 WEB = Service("10.0.0.1", 80)
 GATEWAY, RESOLVER, KNOWN, NEIGHBOUR = "10.0.0.254", "10.0.0.253", "10.3.0.7", "10.3.0.8"
+WEB6, KNOWN6 = Service("fd00::1", 80), "fd03::7"
 ATTACKER, HOST = 0x02_00_00_00_00_66, 0x02_00_00_00_00_07
 ANY = Evidence(key="k", timestamp=1, summary="a surge")
 
@@ -34,28 +35,31 @@ def defence(allow: tuple[str, ...] = (), known: int = 4000) -> SynDefence:
     return SynDefence(SynRules(), (), Ledger(Rules()), AllowList.parse(allow), KnownSources(known))
 
 
-@pytest.mark.parametrize("forged", [GATEWAY, RESOLVER, KNOWN, "10.9.9.9"])
+@pytest.mark.parametrize("forged", [GATEWAY, RESOLVER, KNOWN, "10.9.9.9", "fd00::254", KNOWN6, "fd09::9"])
 def test_flood_in_somebodys_name(forged):
     """Gateway, DNS server, a known client, somebody allowed: guarded against, never blocked."""
-    desk = Desk(
-        rules=Rules(allow=(GATEWAY, RESOLVER, "10.9.0.0/16")), syn=SynRules(grace_ms=0, patience_ms=0)
-    )
-    desk.hand(HANDSHAKE, {"source": KNOWN, "service": WEB.address, "port": 80, "at": NOW})
+    service = WEB6 if ":" in forged else WEB
+    allow = (GATEWAY, RESOLVER, "10.9.0.0/16", "fd00::254", "fd09::/16")
+    desk = Desk(rules=Rules(allow=allow), syn=SynRules(grace_ms=0, patience_ms=0))
+    for known in (KNOWN, KNOWN6):
+        desk.hand(HANDSHAKE, {"source": known, "service": service.address, "port": 80, "at": NOW})
     for _ in range(2):
-        desk.hand(SYNS, batch(*[(NOW // 1000, forged, WEB.address, 80)] * 600))
+        desk.hand(SYNS, batch(*[(NOW // 1000, forged, service.address, 80)] * 600))
         desk.service.tick()
-    assert desk.guarded == [WEB.address]
+    assert desk.guarded == [service.address]
     assert desk.blocked == []
 
 
-def test_flood_from_the_prefix_of_a_real_host():
+@pytest.mark.parametrize(("prefix", "host"), [("10.3.0.", KNOWN), ("fd03::", KNOWN6)])
+def test_flood_from_the_prefix_of_a_real_host(prefix, host):
     """Every address of it repeats, one of them is known: the prefix stays open, the service is guarded."""
     made = defence()
-    made.handshake(KNOWN, WEB, NOW)
-    rows = [(1, f"10.3.0.{n}", WEB.address, 80) for n in range(256) for _ in range(5)]
+    service = WEB6 if ":" in prefix else WEB
+    made.handshake(host, service, NOW)
+    rows = [(1, f"{prefix}{n}", service.address, 80) for n in range(256) for _ in range(5)]
     made.recent.add(batch(*rows))
-    (decision,) = made.conclude(made.suspect(Suspicion(WEB.address, ANY, NOW, 0)), {})
-    assert (decision.action, decision.target) == ("protect", WEB.target)
+    (decision,) = made.conclude(made.suspect(Suspicion(service.address, ANY, NOW, 0)), {})
+    assert (decision.action, decision.target) == ("protect", service.target)
 
 
 def test_prefix_where_nobody_lives_is_blocked_as_one():
@@ -110,6 +114,15 @@ def test_arp_in_somebodys_name():
         assert desk.blocked == blocked
         assert desk.service.health()["arp_thefts"] == 1
         assert bool(desk.events) != bool(blocked)
+
+
+def test_arp_in_the_gateways_name():
+    """That the gateway is allowed does not help who claims its address: the thief's port and MAC are blocked."""
+    desk = Desk(rules=Rules(allow=(GATEWAY,)))
+    owner = [arp(each, 1, HOST, GATEWAY) for each in (0, 599)]
+    desk.hand(ARP, records([owner[0], arp(1, 3, ATTACKER, "10.0.0.66"), owner[1]]))
+    desk.hand(ARP, records([arp(660, 3, ATTACKER, GATEWAY), arp(661, 1, HOST, GATEWAY)]))
+    assert [(each.target.address, each.target.port) for each in desk.decisions] == [("02:00:00:00:00:66", 3)]
 
 
 def test_a_million_forged_sources():

@@ -9,7 +9,7 @@ from apps.firewall.policy import AllowList, Rules
 from apps.firewall.services import Service
 from apps.firewall.syn_defence import Suspicion, SynDefence
 from apps.firewall.syn_policy import SynRules
-from apps.messages import Evidence, Instruction, Target
+from apps.messages import Decision, Evidence, Instruction, Target
 from tests.apps.firewall.test_recent_syns import batch
 
 WEB = Service("10.0.0.1", 80)
@@ -55,6 +55,20 @@ def test_refused_with_a_reason(allowed, subject, why):
     decisions, answer = tell(desk(allowed), "block", subject)
     assert (decisions, answer.done) == ([], False)
     assert why in answer.text
+
+
+@pytest.mark.parametrize("which", ["g1", WEB.address])
+def test_unblock_releases_a_guard_that_a_flood_led_to(which):
+    """By id or address; guards of the settings stay, and what is none is said to be so."""
+    made = desk()
+    guard = Decision(
+        id="g1", action="protect", switch="*", target=WEB.target, reason="", event_time=1, expires=2 * NOW
+    )
+    made._syn.restore([guard])
+    (lifted,), answer = tell(made, "unblock", which)
+    assert (lifted.action, lifted.target, answer.text) == ("unprotect", WEB.target, "1 lifted")
+    assert made._syn.guarded == []
+    assert not tell(made, "unblock", which)[1].done
 
 
 def test_unblock_by_id_and_by_address():

@@ -43,12 +43,20 @@ class Stage:
         self.items: list[Item] = []
 
     def __enter__(self) -> "Stage":
-        self.server.__enter__()
-        self.target.start()
-        self.run("coordinator.service")
+        try:
+            self.server.__enter__()
+            self.target.start()
+            self.run("coordinator.service")
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all that was started, also where the start failed half-way."""
         for engine in self._engines:
             engine.close()
         for process in reversed(self.processes):
