@@ -1,13 +1,16 @@
 """Sonata queries, measured: `python -m benchmarks.sonata --json FILE`.
 
 correct_queries: queries whose results, switch and host together, equal those of a naive evaluator on
-generated attacks and on real captures.  reduction: packets for each tuple that reached the host, on
---packets packets in two runs, since the switch has not room for all queries at once; for zorro and
-slowloris outside attacks.  host_tuples_per_s: filter, distinct and reduce on one core.
+generated attacks and on real captures; estimates: results that call themselves so.  reduction: packets
+for each tuple that reached the host, on --packets packets in two runs, since the switch has not room for
+all queries at once; for zorro and slowloris outside attacks.  two_tuples_a_result: on all of them, whether
+no more tuples came than that and those of keys without a cell (overflow).
+host_tuples_per_s: filter, distinct and reduce on one core.
 all_queries_cost_ratio: processor time of all eleven together over that of the dearest alone.
 window_200ms_delay_ms: from the end of a window of 200 ms to the result that is known then only.
 declare_to_first_result_ms: from writing a key to its first result, windows of one second, busy network.
 lost_packets: not forwarded while 200 queries came and went.  Real processes, embedded switch.
+bmv2: with `--only bmv2`, which needs root: the queries with all attacks through BMv2, at its own times.
 """
 
 import random
@@ -15,7 +18,8 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -32,6 +36,7 @@ from sdnator.captures import Capture
 from tests.apps.sonata_adapter.traffic import BASE_US, Frame, attack, batch_of, mixed, office, tcp
 from tests.requirements import shared_data
 
+_PARTS = ("host", "correctness", "reduction", "responsiveness", "bmv2")
 CAPTURES = ("synflood_spoofed", "synflood_one_source", "ssh_guessing", "ftp_bruteforce")
 BATCH = 32_768
 _BLOCK_S = 60
@@ -39,20 +44,32 @@ _SECOND = ("syn_flood", "incomplete_flows", "slowloris", "dns_tunnel", "zorro", 
 """Queries of the second run for `reduction`."""
 _OUTSIDE = ("slowloris", "zorro")
 """Queries whose reduction counts outside attacks: what an attack is can be told from its packets only."""
+_DENSE = 10_000
+"""Packets a second that may come together when traffic is played faster than it came."""
 _FASTER = 8.0
-"""Replays are faster than the traffic, but so slow that the cells of a window can be read after it."""
+"""Most replays are faster than the traffic, but so slow that the cells of a window can be read after it."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run all, print a table, write the figures."""
     parser = measure.arguments("sonata", __doc__, rounds=5)
+    parser.add_argument(
+        "--only", nargs="+", choices=_PARTS, default=_PARTS[:-1], help="parts of it; not bmv2"
+    )
+    traffics = ("all attacks", *CATALOGUE, *CAPTURES)
+    parser.add_argument("--traffic", nargs="+", choices=traffics, default=traffics, help="of correctness")
     parser.add_argument("--packets", type=int, default=3_600_000, help="of the run for `reduction`")
     chosen = parser.parse_args(argv)
     figures: dict[str, Any] = {"machine": measure.machine()}
-    figures |= host_figures(chosen.rounds)
-    figures |= correctness()
-    figures |= reduction(int(chosen.packets * chosen.scale))
-    figures |= responsiveness(chosen.rounds)
+    parts: dict[str, Callable[[], dict[str, Any]]] = {
+        "host": lambda: host_figures(chosen.rounds),
+        "correctness": lambda: correctness(chosen.traffic),
+        "reduction": lambda: reduction(int(chosen.packets * chosen.scale)),
+        "responsiveness": lambda: responsiveness(chosen.rounds),
+        "bmv2": bmv2,
+    }
+    for name in chosen.only:
+        figures |= parts[name]()
     for name, value in figures.items():
         print(f"{name:28} {value}")
     measure.write_json(chosen.json, figures)
@@ -111,27 +128,58 @@ def _cost(names: Sequence[str], batches: Sequence[RecordBatch]) -> float:
     return time.process_time() - begin
 
 
-def correctness() -> dict[str, Any]:
+def correctness(traffics: Sequence[str]) -> dict[str, Any]:
     """Every query on every traffic; a query is correct when it is so on all."""
     wrong: dict[str, list[str]] = {}
-    for name, frames in _traffics():
+    estimates: Counter[str] = Counter()
+    late_reads = 0
+    for name, frames in _traffics(traffics):
         with tempfile.TemporaryDirectory() as folder, SonataStage(Path(folder)) as stage:
             stage.declare(QUERIES.values())
-            stage.play(frames, faster=_FASTER)
+            stage.play(frames, faster=_pace(frames))
             results = stage.finish()
             for query in equal_to_naive(frames, results, stage.base_us):
                 wrong.setdefault(query, []).append(name)
-    return {"correct_queries": len(CATALOGUE) - len(wrong), "wrong": wrong}
+            late_reads += stage.late_reads
+            estimates.update(query for query, each in results.items() for one in each if not one["exact"])
+    return {
+        "correct_queries": len(CATALOGUE) - len(wrong),
+        "wrong": wrong,
+        "estimates": dict(estimates),
+        "late_reads": late_reads,
+    }
 
 
-def _traffics() -> Iterator[tuple[str, list[Frame]]]:
-    yield "all attacks", mixed(CATALOGUE, seconds=20)
-    for name in CATALOGUE:
-        rng = random.Random(7)
-        yield name, sorted(office(8, rng, long=True) + attack(name, BASE_US + 10_000, rng))
-    for name in CAPTURES:
-        with Capture(shared_data(f"captures/{name}.pcap")) as capture:
-            yield name, [Frame(time_ns // 1000, length, data) for time_ns, length, data in capture]
+def _pace(frames: Sequence[Frame]) -> float:
+    """How many times as fast as it came traffic is played: dense traffic as it came."""
+    densest = max(Counter(frame.time_us // 10**6 for frame in frames).values())
+    return min(_FASTER, max(1.0, _DENSE / densest))
+
+
+def bmv2() -> dict[str, Any]:
+    """Every query on all attacks through BMv2, whose clock stamps the frames."""
+    frames = mixed(CATALOGUE, seconds=20)
+    with tempfile.TemporaryDirectory() as folder, SonataStage(Path(folder), "bmv2") as stage:
+        stage.declare(QUERIES.values())
+        stage.note_times()
+        stage.play(frames, faster=1)
+        stamped = stage.stamped(frames)
+        results = stage.finish()
+        wrong = equal_to_naive(stamped, results, stage.base_us, zero=stage.base_us)
+    found = {name: len(each) for name, each in results.items()}
+    return {"bmv2": {"correct_queries": len(CATALOGUE) - len(wrong), "wrong": wrong, "results": found}}
+
+
+def _traffics(names: Sequence[str]) -> Iterator[tuple[str, list[Frame]]]:
+    for name in names:
+        if name in CAPTURES:
+            with Capture(shared_data(f"captures/{name}.pcap")) as capture:
+                yield name, [Frame(time_ns // 1000, length, data) for time_ns, length, data in capture]
+        elif name in CATALOGUE:
+            rng = random.Random(7)
+            yield name, sorted(office(8, rng, long=True) + attack(name, BASE_US + 10_000, rng))
+        else:
+            yield name, mixed(CATALOGUE, seconds=20)
 
 
 def reduction(packets: int) -> dict[str, Any]:
@@ -145,6 +193,8 @@ def reduction(packets: int) -> dict[str, Any]:
         "reduction_packets": {},
         "tuples": {},
         "results": {},
+        "overflow": {},
+        "two_tuples_a_result": {},
         "reduction_attacks": 0,
         "reduction_packets_per_s": [],
     }
@@ -177,6 +227,8 @@ def _count(stage: SonataStage, names: list[str], packets: int, figures: dict[str
         seen, n = (quiet, tuples["quiet"][name]) if name in _OUTSIDE else (sent, stage.tuples[name])
         figures["tuples"][name], figures["results"][name] = n, len(results[name])
         figures["reduction_packets"][name] = seen
+        over = figures["overflow"][name] = stage.overflow[name]
+        figures["two_tuples_a_result"][name] = stage.tuples[name] <= 2 * len(results[name]) + over
         figures["reduction"][name] = round(seen / n, 1) if n else None
 
 

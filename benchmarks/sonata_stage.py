@@ -3,27 +3,63 @@
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from apps.sonata_adapter.catalogue import CATALOGUE
+from dataplane.bmv2 import Bmv2
 from due import Item
-from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, end, wait_for
+from sdnator.wire import Feed, VethPair, WireFeed
+from tests.apps.p4runtime_ctrl.stage import BASE_US, PACKETS, Heard, Stage, end, wait_for
+from tests.apps.p4runtime_ctrl.targets import Target
 from tests.apps.sonata_adapter.traffic import Frame
 from tests.naive import sonata
 
 PREFIX = "network.traffic_query.sonata"
 QUERIES = {name: f"{PREFIX}.{name}" for name in CATALOGUE}
 _BLOCK = 512
+_BLOCK_S = 0.01
+"""Frames that are sent together are not farther apart, so that a gap in a capture is a gap here."""
 _IN_FLIGHT = 20_000
 _PACE_S = 0.002
 
 
+class _Bmv2Target(Target):
+    """BMv2 as it is installed: builds differ in the options that they have."""
+
+    def __init__(self, kind: str, folder: Path, *, far: str) -> None:
+        super().__init__(kind, folder)
+        self._far = far
+
+    @property
+    def address(self) -> str:
+        return self._bmv2.address
+
+    def start(self) -> None:
+        self._bmv2 = Bmv2({1: self._far})
+
+    def stop(self) -> None:
+        self._bmv2.close()
+
+
 class SonataStage(Stage):
-    """Switch, controller, Coordinator and adapter; `with SonataStage(folder) as stage`."""
+    """Switch, controller, Coordinator and adapter; `with SonataStage(folder) as stage`.
+
+    `kind`: embedded, or bmv2 behind a veth pair, which needs root and has a clock of its own.
+    """
 
     base_us = BASE_US
+
+    def __init__(self, folder: Path, kind: str = "embedded") -> None:
+        self._cable = ExitStack()
+        self._wire = VethPair.make(self._cable, "so") if kind == "bmv2" else None
+        super().__init__(folder)
+        if self._wire is not None:
+            self.target = _Bmv2Target("bmv2", folder, far=self._wire.far)
 
     def __enter__(self) -> "SonataStage":
         super().__enter__()
@@ -33,14 +69,17 @@ class SonataStage(Stage):
         self._health = Heard(self._observer, "due.health.sonata_adapter")
         self._results: list[Item] = []
         self.controller()
-        self._feed = self.feed()
+        self._feed: Feed = self.feed() if self._wire is None else WireFeed(self._wire.near)
         self.tuples: dict[str, int] = {}
+        self.overflow: dict[str, int] = {}
+        self.late_reads = 0
         wait_for(lambda: self._states.values("network.switch"))
         return self
 
     def __exit__(self, *details: object) -> None:
         self._feed.close()
         super().__exit__(*details)
+        self._cable.close()
 
     @property
     def _telemetry(self) -> list[str]:
@@ -59,16 +98,32 @@ class SonataStage(Stage):
         bits = health[-1]["app"]["bits"] if health else 0  # type: ignore[index]
         return bool(bits) and len(self._telemetry) == bits
 
+    def note_times(self) -> None:
+        """From now on note when the switch took each frame; returns when it tells."""
+        before = len(self._telemetry)
+        self._noted = Heard(self._observer, PACKETS)
+        wait_for(lambda: len(self._telemetry) > before, 30, self.log)
+
+    def stamped(self, frames: Sequence[Frame]) -> list[Frame]:
+        """The frames with the switch's times, after `note_times` and `play`; all must have been noted."""
+        wait_for(lambda: len(self._noted.arrivals()) >= len(frames), 30, self.log)
+        batches = [item.value for item in self._noted.items if item.key == PACKETS]
+        times = np.concatenate([batch["time_us"] for batch in batches])
+        order = np.argsort(self._noted.arrivals(), kind="stable")
+        return [
+            Frame(time_us, frame.length, frame.data)
+            for time_us, frame in zip(times[order].tolist(), frames, strict=True)
+        ]
+
     def play(self, frames: Iterable[Frame], *, faster: float = 0.0, zero: int | None = None) -> int:
         """Send all frames; returns their number.
 
         `faster`: so many times as fast as they were captured, 0 = as fast as the switch takes them.
         `zero`: the switch's clock zero, default the first frame's second.
         """
-        rest = iter(frames)
         sent = done = 0
         begin, first = time.monotonic(), None
-        while part := list(islice(rest, _BLOCK)):
+        for part in blocks(frames, round(_BLOCK_S * faster * 1e6)):
             zero = part[0].time_us // 10**6 * 10**6 if zero is None else zero
             first = part[0].time_us if first is None else first
             if faster:
@@ -78,7 +133,7 @@ class SonataStage(Stage):
                 [f.time_us - zero for f in part], [f.length for f in part], [f.data for f in part]
             )
             sent += len(part)
-            done += len(self._feed.verdicts())
+            done += len(part) if self._wire is not None else len(self._feed.verdicts())
             while sent - done > _IN_FLIGHT:
                 time.sleep(0.001)
                 done += len(self._feed.verdicts())
@@ -92,9 +147,10 @@ class SonataStage(Stage):
         self._health.items.clear()
         wait_for(self._quiet, 120)
         last: Any = self._health.values("health")[-1]
-        found = {key.partition(":")[0].rpartition(".")[2]: n for key, n in last["app"]["tuples"].items()}
-        self.tuples = {name: found.get(name, 0) for name in CATALOGUE}
+        self.tuples = _by_name(last["app"]["tuples"])
+        self.overflow = _by_name(last["app"]["overflow"])
         self._written = last["app"]["results"]
+        self.late_reads = last["app"]["late_reads"]
         return dict(self.tuples)
 
     def finish(self) -> dict[str, list[dict[str, Any]]]:
@@ -184,11 +240,29 @@ class SonataStage(Stage):
         return max(0, sent - before[0] - (self._forwarded - before[1]))
 
 
+def _by_name(counts: dict[str, int]) -> dict[str, int]:
+    """Counts by query instead of by its whole key."""
+    found = {key.partition(":")[0].rpartition(".")[2]: n for key, n in counts.items()}
+    return {name: found.get(name, 0) for name in CATALOGUE}
+
+
+def blocks(frames: Iterable[Frame], span_us: int) -> Iterator[list[Frame]]:
+    """Parts of a replay: at most `_BLOCK` frames, and none longer than `span_us`; 0: no matter how long."""
+    part: list[Frame] = []
+    for frame in frames:
+        if part and (len(part) == _BLOCK or 0 < span_us < frame.time_us - part[0].time_us):
+            yield part
+            part = []
+        part.append(frame)
+    if part:
+        yield part
+
+
 def equal_to_naive(
-    frames: Sequence[Frame], results: dict[str, list[dict[str, Any]]], base_us: int
+    frames: Sequence[Frame], results: dict[str, list[dict[str, Any]]], base_us: int, zero: int | None = None
 ) -> list[str]:
-    """Queries whose results differ from the naive evaluator's."""
-    zero = frames[0].time_us // 10**6 * 10**6
+    """Queries whose results differ from the naive evaluator's; `zero`: as of `SonataStage.play`."""
+    zero = frames[0].time_us // 10**6 * 10**6 if zero is None else zero
     packets = [sonata.read(frame.time_us - zero, frame.length, frame.data) for frame in frames]
     wrong = []
     for name, template in CATALOGUE.items():

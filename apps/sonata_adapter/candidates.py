@@ -2,9 +2,11 @@
 
 A result must meet `syns + syn_acks - acks >= 3`; counts are not negative, so one of the positive ones
 is at least 2.  The switch reports keys at that count, and the host reads the others for these alone.
+Conditions on one count make others stronger: with `bytes >= 500`, `bytes <= 90 * connections` needs six
+connections.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from apps.sonata_adapter.dataflow import VALUE, Table, TableJoin, conjuncts
 from apps.sonata_adapter.errors import NotPlaced
@@ -22,10 +24,12 @@ def candidates(table: Table) -> list[int]:
     """
     walk = _Walk()
     _, conditions = walk.table(table)
+    inequalities = [found for found in map(_inequality, conditions) if found is not None]
+    least = _least(inequalities)
     best: list[int] = []
-    for condition in conditions:
-        found = _thresholds(condition, walk.sources)
-        if any(found) and (not best or sum(map(bool, found)) < sum(map(bool, best))):
+    for terms, bound in inequalities:
+        found = _thresholds(terms, bound, walk.sources, least)
+        if any(found) and (not best or _is_better(found, best)):
             best = found
     if not best:
         raise NotPlaced("no count of a key says early that the key may become a result")
@@ -73,20 +77,44 @@ def _is_count(value: Expression) -> bool:
     return not isinstance(value, Field) or value.name.startswith(VALUE)
 
 
-def _thresholds(condition: Expression, sources: int) -> list[int]:
-    """Counts that the condition implies, one of which must be reached; zeros: it implies nothing."""
-    none = [0] * sources
-    if not isinstance(condition, Binary) or condition.operator not in (">=", ">"):
-        return none
+def _is_better(new: list[int], old: list[int]) -> bool:
+    """Fewer sources that report; where they are the same, at higher counts."""
+    mine, theirs = list(map(bool, new)), list(map(bool, old))
+    return sum(mine) < sum(theirs) or (mine == theirs and sum(new) > sum(old))
+
+
+def _inequality(condition: Expression) -> _Terms | None:
+    """The condition as `sum of terms >= number`; None: it is none."""
+    if not isinstance(condition, Binary) or condition.operator not in (">=", ">", "<=", "<"):
+        return None
     left, right = _linear(condition.left), _linear(condition.right)
     if left is None or right is None:
-        return none
+        return None
+    if condition.operator in ("<=", "<"):
+        left, right = right, left
     terms = {name: left[0].get(name, 0) - right[0].get(name, 0) for name in {*left[0], *right[0]}}
-    least = right[1] - left[1] + (condition.operator == ">")
+    return terms, right[1] - left[1] + (condition.operator in (">", "<"))
+
+
+def _least(inequalities: Sequence[_Terms]) -> dict[str, int]:
+    """What each count is at least, by the conditions on it alone."""
+    found: dict[str, int] = {}
+    for terms, bound in inequalities:
+        if len(terms) == 1:
+            ((name, factor),) = terms.items()
+            if factor > 0:
+                found[name] = max(found.get(name, 0), -(-bound // factor))
+    return found
+
+
+def _thresholds(terms: Mapping[str, int], bound: int, sources: int, least: Mapping[str, int]) -> list[int]:
+    """Counts that the condition implies, one of which must be reached; zeros: it implies nothing."""
+    none = [0] * sources
+    needed = bound - sum(factor * least.get(name, 0) for name, factor in terms.items() if factor < 0)
     positive = {name: factor for name, factor in terms.items() if factor > 0}
-    if least < 1 or not positive:
+    if needed < 1 or not positive:
         return none
-    share = -(-least // len(positive))
+    share = -(-needed // len(positive))
     found = list(none)
     for name, factor in positive.items():
         found[int(name.removeprefix(VALUE))] = -(-share // factor)

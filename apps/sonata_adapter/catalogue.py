@@ -11,7 +11,7 @@ from typing import Final
 
 import msgspec
 
-from apps.sonata_adapter.parameters import ANY_PREFIX, Parameter, Value, number, prefix, window
+from apps.sonata_adapter.parameters import ANY_PREFIX, Parameter, Value, levels, number, prefix, window
 from apps.sonata_adapter.query import (
     ACK,
     FIN,
@@ -178,6 +178,7 @@ def _dns_reflection(values: Values) -> Query:
 _DST: Final = prefix("dst", "only hosts in this prefix")
 _SRC: Final = prefix("src", "only senders in this prefix")
 _W: Final = window(3_000)
+_REFINE: Final = levels()
 
 CATALOGUE: Final[dict[str, Template]] = {
     template.name: template
@@ -186,14 +187,19 @@ CATALOGUE: Final[dict[str, Template]] = {
             name="new_tcp",
             meaning="hosts to which many TCP connections are opened",
             result="dst: the host; count: SYNs to it",
-            parameters=(_W, number("threshold", 40, "report at this many SYNs", unit="SYNs"), _DST),
+            parameters=(_W, number("threshold", 40, "report at this many SYNs", unit="SYNs"), _DST, _REFINE),
             build=_new_tcp,
         ),
         Template(
             name="ssh_brute_force",
             meaning="hosts that get frames of one length to port 22 from many senders",
             result="dst: the host; length: bytes of the frames; count: senders",
-            parameters=(_W, number("threshold", 40, "report at this many senders", unit="senders"), _DST),
+            parameters=(
+                _W,
+                number("threshold", 40, "report at this many senders", unit="senders"),
+                _DST,
+                _REFINE,
+            ),
             build=_ssh_brute_force,
         ),
         Template(
@@ -204,6 +210,7 @@ CATALOGUE: Final[dict[str, Template]] = {
                 _W,
                 number("threshold", 40, "report at this many destinations", unit="destinations"),
                 _SRC,
+                _REFINE,
             ),
             build=_superspreader,
         ),
@@ -215,6 +222,7 @@ CATALOGUE: Final[dict[str, Template]] = {
                 _W,
                 number("threshold", 40, "report at this many ports", unit="ports", high=65_536),
                 _SRC,
+                _REFINE,
             ),
             build=_port_scan,
         ),
@@ -222,7 +230,12 @@ CATALOGUE: Final[dict[str, Template]] = {
             name="ddos",
             meaning="hosts that many sources send to",
             result="dst: the host; count: sources",
-            parameters=(_W, number("threshold", 45, "report at this many sources", unit="sources"), _DST),
+            parameters=(
+                _W,
+                number("threshold", 45, "report at this many sources", unit="sources"),
+                _DST,
+                _REFINE,
+            ),
             build=_ddos,
         ),
         Template(

@@ -13,6 +13,7 @@ import msgspec
 
 from apps.messages import TableUpdate
 from apps.sonata_adapter.catalogue import Template
+from apps.sonata_adapter.clock import Clock
 from apps.sonata_adapter.dataflow import Table, compile_query
 from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.errors import SonataError
@@ -20,7 +21,8 @@ from apps.sonata_adapter.handshake import Handshakes
 from apps.sonata_adapter.keys import HANDSHAKE, Request, request_of
 from apps.sonata_adapter.merge import Merger, patience
 from apps.sonata_adapter.placement import Entry, SwitchLimits
-from apps.sonata_adapter.planner import Plan, QueryPlan, plan
+from apps.sonata_adapter.planner import Plan, QueryPlan
+from apps.sonata_adapter.refinement import Crossings, Refinement
 from apps.sonata_adapter.reports import Reports
 from apps.sonata_adapter.results import Captured, Output, Result
 from apps.sonata_adapter.tallies import CellRead, Tallies
@@ -74,24 +76,11 @@ class _Station:
         self.headers = _Lane(engine())
         self.frames = _Lane(engine())
         self.handshakes = Handshakes()
-        self.reports: dict[str, Reports | Tallies] = {}
+        self.reports: dict[str, Reports | Tallies | Crossings] = {}
         self.base_us = base_us
         for lane in self.lanes:
             lane.host.base_us = base_us
-        self.now_us: int | None = None
-        self._heard: float | None = None
-
-    def clock(self, now_us: int) -> None:
-        """The switch's clock has come to `now_us`."""
-        if self.now_us is None or now_us > self.now_us:
-            self.now_us = now_us
-            self._heard = None
-
-    def idle_s(self, now: float) -> float:
-        """Seconds since its clock was heard of, as far as calls of this tell."""
-        if self._heard is None:
-            self._heard = now
-        return now - self._heard
+        self.clock = Clock()
 
     @property
     def tallies(self) -> list[Tallies]:
@@ -118,15 +107,21 @@ class Control:
         self._limits = limits or SwitchLimits()
         self._engine = partial(engine, limit=keys_limit, lateness_us=lateness_us)
         self._stations: dict[str, _Station] = {}
+        self._refinement = Refinement()
+        self._asked: dict[str, Request] = {}
+        """By identity."""
+        self._keys: dict[str, tuple[str, ...]] = {}
+        """By identity of what is asked for."""
         self._requests: dict[str, Request] = {}
+        """What is counted for them: the same, but for those that are refined."""
         self._outputs: dict[str, tuple[str, ...]] = {}
         self._refused: dict[str, str] = {}
         self.plan = Plan((), ())
 
     @property
     def requests(self) -> list[Request]:
-        """What is in force, by identity."""
-        return list(self._requests.values())
+        """What is asked for and served."""
+        return list(self._asked.values())
 
     @property
     def refused(self) -> Mapping[str, str]:
@@ -151,18 +146,18 @@ class Control:
         requests, outputs, refused = self._read(keys)
         new_refusals = tuple((key, why) for key, why in refused.items() if key not in self._refused)
         self._refused = refused
-        self._outputs = {identity: tuple(sorted(found)) for identity, found in outputs.items()}
-        before, old = self.plan, self._requests
-        self._requests = requests
-        self.plan = plan(list(requests.values()), self._limits, before=before)
+        self._asked = requests
+        self._keys = {identity: tuple(sorted(found)) for identity, found in outputs.items()}
+        return msgspec.structs.replace(self._planned(), refused=new_refusals)
+
+    def refine(self) -> Changes | None:
+        """What follows from prefixes that crossed, or no longer do; None: nothing does."""
+        crossed: dict[str, set[str]] = {}
         for station in self._stations.values():
-            self._refit(station, old)
-        return Changes(
-            withdraw=self._withdrawn(before),
-            updates=self._updates(before),
-            offer=self._offered(before),
-            refused=new_refusals,
-        )
+            for identity, report in station.reports.items():
+                if isinstance(report, Crossings):
+                    crossed.setdefault(identity, set()).update(report.crossed(station.clock.heard_us))
+        return self._planned() if self._refinement.note(crossed) else None
 
     def everything(self) -> Changes:
         """All that is in force, for a controller that has just come."""
@@ -199,7 +194,7 @@ class Control:
         bit = int(name[1:])
         written: list[Written] = []
         if len(batch):
-            station.clock(int(batch["time_us"].max()))
+            station.clock.hear(int(batch["time_us"].max()))
         for found in self.plan.queries:
             if any(entry.bit == bit for entry in found.entries) and found.identity in station.reports:
                 written += self._addressed(station, station.reports[found.identity].take(bit, batch))
@@ -209,10 +204,9 @@ class Control:
         """Questions to the switches about cells of windows that are over, by switch."""
         found: dict[str, list[CellRead]] = {}
         for name, station in self._stations.items():
-            idle_s = station.idle_s(now)
+            station.clock.look(now)
             for tallies in station.tallies:
-                if station.now_us is not None:
-                    found.setdefault(name, []).extend(tallies.due(station.now_us, now, idle_s=idle_s))
+                found.setdefault(name, []).extend(tallies.due(station.clock, now))
         return {name: reads for name, reads in found.items() if reads}
 
     def last_reads(self, now: float) -> dict[str, list[CellRead]]:
@@ -240,7 +234,7 @@ class Control:
         for number, counted in zip(numbers, counts, strict=True):
             for tallies in station.tallies:
                 if tallies.waits_for(number):
-                    written += self._addressed(station, tallies.answer(number, counted, station.now_us or 0))
+                    written += self._addressed(station, tallies.answer(number, counted, station.clock))
         return written
 
     def tick(self, now: float) -> list[Written]:
@@ -248,21 +242,24 @@ class Control:
         written: list[Written] = []
         for station in self._stations.values():
             for tallies in station.tallies:
-                written += self._addressed(station, tallies.expire(now))
+                written += self._addressed(station, tallies.expire(station.clock, now))
             for lane in station.lanes:
                 written += self._processed(station, lane, lane.merger.release(now), now)
-                if station.now_us is not None and lane.merger.is_quiet(now):
-                    written += self._addressed(station, lane.host.advance(station.now_us))
+                heard_us = station.clock.heard_us
+                if heard_us is not None and lane.merger.is_quiet(now):
+                    written += self._addressed(station, lane.host.advance(heard_us))
         return written
 
     def advance(self, switch: str, now_us: int) -> None:
         """Capture time of a switch has come to `now_us`, though no packet may have come here."""
-        self._station(switch).clock(now_us)
+        self._station(switch).clock.hear(now_us)
 
     def finish(self) -> list[Written]:
         """No more packets will come."""
         written: list[Written] = []
         for station in self._stations.values():
+            for tallies in station.tallies:
+                written += self._addressed(station, tallies.flush())
             for lane in station.lanes:
                 written += self._processed(station, lane, lane.merger.flush(), None)
                 written += self._addressed(station, lane.host.finish())
@@ -284,6 +281,7 @@ class Control:
                 for one in self.plan.queries
             },
             "tuples": {one.identity: self._tuples(one) for one in self.plan.queries},
+            "overflow": {one.identity: self._overflow(one) for one in self.plan.queries},
             "bits": len(self.plan.entries) + len(self.plan.copies),
             "host_packets": sum(lane.host.packets for lane in lanes),
             "late": sum(lane.host.late for lane in lanes),
@@ -304,6 +302,11 @@ class Control:
             if one.identity in station.reports:
                 found += station.reports[one.identity].tuples
         return found
+
+    def _overflow(self, one: QueryPlan) -> int:
+        """Those of them that came because a key had no cell."""
+        reports = [station.reports.get(one.identity) for station in self._stations.values()]
+        return sum(each.overflow for each in reports if isinstance(each, (Reports, Tallies)))
 
     def _read(self, keys: Iterable[str]) -> tuple[dict[str, Request], dict[str, set[str]], dict[str, str]]:
         requests: dict[str, Request] = {}
@@ -327,6 +330,19 @@ class Control:
             self._refit(station, {})
         return station
 
+    def _planned(self) -> Changes:
+        """Make the plan anew, and what runs that of the plan."""
+        before, old = self.plan, self._requests
+        clocks = {name: station.clock.heard_us for name, station in self._stations.items()}
+        counts = self._refinement.planned(self._asked, self._limits, before, clocks)
+        self.plan, self._requests = counts.plan, counts.by_identity
+        self._outputs = {count: self._keys[owner] for count, owner in counts.owners.items()}
+        for station in self._stations.values():
+            self._refit(station, old)
+        return Changes(
+            withdraw=self._withdrawn(before), updates=self._updates(before), offer=self._offered(before)
+        )
+
     def _refit(self, station: _Station, old: Mapping[str, Request]) -> None:
         """Make a switch's operators those of the plan."""
         for lane in station.lanes:
@@ -345,17 +361,20 @@ class Control:
             asked = [self._requests[one.identity] for one in mine]
             windows = [request.query.window_us for request in asked if request.kind == "query"]
             lane.merger.hurry(patience(min(windows, default=None)))
-        reports: dict[str, Reports | Tallies] = {}
+        reports: dict[str, Reports | Tallies | Crossings] = {}
         for one in self.plan.queries:
             if one.in_switch:
                 held = station.reports.get(one.identity)
                 reports[one.identity] = held or self._new_reports(one, station)
         station.reports = reports
 
-    def _new_reports(self, one: QueryPlan, station: _Station) -> Reports | Tallies:
-        query = self._requests[one.identity].query
+    def _new_reports(self, one: QueryPlan, station: _Station) -> Reports | Tallies | Crossings:
+        request = self._requests[one.identity]
+        if request.coarse:
+            return Crossings(request, base_us=station.base_us)
+        query = request.query
         kind = Tallies if isinstance(compile_query(query), Table) else Reports
-        return kind(query, one, base_us=station.base_us, since_us=station.now_us)
+        return kind(query, one, base_us=station.base_us, since_us=station.clock.heard_us)
 
     def _processed(
         self, station: _Station, lane: _Lane, batch: RecordBatch | None, now: float | None
@@ -375,7 +394,7 @@ class Control:
             keys = self._outputs.get(output.query, ())
             if output.query == HANDSHAKE and isinstance(output, Captured):
                 written += [Written(keys, found) for found in station.handshakes.process(output.batch)]
-            else:
+            elif isinstance(output, Captured) or self._refinement.is_first(id(station), output):
                 written.append(Written(keys, output))
         return written
 

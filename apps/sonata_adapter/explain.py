@@ -7,15 +7,23 @@ from apps.sonata_adapter.keys import Request
 from apps.sonata_adapter.placement import Entry
 from apps.sonata_adapter.planner import Plan
 from apps.sonata_adapter.query import duration_text
+from apps.sonata_adapter.refinement import MOST, coarsest
+from apps.sonata_adapter.refinement_levels import levels_of
+
+_WHOLE = 128
+"""Bits of an address in a cell's key."""
 
 
 def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
-    """The plan of one query as a drawing in text."""
-    one = found.of(request.identity)
+    """The plan of one query as a drawing in text; of one that is refined, while nothing crosses."""
+    planned = {query.identity for query in found.queries}
+    first = coarsest(request)
+    one = found.of(first.identity if first.identity in planned else request.identity)
     lines = [request.identity]
     if meaning:
         lines.append(f"  {meaning}")
     lines += ["", *(f"  {line}" for line in request.query.text().splitlines()[1:]), ""]
+    lines += _level_lines(request)
     lines.append(f"  in the switch{'' if one.in_switch else ': only copies, because ' + one.reason}")
     for entry in one.entries:
         lines += _entry_lines(entry)
@@ -37,6 +45,24 @@ def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
     return "\n".join(lines)
 
 
+def _level_lines(request: Request) -> list[str]:
+    levels = levels_of(request)
+    if not levels:
+        return []
+    names = [f"/{level} (IPv6: /{4 * level})" for level in levels[:-1]] + ["addresses, which are the results"]
+    delay = duration_text(len(levels) * request.query.window_ms)
+    return [
+        "  refined, one window a level",
+        f"    1. counts by {names[0]}, all the time: the plan below",
+        *(
+            f"    {place}. below each /{levels[place - 2]} that crosses, and a window longer: {name}"
+            for place, name in enumerate(names[1:], 2)
+        ),
+        f"    at most {MOST} prefixes at a time; where more cross, addresses of all packets",
+        f"    an attack is reported from its window {len(levels)} on, at the latest {delay} after its begin",
+    ]
+
+
 def _entry_lines(entry: Entry) -> list[str]:
     if entry.role == "clock":
         period = duration_text(entry.window_us // 1000)
@@ -44,7 +70,7 @@ def _entry_lines(entry: Entry) -> list[str]:
             f"    bit {entry.bit:<3} {match_text(entry.match)}",
             f"      stage {entry.stage}: says every {period} how far time has come, by which windows end",
         ]
-    key = ", ".join(name.removesuffix("_mask") for name, _ in entry.masks)
+    key = ", ".join(name.removesuffix("_mask") + _prefix_text(name, mask) for name, mask in entry.masks)
     unit = "bytes" if entry.by_bytes else "frames"
     what = (
         f"lets new ({key}) pass"
@@ -56,6 +82,11 @@ def _entry_lines(entry: Entry) -> list[str]:
         f"    bit {entry.bit:<3} {match_text(entry.match)}",
         f"      stage {entry.stage}: {what}, {cells}",
     ]
+
+
+def _prefix_text(name: str, mask: int) -> str:
+    cut = name in ("source_mask", "destination_mask") and mask.bit_count() < _WHOLE
+    return f" /{mask.bit_count()}" if cut else ""
 
 
 def match_text(match: Mapping[str, Any]) -> str:

@@ -71,6 +71,10 @@ class Request(msgspec.Struct, frozen=True):
     """Where results go: all parameters, spelled as the interest spelled them."""
     query: Query
     values: tuple[tuple[str, Value], ...] = ()
+    coarse: int = 0
+    """Count by prefixes instead of addresses: so many bits of IPv4, four times as many of IPv6; 0: addresses."""
+    within: str = ""
+    """A prefix that the query was narrowed down to by refinement; its filters say so, too."""
 
 
 def request_of(key: str, templates: Mapping[str, Template]) -> Request | None:

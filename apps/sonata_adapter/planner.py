@@ -9,7 +9,8 @@ each alternative of its filter and a place in a counting stage; in one stage, no
 entries.  Where there is no room for all, those queries go in first that save most tuples.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
 
 import msgspec
 
@@ -32,6 +33,12 @@ from apps.sonata_adapter.expressions import PAYLOAD_FIELDS, Expression, fields_o
 from apps.sonata_adapter.keys import Request
 from apps.sonata_adapter.placement import Copy, Entry, Space, SwitchLimits, by_bytes, masks_of
 from apps.sonata_adapter.query import duration_text
+from apps.sonata_adapter.refinement_levels import address_of, by_family, cut
+
+_SHARE_WITHIN: Final = 2
+"""What a narrowed query takes is one in so many of the cells that it would take of all packets."""
+_CELLS_A_PREFIX: Final = 8
+"""Cells of a coarse level for each prefix that there can be of IPv4: then hardly one is without."""
 
 
 class QueryPlan(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,17 +86,19 @@ def plan(
     limits: SwitchLimits | None = None,
     *,
     before: Plan | None = None,
+    resting: Iterable[int] = (),
 ) -> Plan:
     """The plan for all requests; what `before` has in the switch keeps its place.
 
-    The order of requests does not matter; of new ones those come first that save most.
+    The order of requests does not matter; of new ones those come first that save most.  Bits that are
+    `resting` are not given away: their cells of this window still hold what they counted before.
     """
     limits = limits or SwitchLimits()
     space = Space(limits)
     kept: dict[str, QueryPlan] = {}
     wanted = {request.identity: request for request in requests}
     held = before.copies if before is not None else ()
-    space.take_bits(copy.bit for copy in held)
+    space.take_bits((*resting, *(copy.bit for copy in held)))
     for old in before.queries if before is not None else ():
         if old.identity in wanted and old.in_switch:
             kept[old.identity] = old
@@ -184,9 +193,8 @@ def _entries(request: Request, space: Space, limits: SwitchLimits) -> list[Entry
     outcome = compile_query(request.query)
     if request.kind != "query":
         raise NotPlaced("it asks for the packets themselves")
-    window_us = request.query.window_us
     if isinstance(outcome, Crossing):
-        return _count_entries(outcome.node, space, window_us, outcome.threshold)
+        return _count_entries(request, outcome.node, space, limits, outcome.threshold)
     if not isinstance(outcome, Table) or not limits.reads:
         raise NotPlaced("its result is known at the window's end only, and the values of cells are not read")
     if request.query.window_ms < limits.read_window_ms:
@@ -197,14 +205,50 @@ def _entries(request: Request, space: Space, limits: SwitchLimits) -> list[Entry
     nodes = sources(outcome)
     found: list[Entry] = [space.clock()]
     for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):
-        found += _count_entries(node, space, window_us, threshold, source=place)
+        found += _count_entries(request, node, space, limits, threshold, source=place)
     return found
 
 
 def _count_entries(
-    node: Node, space: Space, window_us: int, threshold: int, *, source: int = 0
+    request: Request, node: Node, space: Space, limits: SwitchLimits, threshold: int, *, source: int = 0
 ) -> list[Entry]:
     """Entries of one reduce, and of the distinct before it."""
+    counted, matches = _countable(node)
+    if request.coarse:
+        matches = by_family(matches)
+    window_us = request.query.window_us
+    share = len(matches) * (_SHARE_WITHIN if request.within else 1)
+    cells = min(_CELLS_A_PREFIX << request.coarse, limits.reduce_cells) if request.coarse else 0
+    found: list[Entry] = []
+    for match in matches:
+        first: Entry | None = None
+        if isinstance(counted.source, DistinctNode):
+            masks = _masks(request, counted.source.values, match)
+            first = space.distinct(match, masks, window_us, share)
+            found.append(first)
+        last = Entry(
+            role="reduce",
+            bit=0,
+            stage=0,
+            match=match,
+            masks=_masks(request, counted.keys, match),
+            window_us=window_us,
+            threshold=threshold,
+            by_bytes=by_bytes(counted.value),
+            source=source,
+            behind=-1 if first is None else first.bit,
+        )
+        found.append(space.place(last, after=-1 if first is None else first.stage, cells=cells))
+    return found
+
+
+def _masks(request: Request, keys: Sequence[Expression], match: Match) -> tuple[tuple[str, int], ...]:
+    masks = masks_of(keys)
+    return cut(masks, address_of(request.query), request.coarse, match) if request.coarse else masks
+
+
+def _countable(node: Node) -> tuple[ReduceNode, Sequence[Match]]:
+    """A reduce that counting stages can do, and the packets for it; raises `NotPlaced`."""
     if not isinstance(node, ReduceNode):
         raise NotPlaced("the switch reports counts that reach a threshold, not each new tuple")
     filters = _packets(node).filters
@@ -215,28 +259,7 @@ def _count_entries(
         raise NotPlaced("the switch cannot filter between its counting stages")
     if isinstance(node.source, DistinctNode) and not isinstance(node.source.source, PacketSource):
         raise NotPlaced("it has more operators in a row than a distinct and a reduce")
-    found: list[Entry] = []
-    for match in conditions.alternatives:
-        first: Entry | None = None
-        if isinstance(node.source, DistinctNode):
-            first = space.distinct(
-                match, masks_of(node.source.values), window_us, len(conditions.alternatives)
-            )
-            found.append(first)
-        last = Entry(
-            role="reduce",
-            bit=0,
-            stage=0,
-            match=match,
-            masks=masks_of(node.keys),
-            window_us=window_us,
-            threshold=threshold,
-            by_bytes=by_bytes(node.value),
-            source=source,
-            behind=-1 if first is None else first.bit,
-        )
-        found.append(space.place(last, after=-1 if first is None else first.stage))
-    return found
+    return node, conditions.alternatives
 
 
 def _serving(request: Request, copies: Sequence[Copy]) -> tuple[Copy, ...]:

@@ -47,12 +47,15 @@ class Reports:
             (name, kind_of(value, inner)) for name, value in outcome.names
         ]
         self.tuples = 0
+        self.overflow = 0
+        """Tuples that came because a key had no cell."""
 
     def take(self, bit: int, batch: RecordBatch) -> list[Result]:
         """Results of the reports of one of the query's bits."""
         self.tuples += len(batch)
         outputs: list[Result] = []
         over = np.flatnonzero(batch["overflow"])
+        self.overflow += len(over)
         if len(over):
             outputs += self._overflowed(batch.take(over))
         crossed = np.flatnonzero(batch["crossed"])

@@ -134,6 +134,7 @@ class SonataAdapterService:
         with self._lock:
             self._write(self._control.tick(time.monotonic()))
             self._read_cells()
+            self._refine()
 
     def stop(self) -> None:
         """Report what is open, and take everything out of the switch."""
@@ -238,6 +239,7 @@ class SonataAdapterService:
         with self._lock:
             if kind == "digests":
                 self._write(self._control.digests(switch, name, batch))
+                self._refine()
             else:
                 self._write(self._control.packets(switch, name, batch, time.monotonic()))
                 self._control.busy(switch, time.monotonic())
@@ -246,11 +248,17 @@ class SonataAdapterService:
     def _on_cells(self, item: Item) -> None:
         """Answers of a switch: `id` and `count` of each question."""
         switch = item.key.rpartition(".")[2]
+        numbers, counts = item.value["id"].tolist(), item.value["count"].tolist()
         with self._lock:
-            self._write(self._control.cells(switch, item.value["id"].tolist(), item.value["count"].tolist()))
+            self._write(self._control.cells(switch, numbers, counts))
 
     def _read_cells(self) -> None:
         self._ask(self._control.reads(time.monotonic()))
+
+    def _refine(self) -> None:
+        changes = self._control.refine()
+        if changes is not None:
+            self._apply(changes)
 
     def _ask(self, questions: dict[str, list[CellRead]]) -> None:
         for switch, reads in questions.items():

@@ -18,6 +18,7 @@ import os
 import shutil
 import sys
 import tempfile
+from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -298,15 +299,23 @@ def run_window(text: str, pieces: list[bytes], base_us: int, limit: int) -> list
     return [msgspec.json.encode(each).decode() for each in outputs if isinstance(each, Result)]
 
 
+def require_spark() -> None:
+    """Raises `SparkMissing` with what to do where pyspark or Java are missing; starts nothing."""
+    if find_spec("pyspark") is None:
+        raise SparkMissing("engine spark needs pyspark: pip install 'sdnator[spark]'")
+    home = os.environ.get("JAVA_HOME")
+    if shutil.which("java") is None and not (home and (Path(home) / "bin" / "java").exists()):
+        raise SparkMissing(
+            "engine spark needs Java 17 or later: install a JRE, and put its java on the PATH or set JAVA_HOME"
+        )
+
+
 def spark_session(master: str) -> Any:
     """Spark's session of this process; raises `SparkMissing`."""
-    try:
-        from pyspark.errors import PySparkException
-        from pyspark.sql import SparkSession
-    except ImportError as error:
-        raise SparkMissing(f"engine spark needs pyspark ({error}): pip install 'sdnator[spark]'") from None
-    if shutil.which("java") is None:
-        raise SparkMissing("engine spark needs Java 17 or later: install a JRE, or put its java on the PATH")
+    require_spark()
+    from pyspark.errors import PySparkException
+    from pyspark.sql import SparkSession
+
     # workers are to be what this process is; and a host name that nothing resolves costs minutes
     os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
     os.environ.setdefault("SPARK_LOCAL_HOSTNAME", "localhost")

@@ -4,42 +4,38 @@ report: a key reached its candidate count ─► when the window is over, read i
 report: a key has no cell                 ─► counted here, exactly
 answers ─► the query's own steps over these keys ─► results
 
-When a window is over is known from the switch's clock, that is, from what it sends.  Where it sends
-nothing for a whole window and a while, this machine's clock decides, and the results say so.
+When a window is over is known from the switch's clock, that is, from what it sends.  Where it falls
+silent, cells are asked for early as well: they may be overwritten before it is heard of again, and a
+count only grows, so the larger of two answers holds.  A key whose answers came too late is reported
+with what is known, as an estimate.
 """
 
 from collections.abc import Iterator
 from itertools import count
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
-from apps.sonata_adapter.columns import Packets, Tuples, address_number, column_of, plain_value
-from apps.sonata_adapter.dataflow import (
-    VALUE,
-    DistinctNode,
-    ReduceNode,
-    Table,
-    compile_query,
-    kinds_of,
-    sources,
-)
-from apps.sonata_adapter.expressions import Expression, Field, Number, text_of
+from apps.sonata_adapter.clock import Clock
+from apps.sonata_adapter.columns import Packets, address_number
+from apps.sonata_adapter.dataflow import Table, compile_query
 from apps.sonata_adapter.placement import Entry
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import Query
-from apps.sonata_adapter.relations import relation_of
 from apps.sonata_adapter.results import Result
+from apps.sonata_adapter.tally_tables import PART, Key, TallyTables
+from apps.sonata_adapter.tally_window import MOST_KEYS, Window
 from due import RecordBatch
 
 TIMEOUT_S: Final = 10.0
 PATIENCE_S: Final = 10.0
 """A switch that is silent for a window and so long is taken to have nothing to say, not to be slow."""
-MOST_KEYS: Final = 16_384
-"""Keys of one window that are asked for; a result that would need more says that it is an estimate."""
-_Key = tuple[tuple[int, ...], ...]
-"""Parts of each key column, in the order of their names under the query."""
+_EARLY: Final = 4
+"""A part of the window after its end: so long the switch's clock is waited for before cells are asked early,
+and so long reports may be under way behind it."""
+_LATE: Final = "cells were read when a later window had begun to overwrite them: a count may be too low"
+_SILENT: Final = "the switch sent nothing; the end was taken from this machine's clock"
 _NUMBERS: Final = count(1)
 
 
@@ -57,20 +53,12 @@ class CellRead(msgspec.Struct, frozen=True, kw_only=True):
     time_us: int
 
 
-class _Window:
-    """What is known of one window."""
-
-    def __init__(self) -> None:
-        self.candidates: dict[_Key, None] = {}
-        self.beyond = 0
-        self.counts: dict[tuple[int, _Key], int] = {}
-        """By bit of the reduce: frames or bytes of keys without a cell, or the cell's value."""
-        self.tuples: dict[tuple[int, _Key], set[_Key]] = {}
-        """By bit of the reduce: new tuples of the distinct before it that had no cell."""
-        self.reported: set[tuple[int, _Key]] = set()
-        self.waiting: set[int] = set()
-        self.asked: float | None = None
-        self.errors: dict[str, None] = {}
+class _Question(NamedTuple):
+    window: int
+    bit: int
+    key: Key
+    last: bool
+    """Asked when the window was over, so that its answer is waited for."""
 
 
 class Tallies:
@@ -82,21 +70,24 @@ class Tallies:
         outcome = compile_query(query)
         assert isinstance(outcome, Table)  # noqa: S101 - the planner sees to it
         self._query = query
-        self._table = outcome
+        self._tables = TallyTables(query, outcome)
         self._base_us = base_us
         self._since_us = since_us
-        self._nodes = [node for node in sources(outcome) if isinstance(node, ReduceNode)]
-        self._keys = [_key_names(table) for table in _tables(outcome)]
         self._reduces = {entry.bit: entry for entry in found.entries if entry.role == "reduce"}
-        self._windows: dict[int, _Window] = {}
-        self._questions: dict[int, tuple[int, int, _Key]] = {}
+        self._windows: dict[int, Window] = {}
+        self._closed: int | None = None
+        """The newest window of which nothing is kept any more."""
+        self._questions: dict[int, _Question] = {}
         self.tuples = 0
+        self.overflow = 0
+        """Tuples that came because a key had no cell."""
         self.missed = 0
-        """Cells that were read too late: a later window had overwritten them."""
+        """Cells that were read too late, and reports of windows that were long over."""
 
     def take(self, bit: int, batch: RecordBatch) -> list[Result]:
         """Note candidates and keys without a cell; results come with the answers."""
         self.tuples += len(batch)
+        self.overflow += int(np.count_nonzero(batch["overflow"]))
         packets = Packets(batch)
         numbers = ((batch["time_us"] - self._base_us) // self._query.window_us).tolist()
         entry = self._reduces.get(bit)
@@ -106,61 +97,78 @@ class Tallies:
             self._distinct(behind, packets, numbers)
         return []
 
+    def _window(self, number: int) -> Window | None:
+        if self._closed is not None and number <= self._closed:
+            self.missed += 1
+            return None
+        return self._windows.setdefault(number, Window())
+
     def _counted(self, entry: Entry, packets: Packets, numbers: list[int], batch: RecordBatch) -> None:
         """Keys that reached the candidate count, and frames whose key has no cell."""
         over = batch["overflow"].tolist()
         amounts = batch["length"].tolist() if entry.by_bytes else [1] * len(batch)
-        fields = [Field(name) for _, name in self._keys[entry.source]]
-        for number, key, without_cell, amount in zip(
-            numbers, _rows(fields, packets), over, amounts, strict=True
-        ):
-            window = self._windows.setdefault(number, _Window())
+        keys = self._tables.keys(entry.source, packets)
+        for number, key, without_cell, amount in zip(numbers, keys, over, amounts, strict=True):
+            window = self._window(number)
+            if window is None:
+                continue
             place = (entry.bit, key)
             if without_cell:
-                window.counts[place] = window.counts.get(place, 0) + amount
+                window.apart[place] = window.apart.get(place, 0) + amount
             else:
                 window.reported.add(place)
-            if entry.threshold and window.counts.get(place, entry.threshold) >= entry.threshold:
-                _remember(window, key)
+            if entry.threshold and window.apart.get(place, entry.threshold) >= entry.threshold:
+                window.remember(key)
 
     def _distinct(self, entry: Entry, packets: Packets, numbers: list[int]) -> None:
         """Tuples that found no cell in the stage of the distinct: they are told apart here."""
-        node = self._nodes[entry.source].source
-        assert isinstance(node, DistinctNode)  # noqa: S101 - else nothing would stand behind a distinct
-        keys = _rows([Field(name) for _, name in self._keys[entry.source]], packets)
-        for number, key, values in zip(numbers, keys, _rows(node.values, packets), strict=True):
-            window = self._windows.setdefault(number, _Window())
+        keys = self._tables.keys(entry.source, packets)
+        tuples = self._tables.tuples(entry.source, packets)
+        for number, key, values in zip(numbers, keys, tuples, strict=True):
+            window = self._window(number)
+            if window is None:
+                continue
             if entry.threshold:
-                _remember(window, key)
+                window.remember(key)
             held = window.tuples.setdefault((entry.bit, key), set())
             if len(held) < MOST_KEYS:
                 held.add(values)
             elif values not in held:
                 window.errors["a key had too many tuples without a cell in the switch"] = None
 
-    def due(self, now_us: int, now: float, *, idle_s: float = 0.0) -> list[CellRead]:
-        """Questions about windows that are over at capture time `now_us`.
-
-        `idle_s`: so long the switch's clock has not been heard of.
-        """
+    def due(self, clock: Clock, now: float) -> list[CellRead]:
+        """Questions about windows that are over, or seem to be while the switch is silent."""
         asked: list[CellRead] = []
+        heard, guess = clock.heard_us, clock.guess_us(now)
+        if heard is None or guess is None:
+            return asked
+        length = self._query.window_us
+        silent = clock.idle_s(now) >= length / 1e6 + PATIENCE_S
         for number, window in self._windows.items():
-            is_over = self._end(number) <= now_us
-            if not is_over and idle_s >= self._query.window_us / 1e6 + PATIENCE_S:
-                is_over = True
-                window.errors["the switch sent nothing; the end was taken from this machine's clock"] = None
-            if window.asked is None and is_over:
-                asked += self._begin(number, window, now)
+            end = self._end(number)
+            if window.over is None and (heard >= end or silent):
+                self._is_over(window, now)
+                if heard < end:
+                    window.errors[_SILENT] = None
+                elif window.early is not None:
+                    window.early_counts = (clock.was_us(window.early) or 0) >= end
+            window.settled = silent or heard >= end + length // _EARLY
+            if window.over is not None:
+                asked += self._ask(number, window, last=True)
+            elif guess >= end + length // _EARLY:
+                window.early = now if window.early is None else window.early
+                asked += self._ask(number, window, last=False)
         return asked
 
     def finish(self, now: float) -> list[CellRead]:
         """Questions about all windows: nothing more will come."""
-        return [
-            read
-            for number, window in self._windows.items()
-            if window.asked is None
-            for read in self._begin(number, window, now)
-        ]
+        asked: list[CellRead] = []
+        for number, window in self._windows.items():
+            if window.over is None:
+                self._is_over(window, now)
+            window.settled = True
+            asked += self._ask(number, window, last=True)
+        return asked
 
     def waits_for(self, question: int) -> bool:
         return question in self._questions
@@ -168,62 +176,101 @@ class Tallies:
     @property
     def waiting(self) -> bool:
         """Whether an answer is outstanding."""
-        return bool(self._questions)
+        return any(window.waiting for window in self._windows.values())
 
     @property
     def open(self) -> int:
         """Windows that results may still come of."""
-        return len(self._windows)
+        return sum(1 for window in self._windows.values() if window.over is None or window.pending)
 
-    def answer(self, question: int, counted: int, now_us: int) -> list[Result]:
-        """The count of a key; results once all of its window are there."""
-        number, bit, key = self._questions.pop(question, (None, 0, ()))
-        window = None if number is None else self._windows.get(number)
-        if number is None or window is None:
+    def answer(self, question: int, counted: int, clock: Clock) -> list[Result]:
+        """The count of a key.
+
+        Results come once all answers of the window are there.
+        """
+        asked = self._questions.pop(question, None)
+        window = None if asked is None else self._windows.get(asked.window)
+        if asked is None or window is None:
             return []
         self.tuples += 1
-        window.counts[bit, key] = counted
+        place = (asked.bit, asked.key)
+        before = window.cells.get(place)
+        window.cells[place] = max(counted, before or 0)
+        if not asked.last:
+            return []
         window.waiting.discard(question)
-        missed = (bit, key) in window.reported and counted < self._reduces[bit].threshold
-        self.missed += missed
-        if missed or now_us >= self._end(number + 1):
-            window.errors["cells were read when a later window had begun to overwrite them"] = None
-        return self._finished(number, window)
+        least = self._reduces[asked.bit].threshold if place in window.reported else 0
+        is_lost = counted < max(least, before or 0)
+        is_late = (clock.heard_us or 0) >= self._end(asked.window + 1)
+        self.missed += is_lost or is_late
+        if (is_lost or is_late) and not (window.early_counts and before is not None and before >= least):
+            (window.doubtful if is_lost else window.unsure).add(asked.key)
+        return self._finished(asked.window, window)
 
-    def expire(self, now: float) -> list[Result]:
+    def expire(self, clock: Clock, now: float) -> list[Result]:
         """Results of windows that have nothing to wait for, or whose answers are overdue: as estimates."""
         found: list[Result] = []
         for number, window in list(self._windows.items()):
-            overdue = window.asked is not None and now - window.asked >= TIMEOUT_S
-            if overdue and window.waiting:
-                window.errors[f"{len(window.waiting)} cells could not be read"] = None
-                for question in window.waiting:
-                    self._questions.pop(question, None)
-                window.waiting.clear()
-            if window.asked is not None and not window.waiting:
-                found += self._finished(number, window)
+            if window.over is not None and now - window.over >= TIMEOUT_S:
+                self._give_up(window)
+            found += self._finished(number, window)
+            is_past = clock.heard_us is not None and clock.heard_us >= self._end(number + 1)
+            if window.over is not None and not window.pending and not window.waiting and is_past:
+                self._forget(number)
         return found
+
+    def flush(self) -> list[Result]:
+        """What has not been reported, as estimates: no more answers will come."""
+        found: list[Result] = []
+        for number, window in list(self._windows.items()):
+            if window.over is None:
+                self._is_over(window, 0.0)
+            window.settled = True
+            unasked = len(window.unasked[True])
+            if unasked:
+                window.errors[f"{unasked} keys were not asked for"] = None
+                window.doubtful.update(window.unasked[True])
+                window.unasked[True].clear()
+            self._give_up(window)
+            found += self._finished(number, window)
+            self._forget(number)
+        return found
+
+    def _forget(self, number: int) -> None:
+        del self._windows[number]
+        self._closed = max(number, self._closed if self._closed is not None else number)
+        self._questions = {n: asked for n, asked in self._questions.items() if asked.window != number}
+
+    def _give_up(self, window: Window) -> None:
+        """Do not wait any longer."""
+        if window.waiting:
+            window.errors[f"{len(window.waiting)} cells could not be read"] = None
+        for question in window.waiting:
+            window.doubtful.add(self._questions.pop(question).key)
+        window.waiting.clear()
 
     def _end(self, number: int) -> int:
         return self._base_us + (number + 1) * self._query.window_us
 
-    def _begin(self, number: int, window: _Window, now: float) -> list[CellRead]:
-        window.asked = now
+    def _is_over(self, window: Window, now: float) -> None:
+        window.over = now
         if window.beyond:
             window.errors[f"{window.beyond} keys beyond the bound of {MOST_KEYS} were not looked at"] = None
-        return list(self._ask(number, window))
 
-    def _ask(self, number: int, window: _Window) -> Iterator[CellRead]:
-        for key in window.candidates:
+    def _ask(self, number: int, window: Window, *, last: bool) -> Iterator[CellRead]:
+        keys = window.unasked[last]
+        window.unasked[last] = []
+        for key in keys:
             for entry in self._reduces.values():
-                if (entry.bit, key) in window.counts:
+                if (entry.bit, key) in window.apart:
                     continue
                 question = next(_NUMBERS)
-                self._questions[question] = (number, entry.bit, key)
-                window.waiting.add(question)
-                parts = dict.fromkeys(_PART.values(), 0)
-                for (_, name), value in zip(self._keys[entry.source], key, strict=True):
-                    parts[_PART[name]] = address_number(value) if len(value) == 2 else value[0]
+                self._questions[question] = _Question(number, entry.bit, key, last)
+                if last:
+                    window.waiting.add(question)
+                parts = dict.fromkeys(PART.values(), 0)
+                for name, value in zip(self._tables.fields(entry.source), key, strict=True):
+                    parts[PART[name]] = address_number(value) if len(value) == 2 else value[0]
                 yield CellRead(
                     id=question,
                     bit=entry.bit,
@@ -231,92 +278,54 @@ class Tallies:
                     **parts,
                 )
 
-    def _finished(self, number: int, window: _Window) -> list[Result]:
-        if window.waiting:
+    def _finished(self, number: int, window: Window) -> list[Result]:
+        """Results of the keys of which all is known."""
+        if window.over is None or window.waiting or not window.pending:
             return []
-        del self._windows[number]
-        relation = relation_of(self._table, lambda node: self._tuples(node, window))
-        kinds = self._query.fields
-        start = self._base_us + number * self._query.window_us
+        unasked = set(window.unasked[True])
+        ready = [key for key in window.pending if key not in unasked and self._is_whole(window, key)]
+        for key in ready:
+            del window.pending[key]
+        groups: tuple[list[tuple[Key, dict[int, int]]], ...] = ([], [], [])
+        for key in ready:
+            group = 2 if key in window.doubtful else 1 if key in window.unsure else 0
+            groups[group].append((key, self._counts(window, key)))
+        sure, unsure, doubtful = groups
+        reasons = list(window.errors)
+        doubts = reasons or [_LATE]
         return [
-            Result(
-                query=self._query.name,
-                window_us=start,
-                length_us=self._query.window_us,
-                at_us=self._end(number),
-                fields={
-                    name: plain_value(kinds[name], column, row)
-                    for name, column in sorted(relation.columns.items())
-                },
-                exact=not window.errors,
-                partial=self._since_us is not None and self._since_us > start,
-                error="; ".join(window.errors),
-            )
-            for row in range(relation.size)
+            *(self._result(number, fields, reasons) for fields in self._tables.results(sure)),
+            *(self._result(number, fields, doubts) for fields in self._tables.results(unsure)),
+            *(self._result(number, fields, doubts) for fields in self._tables.guesses(doubtful)),
         ]
 
-    def _tuples(self, node: object, window: _Window) -> Tuples:
-        """The candidates' counts in one source, as its operator would hold them."""
-        place = next(place for place, other in enumerate(self._nodes) if other == node)
-        bits = [entry.bit for entry in self._reduces.values() if entry.source == place]
-        held: list[tuple[_Key, int]] = []
-        for key in window.candidates:
-            value = sum(window.counts.get((bit, key), 0) for bit in bits)
-            value += sum(len(window.tuples.get((bit, key), ())) for bit in bits)
-            if value:
-                held.append((key, value))
-        inner = kinds_of(self._nodes[place])
-        columns: dict[str, tuple[np.ndarray, ...]] = {}
-        for column, (_, name) in enumerate(self._keys[place]):
-            width = 2 if inner[name] == "address" else 1
-            dtype = np.uint64 if width == 2 else np.int64
-            columns[name] = tuple(
-                np.array([key[column][part] for key, _ in held], dtype=dtype) for part in range(width)
-            )
-        columns[VALUE] = (np.array([n for _, n in held], dtype=np.int64),)
-        return Tuples(columns, len(held))
+    def _is_whole(self, window: Window, key: Key) -> bool:
+        """Whether no more reports of a key without a cell are under way."""
+        return window.settled or not any(
+            (bit, key) in window.apart or (bit, key) in window.tuples for bit in self._reduces
+        )
 
+    def _counts(self, window: Window, key: Key) -> dict[int, int]:
+        """What is known of a key, by source."""
+        counts: dict[int, int] = {}
+        for bit, entry in self._reduces.items():
+            place = (bit, key)
+            cell = window.cells.get(place, 0)
+            if place in window.reported:
+                cell = max(cell, entry.threshold)
+            more = window.apart.get(place, 0) + len(window.tuples.get(place, ()))
+            counts[entry.source] = counts.get(entry.source, 0) + cell + more
+        return counts
 
-_PART: Final = {
-    "ip.src": "source",
-    "ip.dst": "destination",
-    "tcp.sport": "source_port",
-    "udp.sport": "source_port",
-    "tcp.dport": "port",
-    "udp.dport": "port",
-    "length": "length",
-}
-
-
-def _remember(window: _Window, key: _Key) -> None:
-    if key in window.candidates:
-        return
-    if len(window.candidates) < MOST_KEYS:
-        window.candidates[key] = None
-    else:
-        window.beyond += 1
-
-
-def _rows(values: "list[Field] | tuple[Expression, ...]", packets: Packets) -> list[_Key]:
-    """The values of each packet, plain."""
-    columns = [column_of(value, packets) for value in values]
-    parts = [list(zip(*(part.tolist() for part in column), strict=True)) for column in columns]
-    return list(zip(*parts, strict=True))
-
-
-def _tables(table: Table) -> Iterator[Table]:
-    """The table and those joined to it, in the order of `sources`."""
-    yield table
-    for step in table.steps:
-        other = getattr(step, "other", None)
-        if isinstance(other, Table):
-            yield from _tables(other)
-
-
-def _key_names(table: Table) -> list[tuple[str, str]]:
-    """(name under the query, packet field) of each key, sorted: the same order for all sources."""
-    return [
-        (name, text_of(value))
-        for name, value in table.names
-        if not isinstance(value, Number) and text_of(value) != VALUE
-    ]
+    def _result(self, number: int, fields: dict[str, int | str], errors: list[str]) -> Result:
+        start = self._base_us + number * self._query.window_us
+        return Result(
+            query=self._query.name,
+            window_us=start,
+            length_us=self._query.window_us,
+            at_us=self._end(number),
+            fields=fields,
+            exact=not errors,
+            partial=self._since_us is not None and self._since_us > start,
+            error="; ".join(errors),
+        )

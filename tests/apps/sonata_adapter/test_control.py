@@ -223,15 +223,119 @@ def test_a_window_is_over_when_the_switch_has_been_silent_for_one(everything):
     flood = [frame for frame in everything if frame.time_us < BASE_US + 8_500_000]
     for (_, name), sent in switch.process(batch_of(flood)).items():
         control.digests("s1", name, sent)
-    asked = [control.reads(now).get("s1", []) for now in (0.0, 12.9, 13.1)]
+    moments = (0.0, 3.9, 12.9, 13.1)
+    asked = [control.reads(now).get("s1", []) for now in moments]
     written = [
         one
         for reads in asked
         for one in control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
     ]
-    assert asked[0]
-    assert not asked[1]
+    assert asked[0], "windows that are over"
+    assert asked[1], "the last one, early: the switch may forget it before it is heard of again"
+    assert not asked[2]
     assert "this machine's clock" in written[-1].output.error
+
+
+SYN_FLOOD = f"{PREFIX}.syn_flood"
+
+
+def ask_and_answer(control, switch, now, *, answer=True):
+    reads = control.reads(now).get("s1", [])
+    if not answer:
+        return reads, []
+    return reads, control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
+
+
+def report(control, switch, frames, only=lambda _name: True):
+    held = []
+    for (_, name), sent in switch.process(batch_of(frames)).items():
+        if only(name):
+            control.digests("s1", name, sent)
+        else:
+            held.append((name, sent))
+    return held
+
+
+def syns(second, number, target="10.1.1.1"):
+    return [
+        Frame(BASE_US + round(second * 1e6) + n, 60, tcp("10.0.0.9", target, 1000 + n, 80, 2))
+        for n in range(number)
+    ]
+
+
+@pytest.fixture
+def flooded():
+    control, switch = Control(CATALOGUE), SwitchModel(base_us=BASE_US)
+    control.switch("s1", BASE_US)
+    switch.change(control.want([SYN_FLOOD]))
+    return control, switch
+
+
+def test_a_gap_in_the_traffic_costs_no_counts(flooded):
+    """Cells are asked for while the switch is silent, before the next frame overwrites them."""
+    control, switch = flooded
+    report(control, switch, syns(0.5, 4))
+    report(control, switch, syns(2.5, 3))
+    assert not ask_and_answer(control, switch, 0.0)[0], "the window is not over"
+    assert ask_and_answer(control, switch, 1.6)[0]
+    report(control, switch, syns(6.5, 1))
+    _, written = ask_and_answer(control, switch, 4.0)
+    (only,) = [one.output for one in written]
+    assert (only.fields["count"], only.exact) == (7, True)
+
+
+def test_what_is_read_too_late_is_reported_as_an_estimate(flooded):
+    """A burst over several windows overwrites cells: what is known is said, and that it is not all."""
+    control, switch = flooded
+    report(control, switch, [*syns(0.5, 9), *syns(6.5, 9)])
+    _, written = ask_and_answer(control, switch, 0.0)
+    (only,) = [one.output for one in written]
+    assert only.fields["count"] == 2, "as many as the switch has reported"
+    assert not only.exact
+    assert "too low" in only.error
+    assert control.health()["late_reads"]
+
+
+def test_a_report_that_comes_behind_the_clock_is_not_lost(flooded):
+    """Reports and the clock travel apart: a key that is reported when answers are awaited is asked for, too."""
+    control, switch = flooded
+    early = report(control, switch, syns(0.5, 4, "10.1.1.1"))
+    late = report(control, switch, [*syns(1.0, 5, "10.1.1.2"), *syns(3.1, 1)], lambda name: name == "q0")
+    assert not early
+    assert late
+    reads, _ = ask_and_answer(control, switch, 0.0, answer=False)
+    for name, sent in late:
+        control.digests("s1", name, sent)
+    more, written = ask_and_answer(control, switch, 0.1)
+    assert more
+    written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
+    assert {(w.output.fields["dst"], w.output.fields["count"]) for w in written} == {
+        ("10.1.1.1", 4),
+        ("10.1.1.2", 5),
+    }
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_silence_makes_no_results_of_what_is_none(ends, flooded):
+    """Nothing overwrites cells while nothing comes: a busy server stays one, however late it is asked for."""
+    control, switch = flooded
+    answered = [Frame(f.time_us + 900, 60, tcp("10.0.0.9", "10.1.1.1", 9, 80, 16)) for f in syns(0.5, 4)]
+    report(control, switch, [*syns(0.5, 4), *answered])
+    _, written = ask_and_answer(control, switch, 0.0)
+    reads = control.last_reads(20.0) if ends else control.reads(20.0)
+    written += control.cells("s1", [r.id for r in reads["s1"]], [switch.read(r) for r in reads["s1"]])
+    assert not written
+    assert not control.finish()
+
+
+def test_at_the_end_nothing_that_waits_is_lost(flooded):
+    """Windows whose cells nobody tells any more are reported with what is known."""
+    control, switch = flooded
+    report(control, switch, syns(0.5, 4))
+    control.last_reads(0.0)
+    (only,) = [one.output for one in control.finish()]
+    assert (only.fields["dst"], only.exact) == ("10.1.1.1", False)
+    assert "could not be read" in only.error
 
 
 def test_missing_answers_make_estimates(everything):

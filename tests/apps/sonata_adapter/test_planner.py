@@ -13,6 +13,7 @@ from apps.sonata_adapter.explain import explain
 from apps.sonata_adapter.keys import request_of
 from apps.sonata_adapter.placement import SwitchLimits, reciprocal
 from apps.sonata_adapter.planner import Plan, plan
+from apps.sonata_adapter.refinement import coarsest
 from tests.apps.sonata_adapter.switch_model import matches
 from tests.apps.sonata_adapter.traffic import batch_of, mixed
 
@@ -150,3 +151,12 @@ def test_explain_names_switch_and_host(key):
     assert request.identity in text
     assert "in the switch" in text
     assert "on the host" in text
+
+
+def test_explain_shows_levels_and_their_delay():
+    """What is counted first, what below prefixes that cross, and when results come at the latest."""
+    (request,) = requests(f"{PREFIX}.ddos:refine=8/16,window=3s")
+    text = explain(request, plan([coarsest(request)]))
+    assert "by (destination /8), reports 45" in text
+    assert "by (destination /32), reports 45" in text
+    assert "at the latest 9s after its begin" in text

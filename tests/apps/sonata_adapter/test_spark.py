@@ -8,7 +8,7 @@ from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.columns import Packets
 from apps.sonata_adapter.engine import HostEngine
 from apps.sonata_adapter.shards import parts_of, shard_rows, union
-from apps.sonata_adapter.spark import SHARDS, run_window, split_batch
+from apps.sonata_adapter.spark import SHARDS, SparkMissing, require_spark, run_window, split_batch
 from sdnator.captures import CaptureWriter
 from tests.apps.sonata_adapter.traffic import BASE_US as TRAFFIC_US
 from tests.apps.sonata_adapter.traffic import batch_of, mixed
@@ -51,6 +51,18 @@ def test_a_key_goes_to_one_shard():
     hosts = [set(batch["ip_dst_lo"][mine].tolist()) for mine in rows.values()]
     assert sum(map(len, hosts)) == len(set().union(*hosts))
     assert len(union(list(rows.values()))) == int((batch["ip_version"] != 0).sum())
+
+
+def test_what_is_missing_is_said(monkeypatch):
+    """Before anything starts, with what to do."""
+    monkeypatch.delenv("JAVA_HOME", raising=False)
+    monkeypatch.setattr("apps.sonata_adapter.spark.find_spec", lambda _: None)
+    with pytest.raises(SparkMissing, match=r"pip install 'sdnator\[spark\]'"):
+        require_spark()
+    monkeypatch.setattr("apps.sonata_adapter.spark.find_spec", lambda _: True)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SparkMissing, match="install a JRE"):
+        require_spark()
 
 
 @pytest.mark.timeout(900)
