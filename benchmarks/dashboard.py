@@ -5,7 +5,8 @@
 
 A producer writes updates at a fixed rate into an embedded server; the dashboard takes them and one page is
 open.  Measured: updates taken a second; frames of the page by requestAnimationFrame, which headless Chromium
-caps at 60; updates of the plot that reach the page; memory of the dashboard and of the page over time.
+caps at 60, and the longest wait for one; updates of the figures that reach the page; memory of the dashboard
+and of the page over time.
 """
 
 import argparse
@@ -34,12 +35,20 @@ _PACKETS = 16
 _LOOK_SECONDS = 5.0
 _FRAMES = """
 if (window.frames_seen !== undefined) return false;
-window.frames_seen = 0; window.plots_seen = 0;
-const step = () => { window.frames_seen += 1; requestAnimationFrame(step); };
+window.frames_seen = 0; window.plots_seen = 0; window.longest_gap = 0;
+let before = performance.now();
+const step = (now) => {
+  window.frames_seen += 1; window.longest_gap = Math.max(window.longest_gap, now - before); before = now;
+  requestAnimationFrame(step);
+};
 requestAnimationFrame(step);
 new MutationObserver(() => { window.plots_seen += 1; })
   .observe(document.querySelector('.figures'), {subtree: true, childList: true, characterData: true});
 return true;
+"""
+_SEEN = """
+const gap = window.longest_gap; window.longest_gap = 0;
+return [window.frames_seen, window.plots_seen, performance.memory.usedJSHeapSize, gap];
 """
 
 
@@ -148,15 +157,13 @@ def watch(driver: Any, pid: int, metrics: str, seconds: float, rate: int) -> dic
         if driver.execute_script(_FRAMES):  # a page that was loaded anew counts from 0
             loads, frames_before, plots_before = loads + 1, frames, plots
         time.sleep(min(_LOOK_SECONDS, seconds / 4))
-        page = driver.execute_script(
-            "return [window.frames_seen, window.plots_seen, performance.memory.usedJSHeapSize]"
-        )
-        seen, drawn, heap = (float(each or 0) for each in page)
+        seen, drawn, heap, gap = (float(each or 0) for each in driver.execute_script(_SEEN))
         frames, plots = frames_before + seen, plots_before + drawn
         looks.append(
             {
                 "at": time.monotonic() - began,
                 "frames": frames,
+                "longest_frame_ms": round(gap, 1),
                 "page_updates": plots,
                 "page_mib": round(heap / 2**20, 1),
                 "dashboard_mib": resident_mib(pid),
@@ -164,32 +171,33 @@ def watch(driver: Any, pid: int, metrics: str, seconds: float, rate: int) -> dic
                 "taken": taken(metrics),
             }
         )
-    first, last = looks[0], looks[-1]
+    about = {"page_reloads": loads - 1, "seconds": seconds, "load": os.getloadavg()[0]}
+    return {"updates_wanted_per_s": rate, **figures(looks), **about, "memory": looks}
+
+
+def figures(looks: list[dict[str, float]]) -> dict[str, Any]:
+    """What all looks together say; the page settles until the first."""
+    first, last, third = looks[0], looks[-1], max(1, len(looks) // 3)
     span = last["at"] - first["at"]
 
     def grown(name: str) -> float:
-        return round((last[name] - first[name]) / span, 1)
+        return last[name] - first[name]
 
-    third = max(1, len(looks) // 3)
+    def mean(name: str, some: list[dict[str, float]]) -> float:
+        return round(statistics.mean(each[name] for each in some), 1)
+
     return {
-        "updates_wanted_per_s": rate,
-        "updates_taken_per_s": grown("taken"),
-        "dashboard_cores": round((last["dashboard_cpu_s"] - first["dashboard_cpu_s"]) / span, 3),
-        "dashboard_cpu_us_per_update": round(
-            1e6
-            * (last["dashboard_cpu_s"] - first["dashboard_cpu_s"])
-            / max(1.0, last["taken"] - first["taken"])
-        ),
-        "frames_per_s": grown("frames"),
-        "page_reloads": loads - 1,
-        "page_updates_per_s": grown("page_updates"),
-        "dashboard_mib_first_third": statistics.mean(each["dashboard_mib"] for each in looks[:third]),
-        "dashboard_mib_last_third": statistics.mean(each["dashboard_mib"] for each in looks[-third:]),
-        "page_mib_first_third": statistics.mean(each["page_mib"] for each in looks[:third]),
-        "page_mib_last_third": statistics.mean(each["page_mib"] for each in looks[-third:]),
-        "seconds": seconds,
-        "load": os.getloadavg()[0],
-        "memory": looks,
+        "updates_taken_per_s": round(grown("taken") / span, 1),
+        "dashboard_cores": round(grown("dashboard_cpu_s") / span, 3),
+        "dashboard_cpu_us_per_update": round(1e6 * grown("dashboard_cpu_s") / max(1.0, grown("taken"))),
+        "frames_per_s": round(grown("frames") / span, 1),
+        "longest_frame_ms": max(each["longest_frame_ms"] for each in looks[1:]),
+        "page_updates_per_s": round(grown("page_updates") / span, 1),
+        "dashboard_mib_first_third": mean("dashboard_mib", looks[:third]),
+        "dashboard_mib_last_third": mean("dashboard_mib", looks[-third:]),
+        "page_mib_first_third": mean("page_mib", looks[:third]),
+        "page_mib_last_third": mean("page_mib", looks[-third:]),
+        "page_mib_least_last_third": min(each["page_mib"] for each in looks[-third:]),
     }
 
 

@@ -95,6 +95,8 @@ def splice(
 
     Labels beside the parts (X.labels.csv) are used; without them all of BENIGN is harmless and all of
     ATTACK is attack.
+
+    Example: sdnator dataset splice monday.pcap attack.pcap both.pcap --gap 2s
     """
     from sdnator.datasets.splice import splice as splice_captures
 
@@ -112,7 +114,10 @@ def rebuild(
     table: Annotated[Path, typer.Argument(metavar="MIRAI.tsv[.gz]", help="tshark's 19 columns.")],
     out: Out,
 ) -> None:
-    """Frames from tshark's table: every column of the table is found in them again."""
+    """Frames from tshark's table: every column of the table is found in them again.
+
+    Example: sdnator dataset rebuild mirai.tsv.gz mirai.pcap
+    """
     from sdnator.datasets.rebuild import rebuild as rebuild_capture
 
     with _writing(out), _packets("rebuilding") as progress:
@@ -129,7 +134,10 @@ def fetch(
     sha256: Annotated[list[str] | None, typer.Option(help="Checksum of each URL, in the same order.")] = None,
     folder: Annotated[Path, typer.Option(help="Where the files go.")] = Path(),
 ) -> None:
-    """Download a published data set; an interrupted download goes on where it ended."""
+    """Download a published data set; an interrupted download goes on where it ended.
+
+    Example: sdnator dataset fetch mirai --url https://example.org/mirai.zip --folder data
+    """
     from urllib.parse import unquote, urlsplit
 
     from sdnator.datasets.fetch import fetch as fetch_file

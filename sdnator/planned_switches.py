@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from sdnator.errors import BadInput
-from sdnator.up_settings import SwitchPlan
+from sdnator.up_settings import LearnPlan, SwitchPlan
 
 _PORTS = range(511)
 
@@ -23,20 +23,37 @@ class PlannedSwitch:
     """Port number to `veth:INTERFACE` or `null`, for a switch that we start."""
     forward: Mapping[int, int] = field(default_factory=dict)
     """Ingress port to egress port."""
+    learn: LearnPlan = field(default_factory=LearnPlan)
     fail: Literal["open", "closed"] = "open"
 
 
 def planned(plan: SwitchPlan, *, look: bool = True) -> PlannedSwitch:
     """Ports and wires read; raises BadInput naming the wrong one.  `look`: are the interfaces there?"""
     ports = parse_ports(plan.ports, plan.kind, look=look)
+    learns = _checked_learning(plan, ports)
     return PlannedSwitch(
         name=plan.name,
         kind=plan.kind,
         device_id=plan.device_id,
         ports=ports,
-        forward=parse_wires(plan.wires, ports, plan.kind),
+        # a wire between the only two ports would leave nothing to learn
+        forward=parse_wires(plan.wires or (("none",) if learns else ()), ports, plan.kind),
+        learn=plan.learn,
         fail=plan.fail,
     )
+
+
+def _checked_learning(plan: SwitchPlan, ports: Mapping[int, str]) -> bool:
+    if plan.learn.ports and plan.fail == "closed":
+        raise BadInput(
+            'fail = "closed" takes out wires only, and what is learnt stays: leave fail or learn out'
+        )
+    for port in plan.learn.ports:
+        if port not in _PORTS[1:-1]:
+            raise BadInput(f"learn.ports: {port}: ports are numbered from 1 to 509")
+        if plan.kind in ("embedded", "bmv2") and port not in ports:
+            raise BadInput(f"learn.ports: there is no port {port}; add {port}=veth:INTERFACE to ports")
+    return bool(plan.learn.ports)
 
 
 def parse_ports(options: Sequence[str], switch: str, *, look: bool = True) -> dict[int, str]:

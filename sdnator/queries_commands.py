@@ -23,6 +23,7 @@ from apps.sonata_adapter.keys import (
     request_of,
 )
 from apps.sonata_adapter.planner import plan
+from apps.sonata_adapter.refinement import coarsest
 from apps.sonata_adapter.templates import QueryFolder, own_queries
 from apps.sonata_adapter.text import parse_queries
 from due import DueError
@@ -80,7 +81,7 @@ def explain_query(key: KeyArgument) -> None:
     known = templates()
     request = _request(key, known)
     meaning = known[request.name].meaning if request.kind == "query" else ""
-    typer.echo(explain_plan(request, plan([request]), meaning=meaning))
+    typer.echo(explain_plan(request, plan([coarsest(request)]), meaning=meaning))
 
 
 @queries.command("add")

@@ -20,6 +20,8 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
+
 from dataplane.bmv2 import Bmv2, Bmv2Error
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_wire import Wire
@@ -182,6 +184,7 @@ class StandingPipeline:
                     "target": switch.kind,
                     "forward": {str(number): egress for number, egress in switch.forward.items()},
                     "fail": switch.fail,
+                    **({"learn": msgspec.to_builtins(switch.learn)} if switch.learn.ports else {}),
                 }
                 for switch in self.plan.switches
             ],

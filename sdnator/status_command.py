@@ -4,7 +4,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,11 +37,26 @@ def status(*, as_json: Json = False) -> None:
         raise typer.Exit(1)
     parts = {name: {"pid": pid, "alive": _alive(pid)} for name, pid in found.parts.items()}
     apps = _states(found.coordinator)
+    control = _control(found.coordinator) if apps is not None else None
     well = all(part["alive"] for part in parts.values()) and apps is not None
     if as_json:
-        print(json.dumps({"running": True, "well": well, **shown(found), "parts": parts, "apps": apps}))
+        print(
+            json.dumps(
+                {
+                    "running": True,
+                    "well": well,
+                    **shown(found),
+                    "parts": parts,
+                    "apps": apps,
+                    "control": control,
+                }
+            )
+        )
     else:
         _show_status(found, parts, apps)
+        wired = {str(one["name"]) for one in found.switches if one.get("forward")}
+        for line in control_lines(control, wired):
+            print(line)
     raise typer.Exit(0 if well else 1)
 
 
@@ -91,6 +106,39 @@ def _states(coordinator: str) -> dict[str, str] | None:
         return {app["app_id"]: ", ".join(app["states"]) for app in ask(coordinator, "/apps")}
     except PipelineError:
         return None
+
+
+def _control(coordinator: str) -> dict[str, Any] | None:
+    """What the controller says of its switches; None where it says nothing."""
+    from sdnator.coordinator_commands import ask
+
+    try:
+        return controlled(ask(coordinator, "/health"))
+    except PipelineError:
+        return None
+
+
+def controlled(health: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Of the Coordinator's /health: whether the sentinel is there, and how each switch is and fails."""
+    told = health.get("apps", {}).get("p4runtime_ctrl", {}).get("health", {}).get("app", {})
+    if "switches" not in told:
+        return None
+    names = ("connected", "primary", "fail", "stations")
+    switches = {one["switch"]: {name: one[name] for name in names if name in one} for one in told["switches"]}
+    return {"sentinel": bool(told.get("sentinel")), "switches": switches}
+
+
+def control_lines(control: Mapping[str, Any] | None, wired: Collection[str]) -> Iterator[str]:
+    """For people: a line for each switch; a sentinel is there for those that are `wired`."""
+    for name, one in (control or {"switches": {}})["switches"].items():
+        state = "under control" if one.get("connected") and one.get("primary") else "NOT under control"
+        if one.get("fail") == "closed":
+            watch = "a sentinel watches" if control and control["sentinel"] else "but NO sentinel watches"
+            fails = f"fails closed, {watch if name in wired else 'and has no wires'}"
+        else:
+            fails = "fails open: its wires stay while nobody controls it"
+        learnt = f"; {one['stations']} stations learnt" if "stations" in one else ""
+        yield f"switch {name} is {state}; it {fails}{learnt}"
 
 
 def down(

@@ -73,6 +73,18 @@ def up(
             help="GiB that the embedded archive may take; the oldest items go first; default: 10.", min=0.01
         ),
     ] = None,
+    engine: Annotated[
+        str,
+        typer.Option(
+            help="What runs queries' operators on the host: numpy, or spark (extra `spark`); default: numpy."
+        ),
+    ] = "",
+    spark_master: Annotated[
+        str,
+        typer.Option(
+            help="Where Spark runs: local[N] or spark://HOST:PORT; default: local[2].", metavar="URL"
+        ),
+    ] = "",
     no_dashboard: Annotated[bool, typer.Option("--no-dashboard", help="Serve no page.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say where everything is as one JSON line.")
@@ -102,6 +114,8 @@ def up(
         mitigate=not no_mitigate,
         quota=quota,
         dashboard=not no_dashboard,
+        engine=engine,
+        spark_master=spark_master,
     )
     with _stop_signals() as reloads:
         state = running.state_folder()

@@ -39,6 +39,8 @@ class Given:
     mitigate: bool = True
     quota: float | None = None
     dashboard: bool = True
+    engine: str = ""
+    spark_master: str = ""
 
     def file(self) -> Path | None:
         """The configuration that holds."""
@@ -50,7 +52,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
     config = config_file.load(given.file())
     own: UpSettings = config.struct("up")
     archive = given.archive or own.archive
-    settings = {name: config.section(name) for name in ("p4runtime_ctrl", "sonata_adapter")}
+    settings = {"p4runtime_ctrl": config.section("p4runtime_ctrl"), "sonata_adapter": _adapter(config, given)}
     settings["coordinator"] = _coordinator(config, given.quota or own.quota, embedded=not archive)
     settings["kitsune"] = _kitsune(config, given)
     settings["firewall"] = _firewall(config, given)
@@ -73,6 +75,25 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
 def _coordinator(config: "Config", quota: float, *, embedded: bool) -> dict[str, Any]:
     limit = {"retain_bytes": int(quota * _GIB)} if embedded else {}
     return limit | config.section("coordinator")
+
+
+def _adapter(config: "Config", given: Given) -> dict[str, Any]:
+    """The adapter's settings; that its engine cannot run is said now, not in its log."""
+    said = {"engine": given.engine, "spark_master": given.spark_master}
+    settings = config.section("sonata_adapter") | {name: value for name, value in said.items() if value}
+    engine = settings.get("engine", "numpy")
+    if engine not in ("numpy", "spark"):
+        raise BadInput(f"--engine {engine}: there are numpy and spark")
+    if given.spark_master and engine != "spark":
+        raise BadInput(f"--spark-master {given.spark_master}: only with --engine spark")
+    if engine == "spark":
+        from apps.sonata_adapter.spark import SparkMissing, require_spark
+
+        try:
+            require_spark()
+        except SparkMissing as error:
+            raise BadInput(str(error)) from None
+    return settings
 
 
 def _kitsune(config: "Config", given: Given) -> dict[str, Any]:

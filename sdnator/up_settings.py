@@ -20,6 +20,25 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             raise ValueError(f"quota={self.quota}: at least 0.01 GiB")
 
 
+class LearnPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Switching by learnt MAC addresses, as the controller does it; without ports it does not."""
+
+    ports: tuple[int, ...] = ()
+    """Frames are switched between these by learnt MAC addresses, where there is no wire; none: no learning."""
+    age_s: float = 300.0
+    """A station that has sent nothing for so long is forgotten."""
+    limit: int = 8192
+    """Most stations; frames to further ones go to all of the ports."""
+
+    def __post_init__(self) -> None:
+        if len(self.ports) == 1 or len(set(self.ports)) < len(self.ports):
+            raise ValueError(f"learn.ports={list(self.ports)}: give two or more, each once")
+        if not self.age_s >= 1:
+            raise ValueError(f"learn.age_s={self.age_s}: at least 1 s")
+        if self.limit < 1:
+            raise ValueError(f"learn.limit={self.limit}: at least 1")
+
+
 class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A switch: started with the pipeline, or one that runs already."""
 
@@ -32,7 +51,8 @@ class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     ports: tuple[str, ...] = ()
     """Ports of a switch that we start: N=veth:INTERFACE or N=null."""
     wires: tuple[str, ...] = ()
-    """Ports joined both ways, N-M; of exactly two ports by itself; "none": only listen."""
+    """Ports joined both ways, N-M; of exactly two ports by itself, unless it learns; "none": only listen."""
+    learn: LearnPlan = LearnPlan()
     fail: Literal["open", "closed"] = "open"
     """While it is not under control: open keeps the wires, closed takes them out."""
 

@@ -12,8 +12,10 @@ from xml.etree import ElementTree as ET
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from sdnator import reference
+from sdnator.cli import app
 from sdnator.flow_picture import Row, rows, svg
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -82,6 +84,20 @@ def test_commands_are_read_as_people_type_them():
     assert "| `--also` | `STR` |  | Others. May be repeated. |" in text
     assert "| `--json` |  |  | For programs. |" in text
     assert "| `--size` | `N` | `3` | a\\|b Environment: `SIZE`. |" in text
+
+
+def every_command():
+    """Words of each command that does something, groups walked through."""
+    headings = re.findall(r"^#{2,4} sdnator (.+)$", reference.cli(), re.MULTILINE)
+    return [one.split() for one in headings if not any(other.startswith(f"{one} ") for other in headings)]
+
+
+@pytest.mark.parametrize("words", [*every_command(), ["demo"]], ids=" ".join)
+def test_help_of_every_command_has_an_example(words):
+    """As people type it."""
+    done = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "200"})
+    assert done.exit_code == 0
+    assert f"Example: sdnator {' '.join(words)}" in done.stdout
 
 
 def test_flow_picture_draws_who_writes_and_who_receives():

@@ -33,9 +33,9 @@ class AppsPanel:
             with ui.element("div").classes("panel wide"):
                 ui.label("Who gets what from whom").classes("panel-title")
                 ui.label(
-                    "▲ items written, ▼ items received a second; point at an arrow for its keys"
+                    "▲ items written, ▼ items received a second; point at an arrow for its keys and their rates"
                 ).classes("quiet")
-                self._chart = ui.echart(flow_chart((), (), {})).style("height: 380px; width: 100%")
+                self._chart = ui.echart(flow_chart((), (), {}, {})).style("height: 380px; width: 100%")
                 self._chart.classes("flow")
             with ui.element("div").classes("panel wide"):
                 ui.label("Instances").classes("panel-title")
@@ -52,7 +52,7 @@ class AppsPanel:
             self._seen = board.versions["apps"]
             here = board.present()
             names = {app["app_id"] for app in here}
-            options = flow_chart(here, board.flow, board.rates)
+            options = flow_chart(here, board.flow, board.rates, board.rates_by_key())
             rows = [self._row(one) for one in board.instances if one["app_id"] in names]
             fault = board.coordinator
         self._chart.options.clear()

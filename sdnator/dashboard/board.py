@@ -19,6 +19,7 @@ BINS: Final = 240
 PARTS: Final = ("coordinator", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "dashboard")
 """Apps whose absence is news; others come and go."""
 STANDING: Final = ("block", "protect")
+EVERY_SWITCH: Final = ("", "*")
 
 
 @dataclass(slots=True)
@@ -76,11 +77,14 @@ class Board:
         self.flow: list[dict[str, Any]] = []
         self.rates: dict[str, tuple[float, float]] = {}
         """Items written and received a second, by app."""
+        self.key_rates: OrderedDict[tuple[str, str], Mapping[str, float]] = OrderedDict()
+        """Items written a second by key without specs, by app and instance."""
         self.coordinator = ""
         """What is wrong with the Coordinator; empty: nothing."""
         self.counts: Counter[str] = Counter()
         self.versions: Counter[str] = Counter()
         self._written: dict[str, tuple[float, int, int]] = {}
+        self._keys: OrderedDict[tuple[str, str], tuple[float, Mapping[str, int]]] = OrderedDict()
 
     def score(self, value: Mapping[str, Any], now: float) -> None:
         """A score summary."""
@@ -98,9 +102,16 @@ class Board:
         """Decisions, in the order they were made: the latest of a target on a switch holds."""
         with self.lock:
             for each in decisions:
-                key = (each.switch, each.target.kind, each.target.address, each.target.port)
-                self.decisions.pop(key, None)
-                self.decisions[key] = each
+                about = (each.target.kind, each.target.address, each.target.port)
+                others = tuple(self.switches) if each.switch in EVERY_SWITCH else ()
+                general = [self.decisions.get((switch, *about)) for switch in EVERY_SWITCH]
+                if each.switch not in EVERY_SWITCH and any(
+                    one and (one.id, one.action) == (each.id, each.action) for one in general
+                ):
+                    continue  # said again, to a switch that came later
+                for switch in (*others, each.switch):
+                    self.decisions.pop((switch, *about), None)
+                self.decisions[each.switch, *about] = each
                 while len(self.decisions) > DECISIONS_KEPT:
                     self.decisions.popitem(last=False)
                 self._changed("decisions")
@@ -119,13 +130,14 @@ class Board:
     def switch(self, value: Mapping[str, Any]) -> None:
         """The state of a switch."""
         with self.lock:
-            self._keep(self.switches, str(value["switch"]), value)
+            _keep(self.switches, str(value["switch"]), value)
             self._changed("switches")
 
-    def healthy(self, app: str, value: Mapping[str, Any]) -> None:
-        """What an app says of itself."""
+    def healthy(self, app: str, value: Mapping[str, Any], now: float) -> None:
+        """What an app says of itself, at `now` (s)."""
         with self.lock:
-            self._keep(self.health, app, value)
+            _keep(self.health, app, value)
+            self._rate_keys(app, value.get("engine", {}), now)
             self._changed("health")
 
     def coordinated(
@@ -139,6 +151,9 @@ class Board:
         with self.lock:
             self.apps, self.instances, self.flow, self.coordinator = apps, instances, flow, ""
             self._rate(now)
+            here = {one["instance_id"] for one in instances if one["state"] != "offline"}
+            for name in [name for name in self.key_rates if name[1] not in here]:
+                del self.key_rates[name]
             self._changed("apps")
 
     def uncoordinated(self, why: str) -> None:
@@ -154,6 +169,13 @@ class Board:
     def present(self) -> list[dict[str, Any]]:
         """Apps that are here, and parts of the product that ought to be."""
         return [app for app in self.apps if set(app["states"]) != {"offline"} or app["app_id"] in PARTS]
+
+    def rates_by_key(self) -> dict[str, Counter[str]]:
+        """Items written a second by app and key, all instances together."""
+        found: dict[str, Counter[str]] = {}
+        for (app, _), rates in self.key_rates.items():
+            found.setdefault(app, Counter()).update(rates)
+        return found
 
     def line(self) -> float | None:
         """The score from which Kitsune calls a packet anomalous."""
@@ -175,12 +197,25 @@ class Board:
         self._written = {app: (now, *both) for app, both in totals.items()}
         self.rates = {app: rate for app, rate in self.rates.items() if app in totals}
 
-    def _keep(self, kept: OrderedDict[str, Mapping[str, Any]], name: str, value: Mapping[str, Any]) -> None:
-        kept[name] = value
-        kept.move_to_end(name)
-        while len(kept) > NAMES_KEPT:
-            kept.popitem(last=False)
+    def _rate_keys(self, app: str, engine: Mapping[str, Any], now: float) -> None:
+        name, written = (app, str(engine.get("instance", ""))), engine.get("keys", {})
+        then, before = self._keys.get(name, (now, {}))
+        if now > then:
+            rates = {
+                key: (count - before[key]) / (now - then)
+                for key, count in written.items()
+                if count >= before.get(key, count + 1)
+            }
+            _keep(self.key_rates, name, rates)
+        _keep(self._keys, name, (now, written))
 
     def _changed(self, topic: str) -> None:
         self.versions[topic] += 1
         self.counts[topic] += 1
+
+
+def _keep(kept: OrderedDict[Any, Any], name: Any, value: Any) -> None:
+    kept[name] = value
+    kept.move_to_end(name)
+    while len(kept) > NAMES_KEPT:
+        kept.popitem(last=False)

@@ -2,13 +2,18 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from math import ceil, log10
 from typing import Any
 
+from due.keys import Key
 from sdnator.dashboard.board import Bin
 from sdnator.dashboard.texts import number
 
 GREY, BLUE, RED, AMBER = "#8a8f98", "#3b82d6", "#d9534f", "#e0a030"
 _LEAST_SCORE = 0.001
+_LEAST_SHOWN = 0.05
+_TOLD = 12
 _GRID = "rgba(128,128,128,0.18)"
 _PLACES = {
     "p4runtime_ctrl": (12, 52),
@@ -30,7 +35,7 @@ def score_chart() -> dict[str, Any]:
         "legend": {"top": 0, "left": 40, "textStyle": {"color": GREY}, "itemHeight": 8},
         "tooltip": {"trigger": "axis"},
         "xAxis": {"type": "time", **axis},
-        "yAxis": {"type": "log", "min": _LEAST_SCORE, **axis},
+        "yAxis": {"type": "log", "min": _LEAST_SCORE, "max": top([], None), **axis},
         "series": [
             {
                 **line,
@@ -61,6 +66,11 @@ def threshold(value: float | None) -> dict[str, Any]:
     }
 
 
+def top(scores: Iterable[float], line: float | None) -> float:
+    """End of the axis: a power of ten that scores and line have room below; ECharts finds none without scores."""
+    return 10.0 ** ceil(log10(min(1e12, max(10.0, line or 0.0, *scores))))
+
+
 def score_points(bins: Iterable[Bin]) -> tuple[list[list[float]], list[list[float]]]:
     """Points of both series: time in ms, score."""
     highest, mean = [], []
@@ -76,8 +86,12 @@ def flow_chart(
     apps: Iterable[Mapping[str, Any]],
     flow: Iterable[Mapping[str, Any]],
     rates: Mapping[str, tuple[float, float]],
+    by_key: Mapping[str, Mapping[str, float]],
 ) -> dict[str, Any]:
-    """Apps as nodes with what they write and receive a second; who gets what from whom as edges."""
+    """Apps as nodes with what they write and receive a second; who gets what from whom as edges.
+
+    `by_key`: items a second of each key that an app writes; an edge has those its interests match.
+    """
     keys: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
     for one in flow:
         if one["producer"] != one["consumer"]:
@@ -107,7 +121,7 @@ def flow_chart(
                 },
                 "lineStyle": {"color": GREY, "opacity": 0.7},
                 "data": [_node(name, rates, strangers) for name in names],
-                "links": [_edge(pair, sorted(found), rates) for pair, found in sorted(keys.items())],
+                "links": [_edge(pair, sorted(found), by_key) for pair, found in sorted(keys.items())],
             }
         ],
     }
@@ -125,12 +139,34 @@ def _node(name: str, rates: Mapping[str, tuple[float, float]], strangers: list[s
     }
 
 
-def _edge(pair: tuple[str, str], keys: list[str], rates: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+def _edge(
+    pair: tuple[str, str], interests: list[str], by_key: Mapping[str, Mapping[str, float]]
+) -> dict[str, Any]:
     producer, consumer = pair
-    written = rates.get(producer, (0.0, 0.0))[0]
+    written = by_key.get(producer, {})
+    goes = {key: {interest for interest in interests if _wants(interest, key)} for key in written}
+    wanted = {
+        interest: sum(written[key] for key in written if interest in goes[key]) for interest in interests
+    }
+    total = sum(written[key] for key in written if goes[key])
+    lines = [
+        f"{interest} {number(wanted[interest])}/s" if written else interest
+        for interest in sorted(interests, key=lambda one: -wanted[one])[:_TOLD]
+    ]
     return {
         "source": producer,
         "target": consumer,
-        "lineStyle": {"width": 1 + min(4.0, len(str(int(written))) * 0.7), "curveness": 0.16},
-        "tooltip": {"formatter": "<br>".join([f"{producer} → {consumer}", *keys[:12]])},
+        "lineStyle": {"width": 1 + min(4.0, len(str(int(total))) * 0.7), "curveness": 0.16},
+        "label": {
+            "show": total >= _LEAST_SHOWN,
+            "formatter": f"{number(total)}/s",
+            "color": GREY,
+            "fontSize": 10,
+        },
+        "tooltip": {"formatter": "<br>".join([f"{producer} → {consumer}", *lines])},
     }
+
+
+@lru_cache(maxsize=4096)
+def _wants(interest: str, key: str) -> bool:
+    return Key.parse(interest).matches_path(key)

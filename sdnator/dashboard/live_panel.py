@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from sdnator.dashboard.charts import score_chart, score_points, threshold
+from sdnator.dashboard.charts import score_chart, score_points, threshold, top
 from sdnator.dashboard.texts import alert_row, decision_row, number
 
 if TYPE_CHECKING:
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from sdnator.dashboard.service import DashboardService
 
 _SHOWN = 50
+_LISTS_SECONDS = 1.0
+"""Lists change no more often: people read them, and press buttons in them."""
 _ENTRY = """
 <q-tr :props="props"><q-td colspan="100%"><div class="entry">
   <div :class="'mark ' + (props.row.action || 'alert')"></div>
@@ -27,7 +29,7 @@ _ENTRY = """
   <div class="side">BUTTONS</div>
 </div></q-td></q-tr>
 """
-_BUTTON = """<q-btn SHOWN flat dense no-caps size="sm" color="primary" icon="ICON" label="LABEL"
+_BUTTON = """<q-btn SHOWN flat dense no-caps size="sm" color="primary" icon="ICON" LABEL
   class="NAME" @click="() => $parent.$emit('NAME', props.row)" />"""
 
 
@@ -45,6 +47,7 @@ class LivePanel:
         self._board = service.board
         self._acting = acting
         self._seen: dict[str, int] = {}
+        self._listed = float("-inf")
         self._numbers: dict[str, ui.label] = {}
         with ui.element("div").classes("figures q-mb-sm"):
             for name in (
@@ -64,8 +67,8 @@ class LivePanel:
                 self._chart = ui.echart(score_chart()).style("height: 260px; width: 100%").classes("scores")
             with ui.element("div").classes("panel"):
                 ui.label("Blocks and guards").classes("panel-title")
-                undo = _button("undo", "Undo", "undo", 'v-if="props.row.undo"')
-                buttons = undo + _button("allow", "Allow", "verified_user")
+                undo = _button("undo", ':label="props.row.undo"', "undo", 'v-if="props.row.undo"')
+                buttons = undo + _button("allow", 'label="Allow"', "verified_user", 'v-if="props.row.allow"')
                 self._decisions = self._feed("decisions", buttons, "nothing is blocked or guarded")
                 self._decisions.on("undo", self._undo)
                 self._decisions.on("allow", self._allow)
@@ -96,12 +99,9 @@ class LivePanel:
         with board.lock:
             if self._new("scores", "health"):
                 points, line = score_points(board.scores.bins), board.line()
-            if self._new("decisions"):
-                rows["decisions"] = self._decision_rows()
-            if self._new("alerts"):
-                first = board.counts["alerts"]
-                newest = list(board.alerts)[: -_SHOWN - 1 : -1]
-                rows["alerts"] = [alert_row(each, first - place) for place, each in enumerate(newest)]
+            if time.monotonic() - self._listed >= _LISTS_SECONDS:
+                self._listed = time.monotonic()
+                rows = self._rows()
             figures = self._figures(now)
         if points is not None:
             self._draw(points, line)
@@ -116,7 +116,19 @@ class LivePanel:
         highest, mean = self._chart.options["series"]
         highest["data"], mean["data"] = points
         highest["markLine"] = threshold(line)
+        self._chart.options["yAxis"]["max"] = top((score for _, score in points[0]), line)
         self._chart.update()
+
+    def _rows(self) -> dict[str, list[dict[str, Any]]]:
+        board = self._board
+        rows = {}
+        if self._new("decisions"):
+            rows["decisions"] = self._decision_rows()
+        if self._new("alerts"):
+            first = board.counts["alerts"]
+            newest = list(board.alerts)[: -_SHOWN - 1 : -1]
+            rows["alerts"] = [alert_row(each, first - place) for place, each in enumerate(newest)]
+        return rows
 
     def _decision_rows(self) -> list[dict[str, Any]]:
         answers: dict[str, dict[str, str]] = {}

@@ -113,7 +113,7 @@ class DashboardService:
                 Confirmation.from_value(item.value)
             ),
             "network.switch.p4runtime_ctrl.*": lambda item: board.switch(item.value),
-            "due.health.*": lambda item: board.healthy(item.app_id, item.value),
+            "due.health.*": lambda item: board.healthy(item.app_id, item.value, time.monotonic()),
             ANSWERS: self._on_answer,
         }
         for key, handler in handlers.items():

@@ -39,7 +39,9 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
         "where": f"{'dry run · ' if one.dry_run else ''}{where} · {until}",
         "reason": one.reason,
         "said": said,
-        "undo": one.action == "block",
+        # a guard without end is one that the settings name: it stays
+        "undo": "Undo" if one.action == "block" else "Release" if one.expires else "",
+        "allow": one.action == "block",
     }
 
 

@@ -1,4 +1,4 @@
-"""The dashboard as people use it: a real browser signs in, undoes a block, and the switch has no rule any more."""
+"""The dashboard as people use it: a real browser signs in, undoes a block, releases a guard, and their rules are gone."""
 
 import json
 import time
@@ -6,11 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from apps.messages import Decision, Target
+from due import DB_ONLY, PRODUCER, Capability, Engine, Options
+from due.drivers.embedded_redis import EmbeddedServer
 from tests.end_to_end.test_bad_input import processes_of
 from tests.end_to_end.test_up import Operator, until
 from tests.requirements import missing, require_program
 
 ADDRESS = "198.51.100.66"
+GUARDED = "192.0.2.80"
 
 
 def browser():
@@ -122,14 +126,35 @@ def running(tmp_path):
     """An operator's pipeline with the page on a free port."""
     operator = Operator(tmp_path)
     operator.environment["SDNATOR_DASHBOARD_PORT"] = "0"
+    guarded_before(tmp_path)
     with operator.up(page=()) as (_, said):
         yield operator, said
     assert processes_of(operator.mark) == []
 
 
-def blocked(operator):
-    entries = operator.figures("tables", "s1", "--table", "block_src")["entries"]
-    return any(ADDRESS in one["entry"] for one in entries)
+def guarded_before(folder):
+    """A guard in the archive, as a firewall leaves it that a flood made guard a service."""
+    key, now = "network.protect.firewall.ipv4", time.time_ns()
+    target = Target(kind="ip", address=GUARDED, port=80)
+    guard = Decision(
+        id="g1", action="protect", switch="*", target=target, reason="a flood", event_time=now,
+        expires=now + 3_600 * 10**9,
+    )  # fmt: skip
+    archive = folder / "data" / "sdnator" / "archive.db"
+    archive.parent.mkdir(parents=True)
+    with EmbeddedServer(folder / "before") as server:
+        places = {"updates": server.url, "archive": f"sqlite://{archive}", "directory": str(folder / "due")}
+        engine = Engine(Options(**places, coordinated=False))
+        engine.init(
+            "firewall", PRODUCER, capabilities=[Capability(key, delivery="reliable", archive="always")]
+        )
+        engine.write(key, guard.to_value(), [DB_ONLY], event_time=now)
+        engine.close()
+
+
+def in_switch(operator, table, address):
+    entries = operator.figures("tables", "s1", "--table", table)["entries"]
+    return any(address in one["entry"] for one in entries)
 
 
 @pytest.mark.timeout(480)
@@ -144,7 +169,8 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
         return done.returncode == 0 or "blocked already" in done.stderr
 
     until(told)
-    until(lambda: blocked(operator))
+    until(lambda: in_switch(operator, "block_src", ADDRESS))
+    until(lambda: in_switch(operator, "protect", GUARDED))
     driver = browser()
     try:
         page = Page(driver, said["dashboard"])
@@ -153,11 +179,13 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
         page.sign_in("not the token, but as long", lambda: page.seen(".fault", "not the token"))
         page.sign_in(token, lambda: page.seen(".sign-out"))
 
-        def gone():
-            return not blocked(operator)
+        for label, table, address in (("Undo", "block_src", ADDRESS), ("Release", "protect", GUARDED)):
 
-        # what the page shows is no proof: it is empty for a moment after signing in
-        until(lambda: gone() or (page.click_now(".undo") and soon(gone)))
+            def gone(table=table, address=address):
+                return not in_switch(operator, table, address)
+
+            # what the page shows is no proof: it is empty for a moment after signing in
+            until(lambda label=label, gone=gone: gone() or (page.click_now(".undo", label) and soon(gone)))
         page.find(".decisions", "nothing is blocked")
         look_around(page)
     finally:

@@ -2,11 +2,15 @@
 
 import time
 
+import msgspec
 import pytest
 
+from apps.p4runtime_ctrl.stations import LearnSettings
 from sdnator.errors import BadInput, PipelineError
+from sdnator.planned_switches import PlannedSwitch
 from sdnator.standing_pipeline import DEATHS, StandingPipeline
 from sdnator.standing_plan import StandingPlan
+from sdnator.up_settings import LearnPlan
 
 
 @pytest.fixture
@@ -49,6 +53,16 @@ def test_a_server_that_is_not_there_ends_the_start_before_anything_runs(tmp_path
     with pytest.raises(kind, match="Data Updates"), StandingPipeline(plan, print):
         pass
     assert not list((tmp_path / "logs").iterdir())
+
+
+def test_the_controller_is_told_which_switch_learns(tmp_path):
+    """As its own settings have it; a switch that does not learn has nothing of it."""
+    switches = (PlannedSwitch(learn=LearnPlan(ports=(1, 2))), PlannedSwitch(name="s2"))
+    made = StandingPipeline(StandingPlan(state=tmp_path, archive="", switches=switches), print)
+    made._bases = made.switch_addresses = dict.fromkeys(("s1", "s2"), 0)
+    first, second = made._settings("p4runtime_ctrl")["switches"]
+    assert msgspec.convert(first["learn"], LearnSettings).ports == (1, 2)
+    assert "learn" not in second
 
 
 def test_logs_of_the_last_run_are_kept_beside(tmp_path):

@@ -3,13 +3,17 @@
 import json
 import os
 
+import msgspec
 import pytest
 from typer.testing import CliRunner
 
+from apps.p4runtime_ctrl.stations import LearnSettings
 from sdnator.errors import BadInput
-from sdnator.planned_switches import parse_ports, parse_wires
+from sdnator.planned_switches import parse_ports, parse_wires, planned
 from sdnator.running import claimed
+from sdnator.status_command import control_lines, controlled
 from sdnator.up_plan import model_settings
+from sdnator.up_settings import LearnPlan, SwitchPlan
 from tests.end_to_end.operator_app import app
 
 
@@ -52,6 +56,31 @@ def test_wrong_ports_are_named(option, switch, word):
 def test_a_port_is_given_once():
     with pytest.raises(BadInput, match="twice"):
         parse_ports(["1=null", "1=null"], "embedded")
+
+
+def test_ports_that_learn_are_there_and_no_wire_by_themselves():
+    learn = LearnPlan(ports=(1, 2))
+    plan = SwitchPlan(ports=("1=null", "2=null"), learn=learn)
+    assert (planned(plan).forward, planned(plan).learn) == ({}, learn)
+    with pytest.raises(BadInput, match="there is no port 2"):
+        planned(SwitchPlan(ports=("1=null",), learn=learn))
+    with pytest.raises(BadInput, match="closed"):
+        planned(msgspec.structs.replace(plan, fail="closed"))
+    with pytest.raises(BadInput, match="1 to 509"):
+        planned(SwitchPlan(kind="10.0.0.2:9559", learn=LearnPlan(ports=(1, 510))))
+
+
+@pytest.mark.parametrize("wrong", [{"ports": (1,)}, {"ports": (1, 1)}, {"age_s": 0.0}, {"limit": 0}])
+def test_learning_that_cannot_be_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"learn\."):
+        LearnPlan(**wrong)
+
+
+def test_learning_defaults_are_the_controllers():
+    """The command line does not import the controller, so they stand twice."""
+    own = {one.name: one.default for one in msgspec.structs.fields(LearnPlan) if one.name != "ports"}
+    its = {one.name: one.default for one in msgspec.structs.fields(LearnSettings) if one.name != "ports"}
+    assert own == its
 
 
 def test_two_ports_are_a_wire_by_themselves():
@@ -105,6 +134,30 @@ def test_a_pipeline_that_starts_is_told(tmp_path):
     )
 
 
+def test_status_tells_who_closes_a_switch_that_nobody_controls():
+    told = {
+        "sentinel": False,
+        "switches": [
+            {"switch": "s1", "connected": True, "primary": True, "fail": "open", "packet_in": 3},
+            {"switch": "s2", "connected": False, "primary": False, "fail": "closed", "stations": 2},
+        ],
+    }
+    control = controlled({"apps": {"p4runtime_ctrl": {"health": {"app": told, "engine": {}}}}})
+    assert control["switches"]["s2"] == {
+        "connected": False,
+        "primary": False,
+        "fail": "closed",
+        "stations": 2,
+    }
+    first, second = control_lines(control, {"s1", "s2"})
+    assert first == "switch s1 is under control; it fails open: its wires stay while nobody controls it"
+    assert "s2 is NOT under control; it fails closed, but NO sentinel watches; 2 stations learnt" in second
+    assert "a sentinel watches" in list(control_lines({**control, "sentinel": True}, {"s2"}))[1]
+    assert "closed, and has no wires" in list(control_lines(control, ()))[1]
+    assert controlled({"apps": {}}) is None, "the controller has said nothing yet"
+    assert list(control_lines(None, ())) == []
+
+
 def test_down_is_content_where_nothing_runs():
     done = run("down")
     assert (done.exit_code, done.stdout) == (0, "no pipeline was running\n")
@@ -115,3 +168,17 @@ def test_wrong_archive_is_told_before_anything_starts(tmp_path):
     with pytest.raises(BadInput, match="--archive"):
         run("up", "--archive", "postgres://somewhere")
     assert not (tmp_path / "state" / "sdnator" / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--engine", "flink"], "there are numpy and spark"),
+        (["--spark-master", "local[4]"], "only with --engine spark"),
+        (["--engine", "spark"], r"pip install 'sdnator\[spark\]'"),
+    ],
+)
+def test_an_engine_that_cannot_run_is_said_before_anything_starts(options, word, monkeypatch):
+    monkeypatch.setattr("apps.sonata_adapter.spark.find_spec", lambda _: None)
+    with pytest.raises(BadInput, match=word):
+        run("up", *options)

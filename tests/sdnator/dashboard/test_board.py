@@ -23,6 +23,10 @@ def decision(number, action="block", address="192.0.2.1"):
     )  # fmt: skip
 
 
+def on(switch, one):
+    return Decision(**({name: getattr(one, name) for name in one.__struct_fields__} | {"switch": switch}))
+
+
 def alert(number):
     return Alert(
         id=str(number), sender=Sender(switch="s1", port=1, mac="02:00:00:00:00:01"), event_time=number,
@@ -52,7 +56,7 @@ def test_everything_is_bounded():
             Confirmation(id=str(number), switch="s1", state="installed", action="block", event_time=0)
         )
         board.switch({"switch": f"s{number}"})
-        board.healthy(f"app{number}", {})
+        board.healthy(f"app{number}", {}, float(number))
     assert len(board.scores.bins) == BINS
     assert len(board.alerts) == ALERTS_KEPT
     assert len(board.decisions) == len(board.answers) == DECISIONS_KEPT
@@ -68,11 +72,36 @@ def test_the_latest_decision_of_a_target_holds():
     assert [each.id for each in board.standing()] == ["4", "2"]
 
 
+def test_a_decision_for_every_switch_stands_once():
+    """A switch that comes later is told by itself."""
+    board = Board()
+    general = on("*", decision(1, "protect"))
+    board.decide([general, on("s1", general)])
+    longer = Decision(**{name: getattr(general, name) for name in general.__struct_fields__} | {"expires": 9})
+    assert board.standing() == [general]
+    board.decide([longer])
+    assert board.standing() == [longer]
+    other = on("s1", decision(2))
+    board.decide([other])
+    assert board.standing() == [other, longer]
+
+
+def test_what_is_lifted_for_every_switch_is_lifted_for_each():
+    """Also for one whose decision came before the general one."""
+    board = Board()
+    board.switch({"switch": "s1"})
+    board.decide([decision(1, "protect"), decision(2, "protect", address="192.0.2.2")])
+    board.decide([on("*", decision(3, "unprotect"))])
+    assert [each.id for each in board.standing()] == ["2"]
+
+
 def test_rates_follow_from_two_looks_and_a_new_instance_begins_at_none():
     board = Board()
 
     def look(written, now):
-        instances = [{"app_id": "a", "written": written, "received": 0}]
+        instances = [
+            {"app_id": "a", "instance_id": "1", "state": "active", "written": written, "received": 0}
+        ]
         board.coordinated([{"app_id": "a", "states": {"active": 1}}], instances, [], now)
 
     look(100, 10.0)
@@ -81,6 +110,23 @@ def test_rates_follow_from_two_looks_and_a_new_instance_begins_at_none():
     assert board.rates == {"a": (25.0, 0.0)}
     look(0, 14.0)
     assert board.rates == {"a": (0.0, 0.0)}
+
+
+def test_rates_of_keys_follow_from_what_two_instances_say_of_themselves():
+    board = Board()
+
+    def say(instance, now, **keys):
+        board.healthy("a", {"engine": {"instance": instance, "keys": keys}}, now)
+
+    say("1", 10.0, x=100, y=7)
+    say("2", 10.0, x=1_000)
+    assert board.rates_by_key() == {}
+    say("1", 12.0, x=150, y=7, new=5)
+    say("2", 11.0, x=1_010)
+    assert board.rates_by_key() == {"a": {"x": 35.0, "y": 0.0}}
+    here = [{"app_id": "a", "instance_id": "1", "state": "active", "written": 0, "received": 0}]
+    board.coordinated([], here, [], 12.0)
+    assert board.rates_by_key()["a"]["x"] == 25.0, "who is gone writes nothing"
 
 
 def test_apps_that_came_and_went_are_no_news_but_missing_parts_are():
@@ -93,7 +139,7 @@ def test_apps_that_came_and_went_are_no_news_but_missing_parts_are():
 def test_the_line_is_kitsunes_own():
     board = Board()
     assert board.line() is None
-    board.healthy("kitsune", {"app": {"line": 1.25}})
+    board.healthy("kitsune", {"app": {"line": 1.25}}, 1.0)
     assert board.line() == 1.25
 
 

@@ -3,7 +3,7 @@
 import json
 
 from sdnator.dashboard.board import Bin
-from sdnator.dashboard.charts import flow_chart, score_chart, score_points, threshold
+from sdnator.dashboard.charts import flow_chart, score_chart, score_points, threshold, top
 from sdnator.dashboard.texts import number
 
 FLOW = [
@@ -25,8 +25,12 @@ def test_the_threshold_is_drawn_where_it_is_known():
     json.dumps(score_chart())
 
 
+def test_the_axis_ends_above_scores_and_threshold_even_without_scores():
+    assert [top([], None), top([0.2], 1.0), top([33.0], 1.0), top([], 2_000.0)] == [10, 10, 100, 10_000]
+
+
 def test_apps_are_nodes_and_what_they_tell_each_other_is_one_arrow():
-    options = flow_chart([{"app_id": "firewall"}], FLOW, {"kitsune": (12.0, 3.0)})
+    options = flow_chart([{"app_id": "firewall"}], FLOW, {"kitsune": (12.0, 3.0)}, {})
     series = options["series"][0]
     assert {node["name"] for node in series["data"]} == {"firewall", "kitsune", "stranger"}
     arrows = {(one["source"], one["target"]): one["tooltip"]["formatter"] for one in series["links"]}
@@ -34,6 +38,24 @@ def test_apps_are_nodes_and_what_they_tell_each_other_is_one_arrow():
     assert "network.anomaly.kitsune.score" in arrows["kitsune", "firewall"]
     assert any("12/s" in node["label"]["formatter"] for node in series["data"])
     json.dumps(options)
+
+
+def test_an_arrow_has_the_rates_of_the_keys_that_go_along_it():
+    rates = {
+        "network.anomaly.kitsune.score": 40.0,
+        "network.anomaly.kitsune.alert": 2.0,
+        "due.health.kitsune": 1.0,
+    }
+    both = [*FLOW, {"producer": "kitsune", "consumer": "firewall", "interest": "network.anomaly.kitsune.*"}]
+    first, _ = flow_chart([], both, {}, {"kitsune": rates})["series"][0]["links"]
+    assert first["label"]["formatter"] == "42/s", "what two interests want goes once"
+    told = first["tooltip"]["formatter"].split("<br>")
+    assert told == [
+        "kitsune → firewall",
+        "network.anomaly.kitsune.* 42/s",
+        "network.anomaly.kitsune.score 40/s",
+        "network.anomaly.kitsune.alert 2/s",
+    ]
 
 
 def test_numbers_are_short():
