@@ -11,6 +11,9 @@ PYTHON ?= python3
 VENV := .venv
 # optional parts of pyproject.toml to install: `make EXTRAS=dev,spark test` tests the Spark engine too
 EXTRAS ?= dev
+# how many workers share the tests (tests/conftest.py says how); 0: one after the other
+WORKERS ?= 2
+PYTEST := -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 BIN := $(VENV)/bin
 comma := ,
 BASE := $(VENV)/.set-up
@@ -43,7 +46,7 @@ demo: $(BASE)
 
 test: venv
 	@echo "==> tests"
-	@$(BIN)/python -m pytest
+	@$(BIN)/python $(PYTEST)
 
 check: venv
 	$(BIN)/ruff check .
@@ -57,7 +60,7 @@ reference: venv
 	$(BIN)/python -m sdnator.reference docs
 
 coverage: venv
-	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m coverage run -m pytest
+	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m coverage run $(PYTEST)
 	$(BIN)/python -m coverage combine --quiet
 	$(BIN)/python -m coverage report --skip-covered
 

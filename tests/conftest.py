@@ -1,12 +1,43 @@
-"""Fixtures for all tests, and the promise that the suite leaves no process behind."""
+"""Fixtures for all tests, how workers share them, and the promise that the suite leaves no process behind."""
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from tests.requirements import IN_CI
+
+WHOLE_PIPELINES = ("tests/end_to_end/", "tests/test_docs.py")
+"""Each of these tests keeps both cores of a small machine busy with processes, and some of them measure."""
+ONE_SWITCH = "tests/p4/"
+"""These files share a compiled switch."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The longest piece first: one worker is busy with it while the others take all the rest."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_PIPELINES))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
+    """Share the tests between workers: a file is one piece, so that its fixtures are made once."""
+    return Pieces(config, log)
+
+
+class Pieces(LoadFileScheduling):
+    """Whole pipelines are one piece together: no two of them are measured side by side.
+
+    A scheduler of our own, because the groups of `--dist loadgroup` do nothing with pytest 9.2.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        if nodeid.startswith(WHOLE_PIPELINES):
+            return "whole pipelines"
+        return ONE_SWITCH if nodeid.startswith(ONE_SWITCH) else nodeid.partition("::")[0]
 
 
 def _children() -> set[int]:

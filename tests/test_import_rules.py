@@ -83,7 +83,9 @@ def test_p4_folder_is_no_package():
 
 
 @pytest.mark.parametrize(
-    "path", [p for f in OURS - {"sdnator_due"} for p in sources(f)], ids=lambda p: str(p.relative_to(ROOT))
+    "path",
+    [p for f in sorted(OURS - {"sdnator_due"}) for p in sources(f)],
+    ids=lambda p: str(p.relative_to(ROOT)),
 )
 def test_no_file_is_longer_than_600_lines(path):
     """A file should fit a reader's head."""

@@ -65,16 +65,12 @@ def test_capture_shorter_than_training_names_the_options(capture):
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        (("--fm-grace", "100"), "--ad-grace"),
-        (("--pace", "fast"), "--pace"),
-        (("--telemetry", "netflow"), "packet-in or digest"),
-        (("--switch", "somewhere"), "--switch"),
         (("--switch", "127.0.0.1:9"), "--inject"),
         (("--report", "/proc/report"), "--report"),
     ],
 )
 def test_wrong_option_is_named(capture, options, word):
-    """Before anything is started."""
+    """Before anything is started; tests/sdnator/test_replay_command.py has the other options."""
     done = sdnator("replay", capture, "--train", "1000", *options)
     assert done.returncode == 2
     assert word in told(done)
