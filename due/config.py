@@ -31,7 +31,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     window_bytes: int = 16 << 20
     """What a producer keeps per reliable stream until its readers acknowledge; then `write` waits."""
     retain_bytes: int = 16 << 20
-    """What stays in a reliable stream after that, for replay."""
+    """What stays after that for replay, in equal shares for the reliable streams of a process."""
     group_timeout: float = 30.0
     """Readers not seen for so long no longer hold a producer back, seconds."""
     backlog_bytes: int = 32 << 20

@@ -1,7 +1,8 @@
 """What one engine writes under one concrete key: numbering, batching, and what waits for permission.
 
-    write ──► put ──► buffer ──cut──► sink(frame, payload, mode)      cut by bytes, by time, by NO_WAIT
-                └──► big values: a frame of their own, copied once
+    write ──► put ──► buffer ──cut──► sink([(frame, payload)], mode)    cut by bytes, by time, by NO_WAIT
+                └──► big values: a frame of their own, copied once; those that follow each other closely
+                     are handed over together, which saves a system call and a wake-up for each
 
 Callers hold `lock`.  No I/O here: the sink does it.
 """
@@ -26,11 +27,14 @@ ARCHIVE = 2
 """Mode bit: goes to Data Archives."""
 BOTH = PUBLISH | ARCHIVE
 
-Sink = Callable[["Outlet", Frame, bytes, int], None]
+Sent = tuple[Frame, bytes]
+"""What stands in a frame, and the frame as it travels."""
+Sink = Callable[["Outlet", list[Sent], int], None]
 Waiting = tuple[Any, int, bool, int | None, int]
 """(frozen value, mode, NO_WAIT, event time, timestamp)"""
 
 _ITEM_OVERHEAD = 12
+_CLOSELY_NS = 1_000_000
 
 
 class Outlet:
@@ -76,12 +80,15 @@ class Outlet:
         self._values: list[Any] = []
         self._times: list[int] = []
         self._events: list[int] | None = None
+        self._big: list[Sent] = []
+        """Never together with values in the buffer."""
+        self._big_at = -_CLOSELY_NS
 
     @property
     def idle(self) -> bool:
         """Whether nothing waits here."""
         paced = self.pacer is not None and self.pacer.due() is not None
-        return not (self._values or self.held or self.queued or paced)
+        return not (self._values or self._big or self.held or self.queued or paced)
 
     def retire(self) -> tuple[int, int] | None:
         """Put it away if it is idle and nobody is writing: the numbers its successor begins with."""
@@ -109,9 +116,9 @@ class Outlet:
         else:
             value, size = self._sized(value)
         if size >= self._single_bytes:
-            self._put_single(value, mode, event_time, now)
+            self._put_single(value, mode, event_time, now, stays=stays)
             return
-        if mode != self._mode:
+        if mode != self._mode or self._big:
             self.cut()
             self._mode = mode
         if stays and not self._values:
@@ -129,7 +136,11 @@ class Outlet:
             self.cut()
 
     def cut(self) -> None:
-        """Send what is buffered as one frame."""
+        """Send what is buffered as one frame, or the big values that wait."""
+        if self._big:
+            big, self._big, self._size = self._big, [], 0
+            self._sink(self, big, self._mode)
+            return
         values = self._values
         if not values:
             return
@@ -137,10 +148,12 @@ class Outlet:
         frame = self._head(self.sequence - count + 1, self._times, self._events, self._mode, count)
         frame.values = values
         self._values, self._times, self._events, self._size = [], [], None, 0
-        self._sink(self, frame, encode_frame(frame), self._mode)
+        self._sink(self, [(frame, encode_frame(frame))], self._mode)
 
-    def _put_single(self, value: Any, mode: int, event_time: int | None, now: int) -> None:
-        self.cut()
+    def _put_single(self, value: Any, mode: int, event_time: int | None, now: int, *, stays: bool) -> None:
+        if self._values or mode != self._mode:
+            self.cut()
+            self._mode = mode
         events = None if event_time is None else [event_time]
         published = self.published
         head = self._head(self.sequence + 1, [now], events, mode, 1)
@@ -150,7 +163,14 @@ class Outlet:
             self.published = published
             raise
         self.sequence += 1
-        self._sink(self, head, payload, mode)
+        closely, self._big_at = now - self._big_at < _CLOSELY_NS, now
+        self._big.append((head, payload))
+        self._size += len(payload)
+        if not (stays and closely) or self.reliable or self._size >= self._frame_bytes:
+            self.filled += closely
+            self.cut()
+        elif len(self._big) == 1:
+            self._dirty(self)
 
     def _head(
         self, sequence: int, times: list[int], events: list[int] | None, mode: int, count: int

@@ -11,7 +11,7 @@ from typing import Any
 
 from due.archiver import Archiver
 from due.backends import open_archive, open_spool, open_updates
-from due.codec import Frame, packed
+from due.codec import packed
 from due.config import Options
 from due.dispatcher import Dispatcher
 from due.drivers.base import ArchiveDriver
@@ -23,7 +23,7 @@ from due.keys import Key
 from due.membership import Member, Registration
 from due.messages import Assignment, AssignmentCallback, Interest
 from due.observation import Observation
-from due.outlet import ARCHIVE, PUBLISH, Outlet
+from due.outlet import ARCHIVE, PUBLISH, Outlet, Sent
 from due.sender import Sender
 
 log = logging.getLogger("due")
@@ -228,21 +228,23 @@ class Session:
             dirty=self.sender.dirty,
         )
 
-    def _sink(self, outlet: Outlet, frame: Frame, payload: bytes, mode: int) -> None:
+    def _sink(self, outlet: Outlet, sent: list[Sent], mode: int) -> None:
         if mode & PUBLISH:
-            self._publish(outlet, payload, len(frame.timestamps))
+            self._publish(outlet, sent)
         if mode & ARCHIVE:
             archiver = self._archiver or self._open_archiver()
-            archiver.put(packed(frame, payload, index=outlet.index))
+            for frame, payload in sent:
+                archiver.put(packed(frame, payload, index=outlet.index))
 
-    def _publish(self, outlet: Outlet, payload: bytes, count: int) -> None:
+    def _publish(self, outlet: Outlet, sent: list[Sent]) -> None:
         if outlet.reliable:
-            self.publisher.append(outlet.key.path, payload)
+            for _, payload in sent:
+                self.publisher.append(outlet.key.path, payload)
             return
         try:
-            self.publisher.publish(outlet.key.path, payload)
+            self.publisher.publish(outlet.key.path, *(payload for _, payload in sent))
         except UpdatesUnavailable:
-            self._unpublished += count
+            self._unpublished += sum(len(frame.timestamps) for frame, _ in sent)
 
     def _open_archiver(self) -> Archiver:
         with self._lock:

@@ -113,10 +113,10 @@ class Delivery(msgspec.Struct, frozen=True, gc=False):
 class Publisher(Protocol):
     """The sending half of a Data Updates connection.  Thread-safe; sends keep their order."""
 
-    def publish(self, path: str, payload: bytes) -> None:
+    def publish(self, path: str, *payloads: bytes) -> None:
         """Send to all who are subscribed now (best effort); does not wait for the server's answer.
 
-        Raises `UpdatesUnavailable` when there is no connection: the payload is lost.
+        Raises `UpdatesUnavailable` when there is no connection: the payloads are lost.
         """
         ...
 

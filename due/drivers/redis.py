@@ -88,16 +88,16 @@ class RedisPublisher:
         self._counts = {"refused": 0, "lost_disconnected": 0, "reconnects": 0, "held_back": 0, "resent": 0}
         self._connect()
 
-    def publish(self, path: str, payload: bytes) -> None:
+    def publish(self, path: str, *payloads: bytes) -> None:
         """See `Publisher.publish`."""
         with self._lock:
             if self._wire is None:
-                self._counts["lost_disconnected"] += 1
+                self._counts["lost_disconnected"] += len(payloads)
                 raise UpdatesUnavailable(f"no connection to {self._url}")
             channel = self._channels.get(path) or self._channel(path)
             try:
-                self._wire.send(b"PUBLISH", channel, payload)
-                self._outstanding.append(_MESSAGE)
+                self._wire.send_all([(b"PUBLISH", channel, payload) for payload in payloads])
+                self._outstanding.extend([_MESSAGE] * len(payloads))
                 self._collect()
             except UpdatesUnavailable as error:
                 self._lose(error)
@@ -262,7 +262,7 @@ class RedisPublisher:
         ledger = question.ledger
         ledger.asked = False
         ledger.acknowledged(question.answer())
-        point = ledger.trim_point()
+        point = ledger.trim_point(len(self._ledgers))
         if point is not None and self._wire is not None:
             command = (b"XTRIM", stream_name(ledger.path), b"MINID", b"~", f"{point[0]}-{point[1]}")
             self._wire.send(*command)

@@ -104,10 +104,10 @@ class StreamLedger:
             self.retained.append(entry)
             self._retained_bytes += entry.size
 
-    def trim_point(self) -> tuple[int, int] | None:
-        """Forget the oldest retained payloads over the limit; returns the id from which to keep."""
+    def trim_point(self, streams: int = 1) -> tuple[int, int] | None:
+        """Forget the oldest retained payloads over the share of one of `streams`; the id from which to keep."""
         trimmed = False
-        while len(self.retained) > 1 and self._retained_bytes > self._retain:
+        while len(self.retained) > 1 and self._retained_bytes > self._retain // streams:
             self._retained_bytes -= self.retained.popleft().size
             trimmed = True
         return self.retained[0].id if trimmed else None

@@ -7,7 +7,7 @@ parsing (RESP3, its default, formats each push into a log line).
 
 import socket
 import ssl
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import hiredis
@@ -19,6 +19,8 @@ _READ = 1 << 18
 _PARSER_KEEPS = 1 << 20
 """Spare bytes that the parser does not give back after each message, to ask for them again at the next."""
 _JOIN_BELOW = 1 << 14
+_MOST_PARTS = 512
+"""Linux gathers 1,024 at most."""
 
 
 def client(url: str) -> redis.Redis:
@@ -63,12 +65,16 @@ class Wire:
 
     def send(self, *arguments: bytes | str | int) -> None:
         """Send one command; a big last argument is not copied."""
-        last = arguments[-1]
-        if isinstance(last, bytes) and len(last) >= _JOIN_BELOW:
-            head = pack((*arguments[:-1], b""))
-            self._send_parts([head[:-5] + b"%d\r\n" % len(last), last, b"\r\n"])
-        else:
-            self.send_packed(pack(arguments))
+        self.send_all([arguments])
+
+    def send_all(self, commands: Sequence[tuple[bytes | str | int, ...]]) -> None:
+        """Send commands with one call of the system where they are few; big last arguments are not copied."""
+        parts = [part for arguments in commands for part in _parts(arguments)]
+        if len(parts) == 1:
+            self.send_packed(parts[0])
+            return
+        for first in range(0, len(parts), _MOST_PARTS):
+            self._send_parts(parts[first : first + _MOST_PARTS])
 
     def send_packed(self, data: bytes) -> None:
         """Send packed commands."""
@@ -152,6 +158,14 @@ class Wire:
                 return self._socket.recv_into(self._buffer)
             finally:
                 self._socket.settimeout(None)
+
+
+def _parts(arguments: tuple[bytes | str | int, ...]) -> list[bytes]:
+    last = arguments[-1]
+    if not isinstance(last, bytes) or len(last) < _JOIN_BELOW:
+        return [pack(arguments)]
+    head = pack((*arguments[:-1], b""))
+    return [head[:-5] + b"%d\r\n" % len(last), last, b"\r\n"]
 
 
 def pack(arguments: tuple[bytes | str | int, ...]) -> bytes:

@@ -11,6 +11,8 @@ from due.errors import UnsupportedValue
 from due.keys import Key
 from due.outlet import ARCHIVE, BOTH, PUBLISH, Outlet
 
+SECOND = 10**9
+
 
 def _outlet(frame_bytes=1000, single_bytes=300):
     sent = []
@@ -21,7 +23,7 @@ def _outlet(frame_bytes=1000, single_bytes=300):
         "inst",
         frame_bytes=frame_bytes,
         single_bytes=single_bytes,
-        sink=lambda _outlet, _frame, payload, mode: sent.append((decode_frame(payload), mode)),
+        sink=lambda _outlet, parts, mode: sent.extend((decode_frame(part), mode) for _, part in parts),
         dirty=dirty.append,
     )
     return outlet, sent, dirty
@@ -66,10 +68,36 @@ def test_a_frame_is_cut_by_its_bytes():
 def test_big_values_go_alone_and_at_once():
     outlet, sent, _ = _outlet()
     batch = RecordBatch({"a": np.arange(3)})
-    for value in (b"small", b"x" * 300, batch, np.zeros(100)):
-        outlet.put(value, BOTH, None, 1)
+    for n, value in enumerate((b"small", b"x" * 300, batch, np.zeros(100))):
+        outlet.put(value, BOTH, None, n * SECOND)
     assert [len(frame.values) for frame, _ in sent] == [1, 1, 1, 1]
     assert sent[2][0].values[0] == batch
+
+
+def test_big_values_that_follow_each_other_closely_go_together():
+    """The first at once, the next when they fill a frame or somebody cuts; each has a frame of its own."""
+    outlet, _, dirty = _outlet(frame_bytes=900)
+    handed = []
+    outlet._sink = lambda _outlet, parts, _mode: handed.append(len(parts))
+    for n in range(6):
+        outlet.put(b"x" * 300, BOTH, None, n)
+    assert handed == [1, 3]
+    assert not outlet.idle
+    assert len(dirty) == 2
+    outlet.put(b"small", BOTH, None, 7)
+    outlet.cut()
+    assert handed == [1, 3, 2, 1]
+
+
+def test_big_values_do_not_wait_for_others_where_it_would_save_nothing():
+    outlet, sent, _ = _outlet(frame_bytes=1000)
+    outlet.reliable = True
+    outlet.put(b"x" * 300, BOTH, None, 0)
+    outlet.put(b"x" * 300, BOTH, None, 1)
+    assert len(sent) == 2, "each entry of a stream is sent by itself"
+    outlet.reliable = False
+    outlet.put(b"x" * 300, BOTH, None, 2, stays=False)
+    assert len(sent) == 3, "the writer does not want to wait"
 
 
 def test_a_changed_value_does_not_change_what_was_written():

@@ -34,6 +34,7 @@ def test_acknowledged_payloads_are_retained_up_to_a_limit_then_trimmed():
     assert ledger.trim_point() == (3, 0)
     assert [e.id for e in ledger.retained] == [(3, 0), (4, 0), (5, 0), (6, 0)]
     assert ledger.trim_point() is None
+    assert ledger.trim_point(streams=2) == (5, 0), "streams of one process share the limit"
 
 
 def test_what_the_server_has_not_answered_is_never_forgotten():
