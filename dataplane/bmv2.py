@@ -62,12 +62,7 @@ class Bmv2:
         command = [program, "--no-p4", "--device-id", str(device_id), "--log-console", "-L", "warn"]
         for number, interface in sorted(interfaces.items()):
             command += ["-i", f"{number}@{interface}"]
-        offered = subprocess.run([program, "--help"], capture_output=True, text=True, check=False).stdout
-        # both would be shared with other instances; builds differ in having them
-        if "--thrift-port" in offered:
-            command += ["--thrift-port", str(_free_port())]
-        if "--notifications-addr" in offered:
-            command += ["--notifications-addr", f"ipc://{folder}/notifications"]
+        command += unshared(program, folder)
         command += ["--", "--grpc-server-addr", self.address, "--cpu-port", str(cpu_port)]
         if packet_stream:
             command += ["--dp-grpc-server-addr", self.packet_address]
@@ -119,6 +114,17 @@ class Bmv2:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def unshared(program: str, folder: Path) -> list[str]:
+    """Options for what instances would share otherwise; builds of BMv2 differ in having it."""
+    offered = subprocess.run([program, "--help"], capture_output=True, text=True, check=False).stdout
+    options = []
+    if "--thrift-port" in offered:
+        options += ["--thrift-port", str(_free_port())]
+    if "--notifications-addr" in offered:
+        options += ["--notifications-addr", f"ipc://{folder}/notifications"]
+    return options
 
 
 def _with_port(address: str) -> str:

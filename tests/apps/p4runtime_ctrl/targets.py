@@ -10,6 +10,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+from dataplane.bmv2 import unshared
 from tests.requirements import optional_program
 
 KINDS = ("embedded", "bmv2")
@@ -41,7 +42,7 @@ class Target:
                     "--cpu-port", "510", *ports, *self._more]  # fmt: skip
         veths = [port.replace("=veth:", "@") for port in self._ports if "=veth:" in port]
         ports = [part for veth in veths for part in ("-i", veth)]
-        return [self._program, "--no-p4", "--device-id", "1", "--thrift-port", str(free_port()), "-L", "off",
+        return [self._program, "--no-p4", "--device-id", "1", *unshared(self._program, self.folder), "-L", "off",
                 *ports, "--", "--grpc-server-addr", self.address, "--cpu-port", "510"]  # fmt: skip
 
     def start(self) -> None:
