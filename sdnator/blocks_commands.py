@@ -107,7 +107,7 @@ def remove_block(
     updates: UpdatesOption = "",
     archive: ArchiveOption = "",
 ) -> None:
-    """Lift a block by its id, or all of an address.
+    """Lift a block by its id, or all of an address; guards that a flood led to likewise.
 
     Example: sdnator blocks remove 192.0.2.66
     """
