@@ -41,7 +41,11 @@ def nx_server(folder: Path, *, db: str = "memory", port: int = 0) -> Iterator[st
         yield f"mongodb://127.0.0.1:{_port(log, process)}/due_test"
     finally:
         process.terminate()
-        process.wait(10)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:  # it waits for connections that its clients still hold
+            process.kill()
+            process.wait()
 
 
 def _port(log: Path, process: "subprocess.Popen[bytes]") -> int:
