@@ -5,7 +5,6 @@ packets, frames ─► merge ─► host operators ─┐
 reports of counting stages ─────────────────┴─► outputs, each under the keys that asked for it
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -66,6 +65,8 @@ class _Lane:
         self.merger = Merger()
         self.names: set[str] = set()
         """Streams that bring its packets."""
+        self.brought: dict[str, int] = {}
+        """Packets by stream."""
 
 
 class _Station:
@@ -74,11 +75,6 @@ class _Station:
     def __init__(self, engine: Callable[[], WindowEngine], base_us: int) -> None:
         self.headers = _Lane(engine())
         self.frames = _Lane(engine())
-        self.straight: dict[str, HostEngine] = {}
-        """Captures of one copy each: one stream is in order, so it waits for no other.  In a SYN flood the
-        SYN-ACKs fall silent when the victim's backlog is full, and the SYNs are wanted at once."""
-        self.brought: Counter[str] = Counter()
-        """Packets by stream."""
         self.handshakes = Handshakes()
         self.reports: dict[str, Reports | Tallies | Crossings] = {}
         self.base_us = base_us
@@ -175,20 +171,15 @@ class Control:
         station.base_us = base_us
         for lane in station.lanes:
             lane.host.base_us = base_us
-        for host in station.straight.values():
-            host.base_us = base_us
         return new
 
     def packets(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
         """Copied packets of one of the sources, at `now` (seconds of any clock)."""
         station = self._station(switch)
-        station.brought[name] += len(batch)
         written: list[Written] = []
-        for one in self.plan.queries:
-            if one.identity in station.straight and _name(one.copies[0].bit) == name:
-                written += self._addressed(station, station.straight[one.identity].process(batch))
         for lane in station.lanes:
             if name in lane.names:
+                lane.brought[name] = lane.brought.get(name, 0) + len(batch)
                 written += self._processed(station, lane, lane.merger.put(name, batch, now), now)
         return written
 
@@ -284,8 +275,6 @@ class Control:
         """Counters for people."""
         stations = self._stations.values()
         lanes = [lane for station in stations for lane in station.lanes]
-        hosts = [lane.host for lane in lanes]
-        hosts += [host for station in stations for host in station.straight.values()]
         return {
             "queries": {
                 one.identity: "switch" if one.in_switch else f"host: {one.reason}"
@@ -294,8 +283,8 @@ class Control:
             "tuples": {one.identity: self._tuples(one) for one in self.plan.queries},
             "overflow": {one.identity: self._overflow(one) for one in self.plan.queries},
             "bits": len(self.plan.entries) + len(self.plan.copies),
-            "host_packets": sum(host.packets for host in hosts),
-            "late": sum(host.late for host in hosts),
+            "host_packets": sum(lane.host.packets for lane in lanes),
+            "late": sum(lane.host.late for lane in lanes),
             "disordered": sum(lane.merger.disordered for lane in lanes),
             "without_payload": sum(lane.host.without_payload for lane in lanes),
             "reports": sum(report.tuples for station in stations for report in station.reports.values()),
@@ -308,7 +297,8 @@ class Control:
         """What reached the host for a query, of all switches."""
         found = 0
         for station in self._stations.values():
-            found += sum(station.brought[_name(copy.bit)] for copy in one.copies)
+            lane = station.frames if one.payload else station.headers
+            found += sum(lane.brought.get(_name(copy.bit), 0) for copy in one.copies)
             if one.identity in station.reports:
                 found += station.reports[one.identity].tuples
         return found
@@ -355,18 +345,11 @@ class Control:
 
     def _refit(self, station: _Station, old: Mapping[str, Request]) -> None:
         """Make a switch's operators those of the plan."""
-        straight = {one.identity for one in self.plan.queries if self._is_straight(one)}
-        station.straight = {
-            identity: station.straight.get(identity) or self._capture(identity, station.base_us)
-            for identity in sorted(straight)
-        }
         for lane in station.lanes:
             mine = [
                 one
                 for one in self.plan.queries
-                if not one.in_switch
-                and one.identity not in straight
-                and one.payload == (lane is station.frames)
+                if not one.in_switch and one.payload == (lane is station.frames)
             ]
             host = {one.identity for one in mine}
             for identity in old.keys() - host:
@@ -384,16 +367,6 @@ class Control:
                 held = station.reports.get(one.identity)
                 reports[one.identity] = held or self._new_reports(one, station)
         station.reports = reports
-
-    def _is_straight(self, one: QueryPlan) -> bool:
-        capture = self._requests[one.identity].kind == "capture"
-        return capture and not one.in_switch and not one.payload and len(one.copies) == 1
-
-    def _capture(self, identity: str, base_us: int) -> HostEngine:
-        """A filter alone: no other engine would be of use."""
-        host = HostEngine(base_us=base_us)
-        host.add(self._requests[identity].query)
-        return host
 
     def _new_reports(self, one: QueryPlan, station: _Station) -> Reports | Tallies | Crossings:
         request = self._requests[one.identity]

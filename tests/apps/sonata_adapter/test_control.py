@@ -66,22 +66,6 @@ def everything():
     return mixed(CATALOGUE, seconds=16)
 
 
-def test_captures_of_one_copy_wait_for_no_silent_stream():
-    """SYNs come out at once though nothing is heard of SYN-ACKs."""
-    syn = "network.traffic_capture.sonata.tcp:flag=syn"
-    control, switch = Control(CATALOGUE), SwitchModel()
-    control.switch("s1", 0)
-    switch.change(control.want([syn, "network.traffic_capture.sonata.tcp:flag=syn+ack"]))
-    frames = [Frame(BASE_US + n, 60, tcp("10.0.0.1", "10.0.0.2", n, 80, 2)) for n in range(9)]
-    written = [
-        one
-        for (_, name), sent in switch.process(batch_of(frames)).items()
-        for one in control.packets("s1", name, sent, 0.0)
-    ]
-    assert [(one.keys, len(one.output.batch)) for one in written] == [((syn,), 9)]
-    assert control.health()["host_packets"] == 9
-
-
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_split_equals_naive(name, everything):
     """Each query alone: what the switch counts and what the host adds are the naive evaluator's results."""
