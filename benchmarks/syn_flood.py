@@ -24,6 +24,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -266,13 +267,16 @@ def measure(names: Sequence[str], rounds: int, data: Path, keep: Path | None) ->
         bench.found()
         memory.append(stage.memory())
         kernel, firewall = stage.lab.settings(), stage.firewall
-    innocent = {**_innocent(data), "flash_crowd": crowd, "clients": bench.innocent_blocked()}
+    days = _innocent(data)
+    innocent = {name: found["block"] for name, found in days.items()}
+    innocent |= {"flash_crowd": crowd, "clients": bench.innocent_blocked()}
     figures = {version: {name: bench.kinds[version, name].figures() for name in names} for version in PLANS}
     return {
         **figures[4],
         "ipv6": figures[6],
         "innocent_blocks": sum(innocent.values()),
         "innocent": {**innocent, "flash_crowd_success": crowd_success},
+        "innocent_guards": {name: found["protect"] for name, found in days.items()},
         "looped": _short(bench.looped),
         "as_recorded": _short(bench.recorded),
         "memory_mb": memory,
@@ -283,10 +287,10 @@ def measure(names: Sequence[str], rounds: int, data: Path, keep: Path | None) ->
     }
 
 
-def _innocent(data: Path) -> dict[str, int]:
+def _innocent(data: Path) -> dict[str, Counter[str]]:
     return {
         "public_capture": decisions_on(public_capture(data / "kitsune" / "mirai_38k.tsv.gz")),
-        "generated_days": sum(decisions_on(generated_day(3000, seed)) for seed in (1, 2)),
+        "generated_days": decisions_on(generated_day(3000, 1)) + decisions_on(generated_day(3000, 2)),
     }
 
 

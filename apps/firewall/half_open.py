@@ -52,6 +52,11 @@ class Answers:
         if not self.missing:
             self._recent.add(batch, now)
 
+    def lacks(self, service: Service) -> bool:
+        """Whether this service has answered nobody lately, as far as is seen: then nothing is half-open there."""
+        wanted = Wanted(service)
+        return not any(wanted.rows(block).any() for _, block in self._recent.blocks())
+
     def find(self, wanted: "Wanted", before: float) -> Iterator[HalfOpen]:
         """Answers that came before a time and are wanted; a connection may come more than once."""
         for came, block in self._recent.blocks():

@@ -114,7 +114,10 @@ class FirewallService:
         self._counts = dict.fromkeys(("alerts", "handshakes", "syns", "syn_acks", "arp_thefts"), 0)
         services = tuple(Service.parse(text) for text in settings.guard)
         allowed = (*settings.rules.allow, *(_surroundings() if settings.allow_surroundings else ()))
-        self._syn = SynDefence(settings.syn, services, self._ledger, AllowList.parse(allowed), self._known)
+        after_s = settings.syn.reset_after_ms / 1000
+        self._answers = Answers(settings.syn.sample, AGED_S + after_s)
+        allow_list = AllowList.parse(allowed)
+        self._syn = SynDefence(settings.syn, services, self._ledger, allow_list, self._known, self._is_silent)
         self._desk = Desk(self._ledger, self._syn, allowed)
         self._allow_entries = AllowEntries()
         self._leftovers: dict[str, list[TableUpdate]] = {}
@@ -125,8 +128,6 @@ class FirewallService:
         """By host: when to look, wall clock, and at what."""
         self._undecided: dict[str, tuple[float, Suspicion]] = {}
         """The same for the second look, after which sources are blocked."""
-        after_s = settings.syn.reset_after_ms / 1000
-        self._answers = Answers(settings.syn.sample, AGED_S + after_s)
         self._resets = Resets(self._answers, after_s=after_s, limit=settings.syn.resets)
         self._bindings = _bindings(settings)
         self._archive = Archive(engine, settings.archive_patience_s)
@@ -170,6 +171,10 @@ class FirewallService:
         self._engine.observe(stream.with_specs(flag="syn").text).subscribe(self._on_syns)
         if rules.resets:
             self._engine.observe(stream.with_specs(flag="syn+ack").text).subscribe(self._on_syn_acks)
+
+    def _is_silent(self, service: Service) -> bool:
+        """Without resets nobody asks for SYN-ACKs, and nothing is known of answers."""
+        return self._settings.syn.resets > 0 and self._answers.lacks(service)
 
     def _take_up_history(self) -> None:
         """What was in force before a restart is in force again, in our books as it is in the switch."""

@@ -81,8 +81,11 @@ class SynDefence:
         ledger: Ledger,
         allow: AllowList,
         known: KnownSources,
+        is_silent: Callable[[Service], bool] = lambda _: False,
     ) -> None:
+        """`is_silent`: whether nobody is seen to be answered by a service."""
         self.rules = rules
+        self._is_silent = is_silent
         self.known = known
         self._always = frozenset(services)
         self._ledger = ledger
@@ -154,13 +157,20 @@ class SynDefence:
         for port, syns in sorted(by_port.items()):
             sample = Sample(Service(watch.host, port), syns)
             verdict = judge_syns(sample, self.rules, self.allow, self.known, self.gather)
-            if verdict.block and not sure:
+            if verdict.block and sure and self._is_dead(sample.service):
+                # a device may knock again and again at a server that is gone: nothing is held open there.  Where
+                # only one direction passes the switch the guard has to do, since nobody can tell the two apart
+                decisions += self._guard(sample.service, f"{verdict.reason} once it answers anybody", watch)
+            elif verdict.block and not sure:
                 watch.unsure = True
                 reason = f"{verdict.reason} unless they finish their handshakes soon; guarded meanwhile"
                 decisions += self._guard(sample.service, reason, watch)
             else:
                 decisions += self._carry_out(sample.service, verdict, watch, offences)
         return decisions
+
+    def _is_dead(self, service: Service) -> bool:
+        return service not in self.services and self._is_silent(service)
 
     def gather(self, addresses: Iterable[str]) -> dict[str, list[str]]:
         """Prefixes that may be blocked instead of so many of the addresses."""

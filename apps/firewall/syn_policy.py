@@ -5,7 +5,7 @@ floods have almost one address per SYN: there only the SYN guard helps.  A guard
 first; a block follows when the sources had time to finish their handshakes, and did not.  An address
 that has completed handshakes before, or is on the allow-list, is never blocked, since anybody can write
 it into a SYN; nor is one that sends far less than the flood's own sources: a client of a service whose
-backlog is full repeats its SYNs, too.
+backlog is full repeats its SYNs, too.  Where a service answers nobody (SynDefence knows), nobody is blocked.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping

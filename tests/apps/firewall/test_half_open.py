@@ -29,6 +29,14 @@ def due(made: Resets, now: float, *spared: str, switches: tuple[str, ...] = ("s1
     return [each.client & 0xFF for each in found]
 
 
+def test_a_service_that_answers_nobody_is_told_from_one_that_does():
+    """The port counts, too."""
+    kept = answers("10.2.0.1")
+    assert not kept.lacks(WEB)
+    assert kept.lacks(Service("10.0.0.9", 80))
+    assert kept.lacks(Service(WEB.address, 443))
+
+
 def test_nothing_before_the_switch_confirms_nor_before_their_time():
     """A reset backlog would be filled again; a client may still answer."""
     made = resets(answers("10.2.0.5"))

@@ -50,8 +50,9 @@ def test_spoofed_flood_guards_then_resets_what_is_half_open():
 
 
 def test_one_source_is_guarded_against_first_and_blocked_when_sure():
-    """A guard harms nobody; the block comes with the second look."""
+    """A guard harms nobody; the block comes with the second look, if the victim is seen to answer."""
     desk = Desk(syn=SynRules(grace_ms=0, patience_ms=50))
+    desk.hand(SYN_ACKS, records([syn_ack("77.0.0.1", 1, VICTIM, 8, time_us=NOW // 1000)]))
     flood(desk, "77.0.0.1", each=600)
     assert (desk.guarded, desk.blocked) == ([VICTIM], [])
     assert "unless they finish" in desk.decisions[0].reason

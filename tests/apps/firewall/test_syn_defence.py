@@ -47,6 +47,20 @@ def test_repeating_sources_are_blocked_with_evidence():
     assert decision.evidence == (FLOOD,)
 
 
+def test_who_knocks_at_a_server_that_is_gone_is_not_blocked():
+    """Nothing is half-open there; the guard says so, and the block follows when the service is heard of."""
+    silent = {WEB}
+    made = SynDefence(
+        SynRules(), (), Ledger(Rules()), AllowList.parse(()), KnownSources(10), silent.__contains__
+    )
+    (decision,) = flood(made, 1, 600)
+    assert decision.action == "protect"
+    assert decision.reason.startswith("600 unfinished SYNs from 1 sources")
+    assert "these are blocked once it answers anybody" in decision.reason
+    made.handshake("10.9.9.9", WEB, NOW)
+    assert [each.action for each in flood(made, 1, 600, NOW + SECOND)] == ["block"]
+
+
 def test_blocked_source_is_not_blocked_twice():
     """A second look at the same flood adds nothing."""
     made = defence()
