@@ -85,8 +85,9 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def bmv2():
+    """One for each case: a frame that goes round for ever in BMv2 would leave it under the next program."""
     optional_program(PROGRAM)
     target = Bmv2Target()
     yield target
