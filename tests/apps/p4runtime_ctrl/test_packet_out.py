@@ -139,10 +139,10 @@ def test_frames_leave_through_their_port(kind, tmp_path):
     if kind == "bmv2":
         optional_program("simple_switch_grpc")
     with cabled(kind, tmp_path) as (stage, wire):
-        stage.controller()
         out = Capability("network.packet_out.firewall.*", delivery="reliable")
         engine = stage.engine(capabilities=(out,))
-        heard = Heard(engine, STATE)
+        heard = Heard(engine, STATE)  # before the controller comes: it tells its state when that changes
+        stage.controller()
         frames = [frame(1), frame(2) + b"y" * 40, frame(3)]
         value = {
             "port": np.ones(3, dtype=np.uint16),
