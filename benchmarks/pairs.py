@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import redis
@@ -21,6 +21,7 @@ from due import CONSUMER, PRODUCER, PUB_ONLY, Engine, Item, Options, RecordBatch
 FRAME = 860
 """Messages of 100 bytes in a frame of DUE."""
 _MOST_FRAMES = 8
+_AROUND_S = 0.3
 KEY = "bench.pairs.app.message"
 CHANNEL = "bench"
 _spawn = multiprocessing.get_context("spawn")
@@ -222,14 +223,30 @@ def _listen(pipe: Connection, url: str, messages: int, callback: Callable[[bytes
     client.close()
 
 
+def end_of_writing(pipe: Connection, seconds: float) -> float:
+    """Report as ready and wait for the common start; producers write from before it until after its end."""
+    pipe.send(0)
+    start = float(pipe.recv())
+    time.sleep(max(0.0, start - time.time() - _AROUND_S))
+    return start + seconds + _AROUND_S
+
+
+def tell_rate(pipe: Connection, count: list[int], seconds: float) -> NoReturn:
+    """Report as ready, count in the span that all consumers share, answer the rate, and leave at once."""
+    pipe.send(0)
+    start = float(pipe.recv())
+    time.sleep(max(0.0, start - time.time()))
+    began, before = time.time(), count[0]
+    time.sleep(max(0.1, start + seconds - time.time()))
+    pipe.send((count[0] - before) / (time.time() - began))
+    os._exit(0)
+
+
 def raw_stream_producer(pipe: Connection, url: str, number: int, seconds: float) -> None:
     """redis-py: frames of 100-byte messages on a stream, held back while more than a few are unread."""
     client: Any = raw_client(url)
     name, payload, encoder = f"bench:{number}", bytes(100), msgspec.msgpack.Encoder()
-    pipe.send(0)
-    start = pipe.recv()
-    time.sleep(max(0.0, start - time.time() - 0.3))
-    end = start + seconds + 0.3
+    end = end_of_writing(pipe, seconds)
     while time.time() < end:
         pipeline = client.pipeline(transaction=False)
         for _ in range(_MOST_FRAMES // 2):
@@ -240,7 +257,7 @@ def raw_stream_producer(pipe: Connection, url: str, number: int, seconds: float)
         pipeline.xlen(name)
         unread = pipeline.execute()[-1]
         while unread > _MOST_FRAMES and time.time() < end:
-            time.sleep(0.003)
+            time.sleep(0.003)  # to ask at once would cost the server more than the frames do
             unread = client.xlen(name)
     os._exit(0)
 
@@ -256,13 +273,7 @@ def raw_stream_consumer(pipe: Connection, url: str, number: int, seconds: float)
         count[0] += 1
 
     threading.Thread(target=_read_stream, args=(client, name, callback), daemon=True).start()
-    pipe.send(0)
-    start = pipe.recv()
-    time.sleep(max(0.0, start - time.time()))
-    began, before = time.time(), count[0]
-    time.sleep(max(0.1, start + seconds - time.time()))
-    pipe.send((count[0] - before) / (time.time() - began))
-    os._exit(0)
+    tell_rate(pipe, count, seconds)
 
 
 def _read_stream(client: Any, name: str, callback: Callable[[bytes], None]) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.measure import arguments, bars, machine, table, write_json
-from benchmarks.pairs import _spawn, raw_stream_consumer, raw_stream_producer
+from benchmarks.pairs import _spawn, end_of_writing, raw_stream_consumer, raw_stream_producer, tell_rate
 from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Interest, Item, Options
 from due.codec import Frame, decode_frame, encode_frame, freeze
 from due.drivers.embedded_redis import EmbeddedServer
@@ -113,10 +113,7 @@ def _producer(pipe: Connection, url: str, number: int, seconds: float) -> None:
     engine.set_pubsub(url)
     engine.init(f"producer{number}", PRODUCER, capabilities=[Capability(key, delivery="reliable")])
     payload = bytes(SIZE)
-    pipe.send(0)
-    start = pipe.recv()
-    time.sleep(max(0.0, start - time.time() - 0.3))
-    end = start + seconds + 0.3
+    end = end_of_writing(pipe, seconds)
     while time.time() < end:
         for _ in range(500):
             engine.write(key, payload, [PUB_ONLY])
@@ -133,13 +130,7 @@ def _consumer(pipe: Connection, url: str, number: int, seconds: float) -> None:
         count[0] += 1
 
     engine.observe(f"bench.scale.p{number}.x").subscribe(callback)
-    pipe.send(0)
-    start = pipe.recv()
-    time.sleep(max(0.0, start - time.time()))
-    began, before = time.time(), count[0]
-    time.sleep(max(0.1, start + seconds - time.time()))
-    pipe.send((count[0] - before) / (time.time() - began))
-    os._exit(0)
+    tell_rate(pipe, count, seconds)
 
 
 def coordinator_share(url: str, folder: str, seconds: float) -> float:
