@@ -12,7 +12,6 @@ import json
 import os
 import signal
 import sys
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +25,7 @@ from dataplane.p4runtime_server import P4RuntimeServer, ServerError
 from dataplane.packet_loop import PacketClock, PacketLoop
 from dataplane.port_options import FORMS, captures, open_ports
 from dataplane.ports import Port
+from dataplane.stop import Stop
 
 _GC_ALLOCATIONS = 50_000
 _PR_SET_PDEATHSIG = 1
@@ -52,9 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run until a signal comes; 0, 2 where an option cannot be met, 1 after a fault of our own."""
     arguments = options().parse_args(argv)
     _end_with_parent()
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = Stop((signal.SIGTERM, signal.SIGINT))
     try:
         return _run(arguments, stop)
     except DataplaneError as error:
@@ -62,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(arguments: argparse.Namespace, stop: threading.Event) -> int:
+def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     clock = PacketClock(driven=captures(arguments.port))
     credentials = _credentials(arguments)
     ports = open_ports(arguments.port, arguments.cpu_port, clock.now)

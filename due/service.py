@@ -14,7 +14,7 @@ import logging
 import os
 import signal
 import sys
-import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -101,11 +101,11 @@ def run(
         if status is not None:
             status.close()
         return 2 if isinstance(error, InvalidOption) else 1
-    stop = _stop_event()
+    stopped = _stop_signals()
     if os.getppid() != parent and not arguments.stay:
-        stop.set()
+        stopped.append(signal.SIGTERM)
     try:
-        return _Run(app_id, service(engine, chosen), engine, status).drive(stop)
+        return _Run(app_id, service(engine, chosen), engine, status).drive(stopped)
     finally:
         engine.close()
         if status is not None:
@@ -151,11 +151,13 @@ def _options(arguments: argparse.Namespace) -> Options:
     return msgspec.structs.replace(options, **given)
 
 
-def _stop_event() -> threading.Event:
-    stop = threading.Event()
+def _stop_signals() -> list[int]:
+    """The signals that came, as they come."""
+    came: list[int] = []
+    # no threading.Event: the handler may run while the main thread holds the event's own lock, for ever then
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda _number, _frame: stop.set())
-    return stop
+        signal.signal(number, lambda got, _frame: came.append(got))
+    return came
 
 
 class _Run:
@@ -167,8 +169,8 @@ class _Run:
         self._engine = engine
         self._status = status
 
-    def drive(self, stop: threading.Event) -> int:
-        """Start, tick until `stop` is set, end; returns the exit code."""
+    def drive(self, stopped: Sequence[int]) -> int:
+        """Start, tick until `stopped` has something in it, end; returns the exit code."""
         try:
             self._app.start()
         except (DueError, OSError) as error:
@@ -180,7 +182,8 @@ class _Run:
         print(json.dumps(self._ready()), flush=True)
         ticks = 0
         try:
-            while not stop.wait(TICK_SECONDS):
+            while not stopped:
+                time.sleep(TICK_SECONDS)
                 self._app.tick()
                 ticks += 1
                 if ticks % _TICKS_PER_HEALTH == 0:

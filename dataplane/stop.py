@@ -1,0 +1,41 @@
+"""How a process of ours is told to end: by a signal, or by one of its threads.
+
+Neither a handler that sets a threading.Event nor `Event.wait` without a time limit is safe for this: the
+handler may run while the main thread holds the event's own lock, and a signal that comes just before the
+thread sleeps does not wake it.  A pipe has neither fault: CPython writes to it as the signal comes.
+"""
+
+import os
+import signal
+from collections.abc import Iterable
+from contextlib import suppress
+from types import FrameType
+
+
+class Stop:
+    """Until one of `signals` comes, or `set` is called.  For the main thread, and once a process.
+
+        stop = Stop((signal.SIGTERM, signal.SIGINT))
+        stop.wait()
+    """
+
+    def __init__(self, signals: Iterable[int]) -> None:
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+        # first: a signal that has a handler and no pipe would be forgotten
+        signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        for number in signals:
+            signal.signal(number, _taken)
+
+    def set(self) -> None:
+        """End the wait, now or when it begins; from any thread."""
+        with suppress(BlockingIOError):  # full: it ends in any case
+            os.write(self._write, b"\0")
+
+    def wait(self) -> None:
+        """Return as soon as it was set."""
+        os.read(self._read, 1)
+
+
+def _taken(_number: int, _frame: FrameType | None) -> None:
+    """The pipe knows."""
