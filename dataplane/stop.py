@@ -15,8 +15,8 @@ from types import FrameType
 class Stop:
     """Until one of `signals` comes, or `set` is called.  For the main thread, and once a process.
 
-        stop = Stop((signal.SIGTERM, signal.SIGINT))
-        stop.wait()
+    stop = Stop((signal.SIGTERM, signal.SIGINT))
+    stop.wait()
     """
 
     def __init__(self, signals: Iterable[int]) -> None:
