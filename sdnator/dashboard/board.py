@@ -133,6 +133,11 @@ class Board:
             _keep(self.switches, str(value["switch"]), value)
             self._changed("switches")
 
+    def knows_switch(self, name: str) -> bool:
+        """Whether it has said anything."""
+        with self.lock:
+            return name in self.switches
+
     def healthy(self, app: str, value: Mapping[str, Any], now: float) -> None:
         """What an app says of itself, at `now` (s)."""
         with self.lock:

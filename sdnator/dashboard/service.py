@@ -26,13 +26,14 @@ from sdnator.errors import SdnatorError
 ANSWERS = "network.answer.firewall.dashboard"
 INSTRUCTION = "network.instruction.dashboard.firewall"
 DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*")
+_STATE = "network.switch.p4runtime_ctrl"
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.score"),
     Interest("network.anomaly.kitsune.alert"),
     *(Interest(key) for key in DECISIONS),
     Interest("network.confirmation.p4runtime_ctrl.*"),
-    Interest("network.switch.p4runtime_ctrl.*"),
+    Interest(f"{_STATE}.*"),
     Interest("due.health.*"),
     Interest(ANSWERS),
 )
@@ -41,6 +42,7 @@ CAPABILITIES = (Capability(INSTRUCTION, delivery="reliable", archive="always"),)
 _POLL_SECONDS = 2.0
 _ANSWER_SECONDS = 10.0
 _WAITING = 64
+_DAY_NS = 86_400 * 10**9
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +114,7 @@ class DashboardService:
             "network.confirmation.p4runtime_ctrl.*": lambda item: board.confirm(
                 Confirmation.from_value(item.value)
             ),
-            "network.switch.p4runtime_ctrl.*": lambda item: board.switch(item.value),
+            f"{_STATE}.*": lambda item: board.switch(item.value),
             "due.health.*": lambda item: board.healthy(item.app_id, item.value, time.monotonic()),
             ANSWERS: self._on_answer,
         }
@@ -140,10 +142,24 @@ class DashboardService:
             return
         ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
         self.board.decide(Decision.from_value(item.value) for item in ordered)
-        since = time.time_ns() - 86_400 * 10**9
+        since = time.time_ns() - _DAY_NS
         query = {"dataKey": "network.anomaly.kitsune.alert", "timestamp": {"$gte": since}}
         for item in self._engine.get(query)[-200:]:
             self.board.alert(Alert.from_value(item.value))
+
+    def _take_up_switches(self) -> None:
+        """What switches said before anybody knew of our interest: then it went to the archive alone."""
+        now = time.time_ns()
+        for place in self.settings.switches:
+            if self.board.knows_switch(place.name):
+                continue
+            try:
+                last, _ = self.find(f"{_STATE}.{place.name}", now - _DAY_NS, now, 1)
+            except DueError as error:
+                log.warning("Data Archives do not answer, switch %s is not shown: %s", place.name, error)
+                return
+            for item in last:
+                self.board.switch(item.value)
 
     def instruct(self, verb: Any, subject: str, answered: Callable[[Answer], None]) -> str:
         """Tell the firewall; `answered` is called in the engine's thread.  Returns the instruction's id."""
@@ -182,6 +198,7 @@ class DashboardService:
                 self.board.uncoordinated(str(error))
             else:
                 self.board.coordinated(apps, instances, flow, time.monotonic())
+                self._take_up_switches()
 
     def _serve(self) -> None:
         from sdnator.dashboard.server import serve

@@ -175,6 +175,7 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
     try:
         page = Page(driver, said["dashboard"])
         page.find(".decisions", ADDRESS)
+        until(lambda: "1 of 1\nswitches" in page.text())  # it was connected before the page was there
         assert not page.shows(".undo"), "who has not signed in may only look"
         page.sign_in("not the token, but as long", lambda: page.seen(".fault", "not the token"))
         page.sign_in(token, lambda: page.seen(".sign-out"))
