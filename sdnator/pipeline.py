@@ -70,6 +70,7 @@ class Pipeline:
         self._plan = plan
         self._logs = plan.folder / "logs"
         self._stack = ExitStack()
+        self._guests = ExitStack()
         self._children: list[Child] = []
         self._bmv2: Bmv2 | None = None
         self._begun_ns = time.time_ns()
@@ -199,11 +200,18 @@ class Pipeline:
             except Bmv2Error as error:
                 raise PipelineError(str(error)) from None
 
+    def before_stop(self, leave: Callable[[], None]) -> None:
+        """Call `leave` before any part is stopped, also where the start fails: for users of Data Updates."""
+        self._guests.callback(leave)
+
     def stop(self) -> None:
         """Stop all parts, the last started first."""
-        while self._children:
-            self._children.pop().stop()
-        self._stack.close()
+        try:
+            self._guests.close()
+        finally:
+            while self._children:
+                self._children.pop().stop()
+            self._stack.close()
 
     def pids(self) -> dict[str, int]:
         """Process ids by name."""

@@ -209,14 +209,12 @@ class ReplayPass:
                 firewall={"rules": {"dry_run": not self._result.mitigate}},
             )
             with Pipeline(plan) as pipeline:
-                try:
-                    self._run(pipeline, engine, progress)
-                finally:
-                    engine.close()
+                self._run(pipeline, engine, progress)
         return self._result
 
     def _join(self, engine: Engine, pipeline: Pipeline) -> None:
         """Make our interests known before any app runs, so that Kitsune's first scores are wanted."""
+        pipeline.before_stop(engine.close)
         engine.set_pubsub(pipeline.updates)
         engine.set_db(pipeline.archive)
         engine.init("replay", CONSUMER, interests=INTERESTS)
