@@ -236,6 +236,7 @@ class Ledger:
             return extended
         del self.blocks[old.id]
         key = (old.switch, old.target.kind, old.target.address)
+        self.probation = {each: until for each, until in self.probation.items() if until > now}
         self.probation[key] = now + PROBATION_S * SECOND
         return _changed(old, now, action="unblock", reason="the block ran out; on probation for ten minutes")
 

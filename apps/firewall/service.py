@@ -133,6 +133,7 @@ class FirewallService:
         self._archive = Archive(engine, settings.archive_patience_s)
         self._announcer = Announcer(engine, *outlets_of(settings))
         self._lock = threading.RLock()
+        self._stopped = False
         self._carried_out: deque[str] = deque(maxlen=1000)
         self._words_since = time.time_ns()
         self._syns_until = 0
@@ -212,6 +213,8 @@ class FirewallService:
 
     def stop(self) -> None:
         """Events are delivered; blocks stay in force, as the archive says."""
+        with self._lock:
+            self._stopped = True
         self._announcer.close()
 
     def health(self) -> dict[str, Any]:
@@ -296,16 +299,26 @@ class FirewallService:
                 summary = f"{rules.threshold} SYNs went to {host} within {rules.window_ms} ms"
                 evidence = Evidence(key=item.key, timestamp=item.timestamp, summary=summary)
                 due_at = time.monotonic() + rules.grace_ms / 1000
-                if len(self._suspected) < HOSTS_WATCHED:
-                    suspicion = Suspicion(host, evidence, item.event_time, since)
-                    self._suspected.setdefault(host, (due_at, suspicion))
-            # the next tick may be 50 ms away
+                if len(self._suspected) < HOSTS_WATCHED and host not in self._suspected:
+                    self._suspected[host] = due_at, Suspicion(host, evidence, item.event_time, since)
+                    self._look_later(rules.grace_ms / 1000)
             self._look_at_what_is_due()
 
     def _on_syn_acks(self, item: Item) -> None:
         with self._lock:
             self._counts["syn_acks"] += len(item.value)
             self._answers.add(item.value, time.monotonic())
+
+    def _look_later(self, seconds: float) -> None:
+        """The next tick may come 50 ms after that, and the next SYN never."""
+        timer = threading.Timer(seconds, self._wake)
+        timer.daemon = True
+        timer.start()
+
+    def _wake(self) -> None:
+        with self._lock:
+            if not self._stopped:
+                self._look_at_what_is_due()
 
     def _look_at_what_is_due(self) -> None:
         now = time.monotonic()

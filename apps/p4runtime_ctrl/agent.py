@@ -1,7 +1,8 @@
 """One switch's part of the service: a worker between DUE and the switch, and what it publishes.  I/O.
 
 packets thread of a connection   packet-ins → record batch → DUE (blocks while consumers are behind)
-worker thread of a switch        decisions, commands, requests, counters: one after the other
+worker thread of a switch        decisions first; commands, requests, state: one after the other
+thread of a reading              asks a busy switch for its counters, for tenths of a second perhaps
 DUE's dispatcher                 puts work into the worker's bounded queue
 """
 
@@ -12,7 +13,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -38,17 +38,12 @@ _JOBS: Final = 10_000
 _ALIVE_S: Final = 1.0
 _SETTLE_S: Final = 1.0
 _COUNTING_SHARE: Final = 5
-"""Reading counters takes at most one part in so many of the worker's time."""
+"""Counters are being read for at most one part in so many of the time."""
 
 Connect = Callable[[Listener], Connection]
 
 
-@dataclass(frozen=True)
-class _Decide:
-    decision: Decision
-
-
-_Job = _Decide | Callable[[], None]
+_Job = Callable[[], None]
 
 
 class Agent:
@@ -87,6 +82,8 @@ class Agent:
         self._connected = False
         self._was_backup = False
         self._recent: deque[Decision] = deque(maxlen=_JOBS)
+        self._urgent: deque[Decision] = deque()
+        """Decisions to be carried out, before any other work."""
         self._readings = Readings()
         self._publishing = threading.Lock()
         self._counting = threading.Event()
@@ -121,7 +118,8 @@ class Agent:
 
     def decide(self, decision: Decision) -> None:
         self._recent.append(decision)
-        self._put(_Decide(decision))
+        self._urgent.append(decision)
+        self._put(self._decide)
 
     def command(self, command: TableCommand) -> None:
         self._put(partial(self._command, command))
@@ -230,19 +228,14 @@ class Agent:
             self._run(jobs)
 
     def _run(self, jobs: Sequence[_Job]) -> None:
-        decisions: list[Decision] = []
         for job in jobs:
-            if isinstance(job, _Decide):
-                decisions.append(job.decision)
-                continue
-            self._decide(decisions)
-            decisions = []
+            if self._session is not None:  # else they wait their turn, for the switch may be about to come
+                self._decide()
             try:
                 job()
             except ControllerError as error:
                 _LOG.error("%s: %s", self.name, error)
                 self._say(str(error))
-        self._decide(decisions)
         if self._session is not None and self._session.broken:
             self._session = None
             self._connection.break_off()
@@ -286,11 +279,11 @@ class Agent:
         if self._session is not None:
             self._switch.withdraw(self._session)
 
-    def _decide(self, decisions: Sequence[Decision]) -> None:
-        if not decisions:
-            return
-        self._confirm(self._switch.decide(decisions, self._session))
-        self._count_soon()
+    def _decide(self) -> None:
+        decisions = [self._urgent.popleft() for _ in range(len(self._urgent))]
+        if decisions:
+            self._confirm(self._switch.decide(decisions, self._session))
+            self._count_soon()
 
     def _command(self, command: TableCommand) -> None:
         self._confirm(self._switch.command(command, self._session))
@@ -345,17 +338,36 @@ class Agent:
         self._put(self._count)
 
     def _count(self) -> None:
-        began = time.monotonic()
+        """Not in this thread: a switch under a flood takes its time, and a decision must not wait for it."""
+        told = (self._session, self._switch.counted_tables, time.monotonic())
+        threading.Thread(
+            target=self._read_counters, args=told, name=f"counters {self.name}", daemon=True
+        ).start()
+
+    def _read_counters(self, session: Session | None, tables: Sequence[int], began: float) -> None:
+        entries: list[Any] = []
+        failed: ControllerError | None = None
         try:
-            if self._session is not None:
-                self._readings.take(self._switch.count_blocks(self._session))
-                self._write_state()
+            if session is not None:
+                entries = [entry for table in tables for entry in session.read_counters(table)]
+        except ControllerError as error:
+            failed = error
         finally:
-            self._counted_second = self._outbound.second
-            self._counted_at = time.monotonic()
-            spent = self._counted_at - began
-            self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
-            self._counting.clear()
+            self._put(partial(self._counted, session, entries, began, failed))
+
+    def _counted(
+        self, session: Session | None, entries: Sequence[Any], began: float, failed: ControllerError | None
+    ) -> None:
+        self._counted_second = self._outbound.second
+        self._counted_at = time.monotonic()
+        spent = self._counted_at - began
+        self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
+        self._counting.clear()
+        if failed is not None:
+            raise failed
+        if session is not None and session is self._session:
+            self._readings.take(self._switch.readings(entries))
+            self._write_state()
 
     def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
         key = f"network.confirmation.p4runtime_ctrl.{self.name}"

@@ -2,6 +2,7 @@
 
     learn digest ─► new station: an entry in both     moved: both modified     known: nothing
     smac silent for the age (idle time-out) ─► both entries go
+    nobody learns ─► smac ignores new senders, else every frame of one would bring a digest that nobody reads
 
 Stations are soft state: they are kept over a lost connection, and taken over from a switch that outlived
 its controller.
@@ -23,6 +24,7 @@ GROUP: Final = 1
 """Multicast group of all ports between which frames are switched."""
 _SMAC, _DMAC = "ingress.smac", "ingress.dmac"
 _DROP: Final = "drop_unknown"
+_LEARN, _IGNORE = "learn", "ignore"
 _Place = tuple[int, int]
 """VLAN (0: none) and MAC address."""
 
@@ -160,7 +162,16 @@ class Stations:
 
 def no_flood(program: Program) -> list[Any]:
     """The default action of a switch that does not learn, where the program could."""
-    actions = program.table(_DMAC).default_actions if _DMAC in program.names else ()
-    if not any(action.name.rpartition(".")[2] == _DROP for action in actions):
+    return _default(program, _DMAC, _DROP)
+
+
+def new_senders(program: Program, *, learn: bool) -> list[Any]:
+    """What happens to frames of senders that are not known, where the program could report them."""
+    return _default(program, _SMAC, _LEARN if learn else _IGNORE)
+
+
+def _default(program: Program, table: str, action: str) -> list[Any]:
+    actions = program.table(table).default_actions if table in program.names else ()
+    if not any(each.name.rpartition(".")[2] == action for each in actions):
         return []
-    return [program.entry(TableUpdate(kind="modify", table=_DMAC, action=_DROP))]
+    return [program.entry(TableUpdate(kind="modify", table=table, action=action))]

@@ -28,7 +28,7 @@ from apps.p4runtime_ctrl.errors import EntryError, ProgramError, SwitchError
 from apps.p4runtime_ctrl.guard import SECRET_WORDS, GuardSettings, secrets_entry
 from apps.p4runtime_ctrl.orders import Order, OrderBook, Owner, owner_of
 from apps.p4runtime_ctrl.p4info import Program
-from apps.p4runtime_ctrl.stations import GROUP, LearnSettings, Stations, no_flood
+from apps.p4runtime_ctrl.stations import GROUP, LearnSettings, Stations, new_senders, no_flood
 from apps.p4runtime_ctrl.telemetry import Classifier, Request
 from apps.p4runtime_ctrl.wires import wires_of
 
@@ -127,6 +127,8 @@ class Switch:
         self.stations = Stations(program, learn) if learn is not None else None
         """Those learnt, where learning is on."""
         self._unlearnt = no_flood(program) if self.stations is None else []
+        for entry in new_senders(program, learn=self.stations is not None):
+            self._desired.put(entry)
         if self.stations is not None:
             self._desired.put(self.stations.flood())
         self._owners: dict[bytes, Owner] = {}
@@ -261,20 +263,24 @@ class Switch:
             answers.append(self._confirmation(owner, state, entry, cause=outcome.message or "idle"))
         return answers
 
-    def count_blocks(self, transport: Transport) -> list[dict[str, Any]]:
-        """Direct counters of the entries that drop traffic, with the decisions they come from."""
+    @property
+    def counted_tables(self) -> list[int]:
+        """Tables with entries that drop traffic."""
+        return sorted({table_id(entry) for entry in self._desired} & self._block_tables)
+
+    def readings(self, entries: Iterable[Any]) -> list[dict[str, Any]]:
+        """What `read_counters` told of these tables, with the decisions that the entries come from."""
         found = []
-        for table in sorted({table_id(entry) for entry in self._desired} & self._block_tables):
-            for entry in transport.read_counters(table):
-                owner = self._owners.get(entry_key(entry))
-                found.append(
-                    {
-                        "id": owner.id if owner else "",
-                        "handle": self.program.describe(entry),
-                        "packets": entry.counter_data.packet_count,
-                        "bytes": entry.counter_data.byte_count,
-                    }
-                )
+        for entry in entries:
+            owner = self._owners.get(entry_key(entry))
+            found.append(
+                {
+                    "id": owner.id if owner else "",
+                    "handle": self.program.describe(entry),
+                    "packets": entry.counter_data.packet_count,
+                    "bytes": entry.counter_data.byte_count,
+                }
+            )
         return found
 
     def withdraw(self, transport: Transport) -> None:

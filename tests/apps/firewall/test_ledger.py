@@ -48,6 +48,15 @@ def test_quiet_block_runs_out_into_probation():
     assert not ledger.on_probation(CAMERA, decision.expires + 600 * SECOND)
 
 
+def test_probation_that_is_over_takes_no_room():
+    ledger = Ledger(Rules())
+    for number in range(3):
+        target = Target(kind="ip", address=f"10.0.0.{number}")
+        ledger.open("s1", target, "hot", (), number * 1000 * SECOND, seconds=10)
+        ledger.due((number * 1000 + 10) * SECOND)
+    assert list(ledger.probation) == [("s1", "ip", "10.0.0.2")]
+
+
 def test_block_is_extended_while_the_attack_goes_on():
     """Sixty-one drops a second are more than three times a training rate of twenty."""
     ledger = Ledger(Rules())

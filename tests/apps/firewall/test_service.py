@@ -60,6 +60,17 @@ def test_one_source_is_guarded_against_first_and_blocked_when_sure():
     assert desk.blocked == ["77.0.0.1"]
 
 
+def test_flood_is_looked_at_in_time_though_neither_tick_nor_syn_comes():
+    desk = Desk(syn=SynRules(grace_ms=20))
+    flood(desk, *spoofed())
+    assert desk.guarded == []
+    for _ in range(6000):
+        if desk.guarded:
+            break
+        time.sleep(0.01)
+    assert desk.guarded == [VICTIM]
+
+
 def test_slow_handshakes_are_no_flood():
     """A far crowd behind one address: guarded for a moment, not blocked, once its handshakes are finished."""
     desk = Desk(syn=SynRules(grace_ms=0, patience_ms=300))

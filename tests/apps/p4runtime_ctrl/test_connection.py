@@ -10,6 +10,7 @@ from apps.p4runtime_ctrl.connection import Connection
 from apps.p4runtime_ctrl.desired_state import INSERT, Change
 from apps.p4runtime_ctrl.errors import NotPrimary, Unreachable
 from apps.p4runtime_ctrl.session import Address
+from p4rt import p4runtime
 from tests.apps.p4runtime_ctrl.fake_switch import FakeSwitch
 from tests.apps.p4runtime_ctrl.programs import packet_in, pipeline, program
 
@@ -20,6 +21,7 @@ class Listener:
     def __init__(self):
         self.changed = threading.Condition()
         self.sessions, self.lost_causes, self.lists, self.others = [], [], [], []
+        self.digest_lists = []
         self.backups = 0
         self.gate = threading.Event()
         self.gate.set()
@@ -43,7 +45,7 @@ class Listener:
         self._note(lambda: self.lists.append(messages))
 
     def digests(self, lists):
-        pass
+        self._note(lambda: self.digest_lists.append(lists))
 
     def other(self, message):
         self._note(lambda: self.others.append(message))
@@ -128,6 +130,15 @@ def test_packets_come_in_order_in_lists(switch, connect):
     assert max(map(len, listener.lists)) <= 64
     frames = [m.metadata[4].value for messages in listener.lists for m in messages]
     assert [int.from_bytes(value, "big") for value in frames] == list(range(1, 1001))
+
+
+def test_digests_between_packets_do_not_cut_them_into_many_lists():
+    listener = Listener()
+    digests = [p4runtime.DigestList(list_id=number) for number in range(50)]
+    packets = [packet_in(number) for number in range(50)]
+    connection = Connection(Address("nowhere", 1, 1), pipeline(), listener)
+    connection._tell([message for pair in zip(digests, packets, strict=True) for message in pair])
+    assert (listener.digest_lists, listener.lists) == ([digests], [packets])
 
 
 def test_a_busy_listener_holds_the_stream(switch, connect):

@@ -224,10 +224,11 @@ def test_an_offer_is_sent_under_its_name_while_observed(stage):
 
 
 def test_idle_entries_are_removed_by_the_capture_clock(stage):
-    stage.controller()
     commands = Capability("network.p4_command.listener.*", delivery="reliable", archive="always")
     engine = stage.engine("listener", capabilities=(commands,))
-    heard = Heard(engine, CONFIRMATIONS, STATE)
+    heard = Heard(engine, CONFIRMATIONS, STATE)  # before there is anything to confirm
+    stage.controller()
+    wait_for(lambda: engine.wanted("network.p4_command.listener.s1"), why=stage.log)
     entry = TableUpdate(
         kind="insert",
         table="block_src",

@@ -138,6 +138,18 @@ def test_who_does_not_learn_ends_the_flooding_of_who_did():
         assert not fake.entries
 
 
+def test_new_senders_are_reported_only_to_who_learns():
+    """Else every frame to a station of a static entry would make a digest that nobody reads."""
+    table = program().table("smac")
+    with FakeSwitch() as fake:
+        for learn, name in ((None, "ignore"), (LEARN, "learn"), (None, "ignore")):
+            held = Attached(fake.address, Switch("s1", program(), lambda: (0, 0), learn=learn))
+            held.until_up()
+            held.connection.close()
+            action = next(action for action in table.actions if action.name == f"ingress.{name}")
+            assert fake.defaults[table.id].action.action.action_id == action.id
+
+
 class Hosts:
     """Frames out of and into the far ends of the switch's ports."""
 

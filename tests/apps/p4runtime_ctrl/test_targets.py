@@ -147,7 +147,7 @@ def test_exists_removed_and_failed_are_told_apart(target, attach):
         for state in states:
             answers = switch.decide([decision(1, action, sender) for sender in SENDERS], attached.session)
             assert [answer.state for answer in answers] == [state] * len(SENDERS)
-    assert switch.count_blocks(attached.session) == []
+    assert switch.counted_tables == []
 
 
 def test_a_large_batch_says_which_of_its_updates_failed(target, attach):
