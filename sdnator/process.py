@@ -33,13 +33,15 @@ class Child:
         self.name = name
         self.log = logs / f"{name}.log"
         with self.log.open("ab") as stderr:
-            # A session of its own: Ctrl-C reaches us only, and we stop the children in order.
+            # A process group of its own: Ctrl-C reaches us only, and we stop the children in order.  Not a session
+            # of its own: Linux shares processors out by session first (sched_autogroup), and then whoever sleeps
+            # most of the time, as Data Updates do, waits 100 ms and more for a processor beside busy parts.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                start_new_session=True,
+                process_group=0,
                 env=os.environ | {_PARENT_VARIABLE: str(os.getpid())},
             )
 

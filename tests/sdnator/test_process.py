@@ -21,6 +21,16 @@ def program(tmp_path, monkeypatch):
     return write
 
 
+def test_child_has_a_group_of_its_own_in_our_session(program):
+    """Ctrl-C does not reach it, and processors are shared out among all parts alike."""
+    child = program("import json, signal\nprint(json.dumps({'ready': True}), flush=True)\nsignal.pause()")
+    try:
+        child.wait_ready()
+        assert (os.getpgid(child.pid), os.getsid(child.pid)) == (child.pid, os.getsid(0))
+    finally:
+        child.stop()
+
+
 def test_ready_line_is_returned(program):
     """What the program says of itself reaches the caller."""
     child = program(
