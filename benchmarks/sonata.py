@@ -4,7 +4,8 @@ correct_queries: queries whose results, switch and host together, equal those of
 generated attacks and on real captures; estimates: results that call themselves so.  reduction: packets
 for each tuple that reached the host, on --packets packets in two runs, since the switch has not room for
 all queries at once; for zorro and slowloris outside attacks.  two_tuples_a_result: on all of them, whether
-no more tuples came than that and those of keys without a cell (overflow).
+no more tuples came than that and those of keys without a cell (overflow).  dns_share: packets that are DNS,
+all of which dns_reflection looks at on the host.
 host_tuples_per_s: filter, distinct and reduce on one core.
 all_queries_cost_ratio: processor time of all eleven together over that of the dearest alone.
 window_200ms_delay_ms: from the end of a window of 200 ms to the result that is known then only.
@@ -30,7 +31,7 @@ from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.engine import HostEngine
 from benchmarks import measure
 from benchmarks.sonata_stage import QUERIES, SonataStage, equal_to_naive
-from benchmarks.sonata_traffic import ATTACKS, MINUTE_PACKETS, minutes
+from benchmarks.sonata_traffic import ATTACKS, MINUTE_PACKETS, Traffic, traffic
 from due import RecordBatch
 from sdnator.captures import Capture
 from tests.apps.sonata_adapter.traffic import BASE_US, Frame, attack, batch_of, mixed, office, tcp
@@ -47,7 +48,7 @@ _OUTSIDE = ("slowloris", "zorro")
 _DENSE = 10_000
 """Packets a second that may come together when traffic is played faster than it came."""
 _FASTER = 8.0
-"""Most replays are faster than the traffic, but so slow that the cells of a window can be read after it."""
+"""How much faster than it came that run plays its traffic: the cells of a window can be read after it."""
 _EXACT = 4.0
 """The same where every result counts: 0.75 s to read the cells of a window of 3 s."""
 
@@ -187,9 +188,11 @@ def _traffics(names: Sequence[str]) -> Iterator[tuple[str, list[Frame]]]:
 def reduction(packets: int) -> dict[str, Any]:
     """Packets for each tuple on the host, by query; None where there was no tuple.
 
-    For `_OUTSIDE` only the parts without attacks count, for the others all.  The second run has
+    For `_OUTSIDE` only the part without attacks counts, for the others all.  The second run has
     `_SECOND`: their counting entries and those of the others do not fit into the switch together.
     """
+    minutes = -(-packets // MINUTE_PACKETS)
+    parts = traffic(minutes)
     figures: dict[str, Any] = {
         "reduction": {},
         "reduction_packets": {},
@@ -197,41 +200,44 @@ def reduction(packets: int) -> dict[str, Any]:
         "results": {},
         "overflow": {},
         "two_tuples_a_result": {},
-        "reduction_attacks": 0,
+        "reduction_attacks": minutes * ATTACKS,
         "reduction_packets_per_s": [],
     }
-    for names in ([name for name in CATALOGUE if name not in _SECOND], list(_SECOND)):
+    first = [name for name in CATALOGUE if name not in _SECOND]
+    # nothing is read from the switch for the first ones
+    for names, faster in ((first, 0.0), (list(_SECOND), _FASTER)):
         with tempfile.TemporaryDirectory() as folder, SonataStage(Path(folder)) as stage:
             stage.declare(QUERIES[name] for name in names)
-            _count(stage, names, packets, figures)
+            _count(stage, names, parts, faster, figures)
     return figures
 
 
-def _count(stage: SonataStage, names: list[str], packets: int, figures: dict[str, Any]) -> None:
-    tuples = dict.fromkeys(("quiet", "all"), dict.fromkeys(CATALOGUE, 0))
-    quiet = sent = attacks = 0
+def _count(
+    stage: SonataStage,
+    names: list[str],
+    parts: tuple[Traffic, Traffic],
+    faster: float,
+    figures: dict[str, Any],
+) -> None:
+    loud, rest = parts
     begin = time.monotonic()
-    for loud, rest in minutes(1 + packets // (MINUTE_PACKETS - 1)):
-        sent += stage.play(loud, faster=_FASTER, zero=BASE_US)
-        attacks += ATTACKS
-        before = stage.settle()
-        part = stage.play(rest, faster=_FASTER, zero=BASE_US)
-        after = stage.settle()
-        sent, quiet = sent + part, quiet + part
-        tuples["quiet"] = {name: n + after[name] - before[name] for name, n in tuples["quiet"].items()}
-        tuples["all"] = after
-        if sent >= packets:
-            break
+    stage.play(loud, faster=faster, zero=BASE_US)
+    before = stage.settle()
+    stage.play(rest, faster=faster, zero=BASE_US)
+    after = stage.settle()
+    sent, quiet = len(loud) + len(rest), len(rest)
     figures["reduction_packets_per_s"].append(round(sent / (time.monotonic() - begin)))
-    figures["reduction_attacks"] = attacks
     results = stage.finish()
     for name in names:
-        seen, n = (quiet, tuples["quiet"][name]) if name in _OUTSIDE else (sent, stage.tuples[name])
+        outside = quiet, after[name] - before[name]
+        seen, n = outside if name in _OUTSIDE else (sent, stage.tuples[name])
         figures["tuples"][name], figures["results"][name] = n, len(results[name])
         figures["reduction_packets"][name] = seen
         over = figures["overflow"][name] = stage.overflow[name]
         figures["two_tuples_a_result"][name] = stage.tuples[name] <= 2 * len(results[name]) + over
         figures["reduction"][name] = round(seen / n, 1) if n else None
+    if "dns_reflection" in names:
+        figures["dns_share"] = round(figures["tuples"]["dns_reflection"] / sent, 4)
 
 
 def responsiveness(rounds: int) -> dict[str, Any]:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apps.sonata_adapter.catalogue import CATALOGUE
+from benchmarks.sonata_traffic import Traffic
 from dataplane.bmv2 import Bmv2
 from due import Item
 from sdnator.wire import Feed, VethPair, WireFeed
@@ -115,25 +117,24 @@ class SonataStage(Stage):
             for time_us, frame in zip(times[order].tolist(), frames, strict=True)
         ]
 
-    def play(self, frames: Iterable[Frame], *, faster: float = 0.0, zero: int | None = None) -> int:
+    def play(self, frames: Sequence[Frame] | Traffic, *, faster: float = 0.0, zero: int | None = None) -> int:
         """Send all frames; returns their number.
 
         `faster`: so many times as fast as they were captured, 0 = as fast as the switch takes them.
         `zero`: the switch's clock zero, default the first frame's second.
         """
+        traffic = frames if isinstance(frames, Traffic) else Traffic.of(frames)
         sent = done = 0
-        begin, first = time.monotonic(), None
-        for part in blocks(frames, round(_BLOCK_S * faster * 1e6)):
-            zero = part[0].time_us // 10**6 * 10**6 if zero is None else zero
-            first = part[0].time_us if first is None else first
+        begin, first = time.monotonic(), int(traffic.times_us[0])
+        times_us = traffic.times_us - (first // 10**6 * 10**6 if zero is None else zero)
+        for part in blocks(np.maximum.accumulate(times_us), round(_BLOCK_S * faster * 1e6)):
             if faster:
-                ahead = (part[-1].time_us - first) / 1e6 / faster - (time.monotonic() - begin)
+                ahead = int(traffic.times_us[part][-1] - first) / 1e6 / faster - (time.monotonic() - begin)
                 time.sleep(max(0.0, ahead))
-            self._feed.send(
-                [f.time_us - zero for f in part], [f.length for f in part], [f.data for f in part]
-            )
-            sent += len(part)
-            done += len(part) if self._wire is not None else len(self._feed.verdicts())
+            self._feed.send(times_us[part].tolist(), traffic.lengths[part].tolist(), traffic.data[part])
+            size = part.stop - part.start
+            sent += size
+            done += size if self._wire is not None else len(self._feed.verdicts())
             while sent - done > _IN_FLIGHT:
                 time.sleep(0.001)
                 done += len(self._feed.verdicts())
@@ -246,16 +247,17 @@ def _by_name(counts: dict[str, int]) -> dict[str, int]:
     return {name: found.get(name, 0) for name in CATALOGUE}
 
 
-def blocks(frames: Iterable[Frame], span_us: int) -> Iterator[list[Frame]]:
-    """Parts of a replay: at most `_BLOCK` frames, and none longer than `span_us`; 0: no matter how long."""
-    part: list[Frame] = []
-    for frame in frames:
-        if part and (len(part) == _BLOCK or 0 < span_us < frame.time_us - part[0].time_us):
-            yield part
-            part = []
-        part.append(frame)
-    if part:
-        yield part
+def blocks(times_us: NDArray[np.int64], span_us: int) -> Iterator[slice]:
+    """Parts of a replay: at most `_BLOCK` frames, and none longer than `span_us`; 0: no matter how long.
+
+    No time is before the one before it.
+    """
+    start = 0
+    while start < len(times_us):
+        part = times_us[start : start + _BLOCK]
+        size = int(np.searchsorted(part, part[0] + span_us, "right")) if span_us else len(part)
+        yield slice(start, start + size)
+        start += size
 
 
 def equal_to_naive(

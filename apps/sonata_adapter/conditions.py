@@ -47,7 +47,7 @@ def conditions_of(filters: tuple[Expression, ...]) -> Conditions:
         if one is None:
             exact = False
             continue
-        merged = [both for left in found for right in one if (both := _both(left, right)) is not None]
+        merged = [each for left in found for right in one if (each := narrowed(left, right)) is not None]
         if len(merged) > _MOST:
             exact = False
             continue
@@ -57,7 +57,7 @@ def conditions_of(filters: tuple[Expression, ...]) -> Conditions:
 
 def disjoint(left: Mapping[str, Any], right: Mapping[str, Any]) -> bool:
     """Whether no packet can meet both."""
-    return _both(left, right) is None
+    return narrowed(left, right) is None
 
 
 def _alternatives(condition: Expression) -> list[Match] | None:
@@ -120,7 +120,7 @@ def _prefix(name: str, prefix: str) -> list[Match] | None:
     return None if field is None else [{"ethertype": kind, field: prefix}]
 
 
-def _both(left: Mapping[str, Any], right: Mapping[str, Any]) -> Match | None:
+def narrowed(left: Mapping[str, Any], right: Mapping[str, Any]) -> Match | None:
     """Conditions for packets that meet both; None where there are none."""
     found = dict(left)
     for field, value in right.items():

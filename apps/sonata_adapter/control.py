@@ -420,14 +420,20 @@ class Control:
 
     def _updates(self, before: Plan) -> tuple[TableUpdate, ...]:
         old, new = before.entries, self.plan.entries
-        found = [_update("delete", entry) for bit, entry in old.items() if new.get(bit) != entry]
+        found = [_update("delete", entry) for bit, entry in old.items() if not _is_kept(new.get(bit), entry)]
         for bit, entry in sorted(new.items()):
             params = entry.params(self.plan.repeated(bit))
-            if old.get(bit) != entry:
+            kept = _is_kept(old.get(bit), entry)
+            if not kept:
                 found.append(_update("insert", entry, params))
-            elif before.repeated(bit) != self.plan.repeated(bit):
+            elif old[bit] != entry or before.repeated(bit) != self.plan.repeated(bit):
                 found.append(_update("modify", entry, params))
         return tuple(found)
+
+
+def _is_kept(one: Entry | None, other: Entry) -> bool:
+    """Whether two entries of one bit are the same; a clock is, at whatever pace."""
+    return one == other or (one is not None and one.role == other.role == "clock")
 
 
 def _name(bit: int) -> str:

@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from apps.sonata_adapter.conditions import Match, disjoint
+from apps.sonata_adapter.conditions import Match, disjoint, narrowed
 from apps.sonata_adapter.errors import NotPlaced
 from apps.sonata_adapter.expressions import Expression, Field, Number, text_of
 
@@ -24,6 +24,8 @@ _KEY_PARTS: Final = {
     "udp.dport": ("port_mask", _SHORT),
     "length": ("length_mask", _SHORT),
 }
+_LAST_KNOWN_PORT: Final = 1_023
+"""Of the well-known ports; from them come answers, from the others what clients send."""
 Role = Literal["distinct", "reduce", "clock"]
 
 
@@ -44,7 +46,7 @@ class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     reads: bool = True
     """Whether the controller answers requests for cells: then differences are counted in the switch, too."""
     read_window_ms: int = 1_000
-    """Shortest window of queries that need cells read, and how often the switch says what time it has."""
+    """Shortest window of queries that need cells read; the switch says no oftener what time it has."""
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,8 +65,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     size: int = 0
     source: int = 0
     """Which of the query's counts it is, in the order of `dataflow.sources`."""
-    behind: int = -1
-    """Of a reduce: the bit of the distinct that lets its tuples pass, -1 = none."""
+    behind: tuple[int, ...] = ()
+    """Of a reduce: the bits of the distincts that let its tuples pass, each those of other packets."""
 
     def params(self, repeated: int = 0) -> dict[str, int]:
         """Parameters of the action `count`; `repeated`: bits to forget for a key seen before."""
@@ -124,18 +126,28 @@ def masks_of(keys: Iterable[Expression]) -> tuple[tuple[str, int], ...]:
 
 
 class Space:
-    """Bits, stages and cells that are still free."""
+    """Bits, stages and cells that are still free.
 
-    def __init__(self, limits: SwitchLimits) -> None:
+    `splits`: a distinct whose tuples hold the source port gets two entries, for packets from well-known
+    ports and for the others, each with its own cells: half as many keys are without a cell.
+    """
+
+    def __init__(self, limits: SwitchLimits, *, splits: bool = False) -> None:
         self._limits = limits
+        self._splits = splits
         self._bits: set[int] = set()
         self._stages: list[list[Entry]] = [[] for _ in range(limits.stages)]
 
-    def copy(self) -> "Space":
-        twin = Space(self._limits)
+    def copy(self, *, splits: bool | None = None) -> "Space":
+        twin = Space(self._limits, splits=self._splits if splits is None else splits)
         twin._bits = set(self._bits)
         twin._stages = [list(stage) for stage in self._stages]
         return twin
+
+    @property
+    def free_stages(self) -> int:
+        """Stages without any entry."""
+        return sum(1 for held in self._stages if not held)
 
     def hold(self, entries: Iterable[Entry]) -> None:
         for entry in entries:
@@ -167,15 +179,28 @@ class Space:
 
     def distinct(
         self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int, alternatives: int
-    ) -> Entry:
-        """An entry for a distinct: one that is there already, with room behind it, or a new one."""
+    ) -> list[Entry]:
+        """Entries for a distinct: those that are there already, with room behind them, or new ones."""
+        parts = _by_source_port(match) if self._splits and "source_port_mask" in dict(masks) else [match]
+        if self._there(match, masks, window_us) is not None:
+            parts = [match]
+        return [self._distinct(part, masks, window_us, alternatives) for part in parts]
+
+    def _there(self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int) -> Entry | None:
+        wanted = ("distinct", match, masks, window_us)
         for number, held in enumerate(self._stages):
             for entry in held:
-                wanted = ("distinct", match, masks, window_us)
-                if (entry.role, entry.match, entry.masks, entry.window_us) == wanted and self._room_behind(
-                    number, match
-                ):
+                is_same = (entry.role, entry.match, entry.masks, entry.window_us) == wanted
+                if is_same and self._room_behind(number, match):
                     return entry
+        return None
+
+    def _distinct(
+        self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int, alternatives: int
+    ) -> Entry:
+        there = self._there(match, masks, window_us)
+        if there is not None:
+            return there
         new = Entry(
             role="distinct",
             bit=0,
@@ -245,3 +270,9 @@ class Space:
             return large
         base, size = max(gaps, key=lambda gap: gap[1])
         return (base, size) if size >= max(1, wish // 4) else None
+
+
+def _by_source_port(match: Match) -> list[Match]:
+    """The packets of a condition in two parts, from well-known ports and from others."""
+    spans = ([0, _LAST_KNOWN_PORT], [_LAST_KNOWN_PORT + 1, _SHORT])
+    return [part for span in spans if (part := narrowed(match, {"sport": span})) is not None]

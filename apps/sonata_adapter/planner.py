@@ -9,7 +9,8 @@ each alternative of its filter and a place in a counting stage; in one stage, no
 entries.  Where there is no room for all, those queries go in first that save most tuples.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import gcd
 from typing import Final
 
 import msgspec
@@ -35,6 +36,8 @@ from apps.sonata_adapter.placement import Copy, Entry, Space, SwitchLimits, by_b
 from apps.sonata_adapter.query import duration_text
 from apps.sonata_adapter.refinement_levels import address_of, by_family, cut
 
+_LONGEST_PERIOD_MS: Final = 10_000
+"""The switch says the time so often at least."""
 _SHARE_WITHIN: Final = 2
 """What a narrowed query takes is one in so many of the cells that it would take of all packets."""
 _CELLS_A_PREFIX: Final = 8
@@ -75,7 +78,7 @@ class Plan(msgspec.Struct, frozen=True):
 
     def repeated(self, bit: int) -> int:
         """Map of the bits that wait behind a distinct."""
-        return sum(1 << entry.bit for entry in self.entries.values() if entry.behind == bit)
+        return sum(1 << entry.bit for entry in self.entries.values() if bit in entry.behind)
 
     def of(self, identity: str) -> QueryPlan:
         return next(query for query in self.queries if query.identity == identity)
@@ -105,9 +108,8 @@ def plan(
             space.hold(old.entries)
     fresh = [request for request in wanted.values() if request.identity not in kept]
     ordered = sorted(fresh, key=lambda request: (-_saving(request, limits), request.identity))
-    found = dict(kept)
-    for request in ordered:
-        found[request.identity] = _counted(request, space, limits)
+    placed, space = _placed(ordered, space, limits)
+    found = _timed({**kept, **placed}, limits)
     copies = _copies([wanted[one.identity] for one in found.values() if not one.in_switch], held, space)
     plans = []
     for identity in sorted(found):
@@ -122,6 +124,56 @@ def plan(
             )
         plans.append(one)
     return Plan(tuple(plans), tuple(copies))
+
+
+def _placed(
+    requests: Sequence[Request], space: Space, limits: SwitchLimits
+) -> tuple[dict[str, QueryPlan], Space]:
+    """Plans for new requests, and what is free then; distincts are split where that takes no query's room."""
+    trials = []
+    for splits in (True, False):
+        trial = space.copy(splits=splits)
+        trials.append(({one.identity: _counted(one, trial, limits) for one in requests}, trial))
+    (split, less), (whole, more) = trials
+    as_many = all(split[identity].in_switch for identity, one in whole.items() if one.in_switch)
+    return trials[0] if as_many and (less.free_stages or not more.free_stages) else trials[1]
+
+
+def _timed(plans: Mapping[str, QueryPlan], limits: SwitchLimits) -> dict[str, QueryPlan]:
+    """The plans, with the switch's clock as slow as the windows of all that it serves allow.
+
+    It tells the end of each window, and something in between.
+    """
+    windows = [
+        entry.window_us // 1000
+        for one in plans.values()
+        if any(entry.role == "clock" for entry in one.entries)
+        for entry in one.entries
+        if entry.role == "reduce"
+    ]
+    period_us = 1000 * clock_period(windows, limits.read_window_ms)
+    return {
+        identity: msgspec.structs.replace(
+            one, entries=tuple(_at_pace(entry, period_us) for entry in one.entries)
+        )
+        for identity, one in plans.items()
+    }
+
+
+def _at_pace(entry: Entry, period_us: int) -> Entry:
+    return msgspec.structs.replace(entry, window_us=period_us) if entry.role == "clock" else entry
+
+
+def clock_period(windows: Iterable[int], least: int) -> int:
+    """How often the switch says the time for these windows, in ms: at the end of each and within it.
+
+    Where that would be oftener than `least`: at the ends of all only, or else every `least`.
+    """
+    common = gcd(*windows)
+    parts = max(2, -(-common // _LONGEST_PERIOD_MS))
+    while common % parts:
+        parts += 1
+    return next((period for period in (common // parts, common) if period >= least), least)
 
 
 def _saving(request: Request, limits: SwitchLimits) -> float:
@@ -221,11 +273,11 @@ def _count_entries(
     cells = min(_CELLS_A_PREFIX << request.coarse, limits.reduce_cells) if request.coarse else 0
     found: list[Entry] = []
     for match in matches:
-        first: Entry | None = None
+        first: list[Entry] = []
         if isinstance(counted.source, DistinctNode):
             masks = _masks(request, counted.source.values, match)
             first = space.distinct(match, masks, window_us, share)
-            found.append(first)
+            found += first
         last = Entry(
             role="reduce",
             bit=0,
@@ -236,9 +288,9 @@ def _count_entries(
             threshold=threshold,
             by_bytes=by_bytes(counted.value),
             source=source,
-            behind=-1 if first is None else first.bit,
+            behind=tuple(entry.bit for entry in first),
         )
-        found.append(space.place(last, after=-1 if first is None else first.stage, cells=cells))
+        found.append(space.place(last, after=max((entry.stage for entry in first), default=-1), cells=cells))
     return found
 
 

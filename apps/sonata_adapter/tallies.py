@@ -93,7 +93,7 @@ class Tallies:
         entry = self._reduces.get(bit)
         if entry is not None:
             self._counted(entry, packets, numbers, batch)
-        for behind in [each for each in self._reduces.values() if each.behind == bit]:
+        for behind in [each for each in self._reduces.values() if bit in each.behind]:
             self._distinct(behind, packets, numbers)
         return []
 

@@ -6,6 +6,7 @@ import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.control import Changes, Control, leftovers
+from apps.sonata_adapter.placement import reciprocal
 from apps.sonata_adapter.results import Captured, Result
 from tests.apps.sonata_adapter.switch_model import SwitchModel
 from tests.apps.sonata_adapter.test_catalogue import expect, same
@@ -127,6 +128,16 @@ def test_adding_a_query_leaves_the_others_alone():
     back = control.want([f"{PREFIX}.ddos"])
     assert {update.kind for update in back.updates} == {"delete", "modify"}
     assert len(back.withdraw) == 2
+
+
+def test_the_clock_changes_its_pace_in_place():
+    """A window that it does not fit makes it faster; nothing else of what runs is touched."""
+    control, switch = Control(CATALOGUE), SwitchModel()
+    switch.change(control.want([f"{PREFIX}.syn_flood:window=3s"]))
+    changes = control.want([f"{PREFIX}.syn_flood:window=3s", f"{PREFIX}.incomplete_flows:window=2s"])
+    (modified,) = [update for update in changes.updates if update.kind != "insert"]
+    assert (modified.kind, int(modified.params["reciprocal"], 16)) == ("modify", reciprocal(1_000_000))
+    switch.change(changes)
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,12 @@ import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.columns import Packets, evaluate
-from apps.sonata_adapter.conditions import conditions_of, disjoint
+from apps.sonata_adapter.conditions import conditions_of, disjoint, narrowed
 from apps.sonata_adapter.dataflow import PacketSource, Table, compile_query, sources
 from apps.sonata_adapter.explain import explain
 from apps.sonata_adapter.keys import request_of
 from apps.sonata_adapter.placement import SwitchLimits, reciprocal
-from apps.sonata_adapter.planner import Plan, plan
+from apps.sonata_adapter.planner import Plan, clock_period, plan
 from apps.sonata_adapter.refinement import coarsest
 from tests.apps.sonata_adapter.switch_model import matches
 from tests.apps.sonata_adapter.traffic import batch_of, mixed
@@ -35,9 +35,9 @@ def test_no_frame_matches_two_entries_of_a_stage():
             assert one.base + one.size <= other.base or other.base + other.size <= one.base
     for entry in entries.values():
         assert entry.base + entry.size <= SwitchLimits().cells
-        if entry.behind >= 0:
-            assert entries[entry.behind].stage < entry.stage
-            assert entries[entry.behind].match == entry.match
+        for bit in entry.behind:
+            assert entries[bit].stage < entry.stage
+            assert narrowed(entries[bit].match, entry.match) == entries[bit].match
     bits = [*entries, *(copy.bit for copy in found.copies)]
     assert len(bits) == len(set(bits))
 
@@ -81,11 +81,16 @@ def test_what_stays_keeps_its_place(seed):
             staying = {one.identity for one in found.queries} & {one.identity for one in before.queries}
             for identity in staying:
                 if before.of(identity).in_switch:
-                    assert found.of(identity).entries == before.of(identity).entries
+                    assert counting(found.of(identity)) == counting(before.of(identity))
             for copy in found.copies:
                 assert all(old.match == copy.match for old in before.copies if old.bit == copy.bit)
         present = changed
     assert found is not None
+
+
+def counting(one):
+    """Its entries but for the switch's clock, whose pace follows the windows."""
+    return [entry for entry in one.entries if entry.role != "clock"]
 
 
 def test_two_hundred_queries_fit_or_fall_back():
@@ -95,6 +100,32 @@ def test_two_hundred_queries_fit_or_fall_back():
     assert len(found.copies) <= SwitchLimits().bits
     assert any(not copy.match for copy in found.copies)
     assert all(one.copies for one in found.queries)
+
+
+def test_a_distinct_is_split_where_that_takes_no_querys_room():
+    """By source port into two with cells of their own, behind both of which the count stands."""
+    alone = plan(requests(f"{PREFIX}.slowloris")).queries[0].entries
+    parts = [entry for entry in alone if entry.role == "distinct"]
+    assert [entry.match["sport"] for entry in parts] == [[0, 1023], [1024, 65_535]]
+    assert [entry.behind for entry in alone if entry.behind] == [tuple(entry.bit for entry in parts)]
+    four = plan(requests(f"{PREFIX}.slowloris"), SwitchLimits(stages=4)).queries[0].entries
+    assert [entry.role for entry in four] == ["clock", "distinct", "reduce", "reduce"]
+
+
+@pytest.mark.parametrize(
+    ("windows", "period"),
+    [
+        ([3000], 1500),
+        ([3000, 30_000], 1500),
+        ([1000], 1000),
+        ([2000, 3000], 1000),
+        ([60_000], 10_000),
+        ([1999], 1999),
+    ],
+)
+def test_the_clock_ticks_at_the_end_of_every_window_and_within(windows, period):
+    """As seldom as that can be, but not less than every ten seconds, nor oftener than every second."""
+    assert clock_period(windows, 1000) == period
 
 
 def test_same_conditions_share_a_copy():

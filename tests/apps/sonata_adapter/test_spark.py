@@ -1,18 +1,33 @@
 """Spark in place of numpy: the same results from the same frames, shard by shard."""
 
 import importlib.util
+from functools import partial
 
 import pytest
+from typer.testing import CliRunner
 
+from apps.p4runtime_ctrl.service import CAPABILITIES as CONTROLLER
 from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.columns import Packets
 from apps.sonata_adapter.engine import HostEngine
+from apps.sonata_adapter.keys import QUERY_PREFIX, request_of
+from apps.sonata_adapter.placement import SwitchLimits
+from apps.sonata_adapter.service import CAPABILITIES, INTERESTS, Settings, SonataAdapterService
 from apps.sonata_adapter.shards import parts_of, shard_rows, union
-from apps.sonata_adapter.spark import SHARDS, SparkMissing, require_spark, run_window, split_batch
+from apps.sonata_adapter.spark import (
+    SHARDS,
+    SparkMissing,
+    require_spark,
+    run_window,
+    spark_session,
+    split_batch,
+)
+from due import NO_WAIT
 from sdnator.captures import CaptureWriter
+from sdnator.queries_commands import queries
+from tests.apps.p4runtime_ctrl.stage import Heard, Stage, wait_for
 from tests.apps.sonata_adapter.traffic import BASE_US as TRAFFIC_US
-from tests.apps.sonata_adapter.traffic import batch_of, mixed
-from tests.end_to_end.command import sdnator
+from tests.apps.sonata_adapter.traffic import batch_of, batches, mixed
 from tests.requirements import missing, require_program
 
 
@@ -65,15 +80,33 @@ def test_what_is_missing_is_said(monkeypatch):
         require_spark()
 
 
-@pytest.mark.timeout(900)
-def test_spark_finds_what_numpy_finds(tmp_path):
-    """A real local Spark: the same lines from the same capture, crossings and window ends alike."""
+@pytest.fixture(scope="module")
+def spark():
+    """A real local Spark for the tests of this module, since it takes long to start."""
     if importlib.util.find_spec("pyspark") is None:
         missing("pyspark is not installed: pip install 'sdnator[spark]'")
     require_program("java")
+    session = spark_session("local[2]")
+    gateway = session.sparkContext._gateway
+    yield
+    session.stop()
+    gateway.shutdown()
+    gateway.proc.stdin.close()
+    gateway.proc.wait(30)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return mixed(["ddos", "syn_flood"], seconds=6)
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("spark")
+def test_spark_finds_what_numpy_finds(tmp_path, frames):
+    """A real local Spark: the same lines from the same capture, crossings and window ends alike."""
     file = tmp_path / "mixed.pcap"
     with CaptureWriter(file) as writer:
-        for frame in mixed(["ddos", "syn_flood"], seconds=8):
+        for frame in frames:
             writer.write(frame.time_us * 1000, frame.data, frame.length)
     lines = {engine: results("syn_flood:window=2s", file, engine) for engine in ("numpy", "spark")}
     assert lines["numpy"]
@@ -81,6 +114,57 @@ def test_spark_finds_what_numpy_finds(tmp_path):
 
 
 def results(query, file, engine):
-    done = sdnator("queries", "run", query, "--capture", file, "--json", "--engine", engine, seconds=800)
-    assert done.returncode == 0, done.stderr[-3000:]
+    done = CliRunner().invoke(queries, ["run", query, "--capture", str(file), "--json", "--engine", engine])
+    assert done.exit_code == 0, done.output[-3000:]
     return sorted(line for line in done.stdout.splitlines() if line.startswith("{"))
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("spark")
+def test_spark_fed_by_reliable_streams(tmp_path, frames):
+    """The adapter on a real local Spark: packets come by DUE, and its results are those of the host's operators."""
+    keys = [f"{QUERY_PREFIX}.{name}:window=2s" for name in ("ddos", "syn_flood")]
+    packets = [*batches(frames, 256)]
+    with Stage(tmp_path) as stage:
+        controller = stage.engine("p4runtime_ctrl", capabilities=CONTROLLER)
+        found = Heard(stage.engine("observer"), *keys)
+        engine = stage.engine("sonata_adapter", interests=INTERESTS, capabilities=CAPABILITIES)
+        # with one bit, every packet is copied: what is sent and what is to be found are one input
+        service = SonataAdapterService(
+            engine, Settings(engine="spark", limits=SwitchLimits(bits=1, stages=0))
+        )
+        service.start()
+        state = {"base_us": TRAFFIC_US, "primary": True}
+        controller.write("network.switch.p4runtime_ctrl.s1", state, [NO_WAIT])
+        wait_for(lambda: service.health()["bits"] and service.health()["switches"], why=service.health)
+        for batch in packets:
+            wait_for(partial(controller.write, "network.packets.p4runtime_ctrl.s1.q0", batch))
+        controller.flush()
+        wait_for(partial(arrived, service, len(frames)), why=service.health)
+        service.stop()
+        truth = host_results(keys, packets)
+        wait_for(lambda: len(found.items) >= len(truth))
+        assert truth
+        assert sorted(map(text_of_item, found.items)) == truth
+
+
+def arrived(service, count):
+    """All packets have come; between them the adapter goes on as when it runs alone."""
+    service.tick()
+    return service.health()["host_packets"] >= count
+
+
+def host_results(keys, packets):
+    engine = HostEngine(base_us=TRAFFIC_US)
+    for key in keys:
+        engine.add(request_of(key, CATALOGUE).query)
+    outputs = [found for batch in packets for found in engine.process(batch)] + engine.finish()
+    return sorted(text_of_value(found.query, found.to_value()) for found in outputs)
+
+
+def text_of_item(item):
+    return text_of_value(item.key, item.value)
+
+
+def text_of_value(key, value):
+    return f"{key} {sorted(value.items())}"
