@@ -5,7 +5,11 @@ DataplaneError
 │   └── Unsupported      it is well-formed, but uses something outside the documented subset
 ├── CompilerError        the generated C could not be built (compiler/)
 ├── InvalidIndex         an index outside a counter, meter or register array (externs.py)
-└── TableError           see tables.py
+└── TableError           a table operation that was refused
+    ├── AlreadyExists    insert of a key that is there
+    ├── NotFound         modify, delete or read of a key that is not
+    ├── TableFull        the program's `size` is reached
+    └── InvalidEntry     wrong kind, width, action, parameter, priority or a constant table
 """
 
 
@@ -27,3 +31,23 @@ class CompilerError(DataplaneError):
 
 class InvalidIndex(DataplaneError):
     """An array index that the program did not declare."""
+
+
+class TableError(DataplaneError):
+    """A table operation that was refused."""
+
+
+class AlreadyExists(TableError):
+    """An entry with this match (and priority) is in the table."""
+
+
+class NotFound(TableError):
+    """No entry with this match (and priority)."""
+
+
+class TableFull(TableError):
+    """The table holds as many entries as the program gave it room for."""
+
+
+class InvalidEntry(TableError):
+    """The entry does not fit the table's key or actions."""

@@ -17,8 +17,7 @@ from typing import Any, ClassVar
 
 import grpc
 
-from dataplane.errors import DataplaneError, InvalidIndex
-from dataplane.tables import AlreadyExists, NotFound, TableFull
+from dataplane.errors import AlreadyExists, DataplaneError, InvalidIndex, NotFound, TableFull
 from p4rt import p4runtime, status
 
 OK = 0

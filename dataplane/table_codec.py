@@ -4,14 +4,17 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from dataplane import bytestrings
+from dataplane.keys import Exact, Lpm, Match, MatchValue, Optional, Range, TableKey, Ternary
 from dataplane.schema import BoundAction, BoundTable
 from dataplane.status import Denied, InvalidArgument, Refused
-from dataplane.tables import Exact, Lpm, Match, MatchValue, Optional, Range, TableEntry, Ternary
+from dataplane.tables import TableEntry
 from dataplane.tree import KeySpec, MatchKind
 
 Reader = Callable[[Any], MatchValue]
 Writer = Callable[[Any, Any], None]
 """ (match value, the message's repeated field `match`): adds the field unless it matches anything. """
+PackedReader = Callable[[Any], int | None]
+""" The repeated field `match` as a packed key (keys.py); None where TableCodec.match must look at it. """
 _COOKIE_BYTES = 8
 
 
@@ -31,8 +34,6 @@ class TableCodec:
         }
         self._wildcards: list[MatchValue | None] = [_wildcard(key) for _, _, key in keys]
         self._required = sum(1 << n for n, value in enumerate(self._wildcards) if value is None)
-        self._exact = [(field_id, key.width) for field_id, kind, key in keys if kind is MatchKind.EXACT]
-        self._all_exact = len(self._exact) == len(keys)
         self._writers = [_WRITERS[kind](key, field_id) for field_id, kind, key in keys]
 
     # -- from the controller ------------------------------------------------------------------------
@@ -43,22 +44,6 @@ class TableCodec:
         Raises InvalidArgument: unknown or repeated field, an exact field left out, a kind that is not
         the table's, or a value that is not canonical (bits outside its mask, a wildcard written out).
         """
-        return (self._match_exact(fields) if self._all_exact else None) or self._match(fields)
-
-    def _match_exact(self, fields: Iterable[Any]) -> Match | None:
-        """The short way for exact keys in their order, as bulk writers send them; None = take the long way."""
-        values = []
-        expected = iter(self._exact)
-        for field in fields:
-            field_id, width = next(expected, (0, 0))
-            data = field.exact.value
-            value = int.from_bytes(data, "big")
-            if not data or value >> width or field.field_id != field_id:
-                return None
-            values.append(Exact(value))
-        return tuple(values) if len(values) == len(self._exact) else None
-
-    def _match(self, fields: Iterable[Any]) -> Match:
         values = self._wildcards.copy()
         seen = 0
         for field in fields:
@@ -122,26 +107,23 @@ class TableCodec:
 
     def entry(self, message: Any) -> TableEntry:
         """A whole TableEntry message.  Raises InvalidArgument, Denied."""
+        name, params, idle_timeout_ns, metadata = self.content(message)
+        match, priority = self.match(message.match), self.priority(message)
+        return TableEntry(match, name, params, priority, idle_timeout_ns, metadata)
+
+    def content(self, message: Any) -> tuple[str, tuple[int, ...], int, bytes]:
+        """Action, parameters, idle time-out and metadata of an entry.  Raises InvalidArgument, Denied."""
         idle_timeout_ns = message.idle_timeout_ns
         if idle_timeout_ns:
-            self._check_idle_timeout(message)
+            self._check_idle_timeout(idle_timeout_ns)
         name, params = self.action(message.action)
-        return TableEntry(
-            self.match(message.match),
-            name,
-            params,
-            self.priority(message),
-            idle_timeout_ns,
-            pack_metadata(message.controller_metadata, message.metadata),
-        )
+        return name, params, idle_timeout_ns, pack_metadata(message.controller_metadata, message.metadata)
 
-    def _check_idle_timeout(self, message: Any) -> None:
+    def _check_idle_timeout(self, idle_timeout_ns: int) -> None:
         if not self.table.spec.has_idle_timeout:
             raise InvalidArgument(f"table {self.name} has no idle time-out")
-        if message.idle_timeout_ns < 0:
-            raise InvalidArgument(
-                f"table {self.name}: idle time-out {message.idle_timeout_ns} ns is negative"
-            )
+        if idle_timeout_ns < 0:
+            raise InvalidArgument(f"table {self.name}: idle time-out {idle_timeout_ns} ns is negative")
 
     # -- to the controller --------------------------------------------------------------------------
 
@@ -169,6 +151,36 @@ class TableCodec:
     def action_id(self, name: str) -> int:
         """The id of one of the table's actions."""
         return self._by_action_name[name].id
+
+
+def packed_reader(bound: BoundTable, key: TableKey) -> PackedReader:
+    """The short way for keys whose fields are all exact and come in their order, as bulk writers send them."""
+    if not key.all_exact:
+        return _never
+    places = tuple(
+        (field_id, spec.width, shift)
+        for field_id, (spec, shift) in zip(bound.field_ids, key.fields, strict=True)
+    )
+    count = len(places)
+    number = int.from_bytes
+
+    def read(fields: Any) -> int | None:
+        if len(fields) != count:
+            return None
+        packed = 0
+        for field, (field_id, width, shift) in zip(fields, places, strict=True):
+            data = field.exact.value
+            value = number(data, "big")
+            if not data or value >> width or field.field_id != field_id:
+                return None
+            packed |= value << shift
+        return packed
+
+    return read
+
+
+def _never(_: Any) -> None:
+    return None
 
 
 def pack_metadata(controller_metadata: int, metadata: bytes) -> bytes:

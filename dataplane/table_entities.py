@@ -11,7 +11,7 @@ from dataplane.meters import meter_config, write_meter_config
 from dataplane.schema import Schema
 from dataplane.status import Denied, InvalidArgument, Missing, Unimplemented
 from dataplane.switch import Switch
-from dataplane.table_codec import TableCodec, unpack_metadata
+from dataplane.table_codec import PackedReader, TableCodec, packed_reader, unpack_metadata
 from dataplane.tables import Match, Table, TableEntry
 from p4rt import p4runtime
 
@@ -33,6 +33,10 @@ class TableEntities:
         self.has_idle_timeouts = False
         self._parts: dict[int, tuple[TableCodec, Table]] = {
             table.id: (TableCodec(table), switch.tables[table.spec.name]) for table in schema.tables.values()
+        }
+        self._packed: dict[int, PackedReader] = {
+            table_id: packed_reader(codec.table, table.key)
+            for table_id, (codec, table) in self._parts.items()
         }
         self._id_of = {codec.name: table_id for table_id, (codec, _) in self._parts.items()}
 
@@ -65,12 +69,14 @@ class TableEntities:
             return self._insert(message, codec, table, has_direct=has_direct)
         if kind == MODIFY:
             return self._modify(message, codec, table)
-        match, priority = codec.match(message.match), codec.priority(message)
-        old = _snapshot(table, match, priority)
-        table.delete(match, priority)
-        return lambda: _restore(table, old)
+        packed = self._packed[codec.table.id](message.match)
+        match = codec.match(message.match) if packed is None else packed
+        return table.take(match, codec.priority(message))
 
     def _insert(self, message: Any, codec: TableCodec, table: Table, *, has_direct: bool) -> Undo:
+        packed = None if has_direct else self._packed[codec.table.id](message.match)
+        if packed is not None:
+            return self._insert_packed(packed, message, codec, table)
         entry = codec.entry(message)
         if entry.idle_timeout_ns:
             self._begin_to_age()
@@ -82,6 +88,15 @@ class TableEntities:
         else:
             table.insert(entry)
         return lambda: table.delete(entry.match, entry.priority)
+
+    def _insert_packed(self, key: int, message: Any, codec: TableCodec, table: Table) -> Undo:
+        """The same for the common case, without an object for the match and its fields."""
+        name, params, idle_timeout_ns, metadata = codec.content(message)
+        codec.priority(message)
+        if idle_timeout_ns:
+            self._begin_to_age()
+        table.insert_packed(key, name, params, idle_timeout_ns, metadata)
+        return lambda: table.delete(key)
 
     def _modify(self, message: Any, codec: TableCodec, table: Table) -> Undo:
         match, priority = codec.match(message.match), codec.priority(message)
@@ -273,13 +288,6 @@ def _snapshot(table: Table, match: Match, priority: int) -> _Snapshot | None:
     counter = table.counter(match, priority) if table.spec.has_counter else None
     meter = table.meter(match, priority) if table.spec.has_meter else None
     return entry, counter, meter
-
-
-def _restore(table: Table, old: _Snapshot | None) -> None:
-    if old is None:
-        return
-    table.insert(old[0])
-    _restore_direct(table, old)
 
 
 def _restore_direct(table: Table, old: _Snapshot) -> None:

@@ -1,77 +1,37 @@
-"""Match-action tables: entries, their validation and their per-entry state.
-
-DataplaneError (errors.py)
-└── TableError
-    ├── AlreadyExists    insert of a key that is there
-    ├── NotFound         modify, delete or read of a key that is not
-    ├── TableFull        the program's `size` is reached
-    └── InvalidEntry     wrong kind, width, action, parameter, priority or a constant table
-"""
+"""Match-action tables: entries, their validation and their per-entry state."""
 
 from collections.abc import Callable, Mapping, Sequence
 from heapq import heappop, heappush
 from threading import RLock
 from typing import NamedTuple
 
-from dataplane.compiler.machine import RangePart, Row, TableStore
-from dataplane.errors import DataplaneError
+from dataplane.compiler.machine import TableStore
+from dataplane.errors import AlreadyExists, InvalidEntry, NotFound, TableError, TableFull
 from dataplane.externs import CounterValue, MeterConfig
-from dataplane.tree import ConstEntry, KeySpec, MatchKind, TableSpec
+from dataplane.keys import Exact, Lpm, Match, MatchValue, Optional, Range, TableKey, Ternary
+from dataplane.tree import ConstEntry, MatchKind, TableSpec
 
+__all__ = [
+    "AlreadyExists",
+    "Exact",
+    "InvalidEntry",
+    "Lpm",
+    "Match",
+    "MatchValue",
+    "NotFound",
+    "Optional",
+    "Range",
+    "Table",
+    "TableEntry",
+    "TableError",
+    "TableFull",
+    "Ternary",
+]
 
-class TableError(DataplaneError):
-    """A table operation that was refused."""
-
-
-class AlreadyExists(TableError):
-    """An entry with this match (and priority) is in the table."""
-
-
-class NotFound(TableError):
-    """No entry with this match (and priority)."""
-
-
-class TableFull(TableError):
-    """The table holds as many entries as the program gave it room for."""
-
-
-class InvalidEntry(TableError):
-    """The entry does not fit the table's key or actions."""
-
-
-class Exact(NamedTuple):
-    value: int
-
-
-class Ternary(NamedTuple):
-    """`value` under `mask`; mask 0 = any."""
-
-    value: int
-    mask: int
-
-
-class Lpm(NamedTuple):
-    """The first `prefix_len` bits of `value`; 0 = any."""
-
-    value: int
-    prefix_len: int
-
-
-class Range(NamedTuple):
-    """low <= field <= high."""
-
-    low: int
-    high: int
-
-
-class Optional(NamedTuple):
-    """Exactly `value`, or anything when None."""
-
-    value: int | None
-
-
-MatchValue = Exact | Ternary | Lpm | Range | Optional
-Match = tuple[MatchValue, ...]
+_Key = int | tuple[Match, int]
+""" Packed (keys.py), or match and priority. """
+_Kept = tuple[str, tuple[int, ...], int, bytes]
+""" An entry without its key: action, parameters, idle time-out, metadata; no object that holds others. """
 
 
 class TableEntry(NamedTuple):
@@ -108,16 +68,17 @@ class Table:
         self._lock = lock
         self._clock = clock
         self._actions = {a.name: (actions[a.name], a) for a in spec.actions}
-        self._keys = tuple(zip(spec.keys, store.place.shifts, strict=True))
-        self._full_mask = sum(((1 << k.width) - 1) << shift for k, shift in self._keys)
-        self._needs_priority = spec.needs_priority
-        self._only_lpm = not spec.needs_priority and any(k.kind is MatchKind.LPM for k in spec.keys)
-        self._exact_widths = [k.width for k in spec.keys] if _all_exact(spec) else None
-        self._slots: dict[tuple[Match, int], int] = {}
-        self._entries: dict[int, TableEntry] = {}
-        self._meters: dict[tuple[Match, int], MeterConfig] = {}
+        self.key = TableKey(spec, store.place.shifts)
+        self._packs = self.key.all_exact
+        self._writable = bool(spec.keys) and not spec.is_const
+        self._slots: dict[_Key, int] = {}
+        self._kept: dict[int, _Kept] = {}
+        self._meters: dict[_Key, MeterConfig] = {}
         self._free: list[int] = []
-        self._timed: dict[tuple[Match, int], int] = {}
+        # the lowest slot first, as in BMv2: it wins among equals, which exact keys never are
+        self._take_free: Callable[[list[int]], int] = list.pop if self._packs else heappop
+        self._give_free: Callable[[list[int], int], None] = list.append if self._packs else heappush
+        self._timed: dict[_Key, int] = {}
         self._default: tuple[str, tuple[int, ...]] | None = None
         self.reset_default()
         for entry in spec.const_entries:
@@ -130,22 +91,41 @@ class Table:
             self._add(entry)
 
     def _add(self, entry: TableEntry) -> None:
-        value, mask, ranges, rank = self._compiled(entry.match, entry.priority)
-        number, params = self._checked_action(entry.action, entry.params)
-        row = Row(value, mask, ranges, rank, number, params)
-        if entry.idle_timeout_ns:
-            self._check_timeout(entry)
-        key = (entry.match, entry.priority)
-        if key in self._slots:
+        kept = (entry.action, tuple(entry.params), entry.idle_timeout_ns, entry.metadata)
+        if self._packs:
+            self._put(self.key.packed(entry.match, entry.priority), kept)
+        else:
+            self._put((entry.match, entry.priority), kept)
+
+    def insert_packed(
+        self, key: int, action: str, params: tuple[int, ...], idle_timeout_ns: int, metadata: bytes
+    ) -> None:
+        """`insert` for bulk writers, where all fields of the key are exact; `key` is packed (keys.py).
+
+        Raises AlreadyExists, TableFull, InvalidEntry.
+        """
+        with self._lock:
+            self._check_writable()
+            self._put(key, (action, params, idle_timeout_ns, metadata))
+
+    def _put(self, key: _Key, kept: _Kept) -> None:
+        action, params, timeout, _ = kept
+        rule = (key, self.key.mask, (), 0) if isinstance(key, int) else self.key.rule(*key)
+        number = self._checked_action(action, params)
+        if timeout:
+            self._check_timeout(timeout)
+        slots = self._slots
+        if key in slots:
             raise AlreadyExists(f"table {self.name} already has an entry for {self._shown(key)}")
-        if len(self._slots) >= self.spec.size:
+        if len(slots) >= self.spec.size:
             raise TableFull(f"table {self.name} is full: its size in the program is {self.spec.size}")
-        slot = heappop(self._free) if self._free else len(self._slots)
-        self._store.insert(slot, row, self._clock())
-        self._slots[key] = slot
-        self._entries[slot] = entry
-        if entry.idle_timeout_ns:
-            self._timed[key] = self._clock()
+        slot = self._take_free(self._free) if self._free else len(slots)
+        now = self._clock()
+        self._store.insert(slot, rule, number, params, now)
+        slots[key] = slot
+        self._kept[slot] = kept
+        if timeout:
+            self._timed[key] = now
 
     def modify(self, entry: TableEntry) -> None:
         """Replace action, parameters, time-out and metadata; counters and meters are kept.
@@ -154,40 +134,71 @@ class Table:
         """
         with self._lock:
             self._check_writable()
-            number, params = self._checked_action(entry.action, entry.params)
+            kept = (entry.action, tuple(entry.params), entry.idle_timeout_ns, entry.metadata)
+            number = self._checked_action(entry.action, entry.params)
             if entry.idle_timeout_ns:
-                self._check_timeout(entry)
-            key = (entry.match, entry.priority)
-            slot = self._slot(*key)
-            self._store.replace(slot, number, params)
-            self._entries[slot] = entry
+                self._check_timeout(entry.idle_timeout_ns)
+            key, slot = self._find(entry.match, entry.priority)
+            self._store.replace(slot, number, entry.params)
+            self._kept[slot] = kept
             self._timed.pop(key, None)
             if entry.idle_timeout_ns:
                 self._store.touch(slot, self._clock())
                 self._timed[key] = self._clock()
 
-    def delete(self, match: Match, priority: int = 0) -> None:
-        """Remove an entry.  Raises NotFound, InvalidEntry."""
+    def delete(self, match: Match | int, priority: int = 0) -> None:
+        """Remove an entry, named by its match or its packed key.  Raises NotFound, InvalidEntry."""
         with self._lock:
             self._check_writable()
-            slot = self._slot(match, priority)
-            self._store.remove(slot)
-            key = (match, priority)
-            heappush(self._free, slot)
-            del self._slots[key], self._entries[slot]
-            self._timed.pop(key, None)
-            self._meters.pop(key, None)
+            self._remove(*self._find(match, priority))
+
+    def _remove(self, key: _Key, slot: int) -> None:
+        self._store.remove(slot)
+        self._give_free(self._free, slot)
+        del self._slots[key], self._kept[slot]
+        self._timed.pop(key, None)
+        self._meters.pop(key, None)
+
+    def take(self, match: Match | int, priority: int = 0) -> Callable[[], None]:
+        """`delete`; what it returns puts the entry back with its counter and meter."""
+        with self._lock:
+            self._check_writable()
+            key, slot = self._find(match, priority)
+            kept, meter = self._kept[slot], self._meters.get(key)
+            counter = self._store.counter(slot) if self.spec.has_counter else None
+            self._remove(key, slot)
+        return lambda: self._put_back(key, kept, counter, meter)
+
+    def _put_back(
+        self, key: _Key, kept: _Kept, counter: tuple[int, int] | None, meter: MeterConfig | None
+    ) -> None:
+        with self._lock:
+            self._put(key, kept)
+            slot = self._slots[key]
+            if counter is not None:
+                self._store.set_counter(slot, *counter)
+            if meter is not None:
+                self._store.set_meter(slot, meter.rates)
+                self._meters[key] = meter
 
     def get(self, match: Match, priority: int = 0) -> TableEntry | None:
         """The entry with this key, or None."""
         with self._lock:
-            slot = self._slots.get((match, priority))
-            return None if slot is None else self._entries[slot]
+            try:
+                key, slot = self._find(match, priority)
+            except TableError:
+                return None
+            return self._entry(key, slot)
 
     def entries(self) -> list[TableEntry]:
         """All entries in the order of insertion (const entries of the program too)."""
         with self._lock:
-            return [self._entries[slot] for slot in self._slots.values()]
+            return [self._entry(key, slot) for key, slot in self._slots.items()]
+
+    def _entry(self, key: _Key, slot: int) -> TableEntry:
+        action, params, timeout, metadata = self._kept[slot]
+        match, priority = self._named(key)
+        return TableEntry(match, action, params, priority, timeout, metadata)
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -196,7 +207,7 @@ class Table:
         """Remove all entries but the program's constant ones."""
         with self._lock:
             if not self.spec.is_const:
-                for match, priority in list(self._slots):
+                for match, priority in map(self._named, list(self._slots)):
                     self.delete(match, priority)
 
     # -- default action -------------------------------------------------------------------------------
@@ -211,9 +222,8 @@ class Table:
         with self._lock:
             if self.spec.default_is_const:
                 raise InvalidEntry(f"the default action of table {self.name} is constant")
-            number, checked = self._checked_action(action, params)
-            self._store.set_default(number, checked)
-            self._default = (action, tuple(checked))
+            self._store.set_default(self._checked_action(action, params), tuple(params))
+            self._default = (action, tuple(params))
 
     def reset_default(self) -> None:
         """Back to the default action of the program."""
@@ -222,7 +232,8 @@ class Table:
             if self._default is None:
                 self._store.set_default(-1, ())
             else:
-                self._store.set_default(*self._checked_action(*self._default))
+                action, params = self._default
+                self._store.set_default(self._checked_action(action, params), params)
 
     # -- per-entry state ------------------------------------------------------------------------------
 
@@ -242,8 +253,7 @@ class Table:
     def meter(self, match: Match, priority: int = 0) -> MeterConfig | None:
         """Direct meter configuration of an entry, None = unconfigured (always green).  Raises NotFound."""
         with self._lock:
-            self._slot(match, priority)
-            return self._meters.get((match, priority))
+            return self._meters.get(self._find(match, priority)[0])
 
     def set_meter(self, match: Match, priority: int, config: MeterConfig | None) -> None:
         """Configure (or with None, clear) the direct meter of an entry.  Raises NotFound, InvalidEntry."""
@@ -252,11 +262,11 @@ class Table:
                 raise InvalidEntry(f"table {self.name} has no direct meter")
             if config is not None:
                 config.check()
-            slot = self._slot(match, priority)
+            key, slot = self._find(match, priority)
             self._store.set_meter(slot, None if config is None else config.rates)
-            self._meters.pop((match, priority), None)
+            self._meters.pop(key, None)
             if config is not None:
-                self._meters[match, priority] = config
+                self._meters[key] = config
 
     def idle_ns(self, match: Match, priority: int, now_us: int) -> int:
         """Time since the last hit (or insertion), ns.  Raises NotFound."""
@@ -269,136 +279,68 @@ class Table:
             result = []
             for key, reported in self._timed.items():
                 slot = self._slots[key]
-                entry = self._entries[slot]
                 since = max(reported, self._store.hit_us(slot))
-                if (now_us - since) * 1000 >= entry.idle_timeout_ns:
+                if (now_us - since) * 1000 >= self._kept[slot][2]:
                     self._timed[key] = now_us
-                    result.append(entry)
+                    result.append(self._entry(key, slot))
             return result
 
     # -- checks ---------------------------------------------------------------------------------------
 
     def _check_writable(self) -> None:
+        if self._writable:
+            return
         if self.spec.is_const:
             raise InvalidEntry(f"table {self.name} has constant entries")
         if not self.spec.keys:
             raise InvalidEntry(f"table {self.name} has no key: only its default action can be set")
 
-    def _check_timeout(self, entry: TableEntry) -> None:
+    def _check_timeout(self, idle_timeout_ns: int) -> None:
         if not self.spec.has_idle_timeout:
             raise InvalidEntry(f"table {self.name} has no idle time-outs (support_timeout in the program)")
-        if entry.idle_timeout_ns < 0:
-            raise InvalidEntry(f"table {self.name}: idle time-out of {entry.idle_timeout_ns} ns")
+        if idle_timeout_ns < 0:
+            raise InvalidEntry(f"table {self.name}: idle time-out of {idle_timeout_ns} ns")
+
+    def _find(self, match: Match | int, priority: int) -> tuple[_Key, int]:
+        """Key and slot of an entry.  Raises NotFound, InvalidEntry."""
+        key: _Key
+        if isinstance(match, int):
+            key = match
+        elif self._packs:
+            key = self.key.packed(match, priority)
+        else:
+            key = (match, priority)
+        slot = self._slots.get(key)
+        if slot is None:
+            if not isinstance(key, int):
+                self.key.rule(*key)
+            raise NotFound(f"table {self.name} has no entry for {self._shown(key)}")
+        return key, slot
 
     def _slot(self, match: Match, priority: int) -> int:
-        slot = self._slots.get((match, priority))
-        if slot is None:
-            self._compiled(match, priority)
-            raise NotFound(f"table {self.name} has no entry for {self._shown((match, priority))}")
-        return slot
+        return self._find(match, priority)[1]
 
-    def _shown(self, key: tuple[Match, int]) -> str:
-        fields = ", ".join(f"{spec.name}={m}" for (spec, _), m in zip(self._keys, key[0], strict=False))
-        return f"({fields})" + (f" at priority {key[1]}" if key[1] else "")
+    def _named(self, key: _Key) -> tuple[Match, int]:
+        """Match and priority of a key."""
+        return (self.key.unpacked(key), 0) if isinstance(key, int) else key
 
-    def _checked_action(self, name: str, params: Sequence[int]) -> tuple[int, tuple[int, ...]]:
+    def _shown(self, key: _Key) -> str:
+        return self.key.shown(*self._named(key))
+
+    def _checked_action(self, name: str, params: Sequence[int]) -> int:
+        """The action's number.  Raises InvalidEntry."""
         found = self._actions.get(name)
         if found is None:
             raise InvalidEntry(f"table {self.name} has no action {name}; it has {', '.join(self._actions)}")
         number, spec = found
         if not params and not spec.params:
-            return number, ()
+            return number
         if len(params) != len(spec.params):
             raise InvalidEntry(f"action {name} takes {len(spec.params)} parameters, got {len(params)}")
         for param, value in zip(spec.params, params, strict=True):
             if not 0 <= value < 1 << param.width:
                 raise InvalidEntry(f"action {name}: {param.name}={value} does not fit {param.width} bits")
-        return number, tuple(params)
-
-    def _compiled(self, match: Match, priority: int) -> tuple[int, int, tuple[RangePart, ...], int]:
-        """Value, mask, ranges and rank for the store.  Raises InvalidEntry."""
-        if len(match) != len(self._keys):
-            raise InvalidEntry(f"table {self.name} has {len(self._keys)} key fields, got {len(match)}")
-        self._check_priority(priority)
-        if self._exact_widths is not None:
-            return self._compiled_exact(match, self._exact_widths), self._full_mask, (), 0
-        value = mask = 0
-        rank = priority
-        ranges: list[RangePart] = []
-        for (spec, shift), m in zip(self._keys, match, strict=True):
-            if isinstance(m, Range):
-                ranges.extend(self._range(spec, shift, m))
-                continue
-            v, k = self._value_and_mask(spec, m)
-            value |= v << shift
-            mask |= k << shift
-            if self._only_lpm and isinstance(m, Lpm):
-                rank = m.prefix_len
-        return value, mask, tuple(ranges), rank
-
-    def _compiled_exact(self, match: Match, widths: Sequence[int]) -> int:
-        compiled = 0
-        for (spec, shift), width, m in zip(self._keys, widths, match, strict=True):
-            value: int = m[0] if m.__class__ is Exact else self._value_and_mask(spec, m)[0]
-            if value >> width:
-                self._value_and_mask(spec, m)
-            compiled |= value << shift
-        return compiled
-
-    def _check_priority(self, priority: int) -> None:
-        if self._needs_priority and priority < 1:
-            raise InvalidEntry(f"table {self.name} needs a priority of at least 1, got {priority}")
-        if not self._needs_priority and priority:
-            raise InvalidEntry(f"table {self.name} takes no priority, got {priority}")
-        if priority >= 1 << 31:
-            raise InvalidEntry(f"table {self.name}: priority {priority} does not fit 31 bits")
-
-    def _range(self, spec: KeySpec, shift: int, m: Range) -> list[RangePart]:
-        full = (1 << spec.width) - 1
-        if spec.kind is not MatchKind.RANGE:
-            raise self._wrong_kind(spec, m)
-        if not 0 <= m.low <= m.high <= full:
-            raise InvalidEntry(
-                f"table {self.name}: {spec.name} range {m.low}..{m.high} is not within 0..{full}"
-            )
-        return [] if (m.low, m.high) == (0, full) else [RangePart(shift, spec.width, m.low, m.high)]
-
-    def _wrong_kind(self, spec: KeySpec, m: MatchValue) -> InvalidEntry:
-        return InvalidEntry(f"table {self.name}: {spec.name} is matched {spec.kind}, got {m}")
-
-    def _value_and_mask(self, spec: KeySpec, m: MatchValue) -> tuple[int, int]:
-        full = (1 << spec.width) - 1
-        if not isinstance(m, _KINDS[spec.kind]):
-            raise self._wrong_kind(spec, m)
-        value, mask = 0, full
-        if isinstance(m, Exact):
-            value = m.value
-        elif isinstance(m, Optional):
-            value, mask = (0, 0) if m.value is None else (m.value, full)
-        elif isinstance(m, Ternary):
-            value, mask = m.value, m.mask
-        elif isinstance(m, Lpm):
-            if not 0 <= m.prefix_len <= spec.width:
-                raise InvalidEntry(f"table {self.name}: {spec.name} prefix length {m.prefix_len}")
-            value, mask = m.value, full ^ (full >> m.prefix_len)
-        if not (0 <= value <= full and 0 <= mask <= full):
-            raise InvalidEntry(f"table {self.name}: {spec.name}={m} does not fit {spec.width} bits")
-        if value & ~mask:
-            raise InvalidEntry(f"table {self.name}: {spec.name}={m} has bits set outside its mask")
-        return value, mask
-
-
-def _all_exact(spec: TableSpec) -> bool:
-    return all(key.kind is MatchKind.EXACT for key in spec.keys)
-
-
-_KINDS: dict[MatchKind, type[MatchValue]] = {
-    MatchKind.EXACT: Exact,
-    MatchKind.LPM: Lpm,
-    MatchKind.TERNARY: Ternary,
-    MatchKind.RANGE: Range,
-    MatchKind.OPTIONAL: Optional,
-}
+        return number
 
 
 def _from_program(entry: ConstEntry, spec: TableSpec) -> TableEntry:

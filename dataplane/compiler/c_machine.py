@@ -11,7 +11,7 @@ from dataplane.compiler import machine as m
 from dataplane.compiler.c_build import compiled_library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
-from dataplane.compiler.machine import Batch, Digest, KeyPlace, Replicas, Row
+from dataplane.compiler.machine import Batch, Digest, KeyPlace, Replicas, Rule
 from dataplane.errors import DataplaneError
 from dataplane.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
@@ -83,6 +83,7 @@ class CTable:
         self._stride = stride
         self._no_params = bytes(8 * stride)
         self._sizes: dict[int, tuple[int, ...]] = {-1: ()}
+        self._state = self._ffi.new("uint64_t[3]")
 
     def know_action(self, number: int, counts: tuple[int, ...]) -> None:
         """Words of each parameter of an action."""
@@ -95,24 +96,26 @@ class CTable:
         data = b"".join([v.to_bytes(size, "little") for v, size in zip(params, sizes, strict=True)])
         return data.ljust(8 * self._stride, b"\0")
 
-    def insert(self, slot: int, row: Row, now_us: int) -> None:
+    def insert(self, slot: int, rule: Rule, action: int, params: Sequence[int], now_us: int) -> None:
+        value, mask, ranges, rank = rule
         parts = self._ffi.NULL
-        if row.ranges:
+        if ranges:
             flat = chain.from_iterable(
-                (r.shift // 64, r.shift % 64, (1 << r.width) - 1, r.low, r.high) for r in row.ranges
+                (r.shift // 64, r.shift % 64, (1 << r.width) - 1, r.low, r.high) for r in ranges
             )
             parts = self._ffi.new("uint64_t[]", list(flat))
+        size = 8 * self._words
         self._lib.dp_insert(
             self._native.handle,
             self._number,
             slot,
-            row.value.to_bytes(8 * self._words, "little"),
-            row.mask.to_bytes(8 * self._words, "little"),
-            len(row.ranges),
+            value.to_bytes(size, "little"),
+            mask.to_bytes(size, "little"),
+            len(ranges),
             parts,
-            row.rank,
-            row.action,
-            self._params(row.action, row.params),
+            rank,
+            action,
+            self._params(action, params),
             now_us,
         )
 
@@ -126,7 +129,7 @@ class CTable:
         self._lib.dp_default(self._native.handle, self._number, action, self._params(action, params))
 
     def _entry(self, slot: int) -> tuple[int, int, int]:
-        state = self._ffi.new("uint64_t[3]")
+        state = self._state
         self._lib.dp_entry(self._native.handle, self._number, slot, state)
         return state[0], state[1], state[2]
 

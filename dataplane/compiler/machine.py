@@ -53,15 +53,11 @@ class RangePart:
     high: int
 
 
-class Row(NamedTuple):
-    """An entry as the back ends look it up: largest rank wins, then the lowest slot."""
+Rule = tuple[int, int, tuple[RangePart, ...], int]
+"""What an entry matches, as the back ends look it up: value, mask, ranges, rank.
 
-    value: int
-    mask: int
-    ranges: tuple[RangePart, ...]
-    rank: int
-    action: int
-    params: tuple[int, ...]
+The largest rank wins, then the lowest slot.
+"""
 
 
 class TableStore(Protocol):
@@ -69,7 +65,7 @@ class TableStore(Protocol):
 
     place: KeyPlace
 
-    def insert(self, slot: int, row: Row, now_us: int) -> None: ...
+    def insert(self, slot: int, rule: Rule, action: int, params: Sequence[int], now_us: int) -> None: ...
 
     def replace(self, slot: int, action: int, params: Sequence[int]) -> None: ...
 

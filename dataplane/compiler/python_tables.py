@@ -8,7 +8,7 @@ from bisect import insort
 from collections.abc import Sequence
 from operator import attrgetter
 
-from dataplane.compiler.machine import KeyPlace, RangePart, Row
+from dataplane.compiler.machine import KeyPlace, RangePart, Rule
 from dataplane.externs import Meter
 from dataplane.tree import ArraySpec, TableSpec
 
@@ -81,13 +81,13 @@ class PythonTable:
                     break
         return found
 
-    def insert(self, slot: int, row: Row, now_us: int) -> None:
-        entry = Entry(row.action, row.params)
+    def insert(self, slot: int, rule: Rule, action: int, params: Sequence[int], now_us: int) -> None:
+        value, mask, ranges, rank = rule
+        entry = Entry(action, tuple(params))
         entry.meter = Meter(per_byte=self._per_byte)
         entry.hit = now_us
-        mask = row.mask
-        entry.value, entry.mask, entry.ranges = row.value & mask, mask, row.ranges
-        entry.order = (-row.rank, slot)
+        entry.value, entry.mask, entry.ranges = value & mask, mask, ranges
+        entry.order = (-rank, slot)
         self._slots[slot] = entry
         group = self._groups.get(mask)
         if group is None:

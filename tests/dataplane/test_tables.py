@@ -1,5 +1,8 @@
 """Entries: what is refused and why, what wins, and what each entry keeps; on both back ends."""
 
+from dataclasses import replace
+from random import Random
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -210,6 +213,62 @@ def test_many_entries_stay_findable_through_growth_and_removal(backend):
         ports = [p for p, _ in switch.process(1, data, 0).outputs]
         assert ports == ([n] if n % 2 else [])
     switch.close()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_hundreds_of_masks_find_what_a_list_finds(backend):
+    """More groups than a word of the sieve has bits, while entries come and go."""
+    program = features()
+    wide = replace(program.tables["I.flows"], size=512)
+    switch = Switch(replace(program, tables={**program.tables, "I.flows": wide}), backend=backend)
+    switch.tables["I.ports"].set_default("I.forward", (2,))
+    table, naive, random = switch.tables["I.flows"], Naive(), Random(4)
+    known: list[TableEntry] = []
+    for n in range(700):
+        if known and random.random() < (0.1 if n < 400 else 0.8):
+            gone = known.pop(random.randrange(len(known)))
+            table.delete(gone.match, gone.priority)
+            naive.delete(gone.match, gone.priority)
+            continue
+        mask = random.getrandbits(32) & random.choice([0x0F, 0xFF00, 0xFFFF0000, 0xF0F0F0F0, 2**32 - 1])
+        match = (Range(0, random.choice([50, 65535])), Ternary(random.getrandbits(32) & mask, mask), Exact(1))
+        entry = TableEntry(match, "I.metered", (n % 500,), 1000 - n)
+        known.append(entry)
+        table.insert(entry)
+        naive.insert(entry)
+        value, c = random.choice(known).match[1].value | random.getrandbits(4), random.randint(0, 100)
+        found = naive.find((c, value, 1))
+        port = switch.process(1, frame(6, a=1, c=c, d=value), 0).outputs[0][0]
+        assert port == (2 if found is None else found.params[0])
+    switch.close()
+
+
+def test_a_taken_entry_comes_back_with_counter_and_meter(switch):
+    route, flows = switch.tables["I.route"], switch.tables["I.flows"]
+    routed = TableEntry((Lpm(0, 0),), "I.drop", idle_timeout_ns=5_000_000, metadata=b"who")
+    metered = TableEntry(flow(0, 1, 0, 0, 1), "I.drop", (), 1)
+    route.insert(routed)
+    flows.insert(metered)
+    route.set_counter(routed.match, 0, CounterValue(5, 500))
+    flows.set_meter(metered.match, 1, MeterConfig(1, 2, 3, 4))
+    undo = [route.take(routed.match), flows.take(metered.match, 1)]
+    assert (len(route), len(flows), switch.expired(10**9)) == (0, 0, [])
+    for put_back in undo:
+        put_back()
+    assert route.entries() == [routed]
+    assert route.counter(routed.match) == CounterValue(5, 500)
+    assert flows.meter(metered.match, 1) == MeterConfig(1, 2, 3, 4)
+    assert switch.expired(10**9) == [(route, routed)]
+
+
+def test_a_packed_key_is_the_key(switch):
+    ports = switch.tables["I.ports"]
+    ports.insert_packed(ports.key.packed(PORT.match, 0), PORT.action, PORT.params, 0, b"")
+    assert ports.get(PORT.match) == PORT
+    with pytest.raises(AlreadyExists):
+        ports.insert(PORT)
+    ports.delete(ports.key.packed(PORT.match, 0))
+    assert ports.entries() == []
 
 
 def test_optional_values():
