@@ -28,6 +28,7 @@ _TICK = 0.1
 _SLOW_TICK = 0.01
 _LATE = 0.01
 """Who wakes up later than this has to wait for a core."""
+_EASING = 0.8
 _RENEW_SECONDS = 1.0
 _SLOW_CALLBACK = 0.02
 
@@ -127,7 +128,8 @@ class Keeper:
 
     def _adapt(self, *, late: bool) -> None:
         """Where cores are short, look at the callbacks more rarely: they need them more."""
-        self._tick = min(2 * self._tick, max(_TICK, self._pause / 4)) if late else max(_TICK, self._tick / 2)
+        longest = max(_TICK, self._pause / 4)
+        self._tick = min(2 * self._tick, longest) if late else max(_TICK, _EASING * self._tick)
 
     def _turn(self) -> None:
         now = time.monotonic()

@@ -25,8 +25,21 @@ _LONGEST_WAIT = 0.05
 _PRESSED_WAIT = 0.2
 """The same where cores are so short that a visit comes late by more than handing over the interpreter takes."""
 _HANDOVER = 0.01
+_EASING = 0.8
 
 Service = Callable[[Outlet, int], float | None]
+
+
+class Pressure:
+    """How rarely to look after writers that need no help: the more rarely, the shorter cores are."""
+
+    def __init__(self) -> None:
+        self._wait = 0.0
+
+    def felt(self, late: float) -> float:
+        """Seconds to stay away after a visit that came `late`.  One visit in time does not end it, many do."""
+        self._wait = min(_PRESSED_WAIT, max(_EASING * self._wait, 8 * (late - _HANDOVER)))
+        return self._wait
 
 
 class Sender:
@@ -43,6 +56,7 @@ class Sender:
         self._new: deque[tuple[Outlet, float]] = deque()
         self._heap: list[tuple[float, int, Outlet]] = []
         self._numbers = count()
+        self._pressure = Pressure()
         self._kick = threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="due-sender", daemon=True)
@@ -96,7 +110,7 @@ class Sender:
         Where cores are so short that we come `late`, we come more rarely: the writers need them more, and
         each visit to a process that waits for a core costs several wake-ups.
         """
-        pressure = min(_PRESSED_WAIT, 8 * max(0.0, late - _HANDOVER))
+        pressure = self._pressure.felt(late)
         if outlet.filled != outlet.filled_before:
             outlet.filled_before = outlet.filled
             outlet.patience = self._linger

@@ -26,7 +26,9 @@ log = logging.getLogger("due.updates")
 _READ_REPLIES_AT = 16
 _MOST_OUTSTANDING = 1024
 _ASK_SECONDS = 0.02
-_POLL_SECONDS = 0.25
+_LEAST_PAUSE = _ASK_SECONDS / 8
+_LONGEST_PAUSE = 5 * _ASK_SECONDS
+_POLL_SECONDS = 0.4
 _CHANNELS = 65536
 _RECONNECT_SECONDS = 0.05
 
@@ -188,6 +190,7 @@ class RedisPublisher:
 
     def _send_announcement(self, ledger: StreamLedger) -> None:
         assert self._wire is not None  # noqa: S101 - callers checked
+        self._wire.make_room()
         self._wire.send(b"SADD", STREAMS, ledger.path)
         self._wire.send(b"PUBLISH", STREAMS, ledger.path)
         self._outstanding.extend((_COMMAND, _COMMAND))
@@ -212,18 +215,23 @@ class RedisPublisher:
             return True
 
     def _wait_for_readers(self, ledger: StreamLedger) -> None:
-        """Back-pressure: until half of the window is free.  Asks less and less often while nothing moves."""
-        pause, kept = _ASK_SECONDS / 8, ledger.kept_bytes
+        """Back-pressure: until half of the window is free.  Asks less and less often while nothing moves.
+
+        Where the last wait was long this one begins with half of that, for each question costs wake-ups.
+        """
+        began, kept, pause = time.monotonic(), ledger.kept_bytes, max(_LEAST_PAUSE, ledger.patience)
+        longest = max(_ASK_SECONDS, pause)
         ledger.waiting = True
         try:
             while ledger.half_full and ledger.kept and not self._closed:
                 self._await_answer(ledger)
                 if ledger.half_full:
                     time.sleep(pause)
-                pause = _ASK_SECONDS / 8 if ledger.kept_bytes < kept else min(2 * pause, _ASK_SECONDS)
+                pause = max(_LEAST_PAUSE, pause / 2) if ledger.kept_bytes < kept else min(2 * pause, longest)
                 kept = ledger.kept_bytes
         finally:
             ledger.waiting = False
+            ledger.patience = min(_LONGEST_PAUSE, (time.monotonic() - began) / 2)
 
     def _await_answer(self, ledger: StreamLedger) -> None:
         """Ask how far the readers are and wait a while for the answer, without keeping others out."""

@@ -62,6 +62,8 @@ class StreamLedger:
         self.asked_at = 0.0
         self.waiting = False
         """A writer waits for the readers."""
+        self.patience = 0.0
+        """How long it is likely to wait the next time, seconds."""
         self._asked_bytes = 0
 
     def ask_again(self, now: float, seconds: float) -> bool:

@@ -18,6 +18,8 @@ from due.errors import InvalidOption, UpdatesUnavailable
 _READ = 1 << 18
 _PARSER_KEEPS = 1 << 20
 """Spare bytes that the parser does not give back after each message, to ask for them again at the next."""
+_SEND_ROOM = 1 << 20
+"""By itself a Unix socket takes two frames; at every third a writer would have to wait for the server."""
 _JOIN_BELOW = 1 << 14
 _MOST_PARTS = 512
 """Linux gathers 1,024 at most."""
@@ -58,6 +60,14 @@ class Wire:
         self._reader.setmaxbuf(_PARSER_KEEPS)
         # kept, because the allocator would map and unmap a new one for each read
         self._buffer = bytearray(_READ)
+
+    def make_room(self) -> None:
+        """Let more wait in the socket; only where something else holds the sender back in time.
+
+        Without that a server that takes more than its readers do drops them.
+        """
+        if self._socket.family == socket.AF_UNIX:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_ROOM)
 
     def fileno(self) -> int:
         """For select."""
