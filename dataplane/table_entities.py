@@ -13,6 +13,7 @@ from dataplane.status import Denied, InvalidArgument, Missing, Unimplemented
 from dataplane.switch import Switch
 from dataplane.table_codec import PackedReader, TableCodec, packed_reader, unpack_metadata
 from dataplane.tables import Match, Table, TableEntry
+from dataplane.update_forms import UpdateForms
 from p4rt import p4runtime
 
 INSERT, MODIFY, DELETE = p4runtime.Update.INSERT, p4runtime.Update.MODIFY, p4runtime.Update.DELETE
@@ -39,6 +40,7 @@ class TableEntities:
             for table_id, (codec, table) in self._parts.items()
         }
         self._id_of = {codec.name: table_id for table_id, (codec, _) in self._parts.items()}
+        self._forms = UpdateForms()
 
     def codec_of(self, table: Table) -> TableCodec:
         """The codec of a table of the switch."""
@@ -51,6 +53,33 @@ class TableEntities:
         return found
 
     # -- TableEntry -----------------------------------------------------------------------------------
+
+    def write_update(self, update: Any) -> Undo | None:
+        """An Update of the same form as an earlier one; None where it has to be read.
+
+        Raises the table's own errors.
+        """
+        found = self._forms.find(update)
+        if found is None:
+            return None
+        form, key = found
+        table = form.table
+        if form.content is None:
+            return table.take(key)
+        table.insert_packed(key, *form.content)
+        return lambda: table.delete(key)
+
+    def learn(self, update: Any) -> None:
+        """An Update of a table entry has succeeded: more of its form may follow."""
+        message = update.entity.table_entry
+        codec, table = self._find(message.table_id)
+        if self._forms.is_full or not table.key.all_exact:
+            return
+        is_plain = not (
+            message.is_default_action or message.idle_timeout_ns or _check_written(codec, message)
+        )
+        if is_plain and update.type != MODIFY and self._packed[codec.table.id](message.match) is not None:
+            self._forms.learn(update, table, codec.content(message) if update.type == INSERT else None)
 
     def write_entry(self, kind: int, message: Any) -> Undo:
         """Insert, modify or delete an entry, or modify a default action.

@@ -27,7 +27,7 @@ class Writer:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._lock = pipeline.switch.lock
-        self._write_entry = pipeline.tables.write_entry
+        self._tables = pipeline.tables
         self._handlers: Mapping[str, Handler] = {
             "table_entry": pipeline.tables.write_entry,
             "direct_counter_entry": pipeline.tables.write_counter,
@@ -82,6 +82,9 @@ class Writer:
         return results
 
     def _one(self, update: Any) -> Undo:
+        return self._tables.write_update(update) or self._read(update)
+
+    def _read(self, update: Any) -> Undo:
         kind = update.type
         if kind not in _KINDS:
             raise InvalidArgument(f"update type {kind} is none of INSERT, MODIFY, DELETE")
@@ -89,7 +92,9 @@ class Writer:
         entry = entity.table_entry
         if entry.table_id:
             # an unset entry has no id: the common case need not ask which kind it is
-            return self._write_entry(kind, entry)
+            undo = self._tables.write_entry(kind, entry)
+            self._tables.learn(update)
+            return undo
         name = entity.WhichOneof("entity")
         handler = self._handlers.get(name)
         if handler is None:

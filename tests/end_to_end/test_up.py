@@ -57,6 +57,8 @@ class Operator:
     @contextmanager
     def up(self, *words: str, page: tuple[str, ...] = ("--no-dashboard",)):
         """A running pipeline and what it said of itself; without a terminal, as a service runs."""
+        # who runs the tests with nohup hands on that SIGHUP is ignored
+        before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
         process = subprocess.Popen(
             self.command("up", "--json", *page, *words),
             env=self.environment,
@@ -65,6 +67,7 @@ class Operator:
             text=True,
             start_new_session=True,
         )
+        signal.signal(signal.SIGHUP, before)
         try:
             assert process.stdout is not None
             line = process.stdout.readline()
