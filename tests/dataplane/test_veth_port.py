@@ -39,6 +39,15 @@ def test_an_interface_that_is_not_there_is_said_plainly():
         VethPort("no-such-if")
 
 
+def carried(names):
+    """Wait until both ends send: the kernel notices the cable some time after the interface is up."""
+    deadline = time.monotonic() + 10
+    for name in names:
+        while Path(f"/sys/class/net/{name}/operstate").read_text().strip() != "up":
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+
 @pytest.fixture
 def pair():
     """Names of a veth pair that is up; frames of the kernel's own are kept off it."""
@@ -53,6 +62,7 @@ def pair():
         with contextlib.suppress(OSError):
             Path(f"/proc/sys/net/ipv6/conf/{name}/disable_ipv6").write_text("1")
         ip("link", "set", name, "arp", "off", "up")
+    carried((ours, theirs))
     yield ours, theirs
     ip("link", "delete", ours)
 
@@ -118,5 +128,6 @@ def test_an_interface_that_goes_down_is_counted_and_comes_back(cable, pair):
     port.send(frame)
     assert port.counters.failed >= 1
     subprocess.run(["ip", "link", "set", pair[0], "up"], check=True)
+    carried(pair)
     other.send(frame)
     assert received(port, 1) == [frame]
