@@ -69,11 +69,12 @@ class TableEntities:
         table.insert_packed(key, *form.content)
         return lambda: table.delete(key)
 
-    def learn(self, update: Any) -> None:
-        """An Update of a table entry has succeeded: more of its form may follow."""
-        message = update.entity.table_entry
+    def learn(self, update: Any, message: Any) -> None:
+        """An Update of a table entry, `message`, has succeeded: more of its form may follow."""
+        if self._forms.is_full:
+            return
         codec, table = self._find(message.table_id)
-        if self._forms.is_full or not table.key.all_exact:
+        if not table.key.all_exact:
             return
         is_plain = not (
             message.is_default_action or message.idle_timeout_ns or _check_written(codec, message)

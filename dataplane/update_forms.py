@@ -75,9 +75,12 @@ class UpdateForms:
         return None
 
     def learn(self, update: Any, table: Table, content: Content | None) -> None:
-        """An update of a table whose key is exact, with its fields in their order, has succeeded."""
+        """An update of a table whose key is exact, with its fields in their order, has succeeded.
+
+        To be asked only while it is not full.
+        """
         data = update.SerializeToString()
-        if not self.is_full and len(data) <= _MOST_BYTES:
+        if len(data) <= _MOST_BYTES:
             self._left -= 1
             form = _form(update, data, table, content)
             self._by_length.setdefault(len(data), []).append(form)
@@ -106,6 +109,3 @@ def _spots(update: Any, data: bytes) -> list[tuple[int, int]]:
         start = next(at for at, byte in enumerate(data) if other[at] != byte)
         found.append((start, len(field.value)))
     return found
-
-
-__all__ = ["Content", "Form", "UpdateForms"]

@@ -93,7 +93,7 @@ class Writer:
         if entry.table_id:
             # an unset entry has no id: the common case need not ask which kind it is
             undo = self._tables.write_entry(kind, entry)
-            self._tables.learn(update)
+            self._tables.learn(update, entry)
             return undo
         name = entity.WhichOneof("entity")
         handler = self._handlers.get(name)

@@ -182,12 +182,14 @@ class _Run:
         print(json.dumps(self._ready()), flush=True)
         ticks = 0
         try:
+            time.sleep(TICK_SECONDS)
             while not stopped:
-                time.sleep(TICK_SECONDS)
                 self._app.tick()
                 ticks += 1
                 if ticks % _TICKS_PER_HEALTH == 0:
                     self._engine.write(f"{HEALTH}.{self._app_id}", self._report(), [PUB_ONLY])
+                # a signal wakes nobody here: it is noted, and seen a tick later at the most
+                time.sleep(TICK_SECONDS)
         finally:
             self._app.stop()
         return 0
