@@ -4,7 +4,6 @@ Each `run_*` sends `count` messages and returns messages per second, from the fi
 last callback in the other process.
 """
 
-import multiprocessing
 import os
 import threading
 import time
@@ -16,6 +15,7 @@ from typing import Any, NoReturn
 import msgspec
 import redis
 
+from benchmarks import worker
 from due import CONSUMER, PRODUCER, PUB_ONLY, Engine, Item, Options, RecordBatch
 
 FRAME = 860
@@ -24,7 +24,6 @@ _MOST_FRAMES = 8
 _AROUND_S = 0.3
 KEY = "bench.pairs.app.message"
 CHANNEL = "bench"
-_spawn = multiprocessing.get_context("spawn")
 
 Runner = Callable[[str, int, int], float]
 
@@ -45,9 +44,7 @@ def raw_client(url: str) -> redis.Redis:
 @contextmanager
 def other_process(target: Callable[..., None], *arguments: Any) -> Iterator[Connection]:
     """Runs `target(pipe, ...)` in another process; it sends "ready" first."""
-    here, there = _spawn.Pipe()
-    process = _spawn.Process(target=target, args=(there, *arguments), daemon=True)
-    process.start()
+    process, here = worker.start(target, *arguments)
     try:
         assert here.recv() == "ready"
         yield here

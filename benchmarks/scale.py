@@ -18,8 +18,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import median
 
+from benchmarks import worker
 from benchmarks.measure import arguments, bars, machine, table, write_json
-from benchmarks.pairs import _spawn, end_of_writing, raw_stream_consumer, raw_stream_producer, tell_rate
+from benchmarks.pairs import end_of_writing, raw_stream_consumer, raw_stream_producer, tell_rate
 from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Interest, Item, Options
 from due.codec import Frame, decode_frame, encode_frame, freeze
 from due.drivers.embedded_redis import EmbeddedServer
@@ -81,10 +82,9 @@ def _run(url: str, pairs: int, seconds: float, consumer: Side, producer: Side) -
     processes = []
     for number in range(pairs):
         for target in (consumer, producer):
-            here, there = _spawn.Pipe()
-            processes.append(_spawn.Process(target=target, args=(there, url, number, seconds), daemon=True))
-            processes[-1].start()
-            pipes.append(here)
+            process, pipe = worker.start(target, url, number, seconds)
+            processes.append(process)
+            pipes.append(pipe)
     for pipe in pipes:
         _answer(pipe)
     start = time.time() + 0.5

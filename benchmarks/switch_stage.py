@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import multiprocessing
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from benchmarks import worker
 from dataplane.capture_port import CaptureFeed
 from due import CONSUMER, PRODUCER, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
@@ -21,7 +21,6 @@ PACKETS_KEY = "network.packets.p4runtime_ctrl.s1.all"
 BLOCK_KEY = "network.block.firewall.ipv4"
 CPU_PORT, COPY_SESSION = 510, 1
 BURST = 256
-_spawn = multiprocessing.get_context("spawn")
 _ids = itertools.count(1)
 
 
@@ -100,9 +99,7 @@ def feed_process(pipe: Any, socket: str, frames: list[bytes]) -> None:
 @contextmanager
 def process(target: Any, *arguments: Any) -> Iterator[Any]:
     """Runs `target(pipe, …)` beside us; the pipe to it."""
-    here, there = _spawn.Pipe()
-    running = _spawn.Process(target=target, args=(there, *arguments), daemon=True)
-    running.start()
+    running, here = worker.start(target, *arguments)
     try:
         if not here.poll(30) or here.recv() != "ready":
             raise RuntimeError(f"{target.__name__} did not start")

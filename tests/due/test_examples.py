@@ -51,14 +51,16 @@ def _start(name: str, server, folder: Path) -> subprocess.Popen[str]:
 
 
 def test_the_analyser_sees_alerts(server, make_engine, tmp_path):
-    kitsune = make_engine("kitsune")
+    kitsune, received = make_engine("kitsune"), []
+    kitsune.observe("due.heartbeat.WorstSenders").subscribe(lambda beat: received.append(beat.value["received"]))
     with _start("analyser.py", server, tmp_path) as process:
         assert process.stdout is not None
         assert process.stdin is not None
         assert process.stdout.readline().startswith("Enter")
         for ip in ("10.0.0.1", "10.0.0.2", "10.0.0.1"):
             kitsune.write("network.anomaly.kitsune.alert", {"sender": {"ip": ip}}, [NO_WAIT, PUB_ONLY])
-        kitsune.flush()
+        # an item counts as received just before its callback: by the second beat that is done
+        wait_for(lambda: received.count(3) >= 2)
         said, _ = process.communicate("\n", timeout=30)
     assert said.strip() == "[('10.0.0.1', 2), ('10.0.0.2', 1)]"
 
