@@ -90,6 +90,25 @@ def producer_cost(url: str, size: int, count: int, consumers: int) -> float:
     return cost
 
 
+def raw_producer_cost(url: str, size: int, count: int, consumers: int) -> float:
+    """The same with redis-py and frames of 100 messages: what the machine adds for more consumers."""
+    frames = count // 100
+    with ExitStack() as stack:
+        pipes = [stack.enter_context(other_process(_frame_consumer, url, frames)) for _ in range(consumers)]
+        client, payload, encoder = raw_client(url), bytes(size), msgspec.msgpack.Encoder()
+        before = time.process_time()
+        for _ in range(frames):
+            messages = []
+            for _ in range(100):
+                messages.append(payload)  # noqa: PERF401 - one by one, as an app writes
+            client.publish(CHANNEL, encoder.encode(messages))
+        cost = (time.process_time() - before) / count * 1e6
+        for pipe in pipes:
+            _finished(pipe)
+        client.close()
+    return cost
+
+
 def run_records(url: str, rows: int, count: int) -> float:
     """DUE with record batches of `rows` packet headers; records per second."""
     import numpy as np
