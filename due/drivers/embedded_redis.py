@@ -6,6 +6,7 @@ The server runs in the foreground as our child, listens on a Unix socket only, a
 
 import ctypes
 import fcntl
+import os
 import shutil
 import signal
 import socket
@@ -21,7 +22,14 @@ from due.drivers.redis_wire import Wire
 from due.errors import UpdatesUnavailable
 
 _PR_SET_PDEATHSIG = 1
-_START_TIMEOUT = 10.0
+_STARTER = """
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
+if os.getppid() != int(sys.argv[1]):
+    sys.exit(1)
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+_START_TIMEOUT = 30.0
 _LONGEST_SOCKET_PATH = 100
 _SUBSCRIBER_LIMIT = ("128mb", "64mb", "20")
 """A subscriber that lets more pile up, or so much for so many seconds, is dropped by the server."""
@@ -89,12 +97,11 @@ class EmbeddedServer:
         log = (self._directory / "server.log").open("ab")
         with log:
             self._process = subprocess.Popen(
-                [server_program(), *self._arguments()],
+                _ending_with_us([server_program(), *self._arguments()]),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 cwd=self._directory,
-                preexec_fn=die_with_parent,  # noqa: PLW1509 - it makes one system call only
             )
         self._wait()
         return self
@@ -174,6 +181,17 @@ def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def _ending_with_us(command: list[str]) -> list[str]:
+    """The command behind a starter that has the kernel end it when this process does.
+
+    Not a `preexec_fn`: that forks, and in a process with gRPC in it the child then dies of gRPC's fork
+    handlers before it becomes the server, and calls of the parent end with CANCELLED.
+    """
+    if sys.platform != "linux":
+        return command
+    return [sys.executable, "-I", "-S", "-c", _STARTER, str(os.getpid()), *command]
 
 
 def shared_server(folder: Path) -> tuple[str, EmbeddedServer | None]:
