@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
 
 from tests.requirements import IN_CI
@@ -14,6 +15,10 @@ WHOLE_PIPELINES = ("tests/end_to_end/", "tests/test_docs.py")
 """Each of these tests keeps both cores of a small machine busy with processes, and some of them measure."""
 ONE_SWITCH = "tests/p4/"
 """These files share a compiled switch."""
+
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+if not IN_CI:  # there hypothesis is patient of itself, and tries the same examples each time
+    settings.load_profile("patient")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
