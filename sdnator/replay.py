@@ -44,6 +44,8 @@ WIRE_WINDOW = 16
 """Most packets in flight into a real interface: BMv2's capture ring has 32 slots, the kernel drops the rest."""
 POLL_SECONDS = 0.002
 LOOK_SECONDS = 0.1
+DEATH_SECONDS = 5.0
+"""A part that dies closes its sockets first; how long it may take until it has ended."""
 COORDINATED = "coordinated"
 """Phase of an engine whose declarations the Coordinator knows."""
 PACKETS = "packets"
@@ -230,14 +232,14 @@ class ReplayPass:
         self._wait_for_packets(pipeline, engine)
         started = time.monotonic()
         with ExitStack() as stack:
-            feed = pipeline.feed()
-            stack.callback(feed.close)
-            if not pipeline.gives_verdicts:
-                self._drops = stack.enter_context(pipeline.drop_counters())
             try:
+                feed = pipeline.feed()
+                stack.callback(feed.close)
+                if not pipeline.gives_verdicts:
+                    self._drops = stack.enter_context(pipeline.drop_counters())
                 self._feed(pipeline, feed, progress)
             except CaptureError as error:
-                pipeline.check()  # says which part died, and how
+                _name_the_dead(pipeline)
                 raise PipelineError(str(error)) from error
         self._result.seconds = time.monotonic() - started
 
@@ -384,6 +386,14 @@ class ReplayPass:
         if silence > SETTLE_SECONDS:
             with self._observer.moved:
                 flight.settle()
+
+
+def _name_the_dead(pipeline: Pipeline) -> None:
+    """Raise PipelineError that says which part died, and how; nothing where none does."""
+    deadline = time.monotonic() + DEATH_SECONDS
+    while time.monotonic() < deadline:
+        pipeline.check()
+        time.sleep(POLL_SECONDS)
 
 
 def wall_seconds_to_block(result: PassResult, first_attack: int | None) -> float | None:

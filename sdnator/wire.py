@@ -20,6 +20,7 @@ ETH_P_ALL = 3
 MTU = 9_216
 """Of our veth pairs: jumbo frames of captures pass."""
 RETRY_SECONDS = 0.0005
+_CABLE_SECONDS = 30.0
 
 
 class Feed(Protocol):
@@ -88,6 +89,10 @@ class VethPair:
     """Two interfaces joined by a wire; gone when closed.
 
     Neither end has addresses, and IPv6 is off, so that the kernel sends nothing of its own.
+
+    Raises:
+        BadInput: no permission, or the name is taken.
+        PipelineError: the kernel does not notice the wire.
     """
 
     def __init__(self, name: str) -> None:
@@ -110,7 +115,9 @@ class VethPair:
             for end in (self.near, self.far):
                 Path(f"/proc/sys/net/ipv6/conf/{end}/disable_ipv6").write_text("1", encoding="ascii")
                 self._ip("link", "set", end, "up")
-        except OSError:
+            for end in (self.near, self.far):
+                _wait_for_cable(end)
+        except (OSError, PipelineError):
             self.close()
             raise
 
@@ -130,6 +137,16 @@ class VethPair:
         pair = cls(f"sdn{label}{os.getpid()}")
         stack.callback(pair.close)
         return pair
+
+
+def _wait_for_cable(interface: str) -> None:
+    """Until the kernel has noticed the wire: what is sent before is dropped without an error."""
+    state = Path("/sys/class/net", interface, "operstate")
+    deadline = time.monotonic() + _CABLE_SECONDS
+    while state.read_text(encoding="ascii").strip() != "up":
+        if time.monotonic() > deadline:
+            raise PipelineError(f"{interface} has no carrier after {_CABLE_SECONDS:.0f} s; see `ip link`")
+        time.sleep(RETRY_SECONDS)
 
 
 _OURS = re.compile(r"sdn[a-z]+(\d+)a")

@@ -15,6 +15,7 @@ from sdnator.datasets.mirai_like import Options, make
 from tests.end_to_end.command import figures, sdnator
 
 MARK = "SDNATOR_TEST_RUN"
+SECONDS = 120
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +107,19 @@ def processes_of(run: str) -> list[int]:
     return found
 
 
+def parts_of(replay: int, part: str) -> list[int]:
+    """Processes that a replay itself has started as this part; a part's own children are none."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == replay and f"\0{part}\0".encode() in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
+        except OSError:  # it has ended meanwhile
+            continue
+    return found
+
+
 @pytest.fixture
 def running(capture, tmp_path):
     """A replay in real time, which takes minutes; its pipeline keeps its files in the test's folder."""
@@ -120,7 +134,7 @@ def running(capture, tmp_path):
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {MARK: run}
     )
     log = keep / "kitsune-alone" / "logs" / "p4runtime_ctrl.log"
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + SECONDS
     while not (log.exists() and "primary" in log.read_text()):
         assert time.monotonic() < deadline
         assert process.poll() is None
@@ -135,7 +149,7 @@ def test_ctrl_c_leaves_nothing_behind(running):
     """Exit code 130, one line, no process, no half-written report."""
     process, run, report = running
     process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=60)
+    out, error = process.communicate(timeout=SECONDS)
     assert process.returncode == 130
     assert "Traceback" not in error
     assert error.rstrip().endswith("sdnator: interrupted; nothing was left running")
@@ -148,8 +162,8 @@ def test_killed_replay_takes_its_pipeline_along(running):
     """Even kill -9 leaves no switch, server or app running."""
     process, run, _ = running
     process.kill()
-    process.communicate(timeout=60)
-    deadline = time.monotonic() + 30
+    process.communicate(timeout=SECONDS)
+    deadline = time.monotonic() + SECONDS
     while processes_of(run) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert processes_of(run) == []
@@ -158,14 +172,14 @@ def test_killed_replay_takes_its_pipeline_along(running):
 @pytest.mark.parametrize("part", ["apps.kitsune.service", "dataplane", "apps.firewall.service"])
 def test_death_of_a_part_is_told(running, part):
     """Which part died, and how; exit code 1."""
-    process, run, _ = running
-    (pid,) = (
-        pid
-        for pid in processes_of(run)
-        if f"\0{part}\0".encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
+    process, _, _ = running
+    deadline = time.monotonic() + SECONDS
+    while not (pids := parts_of(process.pid, part)):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    (pid,) = pids
     os.kill(pid, signal.SIGKILL)
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=SECONDS)
     assert process.returncode == 1
     assert "Traceback" not in error
     assert "was killed by SIGKILL" in error

@@ -54,6 +54,15 @@ class Operator:
         assert done.returncode == 0, done.stderr[-3000:]
         return json.loads(done.stdout)
 
+    def well(self):
+        """What status says as soon as all parts live and all apps are active, None before."""
+        now = json.loads(self.run("status", "--json").stdout)
+        states = {app: (now.get("apps") or {}).get(app, "").split(", ") for app in APPS}
+        return now if now.get("well") and all("active" in each for each in states.values()) else None
+
+    def down(self) -> subprocess.CompletedProcess[str]:
+        return self.run("down", "--timeout", str(SECONDS - 10))
+
     @contextmanager
     def up(self, *words: str, page: tuple[str, ...] = ("--no-dashboard",)):
         """A running pipeline and what it said of itself; without a terminal, as a service runs."""
@@ -105,8 +114,7 @@ def standing(tmp_path_factory):
 
 def test_all_parts_run_and_all_apps_are_active(standing):
     operator, said = standing
-    found = until(lambda: (now := operator.figures("status"))["apps"].keys() >= APPS and now)
-    assert found["well"] is True
+    found = until(operator.well)
     assert found["parts"].keys() == PARTS
     assert all(part["alive"] for part in found["parts"].values())
     assert {found["apps"][app] for app in APPS} == {"active"}
@@ -126,6 +134,7 @@ def test_a_second_one_is_refused(standing):
 def test_others_find_it_by_themselves(standing):
     """Apps, keys, flow, doctor, tables: without an address."""
     operator, _ = standing
+    until(operator.well)
     assert {one["app_id"] for one in operator.figures("apps")["instances"]} >= APPS
     made = {one["key"] for one in operator.figures("keys")["capabilities"]}
     assert "network.anomaly.kitsune.alert" in made
@@ -133,6 +142,7 @@ def test_others_find_it_by_themselves(standing):
     assert ("kitsune", "firewall") in {(one["producer"], one["consumer"]) for one in flow}
     checks = {one["name"]: one for one in operator.figures("doctor")["checks"]}
     assert checks["pipeline"]["state"] == "ok"
+    until(lambda: "ingress.telemetry_active" in operator.run("tables", "s1", "--json").stdout)
     entries = operator.figures("tables", "s1")["entries"]
     assert any(one["table"] == "ingress.telemetry_active" for one in entries)
     assert operator.figures("counters")["switch"] == "s1"
@@ -145,9 +155,13 @@ def test_data_is_seen_as_it_comes_and_afterwards(standing):
     done = operator.run("observe", "due.health.kitsune", "--count", "2", "--json")
     items = [json.loads(line) for line in done.stdout.splitlines()]
     assert [item["appId"] for item in items] == ["kitsune", "kitsune"]
-    past = operator.run("get", "due.event.coordinator", "--since", "1h", "--json")
-    events = [json.loads(line)["value"] for line in past.stdout.splitlines()]
-    assert {"kitsune", "firewall"} <= {one["app_id"] for one in events if one["event"] == "activated"}
+
+    def activated():
+        past = operator.run("get", "due.event.coordinator", "--since", "1h", "--json")
+        events = [json.loads(line)["value"] for line in past.stdout.splitlines()]
+        return {one["app_id"] for one in events if one["event"] == "activated"}
+
+    until(lambda: {"kitsune", "firewall"} <= activated())  # the archive is written behind the pipeline
 
 
 def test_observing_ends_well_with_ctrl_c(standing):
@@ -169,22 +183,15 @@ def test_observing_ends_well_with_ctrl_c(standing):
 def test_a_part_that_dies_is_started_again(standing, part):
     """Under a new process id, which status knows; and the app is active again."""
     operator, _ = standing
-    before = operator.figures("status")["parts"][part]["pid"]
+    before = until(operator.well)["parts"][part]["pid"]
     os.kill(before, signal.SIGKILL)
-
-    def well_again():
-        done = operator.run("status", "--json")
-        now = json.loads(done.stdout)
-        states = {app: now["apps"].get(app, "").split(", ") for app in APPS} if now.get("apps") else {}
-        active = states and all("active" in each for each in states.values())
-        return active and now["well"] and now["parts"][part]["pid"] != before
-
-    until(well_again)
+    until(lambda: (now := operator.well()) and now["parts"][part]["pid"] != before)
 
 
 def test_down_ends_everything_and_keeps_the_archive(operator):
     with operator.up() as (process, said):
-        done = operator.run("down")
+        until(operator.well)
+        done = operator.down()
         assert (done.returncode, done.stdout) == (0, f"stopped (process {said['pid']})\n")
         _, error = process.communicate(timeout=SECONDS)
         assert process.returncode == 0
@@ -199,7 +206,7 @@ def test_down_ends_one_that_is_still_starting(operator):
         operator.command("up"), env=operator.environment, stderr=subprocess.PIPE
     ) as process:
         until(lambda: "starting" in operator.run("status").stdout or process.poll() is not None)
-        done = operator.run("down")
+        done = operator.down()
         _, error = process.communicate(timeout=SECONDS)
     assert (process.returncode, done.returncode) == (0, 0)
     assert b"sdnator: stopped" in error
@@ -252,8 +259,8 @@ def test_a_configuration_holds_and_hangup_takes_up_what_it_can(operator, tmp_pat
         assert b"kitsune_" in urllib.request.urlopen(f"http://{parts['kitsune'][0]}/metrics").read()
         state = tmp_path / "state" / "sdnator"
         assert json.loads((state / "kitsune.settings.json").read_text())["threshold"] == 1.5
-        line = operator.run("logs", "p4runtime_ctrl", "--json").stdout.splitlines()[0]
-        assert "level" in json.loads(line)["line"]
+        logged = until(lambda: operator.run("logs", "p4runtime_ctrl", "--json").stdout)
+        assert "level" in json.loads(logged.splitlines()[0])["line"]
         write(8, 2.5)
         process.send_signal(signal.SIGHUP)
 

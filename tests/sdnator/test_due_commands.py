@@ -190,7 +190,7 @@ def test_a_viewer_that_does_not_keep_up_misses_items_and_holds_nobody_back(tmp_p
         writer = threading.Thread(target=write)
         writer.start()
         try:
-            shown = run("observe", "a.b.*", "--updates", server.url, "--for", "1500ms")
+            shown = run("observe", "a.b.*", "--updates", server.url, "--count", "20")
         finally:
             done.set()
             writer.join()

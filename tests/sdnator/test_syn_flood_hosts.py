@@ -15,5 +15,6 @@ def test_established_and_listening_are_not_half_open():
     """Only what waits for its last ACK."""
     with socket.create_server(("127.0.0.1", 0)) as service:
         port = service.getsockname()[1]
-        with socket.create_connection(("127.0.0.1", port)):
+        # connected on one side is not yet established on the other
+        with socket.create_connection(("127.0.0.1", port)), service.accept()[0]:
             assert half_open(port) == {}
