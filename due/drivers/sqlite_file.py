@@ -7,6 +7,7 @@ frames(key_id, source_id, first and last of time, event time and sequence, paylo
 import os
 import sqlite3
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from due.messages import Item
 
 _VERSION = 1
 _BUSY_S = 5.0
+_AGAIN_S = 0.01
 _LOOKUPS = 256
 _SCHEMA = """
 PRAGMA page_size = 8192;
@@ -140,7 +142,7 @@ class SqliteFile:
         if version > _VERSION:
             raise BackendError(f"archive {self._path} is of a newer version ({version}); update SDNator")
         if version < _VERSION:
-            connection.executescript(_SCHEMA)
+            _make_tables(connection)
         connection.execute(f"PRAGMA synchronous = {self._synchronous}")
         connection.execute("PRAGMA wal_autocheckpoint = 4000")
 
@@ -166,6 +168,7 @@ class SqliteFile:
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
+        """One view of the file: no row of others comes in whose key or source was not there a moment before."""
         with self._errors():
             self._enter()
             try:
@@ -173,8 +176,11 @@ class SqliteFile:
             except IndexError:
                 connection = self._connect()
             try:
+                connection.execute("BEGIN")
                 yield connection
             finally:
+                if connection.in_transaction:
+                    connection.execute("ROLLBACK")
                 if self._closed:
                     connection.close()
                 else:
@@ -207,3 +213,20 @@ class SqliteFile:
             for connection in (*self._idle, *((self._writer,) if self._writer else ())):
                 connection.close()
             self._idle.clear()
+
+
+def _make_tables(connection: sqlite3.Connection) -> None:
+    """Raises `sqlite3.OperationalError` when the file is locked for long."""
+    give_up = time.monotonic() + 2 * _BUSY_S
+    while True:
+        try:
+            connection.executescript(_SCHEMA)
+        except sqlite3.OperationalError as error:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            # two that change a new file's journal mode at once are in each other's way until one lets go
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
+                raise
+            time.sleep(_AGAIN_S)
+        else:
+            return

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -90,6 +91,44 @@ def test_a_reader_sees_keys_that_others_add_later(tmp_path: Path) -> None:
         assert len(reader.find({"dataKey": {"$nin": ["b.*"]}})) == min(n, 2)
     reader.close()
     writer.close()
+
+
+def test_a_source_that_comes_while_one_searches_is_found_the_next_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, writer = opened(tmp_path), opened(tmp_path)
+    writer.insert(items(1))
+    refresh = sqlite_file.Dictionary.refresh
+
+    def meanwhile(table: sqlite_file.Dictionary, connection: sqlite3.Connection) -> None:
+        refresh(table, connection)
+        if table is reader._file.sources:
+            writer.insert(items(1, start=2, instance="another"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sqlite_file.Dictionary, "refresh", meanwhile)
+        assert [i.sequence for i in reader.find({"dataKey": "a.b"})] == [1]
+    assert [i.sequence for i in reader.find({"dataKey": "a.b"})] == [1, 2]
+    reader.close()
+    writer.close()
+
+
+def test_two_that_make_the_file_wait_for_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = sqlite3.connect(tmp_path / "archive.db", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    waited = []
+
+    def sleep(seconds: float) -> None:
+        waited.append(seconds)
+        other.close()
+
+    monkeypatch.setattr(sqlite_file, "_BUSY_S", 0.05)
+    monkeypatch.setattr(sqlite_file, "time", SimpleNamespace(monotonic=lambda: 0.0, sleep=sleep))
+    archive = opened(tmp_path)
+    archive.insert(items(1))
+    assert len(waited) == 1
+    assert len(archive.find({})) == 1
+    archive.close()
 
 
 def _read_in_child(archive: SqliteArchive, result: "multiprocessing.Queue[int]") -> None:
