@@ -105,12 +105,13 @@ class Dispatcher:
                 time.sleep(0.1)
                 continue
             self.busy_since = time.monotonic()
+            # first, for what is forgotten here may have begun anew with these
+            while self._tasks and not self._closing():
+                self._run_task(self._tasks.popleft())
             for delivery in deliveries:
                 self._dispatch(delivery)
                 if self._closing():
                     break
-            while self._tasks and not self._closing():
-                self._run_task(self._tasks.popleft())
             self.busy_since = None
 
     def _closing(self) -> bool:

@@ -51,6 +51,8 @@ class StreamReader:
         self._consumer = consumer
         self._shared = shared
         self._lock = threading.Lock()
+        self._leases = threading.Lock()
+        """Held while leases are written, or one could be renewed after it was given up."""
         self._paths: dict[str, str] = {}
         self._wire: Wire | None = None
         self._wire_id = 0
@@ -101,7 +103,8 @@ class StreamReader:
                 self._held.discard(path)
             self._stale = bool(gone)
             self._withdrawn.update(dict.fromkeys(gone, time.monotonic()))
-        self._write_leases(gone, 0)
+        with self._leases:
+            self._write_leases(gone, 0)
         self._interrupt()
 
     def activate(self, active: bool, *, take_over: bool) -> None:
@@ -182,7 +185,8 @@ class StreamReader:
 
     def renew(self) -> None:
         """Renew the leases; a standby instance holds the group's place too."""
-        self._write_leases(list(self._paths), int(time.time() * 1000))
+        with self._leases:
+            self._write_leases(list(self._paths), int(time.time() * 1000))
         self._drop_groups()
 
     def statistics(self) -> dict[str, int]:
@@ -190,9 +194,12 @@ class StreamReader:
         return {**self._counts, "held_paths": len(self._held)}
 
     def close(self) -> None:
-        """Acknowledge what is done, leave the groups' leases, close."""
+        """Acknowledge what is done, give up the leases for good, close."""
         self._flush_acks()
-        self._write_leases(list(self._paths), 0)
+        with self._lock:
+            paths, self._paths = list(self._paths), {}
+        with self._leases:
+            self._write_leases(paths, 0)
         if self._wire is not None:
             self._wire.close()
             self._wire = None
@@ -285,6 +292,8 @@ class StreamReader:
             self._catch_up &= self._paths.keys()
             history = tuple(self._catch_up)
             paths = history or tuple(p for p in self._paths if p not in self._held)
+            if not self._active:  # put on standby a moment ago
+                history = paths = ()
         command = self._packed_acks()
         if paths:
             self._requested = paths
