@@ -285,6 +285,8 @@ class Session:
         if callback is None:
             return
         with self.keeper.lock:
+            if self.keeper.member.asking:
+                return  # stopped for a moment: nobody has said that less is wanted
             wanted = self.keeper.member.assignments
         if wanted != self._told:
             self._told = wanted

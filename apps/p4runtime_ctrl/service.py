@@ -58,7 +58,6 @@ class P4RuntimeCtrlService:
             raise ProgramError(f"two switches have one name: {', '.join(sorted(names))}")
         self._agents = {each.name: self._agent(each, pipeline) for each in settings.switches}
         self._offers: dict[str, Offer] = {}
-        self._wanted: tuple[str, ...] = ()
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
         self._by_digest = settings.telemetry == "digest"
@@ -166,11 +165,7 @@ class P4RuntimeCtrlService:
             with self._demand:
                 self._offers[offer.name] = offer
 
-    def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
-        with self._demand:
-            self._wanted = tuple(
-                assignment.key for assignment in assignments if assignment.capability in _DATA
-            )
+    def _on_assignments(self, _: tuple[Assignment, ...]) -> None:
         self._demand_changed()
         for agent in self._agents.values():
             agent.say_again()
@@ -178,14 +173,18 @@ class P4RuntimeCtrlService:
     def _demand_changed(self) -> None:
         """Tell agents what is wanted of them; everything while no Coordinator is there to ask.
 
-        A standby instance is told nothing of demand, and leaves the switches' telemetry as it is.
+        A standby instance is told nothing of demand, and leaves the switches' telemetry as it is; so does one
+        that was stopped for a moment: frames that pass while it asks who is active are wanted all the same.
         """
         if not self._chief:
             return
         with self._demand:
+            keys = tuple(each.key for each in self._engine.assignments() if each.capability in _DATA)
+            if not keys and not self._engine.health()["active"]:
+                return
             for name, agent in self._agents.items():
                 everything = key_of("packets", name, ALL)
-                wanted = (*self._wanted, everything) if self._engine.wanted(everything) else self._wanted
+                wanted = (*keys, everything) if self._engine.wanted(everything) else keys
                 demand = demand_for(name, wanted, self._offers, by_digest=self._by_digest)
                 if demand != self._asked.get(name):
                     self._asked[name] = demand
