@@ -68,7 +68,7 @@ class Bmv2:
             command += ["--dp-grpc-server-addr", self.packet_address]
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
-                _ending_with_us(command), stdout=log, stderr=subprocess.STDOUT, cwd=folder
+                ending_with_us(command), stdout=log, stderr=subprocess.STDOUT, cwd=folder
             )
         self._wait(timeout_s)
 
@@ -138,7 +138,7 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _ending_with_us(command: list[str]) -> list[str]:
+def ending_with_us(command: list[str]) -> list[str]:
     """The command behind a starter that has the kernel end it when this process does.
 
     Not a `preexec_fn`: that forks a process with gRPC's threads in it, which may hang before it starts.

@@ -13,7 +13,7 @@ from dataplane.bmv2 import Bmv2
 from dataplane.switch import Backend
 from tests.dataplane.embedded import Embedded
 
-_WAIT_S = 5.0
+_WAIT_S = 60.0
 _QUIET_S = 0.15
 
 

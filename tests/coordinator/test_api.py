@@ -22,6 +22,7 @@ from due.drivers.embedded_redis import EmbeddedServer
 from due.membership import Heartbeat, Registration
 
 EVENTS = "due.event.coordinator"
+WATCHDOG_S = 60
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ def north(engine: Engine, registry: Registry) -> Northbound:
 def client(north: Northbound) -> Iterator[httpx.Client]:
     server = Api(north, "127.0.0.1", 0)
     server.start()
-    with httpx.Client(base_url=server.url, trust_env=False) as client:
+    with httpx.Client(base_url=server.url, trust_env=False, timeout=WATCHDOG_S) as client:
         yield client
     server.stop()
 
@@ -154,7 +155,7 @@ def test_wrong_questions_are_explained(client: httpx.Client, query: str) -> None
 
 
 def test_observe_sends_items_as_they_come(client: httpx.Client, engine: Engine) -> None:
-    with connect(observed(client, "live.*"), proxy=None) as socket:
+    with connect(observed(client, "live.*"), proxy=None, open_timeout=WATCHDOG_S) as socket:
         done = threading.Event()
 
         def write() -> None:
@@ -163,9 +164,11 @@ def test_observe_sends_items_as_they_come(client: httpx.Client, engine: Engine) 
 
         writer = threading.Thread(target=write)
         writer.start()
-        received = json.loads(socket.recv(30))
-        done.set()
-        writer.join()
+        try:
+            received = json.loads(socket.recv(WATCHDOG_S))
+        finally:
+            done.set()
+            writer.join()
     assert (received["dataKey"], received["value"]) == ("live.x", 42)
 
 
@@ -182,14 +185,16 @@ def test_a_slow_reader_misses_the_oldest_and_is_told() -> None:
 
 
 def test_observe_explains_a_wrong_key(client: httpx.Client) -> None:
-    with connect(observed(client, "a..b"), proxy=None) as socket:
-        assert json.loads(socket.recv(30))["error"] == "InvalidKey"
+    with connect(observed(client, "a..b"), proxy=None, open_timeout=WATCHDOG_S) as socket:
+        assert json.loads(socket.recv(WATCHDOG_S))["error"] == "InvalidKey"
 
 
 def test_other_sites_are_refused(client: httpx.Client) -> None:
     assert client.get("/apps", headers={"host": "evil.example"}).status_code == 400
     with pytest.raises(InvalidStatus):
-        connect(observed(client, "a"), origin=Origin("http://evil.example"), proxy=None)
+        connect(
+            observed(client, "a"), origin=Origin("http://evil.example"), proxy=None, open_timeout=WATCHDOG_S
+        )
 
 
 def test_nothing_can_be_written(client: httpx.Client) -> None:

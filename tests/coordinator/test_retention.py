@@ -35,7 +35,7 @@ def run(archive: SqliteArchive, folder: Path, turns: int, allowed: bool = True, 
     )
     retention.start()
     for _ in range(turns):
-        asked.acquire(timeout=30)
+        asked.acquire(timeout=60)
     retention.stop()
     return retention
 
@@ -84,10 +84,10 @@ def test_an_archive_that_is_away_is_tried_again(tmp_path: Path) -> None:
         lambda: SqliteArchive(f"sqlite://{place}/archive.db"), may, age_s=60, max_bytes=0, every_s=0.01
     )
     retention.start()
-    turns.acquire(timeout=30)
+    turns.acquire(timeout=60)
     place.unlink()
     archive = filled(place)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while not retention.deleted and time.monotonic() < deadline:
         time.sleep(0.01)
     retention.stop()

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 INSTANCE = """
 import json, sys, time
 from due import *
-engine = Engine(Options(heartbeat=0.1, **json.loads(sys.argv[1])))
+engine = Engine(Options(heartbeat=0.5, **json.loads(sys.argv[1])))
 engine.init("twin", PRODUCER, capabilities=[Capability("twin.life.twin.beat")])
 print(engine.instance_id, flush=True)
 while True:
@@ -57,10 +57,10 @@ class Site:
         self.processes.append(process)
         return process
 
-    def coordinator(self, name: str) -> "tuple[subprocess.Popen[str], httpx.Client]":
-        address, settings = self.folder / f"{name}.url", self.folder / f"{name}.json"
+    def coordinator(self, name: str, **settings: Any) -> "tuple[subprocess.Popen[str], httpx.Client]":
+        address, file = self.folder / f"{name}.url", self.folder / f"{name}.json"
         address.unlink(missing_ok=True)
-        settings.write_text(json.dumps({"address_file": str(address), "selection": "oldest"}))
+        file.write_text(json.dumps({"address_file": str(address), "selection": "oldest", **settings}))
         places = [
             "--updates",
             self.updates,
@@ -69,19 +69,20 @@ class Site:
             "--directory",
             str(self.folder / name),
         ]
-        process = self.start("-m", "coordinator.service", *places, "--settings", str(settings))
+        process = self.start("-m", "coordinator.service", *places, "--settings", str(file))
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
         assert ready["ready"] is True
         assert ready["http"] == address.read_text()
-        return process, httpx.Client(base_url=ready["http"], trust_env=False)
+        return process, httpx.Client(base_url=ready["http"], trust_env=False, timeout=WATCHDOG_S)
 
     def options(self) -> dict[str, Any]:
         where = self.folder / str(len(self.engines) + len(self.processes))
         return {"updates": self.updates, "archive": self.archive, "directory": str(where)}
 
     def engine(self) -> Engine:
-        self.engines.append(Engine(Options(heartbeat=0.1, **self.options())))
+        """Of this process, which does not take itself for stopped where cores are short."""
+        self.engines.append(Engine(Options(heartbeat=0.1, pause_limit=WATCHDOG_S, **self.options())))
         return self.engines[-1]
 
     def instance(self) -> "tuple[str, subprocess.Popen[str]]":
@@ -124,7 +125,7 @@ def test_what_is_wanted_follows_who_is_there(site: Site) -> None:
     (assignment,) = until(producer.assignments)
     assert assignment.frequency == 10.0
     until(lambda: producer.write("a.b.producer.x", 2) and got)
-    assert {flow["consumer"] for flow in client.get("/flow").json()} >= {"consumer"}
+    until(lambda: "consumer" in {flow["consumer"] for flow in client.get("/flow").json()})
     subscription.dispose()
     until(lambda: not producer.assignments())
     consumer.close()
@@ -157,17 +158,22 @@ def test_after_kill_9_it_knows_all_again_and_data_flows_meanwhile(site: Site) ->
             set(states(client, "producer").values()) == set(states(client, "consumer").values()) == {"active"}
         )
     )
-    assert [flow["interest"] for flow in client.get("/flow").json() if flow["consumer"] == "consumer"] == [
-        "a.b.producer"
-    ]
-    until(lambda: producer.health()["epoch"] > epoch)
+    until(
+        lambda: (
+            [flow["interest"] for flow in client.get("/flow").json() if flow["consumer"] == "consumer"]
+            == ["a.b.producer"]
+        )
+    )
+    # the first word of the new Coordinator may come before it knows the consumer
+    until(lambda: producer.health()["epoch"] > epoch and producer.assignments())
     assert producer.assignments()[0].key == "a.b.producer"
 
 
 def test_of_two_coordinators_one_leads_and_the_other_takes_over(site: Site) -> None:
-    first, one = site.coordinator("one")
+    # an interval so long that the first does not lose the lead by getting no core for a moment
+    first, one = site.coordinator("one", leader_interval_s=0.6)
     until(lambda: one.get("/health").json()["leading"])
-    _, two = site.coordinator("two")
+    _, two = site.coordinator("two", leader_interval_s=0.6)
     leader = one.get("/health").json()["leader"]
     until(lambda: two.get("/health").json()["leader"] == leader)
     assert two.get("/health").json()["leading"] is False

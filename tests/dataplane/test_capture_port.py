@@ -45,7 +45,7 @@ def test_lengths_that_do_not_add_up_are_refused():
 
 def wait(port):
     if not port.waiting():
-        select.select([port], [], [], 5)
+        select.select([port], [], [], 60)
 
 
 def drain(port, count):
@@ -75,14 +75,16 @@ def test_frames_go_in_and_verdicts_come_back(tmp_path):
         sender = threading.Thread(target=feed.send, args=(range(3000), [64] * 3000, frames))
         sender.start()
         assert drain(port, 3000) == [frame + bytes(4) for frame in frames]
-        sender.join(5)
+        sender.join(60)
         stop = threading.Event()
-        threading.Thread(target=answer, args=(port, stop)).start()
+        answering = threading.Thread(target=answer, args=(port, stop))
+        answering.start()
         verdicts = b""
         while len(verdicts) < 3000:
-            select.select([feed], [], [], 5)
+            select.select([feed], [], [], 60)
             verdicts += feed.verdicts()
         stop.set()
+        answering.join(60)
         assert verdicts == b"\x03" * 3000
     assert not (tmp_path / "s").exists()
 

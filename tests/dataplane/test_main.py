@@ -14,7 +14,7 @@ import pytest
 from dataplane.capture_port import CaptureFeed
 from dataplane.pcap_port import PcapReader, PcapWriter
 from p4rt import P4RuntimeStub, p4runtime
-from tests.dataplane.controller import Controller, Names, insert, program_config
+from tests.dataplane.controller import TIMEOUT_S, Controller, Names, insert, program_config
 from tests.requirements import require_program
 
 PROGRAM = Path(__file__).parent / "programs" / "features"
@@ -32,7 +32,7 @@ def start(*arguments):
 
 def ended(process, number=signal.SIGTERM):
     process.send_signal(number)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate(timeout=TIMEOUT_S)
     return process.returncode, out, err
 
 
@@ -46,7 +46,7 @@ def test_it_serves_and_ends_with_its_counts(tmp_path):
         assert controller.arbitrate().status.code == 0
         controller.set_pipeline(program_config(PROGRAM))
         feed.send([1], [60], [bytes(12) + b"\x88\xb5\x0f" + bytes(30)])
-        assert controller.packets.get(timeout=10).metadata[0].value == b"\x01"
+        assert controller.packets.get(timeout=TIMEOUT_S).metadata[0].value == b"\x01"
     code, out, err = ended(process)
     state = json.loads(out)
     assert (code, err, state["packet_in"], state["ports"]["1"]["received"]) == (0, "", 1, 1)
@@ -71,7 +71,7 @@ def test_signals_end_it_cleanly(number):
 )
 def test_what_cannot_be_is_one_line_and_code_2(arguments, text):
     process = start(*arguments)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate(timeout=TIMEOUT_S)
     assert (process.returncode, out) == (2, "")
     assert len(err.splitlines()) == 1
     assert text in err
@@ -81,9 +81,16 @@ def test_an_address_in_use_is_refused():
     process = start()
     address = json.loads(process.stdout.readline())["grpc"]
     second = start("--grpc", address)
-    _, err = second.communicate(timeout=20)
+    _, err = second.communicate(timeout=TIMEOUT_S)
     assert (second.returncode, "cannot listen" in err) == (2, True)
     ended(process)
+
+
+def runs(pid):
+    try:
+        return " Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except OSError:  # gone, perhaps while it was read
+        return False
 
 
 def test_it_does_not_outlive_its_parent():
@@ -94,11 +101,11 @@ def test_it_does_not_outlive_its_parent():
     )
     parent = subprocess.run(
         [sys.executable, "-c", script],
-        capture_output=True, text=True, check=True, timeout=20, cwd=Path(__file__).parents[2],
+        capture_output=True, text=True, check=True, timeout=TIMEOUT_S, cwd=Path(__file__).parents[2],
     )  # fmt: skip
     pid = json.loads(parent.stdout)["pid"]
-    deadline = time.monotonic() + 10
-    while Path(f"/proc/{pid}").exists() and " Z " not in Path(f"/proc/{pid}/stat").read_text():
+    deadline = time.monotonic() + TIMEOUT_S
+    while runs(pid):
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
@@ -125,7 +132,7 @@ def test_tls_with_client_certificates(tmp_path):
     unknown = grpc.ssl_channel_credentials(cert.read_bytes())
     ask = p4runtime.CapabilitiesRequest(device_id=1)
     with grpc.secure_channel(address, known, options) as channel:
-        assert P4RuntimeStub(channel).Capabilities(ask, timeout=10).p4runtime_api_version == "1.4.0"
+        assert P4RuntimeStub(channel).Capabilities(ask, timeout=TIMEOUT_S).p4runtime_api_version == "1.4.0"
     with grpc.secure_channel(address, unknown, options) as channel, pytest.raises(grpc.RpcError):
         P4RuntimeStub(channel).Capabilities(ask, timeout=3)
     ended(process)
@@ -151,7 +158,7 @@ def test_a_capture_file_goes_in_and_out(tmp_path):
         counter = p4runtime.Entity()
         counter.counter_entry.counter_id = next(c for c in names.info.counters).preamble.id
         counter.counter_entry.index.index = 1
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + TIMEOUT_S
         while controller.read(counter)[0].counter_entry.data.packet_count < len(frames):
             assert time.monotonic() < deadline
             time.sleep(0.01)

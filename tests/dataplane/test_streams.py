@@ -42,7 +42,7 @@ def test_a_waiting_stream_is_woken():
         queue.put([b"%d" % n])
         stream.post(b"c")
     stream.end()
-    reader.join(10)
+    reader.join(60)
     assert not reader.is_alive()
     assert got.count(b"c") == 50
 

@@ -52,7 +52,9 @@ def _start(name: str, server, folder: Path) -> subprocess.Popen[str]:
 
 def test_the_analyser_sees_alerts(server, make_engine, tmp_path):
     kitsune, received = make_engine("kitsune"), []
-    kitsune.observe("due.heartbeat.WorstSenders").subscribe(lambda beat: received.append(beat.value["received"]))
+    kitsune.observe("due.heartbeat.WorstSenders").subscribe(
+        lambda beat: received.append(beat.value["received"])
+    )
     with _start("analyser.py", server, tmp_path) as process:
         assert process.stdout is not None
         assert process.stdin is not None

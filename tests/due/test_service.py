@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.due.conftest import wait_for
+from tests.due.conftest import gone, wait_for
 
 ROOT = Path(__file__).parents[2]
 APP = """
@@ -80,7 +80,7 @@ def test_a_service_works_from_ready_to_sigterm(start, tmp_path, make_engine):
     assert health[0]["app"]["ticks"] > 0
     assert health[0]["engine"]["app"] == "doubler"
     process.send_signal(signal.SIGTERM)
-    stdout, _ = process.communicate(timeout=30)
+    stdout, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     assert stdout == ""
     wait_for(lambda: out == [21, "stopped"])
@@ -90,7 +90,7 @@ def _fetch(address, path, host="localhost"):
     request = urllib.request.Request(f"http://{address}{path}", headers={"Host": host})
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        with opener.open(request, timeout=30) as answer:
+        with opener.open(request, timeout=60) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -118,7 +118,7 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
     assert _fetch(address, "/other")[0] == 404
     assert _fetch(address, "/metrics", host="evil.example")[0] == 400
     process.send_signal(signal.SIGTERM)
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=60)
     assert process.returncode == 0
     lines = [json.loads(line) for line in stderr.splitlines()]
     assert all(line["app"] == "doubler" and line["message"] for line in lines)
@@ -139,7 +139,7 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
 def test_a_wrong_option_is_one_clear_line(start, tmp_path, arguments, text):
     (tmp_path / "wrong.json").write_text('{"factr": 3}')
     process = start(*(a.format(folder=tmp_path) for a in arguments))
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=60)
     assert process.returncode in (1, 2)
     assert text in stderr
     assert "Traceback" not in stderr
@@ -164,13 +164,11 @@ def test_a_service_ends_with_its_parent(tmp_path, server):
         "print(child.pid, flush=True)\n"
         "time.sleep(60)\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "DUE_DIRECTORY": str(tmp_path)}
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment
     ) as parent:
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         parent.kill()
-    wait_for(
-        lambda: not Path(f"/proc/{child}").exists() or "Z" in Path(f"/proc/{child}/stat").read_text().split()
-    )
+    wait_for(lambda: gone(child))

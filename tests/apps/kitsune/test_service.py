@@ -93,12 +93,14 @@ def test_scores_and_alerts_of_a_stream(server, controller, tmp_path):
         state = np.concatenate([item["state"] for item in scores])[:3_000]
         assert np.array_equal(np.flatnonzero(state), np.arange(2_001, 3_000))
         assert np.allclose(found[2_001:], wanted[2_001:], rtol=1e-12, atol=0)
-        before = len(alerts)
+        open_until = (int(batch["time_us"][-1]) // 1_000_000 + 1) * 10**9
+        assert open_until not in [alert["event_time"] for alert in alerts]
         process.send_signal(signal.SIGTERM)
         assert process.wait(DEADLINE_S) == 0
-        wait_for(lambda: len(alerts) > before)  # the open second, closed at the stop
-        archived = controller.get(ALERT)
-        assert [item.value["id"] for item in archived] == [alert["id"] for alert in alerts]
+        archived = [item.value for item in controller.get(ALERT)]
+        assert archived[-1]["event_time"] == open_until, "the open second is closed at the stop"
+        wait_for(lambda: len(alerts) == len(archived))
+        assert [alert["id"] for alert in alerts] == [alert["id"] for alert in archived]
         assert len(controller.get(SCORE)) == 13
         assert (tmp_path / "model.npz").exists()
     finally:

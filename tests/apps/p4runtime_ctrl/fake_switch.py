@@ -7,6 +7,7 @@ UNKNOWN with one `p4.Error` per update.
 
 import queue
 import threading
+import time
 from concurrent import futures
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -63,15 +64,21 @@ class FakeSwitch:
     def start(self) -> None:
         self._server = grpc.server(futures.ThreadPoolExecutor(16), options=[("grpc.so_reuseport", 0)])
         add_p4runtime_servicer(self, self._server)
-        self.port = self._server.add_insecure_port(f"127.0.0.1:{self.port}")
-        assert self.port
+        deadline = time.monotonic() + 60
+        while True:
+            try:
+                self.port = self._server.add_insecure_port(f"127.0.0.1:{self.port}")
+                break
+            except RuntimeError:  # the one before may not have let the port go yet
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
         self._server.start()
 
     def stop(self) -> None:
         with self.lock:
             for stream in self.streams:
                 stream.outgoing.put(None)
-        self._server.stop(grace=0).wait(5)
+        self._server.stop(grace=0).wait(60)
 
     def restart(self) -> None:
         self.stop()

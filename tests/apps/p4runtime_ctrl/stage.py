@@ -97,7 +97,7 @@ class Stage:
 
     def kill(self, process: subprocess.Popen[str]) -> None:
         process.kill()
-        process.wait(10)
+        process.wait(60)
 
     def engine(self, app_id: str = "firewall", **init: object) -> Engine:
         engine = Engine(Options(directory=str(self.folder / "due"), handshake_timeout=5.0))
@@ -117,13 +117,13 @@ class Stage:
 def end(process: subprocess.Popen[str]) -> int:
     if process.poll() is None:
         process.terminate()
-    code = process.wait(20)
+    code = process.wait(60)
     if process.stdout is not None:
         process.stdout.close()
     return code
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 30.0, why: Callable[[], object] = str) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = 90.0, why: Callable[[], object] = str) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, why()
@@ -161,7 +161,7 @@ class Bystander:
 
     def __enter__(self) -> "Bystander":
         self._connection.open()
-        assert self._primary.wait(20)
+        assert self._primary.wait(60)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,6 +1,5 @@
 """Real switches for tests: the embedded one always, BMv2 where it is installed; both without ports."""
 
-import ctypes
 import json
 import signal
 import socket
@@ -10,14 +9,14 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from dataplane.bmv2 import unshared
+from dataplane.bmv2 import ending_with_us, unshared
 from tests.requirements import optional_program
 
 KINDS = ("embedded", "bmv2")
 
 
 class Target:
-    """A switch process that can be killed and started again on the same address."""
+    """A switch process that can be killed and started again on the same address, known from its first start on."""
 
     def __init__(
         self, kind: str, folder: Path, *, ports: tuple[str, ...] = (), more: tuple[str, ...] = ()
@@ -27,7 +26,7 @@ class Target:
         self._ports = ports
         self._more = more
         self._program = sys.executable if kind == "embedded" else optional_program("simple_switch_grpc")
-        self._port = free_port()
+        self._port = 0 if kind == "embedded" else free_port()
         self._process: subprocess.Popen[str] | None = None
 
     @property
@@ -46,16 +45,15 @@ class Target:
                 *ports, "--", "--grpc-server-addr", self.address, "--cpu-port", "510"]  # fmt: skip
 
     def start(self) -> None:
+        # the embedded switch sees to it by itself that it ends with us
+        command = self.command if self.kind == "embedded" else ending_with_us(self.command)
         self._process = subprocess.Popen(
-            self.command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            preexec_fn=_die_with_parent,  # noqa: PLW1509 - one call of prctl, nothing else
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
         if self.kind == "embedded":
             assert self._process.stdout is not None
-            assert json.loads(self._process.stdout.readline())["ready"]
+            ready = json.loads(self._process.stdout.readline())
+            self._port = int(ready["grpc"].rpartition(":")[2])
         else:
             _wait_for_port(self._port)
 
@@ -82,7 +80,7 @@ class Target:
     def _end(self) -> None:
         assert self._process is not None
         self._process.send_signal(signal.SIGCONT)
-        self._process.wait(10)
+        self._process.wait(60)
         assert self._process.stdout is not None
         self._process.stdout.close()
         self._process = None
@@ -95,14 +93,10 @@ def free_port() -> int:
 
 
 def _wait_for_port(port: int) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         with closing(socket.socket()) as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
                 return
         time.sleep(0.05)
     raise AssertionError(f"nothing listens on port {port}")
-
-
-def _die_with_parent() -> None:
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)

@@ -41,7 +41,7 @@ class Listener:
         self._note(lambda: self.lost_causes.append(cause))
 
     def packets(self, messages):
-        self.gate.wait(10)
+        self.gate.wait(60)
         self._note(lambda: self.lists.append(messages))
 
     def digests(self, lists):
@@ -50,7 +50,7 @@ class Listener:
     def other(self, message):
         self._note(lambda: self.others.append(message))
 
-    def until(self, condition, seconds=10):
+    def until(self, condition, seconds=60):
         with self.changed:
             assert self.changed.wait_for(condition, seconds), (self.lost_causes, len(self.lists))
 

@@ -67,8 +67,9 @@ def cabled(kind, folder):
     with ExitStack() as held:
         cable = VethPair.make(held, "out")
         stage = held.enter_context(Stage(folder, kind=kind, veth=cable.far, forward={}))
-        wire = held.enter_context(socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY)))
-        wire.bind((cable.near, 0))
+        # protocol 0 until it is bound, or frames of all interfaces would wait in it
+        wire = held.enter_context(socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0))
+        wire.bind((cable.near, _EVERY))
         wire.settimeout(90)
         yield stage, wire
 
@@ -100,7 +101,7 @@ def test_cells_are_read_in_band(kind, tmp_path):
             f"network.packets.p4runtime_ctrl.s1.q{BIT}", STATE,
         )  # fmt: skip
         # the state was asked for last: when it comes, the controller knows that all the others are wanted
-        wait_for(lambda: heard.values("network.switch"), 90, why=stage.log)
+        wait_for(lambda: any(value["primary"] for value in heard.values("network.switch")), 90, why=stage.log)
         wanted = ("network.p4_command.sonata_adapter.s1", f"network.telemetry.sonata.q{BIT}", REQUEST)
         wait_for(lambda: all(map(engine.wanted, wanted)), 90, why=stage.log)
         command = TableCommand(id="c1", updates=(counting(),))

@@ -71,7 +71,8 @@ def test_packets_are_copied_only_while_somebody_wants_them(stage):
         wait_for(lambda: got.append(feed.verdicts()) or any(got))
         return b"".join(got)[0] & 1
 
-    assert copied() == 0
+    # until it has heard of the Coordinator the controller asks for everything
+    wait_for(lambda: copied() == 0, why=stage.log)
     packets = Heard(engine, PACKETS)
     wait_for(
         lambda: any(value["telemetry"] == ["packets"] for value in state.values("switch")), why=stage.log
@@ -91,8 +92,7 @@ def test_packets_of_one_port_are_a_key_of_their_own(stage):
     wait_for(lambda: any(v["telemetry"] == ["port2", "port1"] for v in heard.values("switch")), why=stage.log)
     feed = stage.feed()
     feed.send([1, 2], [60, 60], [frame(1), frame(2)])
-    wait_for(lambda: any(item.key == one for item in heard.items), why=stage.log)
-    assert sum(len(item.value) for item in heard.items if item.key == one) == 2
+    wait_for(lambda: sum(len(item.value) for item in heard.items if item.key == one) == 2, why=stage.log)
     assert not any(item.key == other for item in heard.items)
     feed.close()
 
@@ -159,6 +159,11 @@ def all_frames():
     return times, lengths, frames
 
 
+def told_of(state, count):
+    """A state of after the last of so many digests, and of the records made from copies."""
+    return state["digests"] == count and state["fell_back"] == state["packet_in"]
+
+
 def test_digests_give_the_same_records_as_copied_frames(stage):
     times, lengths, frames = all_frames()
     stage.controller(telemetry="digest")
@@ -168,11 +173,11 @@ def test_digests_give_the_same_records_as_copied_frames(stage):
     feed = stage.feed()
     feed.send(times, lengths, frames)
     wait_for(lambda: len(heard.arrivals()) == len(frames), 90, why=stage.log)
-    wait_for(lambda: heard.values("switch")[-1]["digests"] == len(frames), 90, why=stage.log)
+    # pings and the like of the capture come as copies, too
+    wait_for(lambda: told_of(heard.values("switch")[-1], len(frames)), 90, why=stage.log)
     state = heard.values("switch")[-1]
     assert (state["skipped"], state["lost"]) == (0, 0)
-    # pings and the like of the capture come as copies, too
-    assert 4 * 12 <= state["fell_back"] == state["packet_in"] < len(frames) // 4
+    assert 4 * 12 <= state["packet_in"] < len(frames) // 4
     batches = [item.value for item in heard.items if item.key == PACKETS]
     got = {name: np.concatenate([batch[name] for batch in batches]) for name in PACKET_COLUMNS}
     padded = [frame.ljust(length, b"\0")[:256] for frame, length in zip(frames, lengths, strict=True)]
@@ -200,9 +205,10 @@ def test_frames_are_published_to_who_wants_them(stage):
     wait_for(
         lambda: sum(len(value["frames"]) for value in heard.values("network.frames")) == 2, why=stage.log
     )
-    (value,) = heard.values("network.frames")
-    assert value["frames"] == [frame(1), frame(2)]
-    assert read_frames(**value)["ip_src_lo"].tolist() == [0x0A000001, 0x0A000002]
+    values = heard.values("network.frames")  # in one batch or in two
+    assert [each for value in values for each in value["frames"]] == [frame(1), frame(2)]
+    sources = [source for value in values for source in read_frames(**value)["ip_src_lo"].tolist()]
+    assert sources == [0x0A000001, 0x0A000002]
     feed.close()
 
 
@@ -212,6 +218,7 @@ def test_an_offer_is_sent_under_its_name_while_observed(stage):
     engine = stage.engine("listener", capabilities=(offers,))
     heard = Heard(engine, "network.packets.p4runtime_ctrl.s1.dns", STATE)
     offer = {"name": "dns", "bit": 3, "conditions": {"src": "10.0.0.2", "protocol": 17, "dport": 53}}
+    wait_for(lambda: engine.wanted("network.telemetry.listener.dns"), why=stage.log)
     engine.write("network.telemetry.listener.dns", offer)
     wait_for(lambda: any(v["telemetry"] == ["dns"] for v in heard.values("switch")), why=stage.log)
     feed = stage.feed()
@@ -229,6 +236,7 @@ def test_idle_entries_are_removed_by_the_capture_clock(stage):
     heard = Heard(engine, CONFIRMATIONS, STATE)  # before there is anything to confirm
     stage.controller()
     wait_for(lambda: engine.wanted("network.p4_command.listener.s1"), why=stage.log)
+    wait_for(lambda: any(value["primary"] for value in heard.values("switch")), why=stage.log)
     entry = TableUpdate(
         kind="insert",
         table="block_src",

@@ -114,9 +114,10 @@ def cables(count):
         sockets, far_ends = [], []
         for number in range(count):
             cable = VethPair.make(stack, f"l{'abcdefgh'[number]}")
-            wire = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY))
+            # protocol 0 until it is bound, or frames of all interfaces would wait in it
+            wire = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
             stack.callback(wire.close)
-            wire.bind((cable.near, 0))
+            wire.bind((cable.near, _EVERY))
             wire.setblocking(False)
             sockets.append(wire)
             far_ends.append(cable.far)

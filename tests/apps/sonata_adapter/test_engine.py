@@ -9,8 +9,9 @@ import pytest
 from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.engine import HostEngine
 from apps.sonata_adapter.query import SYN, Query, count, field, ip, largest, length, tcp
+from apps.sonata_adapter.query import udp as own
 from apps.sonata_adapter.results import Captured
-from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, batches, office, udp
+from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, batches, mixed, office, udp
 from tests.apps.sonata_adapter.traffic import tcp as tcp_frame
 
 
@@ -153,3 +154,60 @@ def test_missing_bytes_are_counted(name):
     engine.process(headers)
     assert engine.without_payload == 1
     assert np.array_equal(headers["length"], whole["length"])
+
+
+def outputs(queries, frames, size=700, changes=()):
+    """Results by query; `changes` are called with the engine after so many batches."""
+    engine = HostEngine()
+    for query in queries:
+        engine.add(query)
+    found = []
+    for number, batch in enumerate(batches(frames, size)):
+        for at, change in changes:
+            if at == number:
+                change(engine)
+        found += engine.process(batch)
+    return sorted(str(each) for each in found + engine.finish())
+
+
+def test_queries_together_find_what_each_finds_alone():
+    """They share columns, keys and flows: in small batches and in large ones, disordered ones too."""
+    rng = random.Random(5)
+    frames = mixed(CATALOGUE, seconds=12)
+    near = sorted(frames, key=lambda frame: frame.time_us + rng.randrange(300_000))
+    queries = [template.query() for template in CATALOGUE.values()]
+    queries += [counting(5, 700)]
+    for order, size in ((frames, 20_000), (near, 700)):
+        alone = [text for query in queries for text in outputs([query], order, size)]
+        assert outputs(queries, order, size) == sorted(alone)
+
+
+def test_queries_that_come_and_go_do_not_disturb_the_others():
+    """What the others find is the same, whoever shares their work for a while."""
+    frames = mixed(CATALOGUE, seconds=12)
+    stay = [CATALOGUE[name].query() for name in ("superspreader", "slowloris", "syn_flood")]
+    changes = [
+        (2, lambda engine: engine.add(counting(1))),
+        (3, lambda engine: engine.add(CATALOGUE["ddos"].query({"threshold": 1}))),
+        (5, lambda engine: engine.remove("ddos")),
+        (6, lambda engine: engine.remove("q")),
+    ]
+    names = {query.name for query in stay}
+    kept = [text for text in outputs(stay, frames, 300, changes) if text.split("'")[1] in names]
+    assert kept == outputs(stay, frames, 300)
+
+
+def test_a_query_that_comes_sees_flows_that_others_have_seen_before():
+    """The first packets of the flows were before its time; the next ones count."""
+    frames = [
+        Frame(BASE_US + t * 1000, 60, udp("10.0.0.9", f"10.0.1.{n}", 1, 2))
+        for t in (10, 20)
+        for n in range(50)
+    ]
+    later = Query("later", 3000).map(src=ip.src, dst=ip.dst, port=own.dport).distinct()
+    engine = HostEngine()
+    engine.add(CATALOGUE["superspreader"].query())
+    run(engine, frames[:50])
+    engine.add(later)
+    found = run(engine, frames[50:])
+    assert [r.query for r in found] == ["later"] * 50

@@ -5,12 +5,16 @@ from functools import partial
 import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
+from apps.sonata_adapter.control import Control
+from apps.sonata_adapter.placement import SwitchLimits
+from dataplane.capture_port import COPIED
 from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, end, wait_for
 from tests.apps.sonata_adapter.test_catalogue import expect
 from tests.apps.sonata_adapter.traffic import BASE_US as TRAFFIC_US
 from tests.apps.sonata_adapter.traffic import Frame, mixed
 
 PREFIX = "network.traffic_query.sonata"
+ENTERED = ("installed", "exists")
 
 
 @pytest.fixture
@@ -33,12 +37,17 @@ def test_keys_become_queries_and_leave_with_them(stage):
     adapter = stage.run("apps.sonata_adapter.service", {"limits": {"reads": False}})
     engine = stage.engine("observer")
     states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    confirmations = Heard(engine, "network.confirmation.p4runtime_ctrl.s1")
     stage.controller()
-    wait_for(lambda: states.values("network.switch"))
-    assert telemetry(states) == []
+    # until it has heard of the Coordinator the controller asks for everything
+    wait_for(lambda: states.values("network.switch") and telemetry(states) == [], why=stage.log)
     keys = {name: f"{PREFIX}.{name}:window=2s" for name in CATALOGUE}
+    wanted = Control(CATALOGUE, limits=SwitchLimits(reads=False)).want(keys.values())
     results = Heard(engine, *keys.values())
-    wait_for(lambda: len(telemetry(states)) >= 19, why=lambda: (telemetry(states), stage.log()[-3000:]))
+    wait_for(
+        lambda: is_set_up(wanted, states, confirmations),
+        why=lambda: (telemetry(states), stage.log()[-3000:]),
+    )
     frames = mixed(CATALOGUE, seconds=16)
     feed = stage.feed()
     for begin in range(0, len(frames), 256):
@@ -53,15 +62,25 @@ def test_keys_become_queries_and_leave_with_them(stage):
 
     wait_for(processed)
     feed.close()
+    copied = sum(verdict & COPIED for verdict in verdicts)
+    wait_for(lambda: states.values("network.switch")[-1]["packet_in"] == copied, why=stage.log)
     health = Heard(engine, "due.health.sonata_adapter")
     wait_for(lambda: quiet(health))
     end(adapter)
     shifted = [Frame(f.time_us - TRAFFIC_US + BASE_US, f.length, f.data) for f in frames]
     for name in CATALOGUE:
         truth = {(f.window, f.fields) for f in expect(name, shifted, {"window": 2000})}
-        wait_for(partial(at_least, results, name, truth), 5, partial(found, results, name))
+        wait_for(partial(at_least, results, name, truth), why=partial(found, results, name))
         assert found(results, name) == truth
     results.stop()
+
+
+def is_set_up(wanted, states, confirmations):
+    """The switch has all bits and all counting entries: they come on streams of their own."""
+    entries = set()
+    for one in confirmations.values("confirmation"):
+        (entries.add if one["state"] in ENTERED else entries.discard)(one["handle"])
+    return (len(telemetry(states)), len(entries)) == (len(wanted.offer), len(wanted.updates))
 
 
 def quiet(health):
@@ -97,7 +116,7 @@ def test_two_consumers_share_and_the_last_one_removes(stage):
     wait_for(lambda: telemetry(states) == ["q0"], why=stage.log)
     first.stop()
     second.stop()
-    wait_for(lambda: telemetry(states) == [], 10, stage.log)
+    wait_for(lambda: telemetry(states) == [], why=stage.log)
 
 
 def test_wrong_parameter_is_answered(stage):
@@ -126,7 +145,7 @@ def test_a_killed_adapter_leaves_nothing(stage):
         lambda: "removed" in [item.value["state"] for item in confirmations.items],
         why=lambda: ([item.value for item in confirmations.items], stage.log()[-2000:]),
     )
-    wait_for(lambda: confirmations.items[-1].value["state"] in ("installed", "exists"))
+    wait_for(lambda: confirmations.items[-1].value["state"] in ENTERED)
 
 
 def test_a_new_controller_is_told_everything(stage):

@@ -135,8 +135,13 @@ def test_spark_fed_by_reliable_streams(tmp_path, frames):
         )
         service.start()
         state = {"base_us": TRAFFIC_US, "primary": True}
-        controller.write("network.switch.p4runtime_ctrl.s1", state, [NO_WAIT])
-        wait_for(lambda: service.health()["bits"] and service.health()["switches"], why=service.health)
+
+        def knows_the_switch():
+            controller.write("network.switch.p4runtime_ctrl.s1", state, [NO_WAIT])
+            return service.health()["bits"] and service.health()["switches"]
+
+        # best effort: said until it is heard
+        wait_for(knows_the_switch, why=service.health)
         for batch in packets:
             wait_for(partial(controller.write, "network.packets.p4runtime_ctrl.s1.q0", batch))
         controller.flush()

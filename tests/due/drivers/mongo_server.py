@@ -11,7 +11,10 @@ from pathlib import Path
 
 from tests.requirements import require_program
 
-_STARTED = re.compile(r"Listening on 127\.0\.0\.1:(\d+)")
+_STARTED = re.compile(r"Listening on 127\.0\.0\.1:(\d+)\D")
+
+PATIENT = "serverSelectionTimeoutMS=60000"
+"""Option for the URL of a server that is there, but may be slow to answer where cores are short."""
 
 
 @contextmanager
@@ -49,7 +52,7 @@ def nx_server(folder: Path, *, db: str = "memory", port: int = 0) -> Iterator[st
 
 
 def _port(log: Path, process: "subprocess.Popen[bytes]") -> int:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while time.monotonic() < deadline and process.poll() is None:
         found = _STARTED.search(log.read_text() if log.exists() else "")
         if found:

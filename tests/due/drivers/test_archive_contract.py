@@ -17,7 +17,7 @@ from due.drivers.mongodb import MongoArchive
 from due.drivers.sqlite import SqliteArchive
 from due.errors import BackendError, InvalidKey, InvalidQuery
 from due.messages import Item, RecordBatch
-from tests.due.drivers.mongo_server import mongo_server
+from tests.due.drivers.mongo_server import PATIENT, mongo_server
 from tests.naive.archive_query import naive_find
 
 T0 = 1_700_000_000_123_456_789
@@ -38,7 +38,9 @@ def open_archive(request: pytest.FixtureRequest, tmp_path) -> Iterator[Open]:
     if request.param == "sqlite":
         url = f"sqlite://{tmp_path}/archive.db"
     else:
-        url = request.getfixturevalue("mongo_url") + f"?collection=t{abs(hash(request.node.nodeid))}"
+        url = (
+            request.getfixturevalue("mongo_url") + f"?{PATIENT}&collection=t{abs(hash(request.node.nodeid))}"
+        )
 
     def make() -> ArchiveDriver:
         opened.append(SqliteArchive(url) if request.param == "sqlite" else MongoArchive(url))

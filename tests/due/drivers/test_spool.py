@@ -73,7 +73,7 @@ def test_a_file_that_is_no_spool_is_refused(tmp_path: Path) -> None:
         DiskSpool(tmp_path, 1 << 20)
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(st.tuples(st.sampled_from(["put", "take", "done", "reopen"]), st.integers(0, 4)), max_size=20)
 )

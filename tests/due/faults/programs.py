@@ -19,7 +19,7 @@ def _engine(url: str, app: str, role=PRODUCER | CONSUMER, **init) -> Engine:
 
 
 def produce(url: str, delivery: str, count: str, size: str) -> None:
-    """Write numbered payloads and say where we are; the last line says that all is flushed."""
+    """Write numbered payloads and say where we are, then that all is flushed; one more for each line we get."""
     engine = _engine(
         url,
         "maker",
@@ -32,8 +32,8 @@ def produce(url: str, delivery: str, count: str, size: str) -> None:
             print(number + 1, flush=True)
     engine.flush(120)
     print("flushed", engine.health()["updates"]["resent"], flush=True)
-    sys.stdin.readline()
-    engine.write(KEY, [int(count), padding], [PUB_ONLY])
+    for number, _ in enumerate(sys.stdin, int(count)):
+        engine.write(KEY, [number, padding], [PUB_ONLY])
     engine.close()
 
 
@@ -47,6 +47,8 @@ def consume(url: str, app: str, count: str, delay_ms: str) -> None:
         if delay:
             time.sleep(delay)
         sys.stdout.write(f"{item.sequence} {item.value[0]}\n")
+        if delay:
+            sys.stdout.flush()  # whatever is acknowledged has been said, also if we are killed now
         left[0] -= 1
 
     engine.observe(KEY).subscribe(callback)
@@ -67,7 +69,7 @@ def consume(url: str, app: str, count: str, delay_ms: str) -> None:
 
 def speak(url: str, name: str, heartbeat: str) -> None:
     """One of several standby instances: writes its name and a number every 5 ms, says what came of it."""
-    engine = Engine(Options(heartbeat=float(heartbeat), handshake_timeout=10.0))
+    engine = Engine(Options(heartbeat=float(heartbeat), handshake_timeout=20.0))
     engine.set_pubsub(url)
     engine.init("speaker", PRODUCER, capabilities=[Capability(SPEECH, delivery="reliable")])
     print("instance", engine.instance_id, flush=True)

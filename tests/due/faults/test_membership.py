@@ -17,7 +17,7 @@ def coordinator(programs, own_server, tmp_path):
     return start
 
 
-def _pair(programs, url, heartbeat=0.25):
+def _pair(programs, url, heartbeat=0.5):
     """Two speakers and a listener; returns (listener, active, standby)."""
     listener = programs("listen", url)
     listener.wait_for("ready")
@@ -37,7 +37,7 @@ def _states(program):
     return [line.split()[0] for line in program.lines() if line.startswith(("active", "standby"))]
 
 
-def _watch(condition, seconds=40.0):
+def _watch(condition, seconds=80.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "nothing happened in time"
@@ -79,7 +79,7 @@ def test_a_paused_active_instance_does_not_speak_twice(programs, own_server, coo
 
 def test_data_flows_while_the_coordinator_is_dead_and_it_learns_all_again(programs, own_server, coordinator):
     first = coordinator()
-    listener, (active, process), (standby, standby_process) = _pair(programs, own_server.url, 0.5)
+    listener, (active, process), (standby, standby_process) = _pair(programs, own_server.url)
     _watch(lambda: len(_said(listener, active)) > 50)
     first.kill()
     count = len(_said(listener, active))

@@ -1,0 +1,27 @@
+"""Packets of flows that a window has seen."""
+
+import random
+
+from apps.sonata_adapter.columns import Packets
+from apps.sonata_adapter.flows import SeenFlows
+from tests.apps.sonata_adapter.traffic import batches, office
+
+
+def test_every_flow_of_a_window_is_there_and_few_packets_more():
+    """The first packet of each; a new window and forgetting begin anew."""
+    seen, rows = SeenFlows(), 0
+    for number, batch in enumerate(batches(sorted(office(20, random.Random(3), long=True)), 500)):
+        if number % 5 == 0:
+            seen.begin(number)
+            known = set()
+        packets = Packets(batch)
+        bits, kept = packets.flows().tolist(), seen.new(packets).origin.tolist()
+        fresh = {bit: row for row, bit in reversed(list(enumerate(bits))) if bit not in known}
+        assert set(fresh.values()) <= set(kept)
+        assert kept == sorted(kept)
+        rows += len(kept) - len(fresh)
+        known |= set(bits)
+    assert rows < 50
+    assert not len(seen.new(packets))
+    seen.forget()
+    assert len(seen.new(packets)) == len(set(bits))
