@@ -82,20 +82,20 @@ class BlockReader:
         del self._bytes[:start]
 
     def _take(self, block: bytes, count: int, size: int) -> None:
-        times = np.frombuffer(block, "<i8", count)
-        wire = np.frombuffer(block, "<u4", count, 8 * count).tolist()
-        captured = np.frombuffer(block, "<u4", count, 12 * count)
-        if int(captured.sum(dtype=np.int64)) != size:
+        # no arrays: of a block of one frame they would take longer than the rest of its way
+        times = struct.unpack_from(f"<{count}q", block)
+        wire = struct.unpack_from(f"<{count}I", block, 8 * count)
+        captured = struct.unpack_from(f"<{count}I", block, 12 * count)
+        if sum(captured) != size:
             raise CaptureError("the frames' lengths do not add up to the block's")
-        ends = (np.cumsum(captured, dtype=np.int64) + _PER_FRAME * count).tolist()
-        start = _PER_FRAME * count
+        end = _PER_FRAME * count
         if self._next:
             del self._frames[: self._next], self._times[: self._next]
             self._next = 0
-        self._times += times.tolist()
-        for end, length in zip(ends, wire, strict=True):
-            self._frames.append(block[start:end].ljust(length, b"\0"))
-            start = end
+        self._times += times
+        for length, whole in zip(captured, wire, strict=True):
+            start, end = end, end + length
+            self._frames.append(block[start:end].ljust(whole, b"\0"))
 
     def waiting(self) -> int:
         """Frames not taken yet."""

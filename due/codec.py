@@ -86,7 +86,7 @@ def decode_value(data: bytes | memoryview) -> Any:
     """The inverse of `encode_value`; raises `DecodeError`.  Arrays are read-only views of `data`."""
     try:
         return _value_decoder.decode(data)
-    except (msgspec.DecodeError, ValueError, TypeError, RecursionError) as error:
+    except _DAMAGED as error:
         raise DecodeError(f"not a DUE value: {error}") from error
 
 
@@ -104,6 +104,10 @@ def encode_single(head: Frame, value: Any) -> bytes:
     return b"".join((prefix, *_value_parts(value, len(prefix))))
 
 
+_DAMAGED = (msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError, struct.error)
+"""What reading bytes that are no values may raise; the last two of our own extensions."""
+
+
 def decode_frame(payload: bytes) -> Frame:
     """The inverse of `encode_frame`; raises `NewerVersion` or `DecodeError`."""
     if payload[:4] != _HEADER:
@@ -112,7 +116,7 @@ def decode_frame(payload: bytes) -> Frame:
         raise DecodeError(f"not a DUE frame: begins with {payload[:8]!r}")
     try:
         frame = _frame_decoder.decode(memoryview(payload)[4:])
-    except (msgspec.DecodeError, ValueError, TypeError, RecursionError) as error:
+    except _DAMAGED as error:
         raise DecodeError(f"damaged DUE frame: {error}") from error
     times = len(frame.timestamps) if frame.event_times is None else len(frame.event_times)
     if not len(frame.values) == len(frame.timestamps) == times:
@@ -273,8 +277,8 @@ def _body(head: Any, arrays: Sequence[npt.NDArray[Any]], offset: int) -> list[by
 
 
 def _raw(array: npt.NDArray[Any]) -> memoryview | bytes:
-    if not array.size:
-        return b""
+    if array.nbytes <= _COPIED_BELOW:
+        return array.tobytes()
     return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
 
 
@@ -285,6 +289,8 @@ def _dtype_text(dtype: np.dtype[Any]) -> Any:
 
 
 _EXT_HEADER = 6
+_COPIED_BELOW = 512
+"""Bytes of an array that are copied sooner than a view of them is made."""
 
 
 def _ext_header(code: int, body: list[bytes | memoryview]) -> bytes:

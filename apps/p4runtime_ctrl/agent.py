@@ -37,6 +37,9 @@ _LOG = logging.getLogger(__name__)
 _JOBS: Final = 10_000
 _ALIVE_S: Final = 1.0
 _SETTLE_S: Final = 1.0
+_CALM_S: Final = 0.25
+"""Decisions that follow each other are counted together: to read and show every block costs the switch and us
+as much as carrying out several decisions."""
 _COUNTING_SHARE: Final = 5
 """Counters are being read for at most one part in so many of the time."""
 
@@ -87,6 +90,8 @@ class Agent:
         self._readings = Readings()
         self._publishing = threading.Lock()
         self._counting = threading.Event()
+        self._uncounted = False
+        """Decisions were carried out since counters were read last."""
         self._counted_second = 0
         self._counted_at = 0.0
         self._count_after = 0.0
@@ -147,7 +152,7 @@ class Agent:
         if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
             self._alive_at = now
             self._put(self._check_alive)
-        if now - self._counted_at > 1:
+        if now - self._counted_at > (_CALM_S if self._uncounted else 1):
             self._count_soon()
         self._settle(now)
         if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
@@ -283,7 +288,9 @@ class Agent:
         decisions = [self._urgent.popleft() for _ in range(len(self._urgent))]
         if decisions:
             self._confirm(self._switch.decide(decisions, self._session))
-            self._count_soon()
+            self._uncounted = True
+            if time.monotonic() - self._counted_at > _CALM_S:
+                self._count_soon()
 
     def _command(self, command: TableCommand) -> None:
         self._confirm(self._switch.command(command, self._session))
@@ -339,6 +346,7 @@ class Agent:
 
     def _count(self) -> None:
         """Not in this thread: a switch under a flood takes its time, and a decision must not wait for it."""
+        self._uncounted = False
         told = (self._session, self._switch.counted_tables, time.monotonic())
         threading.Thread(
             target=self._read_counters, args=told, name=f"counters {self.name}", daemon=True

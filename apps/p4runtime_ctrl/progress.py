@@ -79,7 +79,8 @@ class Progress:
         # after a break in both streams the first number may be lower: then the switch began anew
         first = self._highest if self._highest and not self._passed else int(numbers[0]) - 1
         before = self._passed.get(source, first)
-        backwards = np.flatnonzero(np.diff(numbers, prepend=before) % _WRAP >= _HALF)
+        previous = np.concatenate(([before], numbers[:-1]))
+        backwards = np.flatnonzero((numbers - previous) % _WRAP >= _HALF)
         start = 0
         for begin in backwards:
             self._pass(source, numbers[start:begin])
