@@ -1,36 +1,35 @@
 """Fields of packets and tuples as numpy columns, read on demand and once.
 
 An address column is two uint64 halves.  IPv4 addresses have 0 in the upper half; to keep `::1` apart
-from `0.0.0.1`, the upper half of an IPv6 address is stored XOR `_SIX`, whose own value (a reserved
+from `0.0.0.1`, the upper half of an IPv6 address is stored XOR `SIX`, whose own value (a reserved
 multicast prefix) is no source or destination of real packets.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
-from ipaddress import ip_network
-from typing import Any, Final, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.expressions import (
-    Binary,
-    Contains,
-    Expression,
-    Field,
-    Kind,
-    Not,
-    Number,
-    Operator,
-    Within,
-    address_text,
-)
+from apps.sonata_adapter.evaluation import SIX, Rows, column_of, evaluate
+from apps.sonata_adapter.expressions import Expression, Field, Kind, address_text
+from apps.sonata_adapter.numbering import Numbered, Numbering
 from apps.sonata_adapter.payload import Frames
-from apps.sonata_adapter.tables import Column, Hashes, Part, hashes, is_constant, take, zeros
+from apps.sonata_adapter.tables import Column, Hashes, Part, combined, hashes, mixed, take, zeros
 from due import RecordBatch
 
-_SIX: Final = 0xFFFF_0000_0000_0001
-_ALL_ONES: Final = (1 << 64) - 1
+__all__ = [
+    "NO_TUPLES",
+    "Missing",
+    "Numberings",
+    "Packets",
+    "Rows",
+    "Tuples",
+    "address_number",
+    "column_of",
+    "evaluate",
+    "plain_value",
+]
 
 # field -> column of `apps.packets.PACKET_COLUMNS`, for those that are read as they stand
 _PLAIN: Final = {
@@ -61,26 +60,16 @@ _PORTS: Final = {
 _ADDRESSES: Final = {"ip.src": ("ip_src_hi", "ip_src_lo"), "ip.dst": ("ip_dst_hi", "ip_dst_lo")}
 _DNS: Final = ("dns.response", "dns.qtype", "dns.name")
 _DNS_PORT: Final = 53
-_FLOW_SLOTS: Final = 1 << 14
+_MOST: Final = 4
+"""Where more than one in so many of a batch's packets is selected, keys are mixed for all and taken."""
+_MANY: Final = 4_096
+"""For so many rows shared numbers are worth their making."""
+_ALL_PORTS: Final = Field("ports")
+_FLOW: Final = (Field("ip.src"), Field("ip.dst"), _ALL_PORTS)
 
 
-class Rows(Protocol):
-    """Tuples of one batch."""
-
-    def __len__(self) -> int: ...
-
-    def column(self, name: str) -> Column:
-        """A field's values."""
-
-    def contains(self, pattern: bytes) -> NDArray[np.bool_]:
-        """Which packets' payloads contain the pattern."""
-
-    def where(self, condition: Expression) -> "Rows":
-        """The rows for which the condition holds."""
-
-    @property
-    def origin(self) -> NDArray[np.intp]:
-        """For each row its packet's row in the batch."""
+Numberings = dict[tuple[Expression, ...], Numbering]
+"""By the values that keys are made of."""
 
 
 class Missing:
@@ -91,18 +80,23 @@ class Missing:
 
 
 class Packets:
-    """Packets of a batch, all or some: fields are read when first asked for."""
+    """The packets of a batch: fields, keys and selections are made when first asked for, and once."""
 
-    def __init__(
-        self, batch: RecordBatch, rows: NDArray[np.intp] | None = None, missing: "Missing | None" = None
-    ) -> None:
-        self.missing = missing or Missing()
+    _rows: NDArray[np.intp] | None = None
+
+    def __init__(self, batch: RecordBatch, numberings: Numberings | None = None) -> None:
+        self._numberings: Numberings = {} if numberings is None else numberings
+        self._prepare(batch, len(batch), Missing())
+
+    def _prepare(self, batch: RecordBatch, size: int, missing: Missing) -> None:
+        self.missing = missing
         self._batch = batch
-        self._rows = rows
-        self._size = len(batch) if rows is None else len(rows)
+        self._size = size
         self._columns: dict[str, Column] = {}
+        self._terms: dict[Expression, Hashes] = {}
+        self._keys: dict[tuple[Expression, ...], Hashes] = {}
+        self._numbered: dict[tuple[Expression, ...], Numbered | None] = {}
         self._selections: dict[Expression, Packets] = {}
-        self._once: Packets | None = None
 
     def __len__(self) -> int:
         return self._size
@@ -116,11 +110,28 @@ class Packets:
     def origin(self) -> NDArray[np.intp]:
         return np.arange(self._size) if self._rows is None else self._rows
 
+    @property
+    def _every(self) -> "Packets":
+        """All packets of the batch."""
+        return self
+
+    def at(self, kept: NDArray[np.intp]) -> "Packets":
+        """Some of these packets, in the order of `kept`."""
+        return _Selection(self, kept)
+
+    def between(self, first: int, end: int) -> "Packets":
+        """The rows of the batch from `first` on and before `end`; the rows must be in order."""
+        return _Stretch(self, slice(first, end))
+
     def column(self, name: str) -> Column:
         found = self._columns.get(name)
         if found is None:
             found = self._columns[name] = self._read(name)
         return found
+
+    def columns_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> list[Column]:
+        some = self.at(rows)
+        return [column_of(value, some) for value in values]
 
     def where(self, condition: Expression) -> "Packets":
         """The packets for which the condition holds."""
@@ -128,35 +139,61 @@ class Packets:
             return self
         found = self._selections.get(condition)
         if found is None:
-            mask = evaluate(condition, self)
-            if mask.all():
-                found = self
-            else:
-                kept = np.flatnonzero(mask)
-                found = Packets(self._batch, kept if self._rows is None else self._rows[kept], self.missing)
-            self._selections[condition] = found
+            found = self._selections[condition] = self._where(condition)
         return found
 
-    @property
-    def once(self) -> "Packets":
-        """At least the first packet of each flow (addresses, protocol, ports), few others."""
-        if self._once is None:
-            keys = self._flow_keys()
-            home = (keys & np.uint64(_FLOW_SLOTS - 1)).view(np.int64)
-            slots = np.zeros(_FLOW_SLOTS, dtype=np.int64)
-            rows = np.arange(self._size)
-            slots[home[::-1]] = rows[::-1]
-            first = slots[home]
-            kept = np.flatnonzero((first == rows) | (keys[first] != keys))
-            self._once = Packets(self._batch, self.origin[kept], self.missing)
-        return self._once
+    def _where(self, condition: Expression) -> "Packets":
+        mask = evaluate(condition, self)
+        return self if mask.all() else self.at(np.flatnonzero(mask))
 
-    def _flow_keys(self) -> Hashes:
-        source = np.maximum(self._raw("tcp_sport"), self._raw("udp_sport")).astype(np.int64) + 1
-        destination = np.maximum(self._raw("tcp_dport"), self._raw("udp_dport")).astype(np.int64) + 1
-        protocol = self._raw("ip_proto").astype(np.int64) + 1
-        packed = source << 26 | destination << 9 | protocol
-        return hashes([self.column("ip.src"), self.column("ip.dst"), (packed,)], self._size)
+    def keys(self, values: tuple[Expression, ...]) -> Hashes:
+        found = self._keys.get(values)
+        if found is None:
+            found = self._keys[values] = self._made_keys(values)
+        return found
+
+    def _made_keys(self, values: tuple[Expression, ...]) -> Hashes:
+        return combined([self._term(value) for value in values], self._size)
+
+    def numbered(self, values: tuple[Expression, ...]) -> Numbered | None:
+        if self._size < _MANY:
+            return None
+        if values not in self._numbered:
+            self._numbered[values] = self._made_numbers(values)
+        return self._numbered[values]
+
+    def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
+        numbering = self._numberings.setdefault(values, Numbering())
+        return numbering.number(self.keys(values))
+
+    def keys_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> Hashes:
+        known = self._every._keys.get(values)  # noqa: SLF001 - of its own kind
+        if known is None:
+            return self.keys(values)[rows]
+        return known[rows if self._rows is None else self._rows[rows]]
+
+    def flows(self) -> Hashes:
+        """64 bits that the packets of a flow (addresses, protocol, ports) share, and no others."""
+        return self.keys(_FLOW)
+
+    def _term(self, value: Expression) -> Hashes:
+        """The share of a value in keys."""
+        found = self._terms.get(value)
+        if found is None:
+            found = self._terms[value] = self._made_term(value)
+        return found
+
+    def _made_term(self, value: Expression) -> Hashes:
+        return mixed(self._ports() if value == _ALL_PORTS else column_of(value, self))
+
+    def _ports(self) -> Column:
+        """Protocol and ports in one number."""
+        packed = np.maximum(self._raw("tcp_sport"), self._raw("udp_sport")).astype(np.int64)
+        packed <<= 17
+        packed += np.maximum(self._raw("tcp_dport"), self._raw("udp_dport"))
+        packed <<= 9
+        packed += self._raw("ip_proto")
+        return (packed,)
 
     def contains(self, pattern: bytes) -> NDArray[np.bool_]:
         frames = self._frames(None)
@@ -187,7 +224,7 @@ class Packets:
         version = self._raw("ip_version")
         if not (version == 6).any():
             return zeros(self._size), low
-        high = np.where(version == 6, self._raw(high_name) ^ np.uint64(_SIX), np.uint64(0))
+        high = np.where(version == 6, self._raw(high_name) ^ np.uint64(SIX), np.uint64(0))
         return high, low
 
     def _frames(self, rows: NDArray[np.intp] | None) -> Frames | None:
@@ -207,6 +244,81 @@ class Packets:
         if frames is not None:
             response[rows], qtype[rows], name[rows] = frames.dns()
         self._columns |= {"dns.response": (response,), "dns.qtype": (qtype,), "dns.name": (name,)}
+
+
+class _Selection(Packets):
+    """Some packets of a batch: what the ones they were taken from know already is taken from there."""
+
+    _rows: NDArray[np.intp]
+
+    def __init__(self, source: Packets, kept: NDArray[np.intp]) -> None:
+        self._prepare(source._batch, len(kept), source.missing)  # noqa: SLF001 - of its own kind
+        self._source = source
+        self._kept = kept
+        self._rows = kept if source._rows is None else source._rows[kept]  # noqa: SLF001
+
+    @property
+    def _every(self) -> Packets:
+        return self._source._every  # noqa: SLF001
+
+    def between(self, first: int, end: int) -> Packets:
+        return _Stretch(self, slice(*np.searchsorted(self._rows, (first, end)).tolist()))
+
+    def _read(self, name: str) -> Column:
+        for known, rows in ((self._source, self._kept), (self._every, self._rows)):
+            if name in known._columns or (isinstance(known, _Stretch) and name in known._whole._columns):  # noqa: SLF001
+                return take(known.column(name), rows)
+        return super()._read(name)
+
+    def _made_term(self, value: Expression) -> Hashes:
+        every = self._every
+        if isinstance(value, Field) and (value in every._terms or _MOST * self._size > len(every)):  # noqa: SLF001
+            return every._term(value)[self._rows]  # noqa: SLF001
+        return super()._made_term(value)
+
+    def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
+        every = self._every.numbered(values)
+        return every and Numbered(every.table, every.numbers[self._rows])
+
+
+class _Stretch(Packets):
+    """Packets that follow each other, of a batch or a selection: a window's.
+
+    What is asked for is made for all of them and cut, so that the next window finds it made, and windows of
+    other lengths too.
+    """
+
+    _rows: NDArray[np.intp]
+
+    def __init__(self, whole: Packets, part: slice) -> None:
+        rows = whole.origin[part]
+        self._prepare(whole._batch, len(rows), whole.missing)  # noqa: SLF001 - of its own kind
+        self._whole = whole
+        self._part = part
+        self._rows = rows
+
+    @property
+    def _every(self) -> Packets:
+        return self._whole._every  # noqa: SLF001
+
+    def between(self, first: int, end: int) -> Packets:
+        return _Stretch(self, slice(*np.searchsorted(self._rows, (first, end)).tolist()))
+
+    def _where(self, condition: Expression) -> Packets:
+        return self._whole.where(condition).between(int(self._rows[0]), int(self._rows[-1]) + 1)
+
+    def _made_keys(self, values: tuple[Expression, ...]) -> Hashes:
+        return self._whole.keys(values)[self._part]
+
+    def _read(self, name: str) -> Column:
+        return tuple(part[self._part] for part in self._whole.column(name))
+
+    def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
+        whole = self._whole.numbered(values)
+        return whole and Numbered(whole.table, whole.numbers[self._part])
+
+    def _made_term(self, value: Expression) -> Hashes:
+        return self._whole._term(value)[self._part]  # noqa: SLF001
 
 
 class Tuples:
@@ -234,8 +346,22 @@ class Tuples:
 
     def where(self, condition: Expression) -> "Tuples":
         """The tuples for which the condition holds."""
+        if not self._size:
+            return self
         mask = evaluate(condition, self)
         return self if mask.all() else self.take(np.flatnonzero(mask))
+
+    def keys(self, values: tuple[Expression, ...]) -> Hashes:
+        return hashes([column_of(value, self) for value in values], self._size)
+
+    def columns_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> list[Column]:
+        return [take(column_of(value, self), rows) for value in values]
+
+    def keys_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> Hashes:
+        return self.keys(values)[rows]
+
+    def numbered(self, values: tuple[Expression, ...]) -> None:  # noqa: ARG002
+        return None
 
     def take(self, rows: NDArray[np.intp]) -> "Tuples":
         """Some of the tuples, in the order of `rows`."""
@@ -243,91 +369,7 @@ class Tuples:
         return Tuples(made, len(rows), self.origin[rows])
 
 
-def column_of(expression: Expression, rows: Rows) -> Column:
-    """Values of an expression: a field's column, or numbers."""
-    if isinstance(expression, Field):
-        return rows.column(expression.name)
-    return (np.ascontiguousarray(evaluate(expression, rows), dtype=np.int64),)
-
-
-def evaluate(expression: Expression, rows: Rows) -> NDArray[Any]:
-    """Numbers or truth values, one for each row."""
-    match expression:
-        case Number(value):
-            return np.full(len(rows), value, dtype=np.int64)
-        case Field(name):
-            return rows.column(name)[0]
-        case Not(operand):
-            return ~evaluate(operand, rows)
-        case Within(field, prefix):
-            return _within(rows.column(field.name), prefix)
-        case Contains(pattern):
-            return rows.contains(pattern)
-        case Binary(operator, left, right):
-            return _binary(operator, left, right, rows)
-
-
-def _binary(operator: Operator, left: Expression, right: Expression, rows: Rows) -> NDArray[Any]:
-    if operator in ("==", "!=") and isinstance(left, Field) and isinstance(right, Field):
-        pairs = zip(rows.column(left.name), rows.column(right.name), strict=True)
-        same = np.logical_and.reduce([a == b for a, b in pairs])
-        return np.asarray(same if operator == "==" else ~same)
-    first = evaluate(left, rows)
-    second: Any = right.value if isinstance(right, Number) else evaluate(right, rows)
-    return _FUNCTIONS[operator](first, second)
-
-
-def _divide(left: NDArray[Any], right: Any) -> NDArray[Any]:
-    divisor = np.asarray(right)
-    return np.where(divisor == 0, 0, left // np.where(divisor == 0, 1, divisor))
-
-
-def _modulo(left: NDArray[Any], right: Any) -> NDArray[Any]:
-    divisor = np.asarray(right)
-    return np.where(divisor == 0, 0, left % np.where(divisor == 0, 1, divisor))
-
-
-_FUNCTIONS: Final[dict[Operator, Callable[[NDArray[Any], Any], NDArray[Any]]]] = {
-    "+": lambda a, b: a + b,
-    "-": lambda a, b: a - b,
-    "*": lambda a, b: a * b,
-    "/": _divide,
-    "%": _modulo,
-    "&": lambda a, b: a & b,
-    "|": lambda a, b: a | b,
-    "==": lambda a, b: a == b,
-    "!=": lambda a, b: a != b,
-    "<": lambda a, b: a < b,
-    "<=": lambda a, b: a <= b,
-    ">": lambda a, b: a > b,
-    ">=": lambda a, b: a >= b,
-    "and": lambda a, b: a & b,
-    "or": lambda a, b: a | b,
-}
-
-
-def _within(address: Column, prefix: str) -> NDArray[np.bool_]:
-    high, low = address
-    version, first, mask = _prefix(prefix)
-    if is_constant(high) and version == 6:
-        return np.zeros(len(low), dtype=np.bool_)
-    upper = np.asarray(high, dtype=np.uint64)
-    if version == 4:
-        found: NDArray[np.bool_] = low & np.uint64(mask) == np.uint64(first)
-        if not is_constant(high):
-            found &= upper == 0
-        return found
-    upper = upper ^ np.uint64(_SIX)
-    same: NDArray[np.bool_] = upper & np.uint64(mask >> 64) == np.uint64(first >> 64)
-    same &= low & np.uint64(mask & _ALL_ONES) == np.uint64(first & _ALL_ONES)
-    same &= high != 0
-    return same
-
-
-@lru_cache(maxsize=1024)
-def _prefix(text: str) -> tuple[int, int, int]:
-    network = ip_network(text)
-    return network.version, int(network.network_address), int(network.netmask)
+NO_TUPLES: Final = Tuples({}, 0)
 
 
 def plain_value(kind: Kind, column: Column, row: int) -> int | str:
@@ -344,4 +386,4 @@ def plain_value(kind: Kind, column: Column, row: int) -> int | str:
 def address_number(parts: Sequence[int]) -> int:
     """The address that the two halves of a column stand for, as a number."""
     high, low = parts
-    return low if high == 0 else (high ^ _SIX) << 64 | low
+    return low if high == 0 else (high ^ SIX) << 64 | low

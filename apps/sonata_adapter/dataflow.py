@@ -52,7 +52,7 @@ class PacketSource(msgspec.Struct, frozen=True, tag=True):
 
     filters: tuple[Expression, ...]
     once: bool = False
-    """The first packet of each flow in a batch is enough."""
+    """The first packet of each flow in a window is enough."""
 
 
 class DistinctNode(msgspec.Struct, frozen=True, tag=True):

@@ -7,12 +7,14 @@ A window closes when a packet is `lateness_us` beyond its end (at most a quarter
 `advance` or `finish`.  Packets of a closed window are left out and counted in `late`.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
 from typing import Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from apps.sonata_adapter.columns import Packets, Rows, Tuples, column_of, plain_value
+from apps.sonata_adapter.columns import Numberings, Packets, Rows, Tuples, column_of, plain_value
 from apps.sonata_adapter.dataflow import (
     Crossing,
     DistinctNode,
@@ -27,6 +29,7 @@ from apps.sonata_adapter.dataflow import (
     sources,
 )
 from apps.sonata_adapter.expressions import Kind, kind_of
+from apps.sonata_adapter.flows import SeenFlows
 from apps.sonata_adapter.operators import (
     Crossed,
     DistinctOperator,
@@ -42,6 +45,8 @@ from due import RecordBatch
 
 DEFAULT_LIMIT: Final = 1 << 20
 DEFAULT_LATENESS_US: Final = 500_000
+_NEW_FLOWS: Final = PacketSource((), once=True)
+"""What all nodes that want the first packets of flows only start from."""
 
 
 class _Running:
@@ -62,13 +67,18 @@ class _Running:
 class _Window:
     """State of all operators of one window length in one window."""
 
-    def __init__(self, start_us: int, length_us: int, limit: int) -> None:
+    def __init__(
+        self, start_us: int, length_us: int, limit: int, flows: SeenFlows, expected: Mapping[Node, int]
+    ) -> None:
         self.start_us = start_us
         self.length_us = length_us
         self._limit = limit
+        self._expected = expected
+        """How many keys nodes held in a window before."""
         self._distincts: dict[DistinctNode, DistinctOperator] = {}
         self._reduces: dict[ReduceNode, ReduceOperator] = {}
         self._reported: dict[str, Reported] = {}
+        self._flows = flows
 
     def feed(self, node: Node, packets: Packets, memo: dict[Node, Rows | Update]) -> Rows | Update:
         """What the packets make of a node; each node takes them once."""
@@ -79,21 +89,38 @@ class _Window:
 
     def _feed(self, node: Node, packets: Packets, memo: dict[Node, Rows | Update]) -> Rows | Update:
         if isinstance(node, PacketSource):
-            return filtered(packets.once if node.once else packets, node.filters)
+            return self._packets(node, packets, memo)
         rows = self.feed(node.source, packets, memo)
         assert not isinstance(rows, Update)  # noqa: S101 - nothing in a graph stands behind a reduce
         if isinstance(node, DistinctNode):
             distinct = self._distincts.get(node)
             if distinct is None:
-                distinct = self._distincts[node] = DistinctOperator(node, self._limit)
+                distinct = self._distincts[node] = DistinctOperator(
+                    node, self._limit, self._expected.get(node, 0)
+                )
             return distinct.take(rows)
         reduce = self._reduces.get(node)
         if reduce is None:
-            reduce = self._reduces[node] = ReduceOperator(node, self._limit)
+            reduce = self._reduces[node] = ReduceOperator(node, self._limit, self._expected.get(node, 0))
         return reduce.take(rows)
+
+    def _packets(
+        self, node: PacketSource, packets: Packets, memo: dict[Node, Rows | Update]
+    ) -> Rows | Update:
+        if node == _NEW_FLOWS:
+            self._flows.begin(self.start_us)
+            return self._flows.new(packets)
+        rows = self.feed(_NEW_FLOWS, packets, memo) if node.once else packets
+        assert not isinstance(rows, Update)  # noqa: S101 - packets are rows
+        return filtered(rows, node.filters)
 
     def reported(self, query: str) -> Reported:
         return self._reported.setdefault(query, Reported(self._limit))
+
+    def sizes(self) -> dict[Node, int]:
+        """How many keys each node holds."""
+        found: dict[Node, int] = {node: operator.size for node, operator in self._distincts.items()}
+        return found | {node: operator.size for node, operator in self._reduces.items()}
 
     def relation(self, table: Table) -> Relation:
         """A table after all its steps."""
@@ -156,6 +183,9 @@ class HostEngine:
         self._queries: dict[str, _Running] = {}
         self._windows: dict[tuple[int, int], _Window] = {}
         self._closed: dict[int, int] = {}
+        self._flows: dict[int, SeenFlows] = {}
+        self._numberings: Numberings = {}
+        self._sizes: dict[int, dict[Node, int]] = {}
         self.watermark_us: int | None = None
         self.packets = 0
         self.late = 0
@@ -170,12 +200,17 @@ class HostEngine:
     def add(self, query: Query) -> None:
         """Bring a query into force under its name; raises `InvalidQuery`."""
         self._queries[query.name] = _Running(query, self.watermark_us)
+        for flows in self._flows.values():
+            flows.forget()
 
     def remove(self, name: str) -> None:
         """Forget a query; what is open in its windows is not reported."""
         self._queries.pop(name, None)
         lengths = {running.window_us for running in self._queries.values()}
         self._windows = {key: window for key, window in self._windows.items() if key[0] in lengths}
+        self._flows = {length: flows for length, flows in self._flows.items() if length in lengths}
+        self._sizes = {length: sizes for length, sizes in self._sizes.items() if length in lengths}
+        self._numberings.clear()
 
     def process(self, batch: RecordBatch, *, horizon_us: int | None = None) -> list[Result | Captured]:
         """What the packets bring about, in order.
@@ -187,7 +222,7 @@ class HostEngine:
         self.packets += len(batch)
         times = batch["time_us"]
         first, last = int(times.min()), int(times.max())
-        whole = Packets(batch)
+        whole = Packets(batch, self._numberings)
         outputs: list[Result | Captured] = []
         for length, queries in self._by_length().items():
             for index, packets in self._windows_of(whole, length, first - self.base_us, last - self.base_us):
@@ -231,21 +266,21 @@ class HostEngine:
                 self.late += len(whole)
             return
         indices = (whole.batch["time_us"] - self.base_us) // length
-        for index in np.unique(indices).tolist():
-            rows = np.flatnonzero(indices == index)
+        for index, packets in _parts(whole, indices):
             if closed is None or index > closed:
-                yield index, Packets(whole.batch, rows, whole.missing)
+                yield index, packets
             else:
-                self.late += len(rows)
+                self.late += len(packets)
 
     def _feed(
         self, length: int, index: int, packets: Packets, queries: list[_Running], batch: RecordBatch
     ) -> Iterator[Result | Captured]:
         window = self._windows.get((length, index))
         if window is None:
-            window = self._windows[length, index] = _Window(
-                self.base_us + index * length, length, self._limit
-            )
+            flows = self._flows.setdefault(length, SeenFlows())
+            start = self.base_us + index * length
+            window = _Window(start, length, self._limit, flows, self._sizes.get(length, {}))
+            self._windows[length, index] = window
         memo: dict[Node, Rows | Update] = {}
         for running in queries:
             for node in running.nodes():
@@ -286,11 +321,24 @@ class HostEngine:
         outputs: list[Result | Captured] = []
         for key in sorted(keys, key=lambda key: ((key[1] + 1) * key[0], key[0])):
             window = self._windows.pop(key)
+            self._sizes[key[0]] = window.sizes()
             self._closed[key[0]] = max(key[1], self._closed.get(key[0], key[1]))
             for running in self._queries.values():
                 if running.window_us == key[0] and isinstance(running.outcome, Table):
                     outputs += _final(running, running.outcome, window)
         return outputs
+
+
+def _parts(whole: Packets, indices: NDArray[np.int64]) -> Iterator[tuple[int, Packets]]:
+    """The packets of each window; those in order of time share what is made for all."""
+    steps = np.diff(indices)
+    if (steps < 0).any():
+        for index in np.unique(indices).tolist():
+            yield index, whole.at(np.flatnonzero(indices == index))
+        return
+    edges = [0, *(np.flatnonzero(steps) + 1).tolist(), len(indices)]
+    for first, end in pairwise(edges):
+        yield int(indices[first]), whole.between(first, end)
 
 
 def _final(running: _Running, outcome: Table, window: _Window) -> Iterator[Result | Captured]:

@@ -16,8 +16,7 @@ _UDP_HEADER: Final = 8
 _PLAIN_HEADERS: Final = 34
 _DNS_HEADER: Final = 12
 _LABELS: Final = 128
-_LETTERS: Final = (ord("A"), ord("Z"))
-_CASE: Final = 0x20
+_LOWER: Final = np.frombuffer(bytes(range(256)).lower(), dtype=np.uint8).astype(np.uint64)
 _rng: Final = np.random.default_rng()
 _WEIGHTS: Final = _rng.integers(0, 2**64, 512, dtype=np.uint64) | np.uint64(1)
 
@@ -115,14 +114,18 @@ class Frames:
             return found
         sizes = (end - start)[rows]
         places = np.arange(int(sizes.max()))
-        at = np.minimum(start[rows, None] + places, self._width - 1)
-        letters = self._bytes[rows[:, None], at]
-        upper = (letters >= _LETTERS[0]) & (letters <= _LETTERS[1])
-        letters = np.where(upper, letters | _CASE, letters).astype(np.uint64)
+        letters = _LOWER[self._letters(start[rows], rows, places)]
         letters[places >= sizes[:, None]] = 0
         mixed = letters @ _WEIGHTS[: len(places)] + sizes.astype(np.uint64) * _WEIGHTS[-1]
         found[rows] = mixed ^ (mixed >> np.uint64(31))
         return found
+
+    def _letters(self, start: Numbers, rows: NDArray[np.intp], places: Numbers) -> Bytes:
+        """Bytes of these frames from `start` on, one row for each frame."""
+        first, end = int(start[0]), int(start[0]) + len(places)
+        if end <= self._width and (start == first).all():
+            return self._bytes[rows, first:end]
+        return np.asarray(self._bytes[rows[:, None], np.minimum(start[:, None] + places, self._width - 1)])
 
     def payload_contains(self, pattern: bytes) -> NDArray[np.bool_]:
         """Whether the TCP or UDP payload, as far as captured, contains the pattern."""

@@ -65,7 +65,7 @@ class Relation:
         order = np.argsort(theirs, kind="stable")
         ordered = theirs[order]
         begin = np.searchsorted(ordered, mine, side="left")
-        matches = np.searchsorted(ordered, mine, side="right") - begin
+        matches = _matches(ordered, mine, begin)
         if kind == "anti":
             return self.take(np.flatnonzero(matches == 0))
         counts = matches if kind == "inner" else np.maximum(matches, 1)
@@ -75,7 +75,9 @@ class Relation:
         partners = np.full(len(rows), _MISSING, dtype=np.intp)
         partners[has] = order[begin[rows[has]] + nth[has]]
         if kind == "outer":
-            unmatched = np.setdiff1d(np.arange(other.size), partners)
+            alone = np.ones(other.size, dtype=np.bool_)
+            alone[partners[has]] = False
+            unmatched = np.flatnonzero(alone)
             rows = np.concatenate((rows, np.full(len(unmatched), _MISSING)))
             partners = np.concatenate((partners, unmatched))
         return self._paired(other, keys, rows, partners)
@@ -93,6 +95,15 @@ class Relation:
             if name not in keys:
                 made[name] = tuple(_pick(part, partners) for part in column)
         return Relation(made, len(rows))
+
+
+def _matches(ordered: Hashes, wanted: Hashes, begin: NDArray[np.intp]) -> NDArray[np.intp]:
+    """How often each key stands among the ordered ones, from `begin` on."""
+    if not len(ordered) or (ordered[1:] == ordered[:-1]).any():
+        counts: NDArray[np.intp] = np.searchsorted(ordered, wanted, side="right") - begin
+        return counts
+    found = ordered[np.minimum(begin, len(ordered) - 1)] == wanted
+    return np.where(found, 1, 0)
 
 
 def _pick(part: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:

@@ -6,7 +6,7 @@ of 3 in 10^8.
 """
 
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -23,8 +23,14 @@ Column = tuple[Part, ...]
 _DTYPES: Final = {"address": (np.uint64, np.uint64), "name": (np.uint64,)}
 _SMALL: Final = 1 << 10
 _ROOMY: Final = 1 << 16
+_FEW: Final = 12
+"""So many rows are placed sooner one by one than all at a time."""
 _ODD: Final = np.array([secrets.randbits(64) | 1 for _ in range(24)], dtype=np.uint64)
+_PARTS: Final = 2
+"""A column has so many parts at most."""
 _SHIFT: Final = np.uint64(29)
+_HALF: Final = np.uint64(32)
+_LEAST: Final = np.uint64(1)
 _FINAL: Final = np.uint64(0x9E3779B97F4A7C15)
 _UNSEEN: Final = np.uint64(0)
 _ZEROS: Final = np.broadcast_to(_UNSEEN, (1 << 40,))
@@ -45,25 +51,50 @@ def take(column: Column, rows: NDArray[np.intp]) -> Column:
     return tuple(zeros(len(rows)) if is_constant(part) else part[rows] for part in column)
 
 
+def mixed(column: Column) -> Hashes:
+    """64 bits for each value of a column, equal for equal values, whatever batch and place they stand in."""
+    found: Hashes | None = None
+    for part, odd in zip(column, _ODD, strict=False):
+        # 0 adds nothing: a constant part and one that is 0 in this batch give the same
+        if is_constant(part):
+            continue
+        bits = part.view(np.uint64) * odd
+        bits ^= bits >> _HALF
+        found = bits if found is None else found + bits
+    return zeros(len(column[0])) if found is None else found
+
+
+def combined(terms: Sequence[Hashes], rows: int) -> Hashes:
+    """64 bits for each row, never 0, of what `mixed` gave for its columns."""
+    if not terms:
+        return np.ones(rows, dtype=np.uint64)
+    bits: Hashes = terms[0] * _ODD[_PARTS]
+    spare = np.empty_like(bits)
+    for place, term in enumerate(terms[1:], 1):
+        bits += np.multiply(term, _ODD[_PARTS + place % (len(_ODD) - _PARTS)], out=spare)
+    bits ^= np.right_shift(bits, _SHIFT, out=spare)
+    bits *= _FINAL
+    bits ^= np.right_shift(bits, _HALF, out=spare)
+    return np.maximum(bits, _LEAST, out=bits)
+
+
 def hashes(columns: list[Column], rows: int) -> Hashes:
     """64 bits for each row, never 0; equal for equal rows, whatever batch they stand in."""
-    mixed = np.full(rows, _ODD[-1], dtype=np.uint64)
-    place = 0
-    for column in columns:
-        for part in column:
-            odd = _ODD[place % (len(_ODD) - 1)]
-            place += 1
-            if is_constant(part):
-                continue
-            # 0 adds nothing: a constant part and one that is 0 in this batch give the same
-            mixed += part.view(np.uint64) * odd ^ (part.view(np.uint64) >> _SHIFT) * (
-                odd ^ _FINAL | np.uint64(1)
-            )
-    mixed ^= mixed >> _SHIFT
-    mixed *= _FINAL
-    mixed ^= mixed >> np.uint64(32)
-    mixed[mixed == _UNSEEN] = np.uint64(1)
-    return mixed
+    return combined([mixed(column) for column in columns], rows)
+
+
+def alike(keys: Hashes, slots: int) -> NDArray[np.intp]:
+    """For each row the first with the same key.
+
+    Keys that meet in one of the slots (a power of two) may be taken for different from themselves: a row
+    then stands for itself.
+    """
+    home = (keys & np.uint64(slots - 1)).view(np.int64)
+    rows = np.arange(len(keys))
+    first = np.empty(slots, dtype=np.int64)
+    first[home[::-1]] = rows[::-1]
+    found = first[home]
+    return np.where(keys[found] == keys, found, rows)
 
 
 class KeyTable:
@@ -72,28 +103,59 @@ class KeyTable:
     `limit` is how many keys are kept; what comes after gets the number -1.
     """
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, expected: int = 0) -> None:
         self._limit = limit
         self.size = 0
-        self._slots = np.zeros(_SMALL, dtype=np.uint64)
-        self._numbers = np.zeros(_SMALL, dtype=np.int64)
+        slots = _slots_for(min(expected, limit), _SMALL)
+        self._slots = np.zeros(slots, dtype=np.uint64)
+        self._numbers = np.zeros(slots, dtype=np.int64)
 
     def number(self, keys: Hashes) -> tuple[Numbers, NDArray[np.intp]]:
         """For each key its number, and the rows in which new keys stand first, in order."""
         before = self.size
-        self._reserve(min(before + len(keys), self._limit))
+        place, rest = self._look_up(keys)
+        if not len(rest):
+            return self._numbers[place], rest
+        if self._reserve(min(before + len(rest), self._limit)):
+            place, rest = self._look_up(keys)
         mask = len(self._slots) - 1
-        place = (keys & np.uint64(mask)).view(np.int64)
-        rest = np.flatnonzero(self._slots[place] != keys)
         claimed: list[NDArray[np.intp]] = []
-        while len(rest):
+        while len(rest) > _FEW:
             rest, taken = self._claim(keys, place, rest, claimed)
             place[rest] = (place[rest] + taken) & mask
+        if len(rest):
+            claimed.append(self._claim_each(keys, place, rest))
         fresh = np.sort(np.concatenate(claimed)) if claimed else rest
-        self._numbers[place[fresh]] = np.arange(before, before + len(fresh))
+        if len(fresh):
+            self._numbers[place[fresh]] = np.arange(before, before + len(fresh))
         numbers = self._numbers[place]
-        numbers[place < 0] = -1
+        if self.size >= self._limit:
+            numbers[place < 0] = -1
         return numbers, fresh
+
+    def _look_up(self, keys: Hashes) -> tuple[Numbers, NDArray[np.intp]]:
+        """Each key's first slot, and the rows of keys that do not stand there."""
+        place = (keys & np.uint64(len(self._slots) - 1)).view(np.int64)
+        return place, (self._slots[place] != keys).nonzero()[0]
+
+    def _claim_each(self, keys: Hashes, place: Numbers, rest: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Slots for the last few rows, one by one: cheaper than whole rounds; returns which were claimed."""
+        mask = len(self._slots) - 1
+        claimed: list[int] = []
+        for row, key, first in zip(rest.tolist(), keys[rest].tolist(), place[rest].tolist(), strict=True):
+            slot = first
+            while (held := int(self._slots[slot])) not in (key, 0):
+                slot = (slot + 1) & mask
+            if held:
+                place[row] = slot
+            elif self.size == self._limit:
+                place[row] = -1
+            else:
+                place[row] = slot
+                self._slots[slot] = key
+                self.size += 1
+                claimed.append(row)
+        return np.array(claimed, dtype=np.intp)
 
     def _claim(
         self, keys: Hashes, place: Numbers, rest: NDArray[np.intp], claimed: list[NDArray[np.intp]]
@@ -118,13 +180,11 @@ class KeyTable:
             left &= taken
         return rest[left], taken[left]
 
-    def _reserve(self, keys: int) -> None:
-        """Room for this many keys: a quarter full while that is cheap, then half full."""
-        size = len(self._slots)
-        while size < (4 if keys <= _ROOMY else 2) * keys:
-            size *= 2
+    def _reserve(self, keys: int) -> bool:
+        """Room for this many keys: a quarter full while that is cheap, then half full; whether all moved."""
+        size = _slots_for(keys, len(self._slots))
         if size == len(self._slots):
-            return
+            return False
         held = np.flatnonzero(self._slots)
         old_keys, old_numbers = self._slots[held], self._numbers[held]
         self._slots = np.zeros(size, dtype=np.uint64)
@@ -137,6 +197,13 @@ class KeyTable:
             self._numbers[slot[free]] = old_numbers[free]
             left = self._slots[slot] != old_keys
             old_keys, old_numbers, slot = old_keys[left], old_numbers[left], (slot[left] + 1) & (size - 1)
+        return True
+
+
+def _slots_for(keys: int, slots: int) -> int:
+    while slots < (4 if keys <= _ROOMY else 2) * keys:
+        slots *= 2
+    return slots
 
 
 class Growing:

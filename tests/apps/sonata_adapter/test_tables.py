@@ -70,6 +70,20 @@ def test_equal_rows_have_equal_hashes_whatever_their_batch():
     assert not swapped.any()
 
 
+def test_keys_of_near_addresses_differ_and_spread():
+    """Half a million pairs that differ in few bits: no key twice, and slots as full as chance makes them."""
+    for shift in (0, 8, 16, 32, 48):
+        near = np.arange(700, dtype=np.uint64) << np.uint64(shift)
+        left, right = np.repeat(near, 700), np.tile(near, 700)
+        bits = hashes([(zeros(len(left)), left), (zeros(len(right)), right)], len(left))
+        assert len(np.unique(bits)) == len(left)
+        used = len(np.unique(bits & np.uint64((1 << 19) - 1))) / (1 << 19)
+        assert used > 0.55  # chance: 1 - e^(-490000 / 2^19) = 0.61
+        alone = hashes([(near,)], 700)
+        assert len(np.unique(alone)) == 700
+        assert len(np.unique(alone & np.uint64(4095))) > 500
+
+
 @given(st.lists(keys, max_size=300))
 def test_bloom_never_takes_an_old_key_for_a_new_one(batch):
     """What it calls new is new; with room it misses next to nothing."""

@@ -1,0 +1,44 @@
+"""Flows that a window has seen, so that operators that ask about flows only get few packets of each."""
+
+from typing import Final
+
+import numpy as np
+
+from apps.sonata_adapter.columns import Packets
+from apps.sonata_adapter.tables import alike
+
+_SLOTS: Final = 1 << 16
+
+
+class SeenFlows:
+    """The first packet of each flow in a window, and few others, however many flows there are.
+
+    A flow (addresses, protocol, ports) is remembered by its 64 bits in the one slot that they point to,
+    until another flow takes it.
+    """
+
+    def __init__(self) -> None:
+        self._slots = np.zeros(_SLOTS, dtype=np.uint64)
+        self._window = 0
+
+    def begin(self, window: int) -> None:
+        """Packets of this window come now; of another one nothing is remembered."""
+        if window != self._window:
+            self._window = window
+            self.forget()
+
+    def new(self, packets: Packets) -> Packets:
+        """The packets without those of flows that are remembered; these are remembered from now on."""
+        keys = packets.flows()
+        home = (keys & np.uint64(_SLOTS - 1)).view(np.int64)
+        rest = np.flatnonzero(self._slots[home] != keys)
+        if not len(rest):
+            return packets.at(rest)
+        keys, home = keys[rest], home[rest]
+        kept = np.flatnonzero(alike(keys, _SLOTS) == np.arange(len(keys)))
+        self._slots[home[kept]] = keys[kept]
+        return packets.at(rest[kept])
+
+    def forget(self) -> None:
+        """Somebody asks who has not seen the flows so far."""
+        self._slots[:] = 0
