@@ -159,7 +159,8 @@ class _Reading:
 
     def _vlan_tags(self, span: _Span, kind: _Array) -> tuple[_Span, _Array]:
         for depth in range(_MAX_VLAN_TAGS):
-            tagged = np.flatnonzero(np.isin(kind, _VLAN_TAGS) & (span.at + 4 <= span.end))
+            is_tag = np.logical_or.reduce([kind == tag for tag in _VLAN_TAGS])
+            tagged = np.flatnonzero(is_tag & (span.at + 4 <= span.end))
             if not len(tagged):
                 break
             at = span.at[tagged]
@@ -181,6 +182,8 @@ class _Reading:
         return span, kind
 
     def _arp(self, span: _Span) -> None:
+        if not len(span.rows):
+            return
         span = span.only(span.at + 28 <= span.end)
         hardware = self._number(2, span.at)
         span = span.only(((hardware == 1) | (hardware == 6)) & (self._number(4, span.at + 2) == 0x08000604))
@@ -260,7 +263,8 @@ class _Reading:
             found = span.only(there & wanted)
             self._columns[f"{name}_sport"][found.rows] = self._number(2, found.at)
             self._columns[f"{name}_dport"][found.rows] = self._number(2, found.at + 2)
-        return span.rows[there & np.isin(protocol, (_TCP, _UDP, _UDP_LITE))]
+        either: npt.NDArray[np.bool_] = (protocol == _TCP) | (protocol == _UDP) | (protocol == _UDP_LITE)
+        return span.rows[there & either]
 
     def _tcp(self, span: _Span) -> None:
         span = span.only(span.at + 14 <= span.end)
@@ -270,6 +274,8 @@ class _Reading:
 
     def _icmp(self, span: _Span, name: str, errors: _Array) -> _Span:
         """Writes type and code; returns where errors quote the packet they answer."""
+        if not len(span.rows):
+            return span
         span = span.only(span.at + 2 <= span.end)
         kind = self._number(1, span.at)
         self._columns[f"{name}_type"][span.rows] = kind
