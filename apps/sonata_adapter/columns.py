@@ -11,25 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.evaluation import SIX, Rows, column_of, evaluate
+from apps.sonata_adapter.evaluation import SIX, column_of, evaluate
 from apps.sonata_adapter.expressions import Expression, Field, Kind, address_text
 from apps.sonata_adapter.numbering import Numbered, Numbering
 from apps.sonata_adapter.payload import Frames
 from apps.sonata_adapter.tables import Column, Hashes, Part, combined, hashes, mixed, take, zeros
 from due import RecordBatch
-
-__all__ = [
-    "NO_TUPLES",
-    "Missing",
-    "Numberings",
-    "Packets",
-    "Rows",
-    "Tuples",
-    "address_number",
-    "column_of",
-    "evaluate",
-    "plain_value",
-]
 
 # field -> column of `apps.packets.PACKET_COLUMNS`, for those that are read as they stand
 _PLAIN: Final = {
@@ -246,16 +233,15 @@ class Packets:
         self._columns |= {"dns.response": (response,), "dns.qtype": (qtype,), "dns.name": (name,)}
 
 
-class _Selection(Packets):
-    """Some packets of a batch: what the ones they were taken from know already is taken from there."""
+class _Part(Packets):
+    """Some packets of a batch, and what they were taken from."""
 
     _rows: NDArray[np.intp]
 
-    def __init__(self, source: Packets, kept: NDArray[np.intp]) -> None:
-        self._prepare(source._batch, len(kept), source.missing)  # noqa: SLF001 - of its own kind
+    def __init__(self, source: Packets, rows: NDArray[np.intp]) -> None:
+        self._prepare(source._batch, len(rows), source.missing)  # noqa: SLF001 - of its own kind
         self._source = source
-        self._kept = kept
-        self._rows = kept if source._rows is None else source._rows[kept]  # noqa: SLF001
+        self._rows = rows
 
     @property
     def _every(self) -> Packets:
@@ -264,9 +250,17 @@ class _Selection(Packets):
     def between(self, first: int, end: int) -> Packets:
         return _Stretch(self, slice(*np.searchsorted(self._rows, (first, end)).tolist()))
 
+
+class _Selection(_Part):
+    """Packets from here and there: what the ones they were taken from know already is taken from there."""
+
+    def __init__(self, source: Packets, kept: NDArray[np.intp]) -> None:
+        super().__init__(source, kept if source._rows is None else source._rows[kept])  # noqa: SLF001
+        self._kept = kept
+
     def _read(self, name: str) -> Column:
         for known, rows in ((self._source, self._kept), (self._every, self._rows)):
-            if name in known._columns or (isinstance(known, _Stretch) and name in known._whole._columns):  # noqa: SLF001
+            if name in known._columns or (isinstance(known, _Stretch) and name in known._source._columns):  # noqa: SLF001
                 return take(known.column(name), rows)
         return super()._read(name)
 
@@ -281,44 +275,32 @@ class _Selection(Packets):
         return every and Numbered(every.table, every.numbers[self._rows])
 
 
-class _Stretch(Packets):
+class _Stretch(_Part):
     """Packets that follow each other, of a batch or a selection: a window's.
 
     What is asked for is made for all of them and cut, so that the next window finds it made, and windows of
     other lengths too.
     """
 
-    _rows: NDArray[np.intp]
-
-    def __init__(self, whole: Packets, part: slice) -> None:
-        rows = whole.origin[part]
-        self._prepare(whole._batch, len(rows), whole.missing)  # noqa: SLF001 - of its own kind
-        self._whole = whole
+    def __init__(self, source: Packets, part: slice) -> None:
+        super().__init__(source, source.origin[part])
         self._part = part
-        self._rows = rows
-
-    @property
-    def _every(self) -> Packets:
-        return self._whole._every  # noqa: SLF001
-
-    def between(self, first: int, end: int) -> Packets:
-        return _Stretch(self, slice(*np.searchsorted(self._rows, (first, end)).tolist()))
 
     def _where(self, condition: Expression) -> Packets:
-        return self._whole.where(condition).between(int(self._rows[0]), int(self._rows[-1]) + 1)
+        return self._source.where(condition).between(int(self._rows[0]), int(self._rows[-1]) + 1)
 
     def _made_keys(self, values: tuple[Expression, ...]) -> Hashes:
-        return self._whole.keys(values)[self._part]
+        return self._source.keys(values)[self._part]
 
     def _read(self, name: str) -> Column:
-        return tuple(part[self._part] for part in self._whole.column(name))
+        return tuple(part[self._part] for part in self._source.column(name))
 
     def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
-        whole = self._whole.numbered(values)
+        whole = self._source.numbered(values)
         return whole and Numbered(whole.table, whole.numbers[self._part])
 
     def _made_term(self, value: Expression) -> Hashes:
-        return self._whole._term(value)[self._part]  # noqa: SLF001
+        return self._source._term(value)[self._part]  # noqa: SLF001
 
 
 class Tuples:

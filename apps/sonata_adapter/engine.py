@@ -14,7 +14,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.columns import Numberings, Packets, Rows, Tuples, column_of, plain_value
+from apps.sonata_adapter.columns import Numberings, Packets, Tuples, plain_value
 from apps.sonata_adapter.dataflow import (
     Crossing,
     DistinctNode,
@@ -28,6 +28,7 @@ from apps.sonata_adapter.dataflow import (
     kinds_of,
     sources,
 )
+from apps.sonata_adapter.evaluation import Rows, column_of
 from apps.sonata_adapter.expressions import Kind, kind_of
 from apps.sonata_adapter.flows import SeenFlows
 from apps.sonata_adapter.operators import (

@@ -10,7 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from apps.sonata_adapter.columns import Packets, evaluate
+from apps.sonata_adapter.columns import Packets
+from apps.sonata_adapter.evaluation import evaluate
 from apps.sonata_adapter.expressions import ACK, SYN_ACK, address_text
 from apps.sonata_adapter.query import tcp
 from apps.sonata_adapter.results import Handshake

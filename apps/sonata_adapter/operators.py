@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.columns import NO_TUPLES, Rows, Tuples, evaluate
+from apps.sonata_adapter.columns import NO_TUPLES, Tuples
 from apps.sonata_adapter.dataflow import VALUE, DistinctNode, ReduceNode, kinds_of
+from apps.sonata_adapter.evaluation import Rows, evaluate
 from apps.sonata_adapter.expressions import Expression, Number
 from apps.sonata_adapter.numbering import Translation
 from apps.sonata_adapter.sketches import Bloom, CountMin

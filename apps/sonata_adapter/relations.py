@@ -6,8 +6,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.columns import Rows, Tuples, column_of, evaluate
+from apps.sonata_adapter.columns import Tuples
 from apps.sonata_adapter.dataflow import Node, Table, TableJoin, TableStep
+from apps.sonata_adapter.evaluation import Rows, column_of, evaluate
 from apps.sonata_adapter.query import Distinct, Filter, JoinKind, Map, Reduce
 from apps.sonata_adapter.tables import Column, Hashes, hashes, take
 

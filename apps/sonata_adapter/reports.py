@@ -11,9 +11,10 @@ from typing import Final
 
 import numpy as np
 
-from apps.sonata_adapter.columns import Packets, column_of, plain_value
+from apps.sonata_adapter.columns import Packets, plain_value
 from apps.sonata_adapter.dataflow import Crossing, ReduceNode, compile_query, kinds_of
 from apps.sonata_adapter.engine import HostEngine
+from apps.sonata_adapter.evaluation import column_of
 from apps.sonata_adapter.expressions import Field, Kind, kind_of
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import PACKET_KINDS, Query

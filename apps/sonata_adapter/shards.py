@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.columns import Packets, column_of
+from apps.sonata_adapter.columns import Packets
 from apps.sonata_adapter.dataflow import (
     DistinctNode,
     Node,
@@ -22,6 +22,7 @@ from apps.sonata_adapter.dataflow import (
     TableStep,
     compile_query,
 )
+from apps.sonata_adapter.evaluation import column_of
 from apps.sonata_adapter.expressions import PACKET_FIELDS, Expression, Field
 from apps.sonata_adapter.operators import filtered
 from apps.sonata_adapter.query import Distinct, Filter, Map, Query, Reduce

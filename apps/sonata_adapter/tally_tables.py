@@ -6,7 +6,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from apps.sonata_adapter.columns import Packets, Tuples, column_of, plain_value
+from apps.sonata_adapter.columns import Packets, Tuples, plain_value
 from apps.sonata_adapter.dataflow import (
     VALUE,
     DistinctNode,
@@ -17,6 +17,7 @@ from apps.sonata_adapter.dataflow import (
     kinds_of,
     sources,
 )
+from apps.sonata_adapter.evaluation import column_of
 from apps.sonata_adapter.expressions import Expression, Field, Number, text_of
 from apps.sonata_adapter.query import Filter, Query
 from apps.sonata_adapter.relations import relation_of

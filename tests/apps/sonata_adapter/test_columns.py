@@ -5,7 +5,8 @@ import random
 import numpy as np
 import pytest
 
-from apps.sonata_adapter.columns import Packets, column_of
+from apps.sonata_adapter.columns import Packets
+from apps.sonata_adapter.evaluation import column_of
 from apps.sonata_adapter.expressions import Field
 from apps.sonata_adapter.query import ip, tcp, udp
 from tests.apps.sonata_adapter.traffic import batch_of, mixed

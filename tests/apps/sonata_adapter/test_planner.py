@@ -6,9 +6,10 @@ import random
 import pytest
 
 from apps.sonata_adapter.catalogue import CATALOGUE
-from apps.sonata_adapter.columns import Packets, evaluate
+from apps.sonata_adapter.columns import Packets
 from apps.sonata_adapter.conditions import conditions_of, disjoint, narrowed
 from apps.sonata_adapter.dataflow import PacketSource, Table, compile_query, sources
+from apps.sonata_adapter.evaluation import evaluate
 from apps.sonata_adapter.explain import explain
 from apps.sonata_adapter.keys import request_of
 from apps.sonata_adapter.placement import SwitchLimits, reciprocal
