@@ -33,9 +33,10 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
     Forwarding() forwarding;
     Telemetry() telemetry;
     Counting() counting;
+    Sweep() sweep;
 
-    // The controller asks for the count of a key: the answer goes back to it in band, because BMv2 lets
-    // nobody read a register through P4Runtime.
+    // The controller asks for the count of a key, or for those that wait for a window's end: the answer goes
+    // back to it in band, because BMv2 lets nobody read a register through P4Runtime.
     action prepare_reading() {
         meta.reading = 1;
         meta.query_map = 256w1 << hdr.packet_out.query[7:0];
@@ -44,16 +45,16 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
         meta.destination_port = hdr.packet_out.key_port;
         meta.length = (bit<32>)hdr.packet_out.key_length;
         meta.source_port = hdr.packet_out.key_source_port;
-        meta.timestamp = hdr.packet_out.timestamp;
+        meta.timestamp = hdr.packet_out.timestamp == 0 ? meta.timestamp : hdr.packet_out.timestamp;
     }
     action answer_reading() {
         hdr.packet_in.setValid();
         hdr.packet_in.ingress_port = CPU_PORT;
         hdr.packet_in.reason = REASON_CELL;
-        hdr.packet_in.timestamp = hdr.packet_out.timestamp;
+        hdr.packet_in.timestamp = meta.timestamp;
         hdr.packet_in.length = hdr.packet_out.query;
-        hdr.packet_in.sequence = meta.cell_count;
-        hdr.packet_in.arrival = meta.cell_epoch;
+        hdr.packet_in.sequence = hdr.packet_out.operation == OPERATION_SWEEP ? (bit<32>)meta.sweep.left : meta.cell_count;
+        hdr.packet_in.arrival = meta.cell_epoch - 1;
         hdr.packet_in.query_map = meta.overflow;
         standard.egress_spec = CPU_PORT;
     }
@@ -89,7 +90,8 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
     }
 
     apply {
-        if (hdr.packet_out.isValid() && hdr.packet_out.operation != OPERATION_READ_CELL) {
+        if (hdr.packet_out.isValid() && hdr.packet_out.operation != OPERATION_READ_CELL
+                && hdr.packet_out.operation != OPERATION_SWEEP) {
             standard.egress_spec = hdr.packet_out.egress_port;
         } else {
             if (hdr.packet_out.isValid()) {
@@ -110,8 +112,17 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
             if (meta.query_map != 0) {
                 counting.apply(hdr, meta);
             }
+            // a frame that makes a digest of its own leaves the ring to the next one
+            if (meta.sweep.size != 0 && (meta.reading == 1 ? hdr.packet_out.operation == OPERATION_SWEEP
+                    : meta.crossed == 0 && meta.overflow == 0 && meta.learns == 0)) {
+                sweep.apply(meta);
+            }
             if (meta.reading == 1) {
-                answer_reading();
+                if (hdr.packet_out.operation == OPERATION_READ_CELL || hdr.packet_out.key_length == 1 || meta.sweep.left == 1) {
+                    answer_reading();
+                } else {
+                    mark_to_drop(standard);
+                }
             } else {
                 if (meta.learns == 1 && meta.crossed == 0 && meta.overflow == 0) {
                     make_learn_digest();

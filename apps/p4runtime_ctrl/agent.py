@@ -397,7 +397,7 @@ class Agent:
         self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
 
     def _heard(self) -> int:
-        sent = sum(self._sent.values()) + self._outbound.answers
+        sent = sum(self._sent.values()) + self._outbound.answers + self._outbound.counts_reported
         return self._progress.received + self._progress.reported + sent
 
     def _state(self) -> dict[str, Any]:
@@ -418,6 +418,7 @@ class Agent:
             "lost": self._progress.lost,
             "restarts": self._progress.restarts,
             "cells_answered": self._outbound.answers,
+            "counts_reported": self._outbound.counts_reported,
             **self._sent,
             "arrival": arrival,
             "event_time": event_time,

@@ -3,6 +3,7 @@
     network.packets.p4runtime_ctrl.<switch>.<which>   record batches: headers as columns
     network.frames.p4runtime_ctrl.<switch>.<which>    the frames themselves, as far as they are copied
     network.digests.p4runtime_ctrl.<switch>.<which>   reports of the switch's counting stages
+    network.counts.p4runtime_ctrl.<switch>.<which>    differences over their threshold, after their window
 
     <which>: all       every packet: request `packets`, bit 255
              a port    packets of that port: request `port<n>`, bits 254 down
@@ -22,8 +23,8 @@ from apps.p4runtime_ctrl.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry import EVERY_PACKET, Request
 from due import Key
 
-Kind = Literal["packets", "frames", "digests"]
-KINDS: Final[tuple[Kind, ...]] = ("packets", "frames", "digests")
+Kind = Literal["packets", "frames", "digests", "counts"]
+KINDS: Final[tuple[Kind, ...]] = ("packets", "frames", "digests", "counts")
 APP: Final = "p4runtime_ctrl"
 ALL: Final = "all"
 _PORT_BITS: Final = 47
@@ -51,7 +52,7 @@ class Offer(Message, frozen=True, kw_only=True):
     """As in `telemetry.Request`."""
     copy: bool = True
     """Packet-ins of the matching packets; else they only reach the counting stages, and their reports
-    come under `network.digests`."""
+    come under `network.digests` and `network.counts`."""
     digest: bool = False
     """A digest of every matching packet."""
     active: bool = True

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from apps.p4runtime_ctrl.counts_in import CountReader
 from apps.p4runtime_ctrl.demand import APP, Demand, Kind, key_of
 from apps.p4runtime_ctrl.digest_in import DigestReader
 from apps.p4runtime_ctrl.p4info import Program
@@ -38,8 +39,11 @@ class Outbound:
         self._by_digest = by_digest
         self._packets = PacketReader(program, base_us, self.progress)
         self._digests = DigestReader(program, base_us, self.progress)
+        self._counts = CountReader(program, base_us, self.progress)
         self.answers = 0
         """Cells that the switch told."""
+        self.counts_reported = 0
+        """Differences that it reported when their window was over."""
         self._routes: dict[Kind, list[tuple[str, int]]] = {}
         self._unison = Unison()
         self._waited = 0
@@ -88,13 +92,30 @@ class Outbound:
                 self._write(key, chosen.raw(), int(chosen.time_us[-1]) * 1000)
 
     def digests(self, lists: list[Any]) -> None:
-        """Digest lists, in the order of their stream."""
+        """Digest lists, in the order of their stream; lists of counts behind those of frames."""
+        ours = self._counts.digest_id
+        counts = [each for each in lists if each.digest_id == ours] if ours else []
+        frames = [each for each in lists if each.digest_id != ours] if counts else lists
+        if frames:
+            self._write_reports(frames)
+        if counts:
+            self._write_counts(counts)
+
+    def _write_reports(self, lists: list[Any]) -> None:
         reports = self._digests.read(lists)
         if self._by_digest:
             rows = Rows(reports.columns, reports.queries, reports.covered)
             self._write_records(self._unison.digests(rows))
         for key, bit in self._routes.get("digests", ()):
             batch = reports.counted(bit)
+            if len(batch):
+                self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+
+    def _write_counts(self, lists: list[Any]) -> None:
+        counts = self._counts.read(lists)
+        self.counts_reported += len(counts)
+        for key, bit in self._routes.get("counts", ()):
+            batch = counts.of(bit)
             if len(batch):
                 self._write(key, batch, int(batch["time_us"][-1]) * 1000)
 

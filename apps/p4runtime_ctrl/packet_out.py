@@ -1,7 +1,8 @@
 """What apps have a switch send, or answer in band → packet-out messages.
 
     network.packet_out.<app>.<switch>     frames to be sent out of a port
-    network.cell_request.<app>.<switch>   questions about counting cells; the answers come as packet-ins
+    network.cell_request.<app>.<switch>   questions about counting cells, and to report those that wait for
+                                          a window's end; the answers come as packet-ins
 
 A question carries its number as the payload of its packet-out, and the answer brings it back: nothing
 has to be remembered between the two.
@@ -13,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.p4runtime_ctrl.counts_in import DIGEST
 from apps.p4runtime_ctrl.errors import EntryError
 from apps.p4runtime_ctrl.p4info import Program
 from apps.p4runtime_ctrl.values import canonical
@@ -22,7 +24,11 @@ _HEADER: Final = "packet_out"
 _NEEDED: Final = (
     "egress_port", "operation", "query", "key_source", "key_destination", "key_port", "key_length", "timestamp",
 )  # fmt: skip
-_SEND, _READ_CELL = 0, 1
+_SEND, _READ_CELL, _SWEEP = 0, 1, 2
+_SWEEPS: Final = (0, 1, 2)
+_NO_SWEEP, _, _SWEEP_ANSWERED = _SWEEPS
+"""Of the column `sweep`."""
+_OPTIONAL: Final = ("source_port", "sweep")
 _QUESTION: Final = ("id", "query", "src_hi", "src_lo", "dst_hi", "dst_lo", "port", "length", "time_us")
 _ID_BYTES: Final = 8
 _CLOCK_BITS: Final = 48
@@ -36,6 +42,7 @@ class PacketOuts:
         self._fields = program.headers[_HEADER]
         self._largest_port = (1 << self._width("egress_port")) - 1
         self._has_source_port = any(field.name == "key_source_port" for field in self._fields)
+        self._can_sweep = program.digest_id(DIGEST) != 0  # a program without it would send the question out
         self._base_us = base_us
 
     def frames(self, value: Any) -> list[Any]:
@@ -68,28 +75,36 @@ class PacketOuts:
 
         Columns: `id`, `query` (bit), `src_hi`, `src_lo`, `dst_hi`, `dst_lo`, `port`, `length`, `time_us`
         (absolute, within the window that is meant), and `source_port` where the program counts by it.
+        `sweep`: 0 or no such column = read the cell; else report one key of `query` that waits for the end
+        of a window, as of `time_us` (0: as of now): 1 = answered only where more wait, 2 = answered always.
+        The answer's `count` is then 1 where more wait, else 0.
         Raises `EntryError` for a value without these.
         """
         columns = _columns(batch)
-        clock = columns["time_us"].astype(np.int64) - self._base_us
-        askable = (clock >= 0) & (clock < 1 << _CLOCK_BITS)
-        source_ports = columns.get("source_port")
-        if source_ports is not None and not self._has_source_port:
-            askable &= source_ports == 0
+        sweeps, time_us = columns["sweep"], columns["time_us"].astype(np.int64)
+        now = (sweeps != _NO_SWEEP) & (time_us == 0)
+        clock = np.where(now, 0, time_us - self._base_us)
+        askable = (clock >= 0) & (clock < 1 << _CLOCK_BITS) & np.isin(sweeps, _SWEEPS)
+        clock[~now & (clock == 0)] = 1  # 0 would mean now
+        if not self._has_source_port:
+            askable &= columns["source_port"] == 0
+        if not self._can_sweep:
+            askable &= sweeps == _NO_SWEEP
         rows = np.flatnonzero(askable).tolist()
         return [self._question(columns, row, int(clock[row])) for row in rows], len(askable) - len(rows)
 
     def _question(self, columns: Mapping[str, NDArray[Any]], row: int, clock: int) -> Any:
         def number(name: str) -> int:
-            return int(columns[name][row]) if name in columns else 0
+            return int(columns[name][row])
 
+        sweep = number("sweep")
         header = {
-            "operation": _READ_CELL,
+            "operation": _SWEEP if sweep else _READ_CELL,
             "query": number("query"),
             "key_source": number("src_hi") << 64 | number("src_lo"),
             "key_destination": number("dst_hi") << 64 | number("dst_lo"),
             "key_port": number("port"),
-            "key_length": number("length"),
+            "key_length": int(sweep == _SWEEP_ANSWERED) if sweep else number("length"),
             "key_source_port": number("source_port"),
             "timestamp": clock,
         }
@@ -108,8 +123,8 @@ class PacketOuts:
 def _columns(batch: Any) -> dict[str, NDArray[Any]]:
     try:
         columns = {name: np.asarray(batch[name]) for name in _QUESTION}
-        if "source_port" in batch:
-            columns["source_port"] = np.asarray(batch["source_port"])
+        none = np.zeros(columns["id"].shape, dtype=np.uint8)
+        columns |= {name: np.asarray(batch[name]) if name in batch else none for name in _OPTIONAL}
     except (KeyError, TypeError) as error:
         raise EntryError(f"cell_request: {error!r}; its columns are {', '.join(_QUESTION)}") from None
     if len({column.shape for column in columns.values()}) != 1:

@@ -63,6 +63,11 @@ class Progress:
         self.reported += len(sequence)
         self._note("digest", sequence, arrival, time_us)
 
+    def passed(self, time_us: NDArray[np.int64]) -> None:
+        """Reports without numbers, at these capture times."""
+        if len(time_us):
+            self.time_us = max(self.time_us, int(time_us[-1]))
+
     def _note(
         self,
         source: Source,
@@ -70,9 +75,7 @@ class Progress:
         arrival: NDArray[np.uint64],
         time_us: NDArray[np.int64],
     ) -> None:
-        if not len(sequence):
-            return
-        self.time_us = max(self.time_us, int(time_us[-1]))
+        self.passed(time_us)
         numbers = sequence[sequence != 0].astype(np.int64)
         if not len(numbers):
             return

@@ -34,6 +34,7 @@ CAPABILITIES = (
     Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.frames.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.digests.p4runtime_ctrl.*.*", delivery="reliable"),
+    Capability("network.counts.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.cell.p4runtime_ctrl.*", delivery="reliable"),
     Capability("network.confirmation.p4runtime_ctrl.*", delivery="reliable", archive="always"),
     Capability("network.switch.p4runtime_ctrl.*", archive="always"),

@@ -4,17 +4,62 @@ A result must meet `syns + syn_acks - acks >= 3`; counts are not negative, so on
 is at least 2.  The switch reports keys at that count, and the host reads the others for these alone.
 Conditions on one count make others stronger: with `bytes >= 500`, `bytes <= 90 * connections` needs six
 connections.
+
+Where a result is one difference of counts and nothing else, as `syns + syn_acks - acks` is, the switch can
+count it in one cell, up and down: then it needs no candidates (`difference`).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from apps.sonata_adapter.dataflow import VALUE, Table, TableJoin, conjuncts
+import msgspec
+
+from apps.sonata_adapter.dataflow import VALUE, Table, TableJoin, conjuncts, sources
 from apps.sonata_adapter.errors import NotPlaced
 from apps.sonata_adapter.expressions import Binary, Expression, Field, Number, substitute
 from apps.sonata_adapter.query import Filter, Map
 
 _Terms = tuple[dict[str, int], int]
 """Coefficient of each count, and the constant."""
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """A query that reports keys whose counts, added and subtracted, come to a threshold."""
+
+    signs: tuple[int, ...]
+    """For each of `dataflow.sources` 1 or -1; the first is 1."""
+    threshold: int
+    """1 or more."""
+
+
+def difference(table: Table) -> Difference | None:
+    """The table as one difference; None: it is none, or a result says more than what it comes to."""
+    walk = _Walk()
+    try:
+        names, conditions = walk.table(table)
+    except NotPlaced:
+        return None
+    inequalities = [_inequality(condition) for condition in conditions]
+    terms = inequalities[0][0] if inequalities and inequalities[0] is not None else {}
+    signs = tuple(terms.get(f"{VALUE}{place}", 0) for place in range(walk.sources))
+    bounds = [each[1] for each in inequalities if each is not None and each[0] == terms]
+    is_one = len(bounds) == len(inequalities) and all(sign in (1, -1) for sign in signs)
+    says_more = any(_is_count(value) and _linear(value) != (terms, 0) for value in names.values())
+    if not bounds or not is_one or says_more or signs[0] != 1 or max(bounds) < 1:
+        return None
+    return Difference(signs, max(bounds)) if _has_rows(table, signs) else None
+
+
+def _has_rows(table: Table, signs: tuple[int, ...]) -> bool:
+    """Whether each key that one of the added counts has makes a row."""
+    place = 1
+    for step in table.steps:
+        if not isinstance(step, TableJoin):
+            continue
+        kinds = ("outer",) if signs[place] > 0 else ("outer", "left")
+        if len(sources(step.other)) > 1 or step.kind not in kinds:
+            return False
+        place += 1
+    return True
 
 
 def candidates(table: Table) -> list[int]:

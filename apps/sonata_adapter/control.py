@@ -5,6 +5,7 @@ packets, frames ─► merge ─► host operators ─┐
 reports of counting stages ─────────────────┴─► outputs, each under the keys that asked for it
 """
 
+import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -13,8 +14,10 @@ import msgspec
 
 from apps.messages import TableUpdate
 from apps.sonata_adapter.catalogue import Template
+from apps.sonata_adapter.cell_read import CellRead
 from apps.sonata_adapter.clock import Clock
 from apps.sonata_adapter.dataflow import Table, compile_query
+from apps.sonata_adapter.differences import Differences
 from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.handshake import Handshakes
@@ -25,7 +28,7 @@ from apps.sonata_adapter.planner import Plan, QueryPlan
 from apps.sonata_adapter.refinement import Crossings, Refinement
 from apps.sonata_adapter.reports import Reports
 from apps.sonata_adapter.results import Captured, Output, Result
-from apps.sonata_adapter.tallies import CellRead, Tallies
+from apps.sonata_adapter.tallies import Tallies
 from due import RecordBatch
 
 
@@ -33,7 +36,7 @@ class Source(msgspec.Struct, frozen=True, order=True):
     """A stream of the controller: `network.<kind>.p4runtime_ctrl.*.<name>`."""
 
     kind: str
-    """packets, frames or digests."""
+    """packets, frames, digests or counts."""
     name: str
 
 
@@ -57,6 +60,9 @@ class Written(msgspec.Struct, frozen=True):
     output: Output
 
 
+_Counts = Reports | Tallies | Differences | Crossings
+
+
 class _Lane:
     """Host operators and the stream that they see; queries on bytes have a lane of their own."""
 
@@ -76,15 +82,16 @@ class _Station:
         self.headers = _Lane(engine())
         self.frames = _Lane(engine())
         self.handshakes = Handshakes()
-        self.reports: dict[str, Reports | Tallies | Crossings] = {}
+        self.reports: dict[str, _Counts] = {}
         self.base_us = base_us
         for lane in self.lanes:
             lane.host.base_us = base_us
         self.clock = Clock()
 
     @property
-    def tallies(self) -> list[Tallies]:
-        return [each for each in self.reports.values() if isinstance(each, Tallies)]
+    def asking(self) -> list[Tallies | Differences]:
+        """Counts for which cells of the switch are read."""
+        return [each for each in self.reports.values() if isinstance(each, (Tallies, Differences))]
 
     @property
     def lanes(self) -> tuple[_Lane, _Lane]:
@@ -117,6 +124,8 @@ class Control:
         self._outputs: dict[str, tuple[str, ...]] = {}
         self._refused: dict[str, str] = {}
         self.plan = Plan((), ())
+        self._generation = secrets.randbelow(255)
+        """Of the plans: an adapter before this one may have left what waits in the switch."""
 
     @property
     def requests(self) -> list[Request]:
@@ -132,6 +141,11 @@ class Control:
     def sources(self) -> set[Source]:
         """Streams to observe now; none when nothing is wanted."""
         found = {Source("digests", _name(bit)) for bit in self.plan.entries}
+        found |= {
+            Source("counts", _name(entry.count_of))
+            for entry in self.plan.entries.values()
+            if entry.role == "difference"
+        }
         found |= {
             Source("frames" if copy.payload else "packets", _name(copy.bit)) for copy in self.plan.copies
         }
@@ -200,49 +214,63 @@ class Control:
                 written += self._addressed(station, station.reports[found.identity].take(bit, batch))
         return written
 
+    def counts(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
+        """Keys whose differences are over the threshold at the end of a window."""
+        station = self._station(switch)
+        bit = int(name[1:])
+        written: list[Written] = []
+        if len(batch):
+            station.clock.hear(int(batch["time_us"].max()))
+        for identity, report in station.reports.items():
+            if isinstance(report, Differences) and self.plan.of(identity).entries[0].bit == bit:
+                written += self._addressed(station, report.counted(batch, now))
+        return written
+
     def reads(self, now: float) -> dict[str, list[CellRead]]:
         """Questions to the switches about cells of windows that are over, by switch."""
         found: dict[str, list[CellRead]] = {}
         for name, station in self._stations.items():
             station.clock.look(now)
-            for tallies in station.tallies:
-                found.setdefault(name, []).extend(tallies.due(station.clock, now))
+            for counts in station.asking:
+                found.setdefault(name, []).extend(counts.due(station.clock, now))
         return {name: reads for name, reads in found.items() if reads}
 
     def last_reads(self, now: float) -> dict[str, list[CellRead]]:
-        """Questions about all windows that are open, by switch: no more packets will come."""
+        """Questions about all windows that are open, by switch, for no more packets will come.
+
+        To be called again and again while `waits_for_cells`.
+        """
         found = {
-            name: [read for tallies in station.tallies for read in tallies.finish(now)]
+            name: [read for counts in station.asking for read in counts.finish(now)]
             for name, station in self._stations.items()
         }
         return {name: reads for name, reads in found.items() if reads}
 
-    @property
-    def waits_for_cells(self) -> bool:
+    def waits_for_cells(self, now: float) -> bool:
         """Whether an answer is outstanding."""
-        return any(tallies.waiting for station in self._stations.values() for tallies in station.tallies)
+        return any(counts.waits(now) for station in self._stations.values() for counts in station.asking)
 
     @property
     def needs_cells(self) -> bool:
         """Whether answers to such questions are expected."""
-        return any(station.tallies for station in self._stations.values())
+        return any(station.asking for station in self._stations.values())
 
     def cells(self, switch: str, numbers: Sequence[int], counts: Sequence[int]) -> list[Written]:
         """Answers: the count of each question."""
         station = self._station(switch)
         written: list[Written] = []
         for number, counted in zip(numbers, counts, strict=True):
-            for tallies in station.tallies:
-                if tallies.waits_for(number):
-                    written += self._addressed(station, tallies.answer(number, counted, station.clock))
+            for each in station.asking:
+                if each.waits_for(number):
+                    written += self._addressed(station, each.answer(number, counted, station.clock))
         return written
 
     def tick(self, now: float) -> list[Written]:
         """Let go what has waited long enough."""
         written: list[Written] = []
         for station in self._stations.values():
-            for tallies in station.tallies:
-                written += self._addressed(station, tallies.expire(station.clock, now))
+            for counts in station.asking:
+                written += self._addressed(station, counts.expire(station.clock, now))
             for lane in station.lanes:
                 written += self._processed(station, lane, lane.merger.release(now), now)
                 heard_us = station.clock.heard_us
@@ -258,8 +286,8 @@ class Control:
         """No more packets will come."""
         written: list[Written] = []
         for station in self._stations.values():
-            for tallies in station.tallies:
-                written += self._addressed(station, tallies.flush())
+            for counts in station.asking:
+                written += self._addressed(station, counts.flush())
             for lane in station.lanes:
                 written += self._processed(station, lane, lane.merger.flush(), None)
                 written += self._addressed(station, lane.host.finish())
@@ -288,8 +316,8 @@ class Control:
             "disordered": sum(lane.merger.disordered for lane in lanes),
             "without_payload": sum(lane.host.without_payload for lane in lanes),
             "reports": sum(report.tuples for station in stations for report in station.reports.values()),
-            "late_reads": sum(each.missed for station in stations for each in station.tallies),
-            "open_windows": sum(each.open for station in stations for each in station.tallies),
+            "late_reads": sum(each.missed for station in stations for each in station.asking),
+            "open_windows": sum(each.open for station in stations for each in station.asking),
             "refused": len(self._refused),
         }
 
@@ -306,7 +334,7 @@ class Control:
     def _overflow(self, one: QueryPlan) -> int:
         """Those of them that came because a key had no cell."""
         reports = [station.reports.get(one.identity) for station in self._stations.values()]
-        return sum(each.overflow for each in reports if isinstance(each, (Reports, Tallies)))
+        return sum(each.overflow for each in reports if isinstance(each, (Reports, Tallies, Differences)))
 
     def _read(self, keys: Iterable[str]) -> tuple[dict[str, Request], dict[str, set[str]], dict[str, str]]:
         requests: dict[str, Request] = {}
@@ -334,7 +362,10 @@ class Control:
         """Make the plan anew, and what runs that of the plan."""
         before, old = self.plan, self._requests
         clocks = {name: station.clock.heard_us for name, station in self._stations.items()}
-        counts = self._refinement.planned(self._asked, self._limits, before, clocks)
+        self._generation = 1 + self._generation % 255
+        counts = self._refinement.planned(
+            self._asked, self._limits, before, clocks, generation=self._generation
+        )
         self.plan, self._requests = counts.plan, counts.by_identity
         self._outputs = {count: self._keys[owner] for count, owner in counts.owners.items()}
         for station in self._stations.values():
@@ -361,19 +392,21 @@ class Control:
             asked = [self._requests[one.identity] for one in mine]
             windows = [request.query.window_us for request in asked if request.kind == "query"]
             lane.merger.hurry(patience(min(windows, default=None)))
-        reports: dict[str, Reports | Tallies | Crossings] = {}
+        reports: dict[str, _Counts] = {}
         for one in self.plan.queries:
             if one.in_switch:
                 held = station.reports.get(one.identity)
                 reports[one.identity] = held or self._new_reports(one, station)
         station.reports = reports
 
-    def _new_reports(self, one: QueryPlan, station: _Station) -> Reports | Tallies | Crossings:
+    def _new_reports(self, one: QueryPlan, station: _Station) -> _Counts:
         request = self._requests[one.identity]
         if request.coarse:
             return Crossings(request, base_us=station.base_us)
         query = request.query
-        kind = Tallies if isinstance(compile_query(query), Table) else Reports
+        kind: type[Reports | Tallies | Differences] = Reports
+        if isinstance(compile_query(query), Table):
+            kind = Differences if one.entries[0].role == "difference" else Tallies
         return kind(query, one, base_us=station.base_us, since_us=station.clock.heard_us)
 
     def _processed(
@@ -451,7 +484,7 @@ def _update(kind: Any, entry: Entry, params: Mapping[str, int] | None = None) ->
         kind=kind,
         table=f"ingress.count_{entry.stage}.queries",
         match={"query_map": [map_of_bit, map_of_bit]},
-        action=f"ingress.count_{entry.stage}.count",
+        action=f"ingress.count_{entry.stage}.{entry.action}",
         # numbers of more than 64 bits do not travel as such
         params={} if params is None else {name: hex(value) for name, value in params.items()},
         priority=1 + entry.bit,

@@ -138,6 +138,21 @@ def sources(table: Table) -> list[Node]:
     return found
 
 
+def key_fields(table: Table) -> list[list[tuple[str, str]]]:
+    """For each of `sources` the (name under the query, column) of each part of its key, in one order for all."""
+    found = [
+        [
+            (name, text_of(value))
+            for name, value in table.names
+            if not isinstance(value, Number) and text_of(value) != VALUE
+        ]
+    ]
+    for step in table.steps:
+        if isinstance(step, TableJoin):
+            found += key_fields(step.other)
+    return found
+
+
 def kinds_of(node: Node) -> dict[str, Kind]:
     """Columns of a node."""
     match node:

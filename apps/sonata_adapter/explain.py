@@ -33,6 +33,8 @@ def explain(request: Request, found: Plan, *, meaning: str = "") -> str:
     lines.append("  on the host")
     if any(entry.role == "clock" for entry in one.entries):
         lines.append("    keys that may become results; their other counts are read when the window is over")
+    elif any(entry.role == "difference" for entry in one.entries):
+        lines.append("    keys that are over the threshold when the window is over; keys without a cell")
     elif one.in_switch:
         lines.append("    keys that reached the threshold, reported once in a window; keys without a cell")
     if one.in_switch:
@@ -72,16 +74,23 @@ def _entry_lines(entry: Entry) -> list[str]:
         ]
     key = ", ".join(name.removesuffix("_mask") + _prefix_text(name, mask) for name, mask in entry.masks)
     unit = "bytes" if entry.by_bytes else "frames"
-    what = (
-        f"lets new ({key}) pass"
-        if entry.role == "distinct"
-        else f"counts {unit} by ({key}), reports {entry.threshold}"
-    )
+    what = {
+        "distinct": f"lets new ({key}) pass",
+        "reduce": f"counts {unit} by ({key}), reports {entry.threshold}",
+        "difference": _difference_text(entry, unit, key),
+    }[entry.role]
     cells = f"{entry.size:,} cells"
     return [
         f"    bit {entry.bit:<3} {match_text(entry.match)}",
         f"      stage {entry.stage}: {what}, {cells}",
     ]
+
+
+def _difference_text(entry: Entry, unit: str, key: str) -> str:
+    side = ", of answers" if entry.answers else ""
+    sign = "subtracts" if entry.subtracts else "adds"
+    at_end = f", reports {entry.threshold} at the window's end" if entry.bit == entry.count_of else ""
+    return f"{sign} {unit} by ({key}){side}{at_end}"
 
 
 def _prefix_text(name: str, mask: int) -> str:

@@ -4,7 +4,8 @@ A distinct or reduce takes a bit and a place in a stage; no frame may match two 
 a reduce behind a distinct stands in a later stage.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 from typing import Final, Literal
 
 import msgspec
@@ -26,7 +27,9 @@ _KEY_PARTS: Final = {
 }
 _LAST_KNOWN_PORT: Final = 1_023
 """Of the well-known ports; from them come answers, from the others what clients send."""
-Role = Literal["distinct", "reduce", "clock"]
+Role = Literal["distinct", "reduce", "difference", "clock"]
+_DIFFERENCE_ZERO: Final = 1 << 31
+"""What the program has in the cell of a difference that is 0: it may fall below."""
 
 
 class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -67,11 +70,17 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     """Which of the query's counts it is, in the order of `dataflow.sources`."""
     behind: tuple[int, ...] = ()
     """Of a reduce: the bits of the distincts that let its tuples pass, each those of other packets."""
+    count_of: int = 0
+    """Of a difference: the bit of its first entry, whose cells all of them count in."""
+    answers: int = 0
+    """Of a difference: 1 where the packets come from the other side, and their source is the key's destination."""
+    subtracts: int = 0
+    generation: int = 1
+    """Of a difference: 1 to 255, other than that of who had the bit before."""
 
     def params(self, repeated: int = 0) -> dict[str, int]:
-        """Parameters of the action `count`; `repeated`: bits to forget for a key seen before."""
-        return {
-            "query": self.bit,
+        """Parameters of the action; `repeated`: bits to forget for a key seen before."""
+        common = {
             "bit_of_query": 1 << self.bit,
             "source_mask": 0,
             "destination_mask": 0,
@@ -79,13 +88,30 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
             "length_mask": 0,
             "source_port_mask": 0,
             **dict(self.masks),
-            "threshold": self.threshold,
             "by_bytes": self.by_bytes,
             "reciprocal": reciprocal(self.window_us),
             "base": self.base,
             "size": self.size,
-            "repeated": repeated,
         }
+        if self.role != "difference":
+            return {**common, "query": self.bit, "threshold": self.threshold, "repeated": repeated}
+        return {
+            **common,
+            "count_of": self.count_of,
+            "threshold": _DIFFERENCE_ZERO + self.threshold,
+            "answers": self.answers,
+            "subtracts": self.subtracts,
+            "generation": self.generation,
+        }
+
+    @property
+    def action(self) -> str:
+        """Name of the counting stages' action."""
+        return "difference" if self.role == "difference" else "count"
+
+    def value(self, count: int) -> int:
+        """What a count that was read from its cell means."""
+        return count - _DIFFERENCE_ZERO if self.role == "difference" else count
 
 
 class Copy(msgspec.Struct, frozen=True, kw_only=True):
@@ -256,6 +282,26 @@ class Space:
             held.append(entry)
             return entry
         raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its {wanted.role}")
+
+    def difference(self, wanted: Sequence[Entry]) -> list[Entry]:
+        """Entries for one difference: all in one stage, on the same cells; raises `NotPlaced`."""
+        apart = all(disjoint(one.match, other.match) for one, other in combinations(wanted, 2))
+        wish = len(wanted) * self._limits.reduce_cells
+        for number, held in enumerate(self._stages if apart else ()):
+            gap = self._gap(held, wish)
+            fits = all(disjoint(one.match, other.match) for one in wanted for other in held)
+            if not fits or gap is None or len(held) + len(wanted) > self._limits.entries:
+                continue
+            bits = [self.bit() for _ in wanted]
+            found = [
+                msgspec.structs.replace(
+                    entry, bit=bit, count_of=bits[0], stage=number, base=gap[0], size=gap[1]
+                )
+                for entry, bit in zip(wanted, bits, strict=True)
+            ]
+            held.extend(found)
+            return found
+        raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its difference")
 
     def _gap(self, held: Iterable[Entry], wish: int) -> tuple[int, int] | None:
         """The first gap of cells that is as large as wished, else the largest of at least a quarter."""

@@ -4,18 +4,19 @@
                                                 └ no ─► copies of the packets that its filters name
 
 The switch counts a reduce over packets, or over a distinct over packets, whose keys are addresses,
-the destination port and the length.  Each distinct and each reduce takes a bit of the classifier for
+the destination port and the length, and differences of counts over packets in one cell.  Each distinct and each reduce takes a bit of the classifier for
 each alternative of its filter and a place in a counting stage; in one stage, no frame may match two
 entries.  Where there is no room for all, those queries go in first that save most tuples.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from math import gcd
 from typing import Final
 
 import msgspec
 
-from apps.sonata_adapter.candidates import candidates
+from apps.sonata_adapter.candidates import Difference, candidates, difference
 from apps.sonata_adapter.conditions import Match, conditions_of, disjoint
 from apps.sonata_adapter.dataflow import (
     Crossing,
@@ -26,11 +27,12 @@ from apps.sonata_adapter.dataflow import (
     ReduceNode,
     Table,
     compile_query,
+    key_fields,
     sources,
 )
 from apps.sonata_adapter.errors import NotPlaced
 from apps.sonata_adapter.estimates import packets_per_second
-from apps.sonata_adapter.expressions import PAYLOAD_FIELDS, Expression, fields_of, text_of
+from apps.sonata_adapter.expressions import PAYLOAD_FIELDS, Expression, Field, fields_of, text_of
 from apps.sonata_adapter.keys import Request
 from apps.sonata_adapter.placement import Copy, Entry, Space, SwitchLimits, by_bytes, masks_of
 from apps.sonata_adapter.query import duration_text
@@ -40,6 +42,11 @@ _LONGEST_PERIOD_MS: Final = 10_000
 """The switch says the time so often at least."""
 _SHARE_WITHIN: Final = 2
 """What a narrowed query takes is one in so many of the cells that it would take of all packets."""
+_OTHER_SIDE: Final = {
+    "ip.src": "ip.dst", "ip.dst": "ip.src", "tcp.sport": "tcp.dport", "tcp.dport": "tcp.sport",
+    "udp.sport": "udp.dport", "udp.dport": "udp.sport", "length": "length",
+}  # fmt: skip
+"""Where the answer to a packet has a part of its key."""
 _CELLS_A_PREFIX: Final = 8
 """Cells of a coarse level for each prefix that there can be of IPv4: then hardly one is without."""
 
@@ -90,11 +97,13 @@ def plan(
     *,
     before: Plan | None = None,
     resting: Iterable[int] = (),
+    generation: int = 1,
 ) -> Plan:
     """The plan for all requests; what `before` has in the switch keeps its place.
 
     The order of requests does not matter; of new ones those come first that save most.  Bits that are
     `resting` are not given away: their cells of this window still hold what they counted before.
+    `generation` (1 to 255) is other than that of the plans before, for who gets a bit that was another's.
     """
     limits = limits or SwitchLimits()
     space = Space(limits)
@@ -109,7 +118,7 @@ def plan(
     fresh = [request for request in wanted.values() if request.identity not in kept]
     ordered = sorted(fresh, key=lambda request: (-_saving(request, limits), request.identity))
     placed, space = _placed(ordered, space, limits)
-    found = _timed({**kept, **placed}, limits)
+    found = _timed({**kept, **_marked(placed, generation)}, limits)
     copies = _copies([wanted[one.identity] for one in found.values() if not one.in_switch], held, space)
     plans = []
     for identity in sorted(found):
@@ -137,6 +146,20 @@ def _placed(
     (split, less), (whole, more) = trials
     as_many = all(split[identity].in_switch for identity, one in whole.items() if one.in_switch)
     return trials[0] if as_many and (less.free_stages or not more.free_stages) else trials[1]
+
+
+def _marked(plans: Mapping[str, QueryPlan], generation: int) -> dict[str, QueryPlan]:
+    """The plans, with differences told from those that had their bits before."""
+    return {
+        identity: msgspec.structs.replace(
+            one,
+            entries=tuple(
+                msgspec.structs.replace(entry, generation=generation) if entry.role == "difference" else entry
+                for entry in one.entries
+            ),
+        )
+        for identity, one in plans.items()
+    }
 
 
 def _timed(plans: Mapping[str, QueryPlan], limits: SwitchLimits) -> dict[str, QueryPlan]:
@@ -255,10 +278,45 @@ def _entries(request: Request, space: Space, limits: SwitchLimits) -> list[Entry
             f"{duration_text(limits.read_window_ms)} are not read: they would come late"
         )
     nodes = sources(outcome)
+    signed = difference(outcome)
+    if signed is not None:
+        with suppress(NotPlaced):  # then it is counted apart, if there is room for that
+            return _difference_entries(request, outcome, signed, space)
     found: list[Entry] = [space.clock()]
     for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):
         found += _count_entries(request, node, space, limits, threshold, source=place)
     return found
+
+
+def _difference_entries(request: Request, table: Table, signed: Difference, space: Space) -> list[Entry]:
+    """Entries that count up and down in the same cells."""
+    fields = key_fields(table)
+    keys = [dict(each) for each in fields]
+    found: list[Entry] = []
+    for place, (node, sign) in enumerate(zip(sources(table), signed.signs, strict=True)):
+        counted, matches = _countable(node)
+        if isinstance(counted.source, DistinctNode) or counted.function != "sum":
+            raise NotPlaced("the switch adds up frames or bytes for a difference, nothing else")
+        answers = keys[place] != keys[0]
+        if answers and {name: _OTHER_SIDE.get(part) for name, part in keys[place].items()} != keys[0]:
+            raise NotPlaced("the keys of a difference are one side of a conversation")
+        found += [
+            Entry(
+                role="difference",
+                bit=0,
+                stage=0,
+                match=match,
+                masks=masks_of(Field(part) for _, part in fields[0]),
+                threshold=signed.threshold,
+                by_bytes=by_bytes(counted.value),
+                window_us=request.query.window_us,
+                source=place,
+                answers=int(answers),
+                subtracts=int(sign < 0),
+            )
+            for match in matches
+        ]
+    return space.difference(found)
 
 
 def _count_entries(

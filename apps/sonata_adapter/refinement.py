@@ -111,6 +111,8 @@ class Refinement:
         limits: SwitchLimits,
         before: Plan,
         clocks: Mapping[str, int | None],
+        *,
+        generation: int = 1,
     ) -> Counts:
         """Counts for these requests and their plan; `clocks`: how far each switch's time (us) has come."""
         self._resting = [each for each in self._resting if _rests(each, clocks)]
@@ -119,7 +121,7 @@ class Refinement:
             self._looked_at.clear()
             counts = {request.identity: self._of(request) for request in requests.values()}
             found = {count.identity: count for each in counts.values() for count in each}
-            made = plan(list(found.values()), limits, before=before, resting=resting)
+            made = plan(list(found.values()), limits, before=before, resting=resting, generation=generation)
             failed = {
                 each.identity for each in made.queries if found[each.identity].coarse and not each.in_switch
             }

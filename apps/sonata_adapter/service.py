@@ -1,7 +1,7 @@
 """The Sonata adapter as a DUE app: keys become queries in the switch, results come back.
 
     network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata.*, network.p4_command.sonata_adapter.*
-    network.packets|frames|digests.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
+    network.packets|frames|digests|counts.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
 
 Nothing is observed and nothing is offered while nobody wants a result: with no interest the switch
 has no entry and sends nothing.
@@ -24,13 +24,13 @@ import due.service
 from apps.messages import TableCommand, TableUpdate
 from apps.packets import read_frames
 from apps.sonata_adapter.catalogue import CATALOGUE, Template
+from apps.sonata_adapter.cell_read import CellRead
 from apps.sonata_adapter.control import Changes, Control, Source, Written, leftovers
 from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
 from apps.sonata_adapter.placement import SwitchLimits
 from apps.sonata_adapter.results import Captured
-from apps.sonata_adapter.tallies import CellRead
 from apps.sonata_adapter.templates import QueryFolder, own_queries
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
@@ -138,11 +138,13 @@ class SonataAdapterService:
 
     def stop(self) -> None:
         """Report what is open, and take everything out of the switch."""
-        with self._lock:
-            self._ask(self._control.last_reads(time.monotonic()))
         deadline = time.monotonic() + _LAST_ANSWERS_S
-        while self._control.waits_for_cells and time.monotonic() < deadline:
-            time.sleep(_LOOK_S)
+        waits = True
+        while waits and time.monotonic() < deadline:
+            with self._lock:
+                self._ask(self._control.last_reads(time.monotonic()))
+                waits = self._control.waits_for_cells(time.monotonic())
+            time.sleep(_LOOK_S if waits else 0.0)
         with self._lock:
             self._write(self._control.finish())
             self._apply(self._control.want(()))
@@ -240,6 +242,8 @@ class SonataAdapterService:
             if kind == "digests":
                 self._write(self._control.digests(switch, name, batch))
                 self._refine()
+            elif kind == "counts":
+                self._write(self._control.counts(switch, name, batch, time.monotonic()))
             else:
                 self._write(self._control.packets(switch, name, batch, time.monotonic()))
                 self._control.busy(switch, time.monotonic())
@@ -251,6 +255,7 @@ class SonataAdapterService:
         numbers, counts = item.value["id"].tolist(), item.value["count"].tolist()
         with self._lock:
             self._write(self._control.cells(switch, numbers, counts))
+            self._read_cells()
 
     def _read_cells(self) -> None:
         self._ask(self._control.reads(time.monotonic()))
@@ -315,6 +320,7 @@ def cell_request(reads: Sequence[CellRead]) -> RecordBatch:
             "length": np.array([read.length for read in reads], dtype=np.uint16),
             "source_port": np.array([read.source_port for read in reads], dtype=np.uint16),
             "time_us": np.array([read.time_us for read in reads], dtype=np.int64),
+            "sweep": np.array([read.sweep for read in reads], dtype=np.uint8),
         }
     )
 

@@ -11,46 +11,28 @@ with what is known, as an estimate.
 """
 
 from collections.abc import Iterator
-from itertools import count
 from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
+from apps.sonata_adapter.cell_read import LATE, TIMEOUT_S, CellRead
 from apps.sonata_adapter.clock import Clock
-from apps.sonata_adapter.columns import Packets, address_number
+from apps.sonata_adapter.columns import Packets
 from apps.sonata_adapter.dataflow import Table, compile_query
 from apps.sonata_adapter.placement import Entry
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import Query
 from apps.sonata_adapter.results import Result
-from apps.sonata_adapter.tally_tables import PART, Key, TallyTables
+from apps.sonata_adapter.tally_tables import Key, TallyTables
 from apps.sonata_adapter.tally_window import MOST_KEYS, Window
 from due import RecordBatch
 
-TIMEOUT_S: Final = 10.0
 PATIENCE_S: Final = 10.0
 """A switch that is silent for a window and so long is taken to have nothing to say, not to be slow."""
 _EARLY: Final = 4
 """A part of the window after its end: so long the switch's clock is waited for before cells are asked early,
 and so long reports may be under way behind it."""
-_LATE: Final = "cells were read when a later window had begun to overwrite them: a count may be too low"
 _SILENT: Final = "the switch sent nothing; the end was taken from this machine's clock"
-_NUMBERS: Final = count(1)
-
-
-class CellRead(msgspec.Struct, frozen=True, kw_only=True):
-    """A question to the switch: the count of a key in a window."""
-
-    id: int
-    """Unlike that of any other question of this process."""
-    bit: int
-    source: int
-    destination: int
-    port: int
-    length: int
-    source_port: int
-    time_us: int
 
 
 class _Question(NamedTuple):
@@ -173,8 +155,7 @@ class Tallies:
     def waits_for(self, question: int) -> bool:
         return question in self._questions
 
-    @property
-    def waiting(self) -> bool:
+    def waits(self, now: float) -> bool:  # noqa: ARG002 - as `Differences` has it
         """Whether an answer is outstanding."""
         return any(window.waiting for window in self._windows.values())
 
@@ -264,19 +245,12 @@ class Tallies:
             for entry in self._reduces.values():
                 if (entry.bit, key) in window.apart:
                     continue
-                question = next(_NUMBERS)
-                self._questions[question] = _Question(number, entry.bit, key, last)
+                middle_us = self._end(number) - self._query.window_us // 2
+                read = self._tables.question(entry.bit, entry.source, key, middle_us)
+                self._questions[read.id] = _Question(number, entry.bit, key, last)
                 if last:
-                    window.waiting.add(question)
-                parts = dict.fromkeys(PART.values(), 0)
-                for name, value in zip(self._tables.fields(entry.source), key, strict=True):
-                    parts[PART[name]] = address_number(value) if len(value) == 2 else value[0]
-                yield CellRead(
-                    id=question,
-                    bit=entry.bit,
-                    time_us=self._end(number) - self._query.window_us // 2,
-                    **parts,
-                )
+                    window.waiting.add(read.id)
+                yield read
 
     def _finished(self, number: int, window: Window) -> list[Result]:
         """Results of the keys of which all is known."""
@@ -292,7 +266,7 @@ class Tallies:
             groups[group].append((key, self._counts(window, key)))
         sure, unsure, doubtful = groups
         reasons = list(window.errors)
-        doubts = reasons or [_LATE]
+        doubts = reasons or [LATE]
         return [
             *(self._result(number, fields, reasons) for fields in self._tables.results(sure)),
             *(self._result(number, fields, doubts) for fields in self._tables.results(unsure)),

@@ -1,12 +1,13 @@
 """Counts of single keys → the rows that a query makes of them."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 
-from apps.sonata_adapter.columns import Packets, Tuples, plain_value
+from apps.sonata_adapter.cell_read import CellRead
+from apps.sonata_adapter.columns import Packets, Tuples, address_number, plain_value
 from apps.sonata_adapter.dataflow import (
     VALUE,
     DistinctNode,
@@ -14,13 +15,15 @@ from apps.sonata_adapter.dataflow import (
     Table,
     TableJoin,
     TableStep,
+    key_fields,
     kinds_of,
     sources,
 )
-from apps.sonata_adapter.evaluation import column_of
-from apps.sonata_adapter.expressions import Expression, Field, Number, text_of
+from apps.sonata_adapter.evaluation import SIX, column_of
+from apps.sonata_adapter.expressions import Expression, Field
 from apps.sonata_adapter.query import Filter, Query
 from apps.sonata_adapter.relations import relation_of
+from due import RecordBatch
 
 Key = tuple[tuple[int, ...], ...]
 """Parts of each key column, in the order of their names under the query."""
@@ -36,6 +39,8 @@ PART: Final = {
 }
 """Where a key's value stands in the question about its cell."""
 
+_TOLD_ADDRESSES: Final = {"source": "src", "destination": "dst"}
+
 
 class TallyTables:
     """What one query makes of the counts of keys: `sources` in the order of `dataflow.sources`."""
@@ -45,15 +50,38 @@ class TallyTables:
         self._table = table
         self._open = _unfiltered(table)
         self._nodes = [node for node in sources(table) if isinstance(node, ReduceNode)]
-        self._keys = [_key_names(each) for each in _tables(table)]
+        self._keys = key_fields(table)
 
     def fields(self, source: int) -> list[str]:
         """The packet field of each part of a key."""
         return [name for _, name in self._keys[source]]
 
+    def question(self, bit: int, source: int, key: Key, time_us: int) -> CellRead:
+        """The question about the cell of a key."""
+        parts = dict.fromkeys(PART.values(), 0)
+        for name, value in zip(self.fields(source), key, strict=True):
+            parts[PART[name]] = address_number(value) if len(value) == 2 else value[0]
+        return CellRead(
+            bit=bit,
+            time_us=time_us,
+            source=parts["source"],
+            destination=parts["destination"],
+            port=parts["port"],
+            length=parts["length"],
+            source_port=parts["source_port"],
+        )
+
     def keys(self, source: int, packets: Packets) -> list[Key]:
         """The key of each packet."""
         return _rows([Field(name) for name in self.fields(source)], packets)
+
+    def told(self, source: int, batch: RecordBatch) -> list[Key]:
+        """The key of each count that the switch told by itself."""
+        parts = {
+            name: list(zip(*(column.tolist() for column in _told(name, batch)), strict=True))
+            for name in self.fields(source)
+        }
+        return list(zip(*parts.values(), strict=True))
 
     def tuples(self, source: int, packets: Packets) -> list[Key]:
         """What the distinct before a source tells apart, of each packet."""
@@ -95,6 +123,15 @@ class TallyTables:
         return Tuples(columns, len(held))
 
 
+def _told(name: str, batch: RecordBatch) -> tuple[np.ndarray, ...]:
+    """A part of the keys, as columns of packets have it."""
+    place = _TOLD_ADDRESSES.get(PART[name])
+    if place is None:
+        return (batch[PART[name]],)
+    high = batch[f"{place}_hi"]
+    return np.where(high == 0, high, high ^ np.uint64(SIX)), batch[f"{place}_lo"]
+
+
 def _unfiltered(table: Table) -> Table:
     """The table without its conditions: a key that one source holds makes a row."""
     steps: list[TableStep] = []
@@ -114,21 +151,3 @@ def _rows(values: "list[Field] | tuple[Expression, ...]", packets: Packets) -> l
     columns = [column_of(value, packets) for value in values]
     parts = [list(zip(*(part.tolist() for part in column), strict=True)) for column in columns]
     return list(zip(*parts, strict=True))
-
-
-def _tables(table: Table) -> Iterator[Table]:
-    """The table and those joined to it, in the order of `sources`."""
-    yield table
-    for step in table.steps:
-        other = getattr(step, "other", None)
-        if isinstance(other, Table):
-            yield from _tables(other)
-
-
-def _key_names(table: Table) -> list[tuple[str, str]]:
-    """(name under the query, packet field) of each key, sorted: the same order for all sources."""
-    return [
-        (name, text_of(value))
-        for name, value in table.names
-        if not isinstance(value, Number) and text_of(value) != VALUE
-    ]

@@ -3,13 +3,39 @@
 // number (epoch), the query and its whole key beside the count, and a cell of an older window counts as
 // empty, so nothing is ever reset.  Cells are banked by the window's parity: the last window stays
 // readable.  A key whose cell is taken in its window goes to the host as an overflow tuple.
+//
+// Two kinds of counts:
+//   count        only grows: its key is reported when it reaches the threshold
+//   difference   grows with some frames and falls with others (SYNs - FINs): what it comes to is known when
+//                the window is over.  Keys that reached the threshold meanwhile wait in a ring; the query's
+//                frames of later windows take one of them out each, and report it if it is still over.
 
-const bit<32> CELLS = 65536;              // of a stage, both banks together
+const bit<32> STAGE_CELLS = 65536;        // of a stage, both banks together
+const bit<32> CELLS = 8 * STAGE_CELLS;
+const bit<32> DIFFERENCE_ZERO = 0x80000000; // in the cell of a difference: it may fall below zero
 
-control CountStage(in headers_t hdr, inout metadata_t meta) {
-    // epoch (window number + 1) 32 | query 8 | source 128 | destination 128 | extra 48 | count 32
-    @name("cells") register<bit<376>>(CELLS) cells;
+// epoch (window number + 1) 32 | query 8 | source 128 | destination 128 | extra 48
+// | waiting: generation of the ring that the cell waits in, 0 = none 8 | count 32
+@name(".ingress.cells") register<bit<384>>(CELLS) cells;
+// Rings of waiting cells: twice as long as the cells that a query has in a bank, at twice their base.
+@name(".ingress.waiting") register<bit<32>>(CELLS) waiting;
+// A query's ring: generation 8 | epoch of its newest frame 32 | first that waits 32
+// | first that waits for the end of that epoch 32 | behind the last 32
+@name(".ingress.rings") register<bit<136>>(256) rings;
+
+control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) {
     direct_counter(CounterType.packets) stage_counter;
+
+    // Which cell the frame counts in, and what of the cell says that it is the key's.
+    action locate(in bit<8> query, in address_t source, in address_t destination, in bit<48> extra,
+                  in bit<64> reciprocal, in bit<32> base, in bit<32> size) {
+        bit<112> product = (bit<112>)meta.timestamp * (bit<112>)reciprocal;
+        meta.cell_epoch = (bit<32>)(product >> 64) + 1; // a cell of zeros belongs to no window
+        meta.cell_key = meta.cell_epoch ++ query ++ source ++ destination ++ extra;
+        hash(meta.cell_slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
+        meta.cell_slot = meta.cell_slot + first_cell + (meta.cell_epoch[0:0] == 1 ? STAGE_CELLS / 2 : 32w0);
+        cells.read(meta.cell, meta.cell_slot);
+    }
 
     // Params: query: number of the query. *_mask: which parts of the frame are its key; extra is the
     // destination port, the length and the source port. threshold: report when the count reaches it (0 = never).
@@ -24,32 +50,93 @@ control CountStage(in headers_t hdr, inout metadata_t meta) {
         address_t destination = meta.destination & destination_mask;
         bit<48> extra = (meta.destination_port & port_mask) ++ ((bit<16>)meta.length & length_mask)
                         ++ (meta.source_port & source_port_mask);
-        bit<112> product = (bit<112>)meta.timestamp * (bit<112>)reciprocal;
-        bit<32> epoch = (bit<32>)(product >> 64) + 1; // a cell of zeros belongs to no window
-        bit<32> slot;
-        hash(slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
-        slot = slot + (epoch[0:0] == 1 ? CELLS / 2 : 32w0);
-        bit<376> cell;
-        cells.read(cell, slot);
-        bool is_empty = cell[375:344] != epoch;
-        bool is_mine = !is_empty && cell[343:336] == query && cell[335:208] == source
-                       && cell[207:80] == destination && cell[79:32] == extra;
-        bit<32> before = is_mine ? cell[31:0] : 32w0;
-        bit<32> step = by_bytes == 1 ? meta.length : 32w1;
-        bit<32> after = before |+| step;
-        bool writes = (is_empty || is_mine) && meta.reading == 0;
-        cells.write(slot, writes ? epoch ++ query ++ source ++ destination ++ extra ++ after : cell);
-        meta.cell_epoch = epoch - 1;
-        meta.cell_count = before;
-        meta.crossed = meta.crossed | ((is_empty || is_mine) && threshold != 0 && before < threshold && after >= threshold ? bit_of_query : 256w0);
-        meta.overflow = meta.overflow | (is_empty || is_mine ? 256w0 : bit_of_query);
-        meta.query_map = meta.query_map & ~(is_empty ? 256w0 : repeated);
+        locate(query, source, destination, extra, reciprocal, base, size);
+        bit<1> has_cell = 1;
+        if (meta.cell[383:352] != meta.cell_epoch) {
+            meta.cell = meta.cell_key ++ 40w0;
+        } else {
+            meta.query_map = meta.query_map & ~repeated;
+            if (meta.cell[383:40] != meta.cell_key) {
+                has_cell = 0;
+                meta.overflow = meta.overflow | bit_of_query;
+                meta.cell = meta.cell_key ++ 40w0;
+            }
+        }
+        meta.cell_count = meta.cell[31:0];
+        if (has_cell == 1 && meta.reading == 0) {
+            bit<32> step = by_bytes == 1 ? meta.length : 32w1;
+            meta.cell[31:0] = meta.cell_count |+| step;
+            if (meta.cell_count < threshold && meta.cell[31:0] >= threshold) {
+                meta.crossed = meta.crossed | bit_of_query;
+            }
+            cells.write(meta.cell_slot, meta.cell);
+        }
+    }
+
+    // Params as of count, and: count_of: the query whose cells and ring these are, the same for all frames of
+    // a difference. answers: the frame's destination is the key's source, and so on. subtracts: the frame makes
+    // the count smaller. threshold: DIFFERENCE_ZERO + what is reported. generation: 1 to 255, other than that
+    // of whoever had the number count_of before.
+    action difference(bit<8> count_of, query_map_t bit_of_query, address_t source_mask, address_t destination_mask,
+                      bit<16> port_mask, bit<16> length_mask, bit<32> threshold, bit<1> by_bytes,
+                      bit<64> reciprocal, bit<32> base, bit<32> size, bit<16> source_port_mask, bit<1> answers,
+                      bit<1> subtracts, bit<8> generation) {
+        stage_counter.count();
+        address_t source = (answers == 1 ? meta.destination : meta.source) & source_mask;
+        address_t destination = (answers == 1 ? meta.source : meta.destination) & destination_mask;
+        bit<16> port = (answers == 1 ? meta.source_port : meta.destination_port) & port_mask;
+        bit<16> source_port = (answers == 1 ? meta.destination_port : meta.source_port) & source_port_mask;
+        bit<48> extra = port ++ ((bit<16>)meta.length & length_mask) ++ source_port;
+        locate(count_of, source, destination, extra, reciprocal, base, size);
+        bit<1> has_cell = 1;
+        if (meta.cell[383:40] != meta.cell_key) {
+            // another key's in this window; or one of ours that waits, though its window is over
+            if (meta.cell[383:352] == meta.cell_epoch
+                || (meta.cell[351:344] == count_of && meta.cell[39:32] == generation)) {
+                has_cell = 0;
+                meta.overflow = meta.overflow | bit_of_query;
+            }
+            meta.cell = meta.cell_key ++ 8w0 ++ DIFFERENCE_ZERO;
+        }
+        meta.cell_count = meta.cell[31:0];
+
+        bit<136> ring;
+        rings.read(ring, (bit<32>)count_of);
+        if (ring[135:128] != generation) {
+            ring = generation ++ 128w0;
+        }
+        if (meta.cell_epoch > ring[127:96]) { // what waited until now waits for the end of a window that is over
+            ring[127:96] = meta.cell_epoch;
+            ring[63:32] = ring[31:0];
+        }
+        if (has_cell == 1 && meta.reading == 0) {
+            bit<32> step = by_bytes == 1 ? meta.length : 32w1;
+            meta.cell[31:0] = subtracts == 1 ? meta.cell[31:0] |-| step : meta.cell[31:0] |+| step;
+            if (meta.cell[31:0] >= threshold && meta.cell[39:32] != generation) {
+                bit<32> next = ring[31:0] + 1 == 2 * size ? 32w0 : ring[31:0] + 1;
+                if (next == ring[95:64]) { // no room to wait
+                    meta.crossed = meta.crossed | bit_of_query;
+                } else {
+                    waiting.write(first_cell + 2 * base + ring[31:0], meta.cell_slot);
+                    meta.cell[39:32] = generation;
+                    ring[31:0] = next;
+                }
+            }
+            cells.write(meta.cell_slot, meta.cell);
+        }
+        rings.write((bit<32>)count_of, ring);
+        if (ring[95:64] != ring[63:32]) {
+            meta.sweep.size = 2 * size;
+            meta.sweep.ring = first_cell + 2 * base;
+            meta.sweep.query = count_of;
+            meta.sweep.threshold = threshold;
+        }
     }
     @name("queries")
     @brief("Counting queries of this stage, by their bit of the query map")
     table queries {
         key = { meta.query_map: ternary @name("query_map"); }
-        actions = { count; NoAction; }
+        actions = { count; difference; NoAction; }
         default_action = NoAction();
         counters = stage_counter;
         size = 32;
@@ -58,14 +145,14 @@ control CountStage(in headers_t hdr, inout metadata_t meta) {
 }
 
 control Counting(in headers_t hdr, inout metadata_t meta) {
-    @name(".ingress.count_0") CountStage() count_0;
-    @name(".ingress.count_1") CountStage() count_1;
-    @name(".ingress.count_2") CountStage() count_2;
-    @name(".ingress.count_3") CountStage() count_3;
-    @name(".ingress.count_4") CountStage() count_4;
-    @name(".ingress.count_5") CountStage() count_5;
-    @name(".ingress.count_6") CountStage() count_6;
-    @name(".ingress.count_7") CountStage() count_7;
+    @name(".ingress.count_0") CountStage(0 * STAGE_CELLS) count_0;
+    @name(".ingress.count_1") CountStage(1 * STAGE_CELLS) count_1;
+    @name(".ingress.count_2") CountStage(2 * STAGE_CELLS) count_2;
+    @name(".ingress.count_3") CountStage(3 * STAGE_CELLS) count_3;
+    @name(".ingress.count_4") CountStage(4 * STAGE_CELLS) count_4;
+    @name(".ingress.count_5") CountStage(5 * STAGE_CELLS) count_5;
+    @name(".ingress.count_6") CountStage(6 * STAGE_CELLS) count_6;
+    @name(".ingress.count_7") CountStage(7 * STAGE_CELLS) count_7;
     apply {
         count_0.apply(hdr, meta);
         count_1.apply(hdr, meta);
@@ -75,5 +162,31 @@ control Counting(in headers_t hdr, inout metadata_t meta) {
         count_5.apply(hdr, meta);
         count_6.apply(hdr, meta);
         count_7.apply(hdr, meta);
+    }
+}
+
+// Takes the first cell out of a ring whose window is over, and reports it if it is over the threshold.
+control Sweep(inout metadata_t meta) {
+    apply {
+        bit<136> ring;
+        rings.read(ring, (bit<32>)meta.sweep.query);
+        bit<32> head = ring[95:64];
+        bit<32> slot;
+        waiting.read(slot, meta.sweep.ring + head);
+        bit<384> cell;
+        cells.read(cell, slot);
+        cells.write(slot, cell[383:40] ++ 8w0 ++ cell[31:0]);
+        head = head + 1 == meta.sweep.size ? 32w0 : head + 1;
+        rings.write((bit<32>)meta.sweep.query, ring[135:96] ++ head ++ ring[63:0]);
+        meta.sweep.left = head == ring[63:32] ? 1w0 : 1w1;
+        if (cell[31:0] >= meta.sweep.threshold) {
+            // a frame makes one digest at most: whoever wanted one of the frame gets a copy of it
+            meta.copies = meta.copies | meta.digests;
+            meta.digests = 0;
+            digest<count_digest_t>(1, {
+                cell[351:344], cell[383:352] - 1, cell[31:0] - DIFFERENCE_ZERO, cell[343:216], cell[215:88],
+                cell[87:72], cell[71:56], cell[55:40], meta.timestamp
+            });
+        }
     }
 }

@@ -12,6 +12,7 @@ const bit<32> INSTANCE_REPLICATION = 5;
 
 const bit<7> OPERATION_SEND = 0;
 const bit<7> OPERATION_READ_CELL = 1;
+const bit<7> OPERATION_SWEEP = 2;         // as a frame of the query would, after its last frame for a while
 
 // metadata_t.unparsed, and index of unparsed_frames: what the parser could not take apart, and why
 const bit<3> UNPARSED_NOTHING = 0;        // all of it was taken apart
@@ -22,7 +23,8 @@ const bit<3> UNPARSED_PROTOCOL = 4;       // neither TCP, UDP nor ICMP above IP
 const bit<3> UNPARSED_ETHERTYPE = 5;      // neither IP nor ARP, or a third VLAN tag
 
 // packet_in.reason: 0 = a telemetry query wants the frame
-const bit<7> REASON_CELL = 1;             // answer to OPERATION_READ_CELL: sequence = count, arrival = window
+const bit<7> REASON_CELL = 1;             // answer to OPERATION_READ_CELL: sequence = count, arrival = window;
+                                          // to OPERATION_SWEEP: sequence = 1 if more keys wait for it
 
 const bit<16> ETHERTYPE_IPV4 = 0x0800;
 const bit<16> ETHERTYPE_ARP = 0x0806;
@@ -58,14 +60,15 @@ header packet_in_t {
 @controller_header("packet_out")
 header packet_out_t {
     bit<9> egress_port;
-    bit<7> operation;                     // 0: send the frame out of egress_port; 1: read a counting cell
+    bit<7> operation;                     // 0: send the frame out of egress_port; 1: read a counting cell;
+                                          // 2: sweep a ring, answered where more is left, or key_length is 1
     bit<32> query;                        // number of the query, and its key, masked as the query masks it
     address_t key_source;
     address_t key_destination;
     bit<16> key_port;
     bit<16> key_length;
     bit<16> key_source_port;
-    bit<48> timestamp;                    // any time in the window that is asked for, us
+    bit<48> timestamp;                    // any time in the window that is asked for, us; 2: 0 = now
 }
 
 header ethernet_t { mac_t destination; mac_t source; bit<16> ethertype; }
@@ -122,6 +125,15 @@ struct headers_t {
     ports_t quoted_ports;
 }
 
+// The ring of a difference out of which the frame takes a cell.
+struct sweep_t {
+    bit<32> size;                         // of the ring, 0 = none
+    bit<32> ring;                         // where it begins
+    bit<8> query;
+    bit<32> threshold;
+    bit<1> left;                          // more waits behind the one that was taken
+}
+
 struct metadata_t {
     // what a copy for the controller keeps (a plain clone would lose it)
     @field_list(COPY_FIELDS) bit<9> ingress_port;
@@ -161,9 +173,13 @@ struct metadata_t {
     query_map_t digests;                  // queries that want a digest of every frame
     query_map_t crossed;                  // counting queries whose threshold this frame reached
     query_map_t overflow;                 // counting queries that had no cell for this frame's key
-    bit<1> reading;                       // the frame asks for a cell and must not change it
-    bit<32> cell_epoch;
-    bit<32> cell_count;
+    bit<1> reading;                       // the frame asks for cells and must not change counts
+    bit<32> cell_epoch;                   // number of the window + 1
+    bit<344> cell_key;                    // epoch, query and key as a cell holds them
+    bit<32> cell_slot;
+    bit<384> cell;
+    bit<32> cell_count;                   // before the frame
+    sweep_t sweep;
 }
 
 struct frame_digest_t {
@@ -205,4 +221,17 @@ struct learn_digest_t {
     bit<9> port;
     bit<48> timestamp;
     bit<12> vid;
+}
+
+// A key whose difference is over its threshold at a window's end; the key as the cell holds it.
+struct count_digest_t {
+    bit<8> query;
+    bit<32> window;                       // number
+    bit<32> count;                        // two's complement
+    address_t src;
+    address_t dst;
+    bit<16> port;
+    bit<16> length;
+    bit<16> source_port;
+    bit<48> timestamp;                    // when it was found out
 }

@@ -22,6 +22,7 @@ from dataplane.tables import Exact, TableEntry, TableError
 from dataplane.tree import MatchKind, Program
 from p4rt import p4runtime
 from tests.contract.targets import Bmv2Target
+from tests.dataplane import counting_traffic
 from tests.dataplane.controller import Controller, delete, insert, modify, program_config
 from tests.dataplane.loading import features, sdnator, shared
 from tests.dataplane.traffic import Chooser, Maker, feature_frame, network_frame
@@ -33,6 +34,7 @@ _BURST = 12  # BMv2 drops where 64 frames wait for one port
 _UPDATES = 40
 _WAIT_S = 60.0
 _SETTLE_S = 1.0
+_WINDOW_US = 3_600_000_000  # clocks differ: frames of both are in the first window, sweeps say when they are
 _PORTS = (1, 2, 3)
 _ids = itertools.count(10)
 _SESSIONS = {1: [Replica(510, 1)], 5: [Replica(4, 7), Replica(510, 1)], 6: [Replica(4, 7), Replica(510, 1)]}
@@ -64,10 +66,13 @@ class Case:
         mask: Callable[[bytes], bytes] = bytes,
         skip: Callable[[bytes], bool] = lambda _: False,
         layer_2: bool = False,
+        counting: bool = False,
     ) -> None:
         self.path, self.program, self.maker, self.mask, self.skip = path, program, maker, mask, skip
         self.layer_2 = layer_2
         """Nothing but stations and floods: random entries seldom let a frame come so far."""
+        self.counting = counting
+        """Nothing but counting stages, whose cells are used, and packet-outs that read or sweep them."""
 
 
 CASES = {
@@ -81,6 +86,9 @@ CASES = {
     "sdnator": Case(lambda: _HERE.parents[1] / "p4" / "sdnator", sdnator, network_frame, mask=_no_clock),
     "layer 2": Case(
         lambda: _HERE.parents[1] / "p4" / "sdnator", sdnator, network_frame, mask=_no_clock, layer_2=True
+    ),
+    "counting": Case(
+        lambda: _HERE.parents[1] / "p4" / "sdnator", sdnator, network_frame, mask=_no_clock, counting=True
     ),
 }
 
@@ -108,13 +116,14 @@ class Pair:
         program = case.program()
         self.schema: Schema = bind(config.p4info, program)
         self.switch = Switch(program, backend="c" if seed % 2 else "python")
-        tables = self._layer_2() if case.layer_2 else self._tables()
+        tables = self._layer_2() if case.layer_2 else self._counting() if case.counting else self._tables()
         updates = [*tables, *self._replicas(), *self._digests(config)]
         for first in range(0, len(updates), _UPDATES):
             self.controller.write(*updates[first : first + _UPDATES])
         self._digest_names = {d.preamble.id: d.preamble.name for d in config.p4info.digests}
         self._clocks = _clock_members(config.p4info)
         self.digests: set[tuple[str, tuple[int, ...]]] = set()
+        self.windows = 0
         for port in (*_PORTS, 4):
             self.exchange(port, [b"\0"])  # BMv2 knows a port once something came from it
 
@@ -146,13 +155,19 @@ class Pair:
     def _layer_2(self) -> Iterable[Any]:
         default = (("ingress.flood", (1,)), ("ingress.drop_unknown", ()))[self.chooser.random.random() < 0.3]
         yield self._default("ingress.dmac", *default)
-        yield self._entry("ingress.vlan_flood", (Exact(2),), "ingress.flood_vlan", 2)
+        yield self._entry("ingress.vlan_flood", TableEntry((Exact(2),), "ingress.flood_vlan", (2,)))
         for vid, station in itertools.product((0, 1, 2), (1, 2, 3)):
             port, key = self.chooser.random.choice(_PORTS), (Exact(vid), Exact(0x020000000000 + station))
             if self.chooser.random.random() < 0.5:
-                yield self._entry("ingress.smac", key, "ingress.known_station", port)
+                yield self._entry("ingress.smac", TableEntry(key, "ingress.known_station", (port,)))
             if self.chooser.random.random() < 0.5:
-                yield self._entry("ingress.dmac", key, "ingress.set_egress", port)
+                yield self._entry("ingress.dmac", TableEntry(key, "ingress.set_egress", (port,)))
+
+    def _counting(self) -> Iterable[Any]:
+        for default in counting_traffic.defaults(self.chooser.random):
+            yield self._default(*default)
+        for name, entry in counting_traffic.entries(self.chooser.random, self.switch.tables, _WINDOW_US):
+            yield self._entry(name, entry)
 
     def _default(self, name: str, action: str, params: tuple[int, ...]) -> Any:
         self.switch.tables[name].set_default(action, params)
@@ -163,8 +178,7 @@ class Pair:
         TableCodec(bound).write_action(action, params, entity.table_entry)
         return modify(entity)
 
-    def _entry(self, name: str, match: tuple[Exact, ...], action: str, *params: int) -> Any:
-        entry = TableEntry(match, action, params)
+    def _entry(self, name: str, entry: TableEntry) -> Any:
         self.switch.tables[name].insert(entry)
         entity = p4runtime.Entity()
         TableCodec(self.schema.table_of(name)).write(entry, entity.table_entry)
@@ -218,6 +232,15 @@ class Pair:
         result = self.switch.process_many(port, frames, [1_000_000] * len(frames))
         self.target.inject(port, *frames)
         self._compare(result, frames)
+
+    def header(self) -> list[int]:
+        """Of a packet-out: random, or a question about cells as of some window."""
+        random = self.chooser.random
+        if not self.case.counting:
+            return [self.chooser.value(f.width) for f in self.schema.packet_out]
+        self.windows += random.randint(0, 2)
+        asked = counting_traffic.question(random, self.windows * _WINDOW_US + 5)
+        return [asked.get(f.name, 0) for f in self.schema.packet_out]
 
     def packet_out(self, header: list[int], payload: bytes) -> None:
         bits = 0
@@ -320,11 +343,11 @@ def test_embedded_switch_does_what_bmv2_does(bmv2, name, seed):
     for _ in range(0, _FRAMES, _BURST):
         frames: list[bytes] = []
         while len(frames) < _BURST:
-            data = chooser.spoil(case.maker(chooser.random))
+            data = case.maker(chooser.random)
+            data = data if case.counting else chooser.spoil(data)  # a frame that is dropped is not waited for
             if data and not case.skip(data):
                 frames.append(data)
         pair.exchange(chooser.random.choice(_PORTS), frames)
         if pair.schema.packet_out:
-            header = [chooser.value(f.width) for f in pair.schema.packet_out]
-            pair.packet_out(header, frames[0])
+            pair.packet_out(pair.header(), frames[0])
     pair.finish()

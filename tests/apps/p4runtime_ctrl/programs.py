@@ -19,6 +19,17 @@ def program() -> Program:
     return Program.from_text(P4INFO.read_text(encoding="utf-8"))
 
 
+def without(digest: str) -> Program:
+    """A program of one's own that does not have this digest."""
+    message = type(program().message)()
+    message.CopyFrom(program().message)
+    kept = [each for each in message.digests if each.preamble.name != digest]
+    del message.digests[:]
+    message.digests.extend(kept)
+    message.type_info.structs.pop(digest, None)
+    return Program(message)
+
+
 def pipeline() -> Pipeline:
     return Pipeline(b"{}", program().message)
 

@@ -29,7 +29,8 @@ def test_frames_are_routed_apart_and_asked_for_once():
     demand = demand_for("s1", [f"{KEY}.s1.all", key_of("frames", "s1", "all")], {})
     assert names(demand) == [("packets", 255)]
     assert demand.to("packets") == demand.to("frames") == {"all": 255}
-    assert demand_for("s1", ["network.**"], {}).to("digests") == {"all": 255}
+    everything = demand_for("s1", ["network.**"], {})
+    assert everything.to("digests") == everything.to("counts") == {"all": 255}
 
 
 def test_ports_have_requests_of_their_own():
@@ -51,7 +52,16 @@ def test_offers_are_sent_only_while_observed():
         "report": Offer(name="report", bit=8, copy=False, digest=True),
     }
     assert names(demand_for("s1", [f"{KEY}.**"], offers)) == [("packets", 255)]
-    demand = demand_for("s1", [f"{KEY}.s1.scan", f"{KEY}.s1.gone", key_of("digests", "*", "report")], offers)
+    demand = demand_for(
+        "s1",
+        [
+            f"{KEY}.s1.scan",
+            f"{KEY}.s1.gone",
+            key_of("digests", "*", "report"),
+            key_of("counts", "s1", "report"),
+        ],
+        offers,
+    )
     assert names(demand) == [("report", 8), ("scan", 4)]
     assert demand.to("packets") == {"scan": 4}
-    assert demand.to("digests") == {"report": 8}
+    assert demand.to("digests") == demand.to("counts") == {"report": 8}

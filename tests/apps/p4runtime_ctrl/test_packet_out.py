@@ -11,7 +11,7 @@ from apps.p4runtime_ctrl.errors import EntryError
 from apps.p4runtime_ctrl.packet_out import PacketOuts, question_of
 from due import Capability, RecordBatch
 from sdnator.wire import VethPair
-from tests.apps.p4runtime_ctrl.programs import program
+from tests.apps.p4runtime_ctrl.programs import program, without
 from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, frame, wait_for
 from tests.apps.p4runtime_ctrl.targets import KINDS
 from tests.requirements import optional_program, require_netns
@@ -28,8 +28,8 @@ CAPABILITIES = tuple(
 STATE = "network.switch.p4runtime_ctrl.s1"
 
 
-def counting(stage=0, bit=BIT):
-    """UDP frames by their source address, in windows of an hour."""
+def counting(kind="count", stage=0, bit=BIT):
+    """UDP frames by their source address, in windows of an hour; a difference tells of sources with two or more."""
     table = program().table(f"ingress.count_{stage}.queries")
     given = {
         "query": bit,
@@ -37,8 +37,11 @@ def counting(stage=0, bit=BIT):
         "source_mask": hex((1 << 128) - 1),
         "reciprocal": hex((1 << 64) // WINDOW_US),
         "size": 1024,
+        "count_of": bit,
+        "generation": 1,
+        "threshold": (1 << 31) + 2 if kind == "difference" else 0,
     }
-    action = next(action for action in table.actions if action.params)
+    action = next(action for action in table.actions if action.name.endswith(f".{kind}"))
     params = {param.name: given.get(param.name, 0) for param in action.params}
     match = {"query_map": [hex(1 << bit), hex(1 << bit)]}
     return TableUpdate(
@@ -91,40 +94,65 @@ def request(numbers, sources, time_us=BASE_US + 5_000_000):
     )
 
 
+def asked_for(stage):
+    """An app whose query is installed and under way, and what it hears."""
+    engine = stage.engine("sonata_adapter", capabilities=CAPABILITIES)
+    heard = Heard(
+        engine, "network.cell.p4runtime_ctrl.*", "network.confirmation.p4runtime_ctrl.*",
+        f"network.packets.p4runtime_ctrl.s1.q{BIT}", f"network.counts.p4runtime_ctrl.s1.q{BIT}", STATE,
+    )  # fmt: skip
+    # the state was asked for last: when it comes, the controller knows that all the others are wanted
+    wait_for(lambda: any(value["primary"] for value in heard.values("network.switch")), 90, why=stage.log)
+    wanted = ("network.p4_command.sonata_adapter.s1", f"network.telemetry.sonata.q{BIT}", REQUEST)
+    wait_for(lambda: all(map(engine.wanted, wanted)), 90, why=stage.log)
+    command = TableCommand(id="c1", updates=(counting(), counting("difference", stage=1)))
+    engine.write("network.p4_command.sonata_adapter.s1", command.to_value())
+    offer = {"name": f"q{BIT}", "bit": BIT, "conditions": {"protocol": 17}}
+    engine.write(f"network.telemetry.sonata.q{BIT}", offer)
+    engine.flush()
+    wait_for(lambda: heard.values("confirmation"), 90, why=stage.log)
+    assert {value["state"] for value in heard.values("confirmation")} == {"installed"}
+    wait_for(lambda: any(v["telemetry"] for v in heard.values("network.switch")), 90, why=stage.log)
+    assert heard.values("network.switch")[-1]["base_us"] == BASE_US
+    return engine, heard
+
+
+def answers(heard):
+    """The counts that questions brought back, by their numbers."""
+    found = {}
+    for batch in heard.values("network.cell"):
+        found |= dict(zip(batch["id"].tolist(), batch["count"].tolist(), strict=True))
+    return found
+
+
+def counted(heard):
+    """Window, count and host of what the switch reported."""
+    batches = heard.values("network.counts")
+    rows = [zip(each["window"], each["count"], each["src_lo"], strict=True) for each in batches]
+    return sorted(
+        (int(window), int(count), int(host) - 0x0A000000) for row in rows for window, count, host in row
+    )
+
+
 @pytest.mark.parametrize("kind", KINDS)
-def test_cells_are_read_in_band(kind, tmp_path):
+def test_cells_are_read_and_swept_in_band(kind, tmp_path):
     with wired(kind, tmp_path) as (stage, send):
         stage.controller()
-        engine = stage.engine("sonata_adapter", capabilities=CAPABILITIES)
-        heard = Heard(
-            engine, "network.cell.p4runtime_ctrl.*", "network.confirmation.p4runtime_ctrl.*",
-            f"network.packets.p4runtime_ctrl.s1.q{BIT}", STATE,
-        )  # fmt: skip
-        # the state was asked for last: when it comes, the controller knows that all the others are wanted
-        wait_for(lambda: any(value["primary"] for value in heard.values("network.switch")), 90, why=stage.log)
-        wanted = ("network.p4_command.sonata_adapter.s1", f"network.telemetry.sonata.q{BIT}", REQUEST)
-        wait_for(lambda: all(map(engine.wanted, wanted)), 90, why=stage.log)
-        command = TableCommand(id="c1", updates=(counting(),))
-        engine.write("network.p4_command.sonata_adapter.s1", command.to_value())
-        offer = {"name": f"q{BIT}", "bit": BIT, "conditions": {"protocol": 17}}
-        engine.write(f"network.telemetry.sonata.q{BIT}", offer)
-        engine.flush()
-        wait_for(lambda: heard.values("confirmation"), 90, why=stage.log)
-        assert heard.values("confirmation")[0]["state"] == "installed"
-        wait_for(lambda: any(v["telemetry"] for v in heard.values("network.switch")), 90, why=stage.log)
-        assert heard.values("network.switch")[-1]["base_us"] == BASE_US
+        engine, heard = asked_for(stage)
         send([frame(1 + number % 3) for number in range(8)])
         wait_for(lambda: sum(map(len, heard.values("network.packets"))) == 8, 60, why=stage.log)
-
-        def answers():
-            found = {}
-            for batch in heard.values("network.cell"):
-                found |= dict(zip(batch["id"].tolist(), batch["count"].tolist(), strict=True))
-            return found
-
         engine.write(REQUEST, request([7, 1 << 40, 9, 11], [1, 2, 3, 4]))
-        wait_for(lambda: len(answers()) == 4, 60, why=stage.log)
-        assert answers() == {7: 3, 1 << 40: 3, 9: 2, 11: 0}
+        wait_for(lambda: len(answers(heard)) == 4, 60, why=stage.log)
+        # the key has a cell in two stages: the later one answers, and its differences begin at 2^31
+        found = {number: count - (1 << 31) for number, count in answers(heard).items()}
+        assert found == {7: 3, 1 << 40: 3, 9: 2, 11: 0}
+        later = BASE_US + 2 * WINDOW_US
+        engine.write(REQUEST, sweep_request([2, 2, 2, 1], [0, later, later, later]))
+        wait_for(lambda: len(counted(heard)) == 3, 60, why=stage.log)
+        assert counted(heard) == [(0, 2, 3), (0, 3, 1), (0, 3, 2)]
+        wait_for(lambda: {0, 1, 2} <= answers(heard).keys(), 60, why=stage.log)
+        # nobody waits behind the last one, so the last question is not answered
+        assert [answers(heard).get(number) for number in range(4)] == [0, 1, 1, None]
         engine.write(REQUEST, request([12], [1], time_us=5))
         wait_for(
             lambda: heard.values("network.switch")[-1]["packet_outs_refused"] == 1,
@@ -132,7 +160,8 @@ def test_cells_are_read_in_band(kind, tmp_path):
             why=lambda: heard.values("network.switch")[-1],
         )
         state = heard.values("network.switch")[-1]
-        assert (state["cells_asked"], state["cells_answered"], state["lost"]) == (4, 4, 0)
+        assert (state["cells_asked"], state["cells_answered"], state["lost"]) == (8, 7, 0)
+        assert state["counts_reported"] == 3
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -184,6 +213,30 @@ def test_a_question_carries_its_key_and_its_number():
     assert (header["key_source"], header["key_destination"]) == (0x0A000001, 1 << 64)
     assert header["timestamp"] == 5_000_000
     assert question_of(b"short") is None
+
+
+def sweep_request(kinds, times_us):
+    batch = request(range(len(kinds)), [0] * len(kinds))
+    columns = {name: batch[name] for name in batch.columns}
+    length = np.full(len(kinds), 60, dtype=np.uint16)
+    times = np.array(times_us, dtype=np.int64)
+    return RecordBatch({**columns, "length": length, "time_us": times, "sweep": np.array(kinds, np.uint8)})
+
+
+def test_a_sweep_is_asked_for_in_the_place_of_a_cell():
+    times = [BASE_US, 0, BASE_US, BASE_US + 7, 0, BASE_US - 1]
+    packets, refused = OUTS.questions(sweep_request([0, 1, 1, 2, 2, 1], times))
+    found = [header_of(packet) for packet in packets]
+    assert [header["operation"] for header in found] == [1, 2, 2, 2, 2]
+    assert [header["key_length"] for header in found] == [60, 0, 0, 1, 1]
+    assert [header["timestamp"] for header in found] == [1, 0, 1, 7, 0], "0 is now"
+    assert [question_of(packet.payload) for packet in packets] == [0, 1, 2, 3, 4]
+    assert refused == 1
+
+
+def test_sweeps_that_cannot_be_are_counted():
+    assert OUTS.questions(sweep_request([3, 1], [0, 0]))[1] == 1
+    assert PacketOuts(without("count_digest_t"), BASE_US).questions(sweep_request([2], [0])) == ([], 1)
 
 
 @pytest.mark.parametrize("time_us", [BASE_US - 1, BASE_US + (1 << 48)])

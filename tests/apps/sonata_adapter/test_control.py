@@ -8,9 +8,9 @@ from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.control import Changes, Control, leftovers
 from apps.sonata_adapter.placement import reciprocal
 from apps.sonata_adapter.results import Captured, Result
-from tests.apps.sonata_adapter.switch_model import SwitchModel
+from tests.apps.sonata_adapter.switch_model import SwitchModel, counts_of
 from tests.apps.sonata_adapter.test_catalogue import expect, same
-from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, batches, mixed, office, tcp
+from tests.apps.sonata_adapter.traffic import Frame, batch_of, batches, mixed, office, tcp
 from tests.naive import sonata
 
 PREFIX = "network.traffic_query.sonata"
@@ -29,16 +29,17 @@ def play(keys, frames, *, shrink=0, size=512, limits=None):
             tuples += len(sent)
             if kind == "digests":
                 written += control.digests("s1", name, sent)
+            elif kind == "counts":
+                written += control.counts("s1", name, sent, now)
             else:
                 written += control.packets("s1", name, sent, now)
         control.advance("s1", int(batch["time_us"][-1]))
-        for reads in control.reads(now).values():
-            tuples += len(reads)
-            written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
+        tuples += answered(control, switch, control.reads(now), now, written)
         written += control.tick(now + 0.5)
-    for reads in control.last_reads(now).values():
-        tuples += len(reads)
-        written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
+    tuples += answered(control, switch, control.last_reads(now), now, written)
+    while control.waits_for_cells(now):
+        now += 0.5
+        tuples += answered(control, switch, control.last_reads(now), now, written)
     written += control.finish()
     found: dict[str, list[Any]] = {}
     for one in written:
@@ -48,6 +49,20 @@ def play(keys, frames, *, shrink=0, size=512, limits=None):
     assert switch.empty
     assert not control.sources
     return found, tuples
+
+
+def answered(control, switch, asked, now, written):
+    """Questions put to the switch and its answers taken; returns how many tuples that brought."""
+    tuples = 0
+    for read in asked.get("s1", ()):
+        answer, told = switch.answer(read)
+        told = list(told)
+        tuples += len(told) + (answer is not None)
+        if told:
+            written += control.counts("s1", f"q{told[0]['query']}", counts_of(told), now)
+        if answer is not None:
+            written += control.cells("s1", [read.id], [answer])
+    return tuples
 
 
 def ending(frames):
@@ -133,8 +148,8 @@ def test_adding_a_query_leaves_the_others_alone():
 def test_the_clock_changes_its_pace_in_place():
     """A window that it does not fit makes it faster; nothing else of what runs is touched."""
     control, switch = Control(CATALOGUE), SwitchModel()
-    switch.change(control.want([f"{PREFIX}.syn_flood:window=3s"]))
-    changes = control.want([f"{PREFIX}.syn_flood:window=3s", f"{PREFIX}.incomplete_flows:window=2s"])
+    switch.change(control.want([f"{PREFIX}.slowloris:window=3s"]))
+    changes = control.want([f"{PREFIX}.slowloris:window=3s", f"{PREFIX}.slowloris:dst=10.0.0.0/8,window=2s"])
     (modified,) = [update for update in changes.updates if update.kind != "insert"]
     assert (modified.kind, int(modified.params["reciprocal"], 16)) == ("modify", reciprocal(1_000_000))
     switch.change(changes)
@@ -224,146 +239,6 @@ def test_short_windows_stay_on_the_host(everything):
     found, _ = play([f"{PREFIX}.syn_flood:window=200ms"], everything, size=32)
     (results,) = found.values()
     same(rows(results), expect("syn_flood", everything, {"window": 200}))
-
-
-def test_a_window_is_over_when_the_switch_has_been_silent_for_one(everything):
-    """No clock of the switch: this machine's has to do, and the results say so."""
-    control, switch = Control(CATALOGUE), SwitchModel()
-    control.switch("s1", 0)
-    switch.change(control.want([f"{PREFIX}.syn_flood"]))
-    flood = [frame for frame in everything if frame.time_us < BASE_US + 8_500_000]
-    for (_, name), sent in switch.process(batch_of(flood)).items():
-        control.digests("s1", name, sent)
-    moments = (0.0, 3.9, 12.9, 13.1)
-    asked = [control.reads(now).get("s1", []) for now in moments]
-    written = [
-        one
-        for reads in asked
-        for one in control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
-    ]
-    assert asked[0], "windows that are over"
-    assert asked[1], "the last one, early: the switch may forget it before it is heard of again"
-    assert not asked[2]
-    assert "this machine's clock" in written[-1].output.error
-
-
-SYN_FLOOD = f"{PREFIX}.syn_flood"
-
-
-def ask_and_answer(control, switch, now, *, answer=True):
-    reads = control.reads(now).get("s1", [])
-    if not answer:
-        return reads, []
-    return reads, control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
-
-
-def report(control, switch, frames, only=lambda _name: True):
-    held = []
-    for (_, name), sent in switch.process(batch_of(frames)).items():
-        if only(name):
-            control.digests("s1", name, sent)
-        else:
-            held.append((name, sent))
-    return held
-
-
-def syns(second, number, target="10.1.1.1"):
-    return [
-        Frame(BASE_US + round(second * 1e6) + n, 60, tcp("10.0.0.9", target, 1000 + n, 80, 2))
-        for n in range(number)
-    ]
-
-
-@pytest.fixture
-def flooded():
-    control, switch = Control(CATALOGUE), SwitchModel(base_us=BASE_US)
-    control.switch("s1", BASE_US)
-    switch.change(control.want([SYN_FLOOD]))
-    return control, switch
-
-
-def test_a_gap_in_the_traffic_costs_no_counts(flooded):
-    """Cells are asked for while the switch is silent, before the next frame overwrites them."""
-    control, switch = flooded
-    report(control, switch, syns(0.5, 4))
-    report(control, switch, syns(2.5, 3))
-    assert not ask_and_answer(control, switch, 0.0)[0], "the window is not over"
-    assert ask_and_answer(control, switch, 1.6)[0]
-    report(control, switch, syns(6.5, 1))
-    _, written = ask_and_answer(control, switch, 4.0)
-    (only,) = [one.output for one in written]
-    assert (only.fields["count"], only.exact) == (7, True)
-
-
-def test_what_is_read_too_late_is_reported_as_an_estimate(flooded):
-    """A burst over several windows overwrites cells: what is known is said, and that it is not all."""
-    control, switch = flooded
-    report(control, switch, [*syns(0.5, 9), *syns(6.5, 9)])
-    _, written = ask_and_answer(control, switch, 0.0)
-    (only,) = [one.output for one in written]
-    assert only.fields["count"] == 2, "as many as the switch has reported"
-    assert not only.exact
-    assert "too low" in only.error
-    assert control.health()["late_reads"]
-
-
-def test_a_report_that_comes_behind_the_clock_is_not_lost(flooded):
-    """Reports and the clock travel apart: a key that is reported when answers are awaited is asked for, too."""
-    control, switch = flooded
-    early = report(control, switch, syns(0.5, 4, "10.1.1.1"))
-    late = report(control, switch, [*syns(1.0, 5, "10.1.1.2"), *syns(3.1, 1)], lambda name: name == "q0")
-    assert not early
-    assert late
-    reads, _ = ask_and_answer(control, switch, 0.0, answer=False)
-    for name, sent in late:
-        control.digests("s1", name, sent)
-    more, written = ask_and_answer(control, switch, 0.1)
-    assert more
-    written += control.cells("s1", [r.id for r in reads], [switch.read(r) for r in reads])
-    assert {(w.output.fields["dst"], w.output.fields["count"]) for w in written} == {
-        ("10.1.1.1", 4),
-        ("10.1.1.2", 5),
-    }
-
-
-@pytest.mark.parametrize("ends", [False, True])
-def test_silence_makes_no_results_of_what_is_none(ends, flooded):
-    """Nothing overwrites cells while nothing comes: a busy server stays one, however late it is asked for."""
-    control, switch = flooded
-    answered = [Frame(f.time_us + 900, 60, tcp("10.0.0.9", "10.1.1.1", 9, 80, 16)) for f in syns(0.5, 4)]
-    report(control, switch, [*syns(0.5, 4), *answered])
-    _, written = ask_and_answer(control, switch, 0.0)
-    reads = control.last_reads(20.0) if ends else control.reads(20.0)
-    written += control.cells("s1", [r.id for r in reads["s1"]], [switch.read(r) for r in reads["s1"]])
-    assert not written
-    assert not control.finish()
-
-
-def test_at_the_end_nothing_that_waits_is_lost(flooded):
-    """Windows whose cells nobody tells any more are reported with what is known."""
-    control, switch = flooded
-    report(control, switch, syns(0.5, 4))
-    control.last_reads(0.0)
-    (only,) = [one.output for one in control.finish()]
-    assert (only.fields["dst"], only.exact) == ("10.1.1.1", False)
-    assert "could not be read" in only.error
-
-
-def test_missing_answers_make_estimates(everything):
-    """A controller that does not answer: what is known is reported as an estimate, or not at all."""
-    control, switch = Control(CATALOGUE), SwitchModel()
-    control.switch("s1", 0)
-    switch.change(control.want([f"{PREFIX}.syn_flood"]))
-    written = []
-    for now, batch in enumerate(batches(ending(everything), 64)):
-        for (_, name), sent in switch.process(batch).items():
-            written += control.digests("s1", name, sent)
-        control.reads(now)
-        written += control.tick(now)
-    written += control.tick(now + 20)
-    for one in written:
-        assert isinstance(one.output, Result)
-        assert "could not be read" in one.output.error
 
 
 def test_what_a_killed_adapter_left_is_taken_out():
