@@ -26,14 +26,16 @@ const bit<32> DIFFERENCE_ZERO = 0x80000000; // in the cell of a difference: it m
 control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) {
     direct_counter(CounterType.packets) stage_counter;
 
-    // Which cell the frame counts in, and what of the cell says that it is the key's.
+    // Which cell the frame counts in.
     action locate(in bit<8> query, in address_t source, in address_t destination, in bit<48> extra,
                   in bit<64> reciprocal, in bit<32> base, in bit<32> size) {
         bit<112> product = (bit<112>)meta.timestamp * (bit<112>)reciprocal;
         meta.cell_epoch = (bit<32>)(product >> 64) + 1; // a cell of zeros belongs to no window
-        meta.cell_key = meta.cell_epoch ++ query ++ source ++ destination ++ extra;
         hash(meta.cell_slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
-        meta.cell_slot = meta.cell_slot + first_cell + (meta.cell_epoch[0:0] == 1 ? STAGE_CELLS / 2 : 32w0);
+        meta.cell_slot = meta.cell_slot + first_cell;
+        if (meta.cell_epoch[0:0] == 1) {
+            meta.cell_slot = meta.cell_slot + STAGE_CELLS / 2;
+        }
         cells.read(meta.cell, meta.cell_slot);
     }
 
@@ -52,24 +54,24 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
                         ++ (meta.source_port & source_port_mask);
         locate(query, source, destination, extra, reciprocal, base, size);
         bit<1> has_cell = 1;
-        if (meta.cell[383:352] != meta.cell_epoch) {
-            meta.cell = meta.cell_key ++ 40w0;
-        } else {
+        meta.cell_count = 0;
+        if (meta.cell[383:352] == meta.cell_epoch) {
             meta.query_map = meta.query_map & ~repeated;
-            if (meta.cell[383:40] != meta.cell_key) {
+            if (meta.cell[351:344] == query && meta.cell[343:216] == source
+                    && meta.cell[215:88] == destination && meta.cell[87:40] == extra) {
+                meta.cell_count = meta.cell[31:0];
+            } else {
                 has_cell = 0;
                 meta.overflow = meta.overflow | bit_of_query;
-                meta.cell = meta.cell_key ++ 40w0;
             }
         }
-        meta.cell_count = meta.cell[31:0];
         if (has_cell == 1 && meta.reading == 0) {
             bit<32> step = by_bytes == 1 ? meta.length : 32w1;
-            meta.cell[31:0] = meta.cell_count |+| step;
-            if (meta.cell_count < threshold && meta.cell[31:0] >= threshold) {
+            bit<32> after = meta.cell_count |+| step;
+            if (meta.cell_count < threshold && after >= threshold) {
                 meta.crossed = meta.crossed | bit_of_query;
             }
-            cells.write(meta.cell_slot, meta.cell);
+            cells.write(meta.cell_slot, meta.cell_epoch ++ query ++ source ++ destination ++ extra ++ 8w0 ++ after);
         }
     }
 
@@ -89,16 +91,22 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
         bit<48> extra = port ++ ((bit<16>)meta.length & length_mask) ++ source_port;
         locate(count_of, source, destination, extra, reciprocal, base, size);
         bit<1> has_cell = 1;
-        if (meta.cell[383:40] != meta.cell_key) {
-            // another key's in this window; or one of ours that waits, though its window is over
-            if (meta.cell[383:352] == meta.cell_epoch
-                || (meta.cell[351:344] == count_of && meta.cell[39:32] == generation)) {
+        bit<8> mark = 0;
+        meta.cell_count = DIFFERENCE_ZERO;
+        if (meta.cell[383:352] == meta.cell_epoch) {
+            if (meta.cell[351:344] == count_of && meta.cell[343:216] == source
+                    && meta.cell[215:88] == destination && meta.cell[87:40] == extra) {
+                meta.cell_count = meta.cell[31:0];
+                mark = meta.cell[39:32];
+            } else {
                 has_cell = 0;
-                meta.overflow = meta.overflow | bit_of_query;
             }
-            meta.cell = meta.cell_key ++ 8w0 ++ DIFFERENCE_ZERO;
+        } else if (meta.cell[351:344] == count_of && meta.cell[39:32] == generation) {
+            has_cell = 0; // one of ours waits in it, though its window is over
         }
-        meta.cell_count = meta.cell[31:0];
+        if (has_cell == 0) {
+            meta.overflow = meta.overflow | bit_of_query;
+        }
 
         bit<136> ring;
         rings.read(ring, (bit<32>)count_of);
@@ -111,18 +119,18 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
         }
         if (has_cell == 1 && meta.reading == 0) {
             bit<32> step = by_bytes == 1 ? meta.length : 32w1;
-            meta.cell[31:0] = subtracts == 1 ? meta.cell[31:0] |-| step : meta.cell[31:0] |+| step;
-            if (meta.cell[31:0] >= threshold && meta.cell[39:32] != generation) {
+            bit<32> after = subtracts == 1 ? meta.cell_count |-| step : meta.cell_count |+| step;
+            if (after >= threshold && mark != generation) {
                 bit<32> next = ring[31:0] + 1 == 2 * size ? 32w0 : ring[31:0] + 1;
                 if (next == ring[95:64]) { // no room to wait
                     meta.crossed = meta.crossed | bit_of_query;
                 } else {
                     waiting.write(first_cell + 2 * base + ring[31:0], meta.cell_slot);
-                    meta.cell[39:32] = generation;
+                    mark = generation;
                     ring[31:0] = next;
                 }
             }
-            cells.write(meta.cell_slot, meta.cell);
+            cells.write(meta.cell_slot, meta.cell_epoch ++ count_of ++ source ++ destination ++ extra ++ mark ++ after);
         }
         rings.write((bit<32>)count_of, ring);
         if (ring[95:64] != ring[63:32]) {

@@ -175,7 +175,6 @@ struct metadata_t {
     query_map_t overflow;                 // counting queries that had no cell for this frame's key
     bit<1> reading;                       // the frame asks for cells and must not change counts
     bit<32> cell_epoch;                   // number of the window + 1
-    bit<344> cell_key;                    // epoch, query and key as a cell holds them
     bit<32> cell_slot;
     bit<384> cell;
     bit<32> cell_count;                   // before the frame
