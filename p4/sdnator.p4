@@ -45,7 +45,9 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
         meta.destination_port = hdr.packet_out.key_port;
         meta.length = (bit<32>)hdr.packet_out.key_length;
         meta.source_port = hdr.packet_out.key_source_port;
-        meta.timestamp = hdr.packet_out.timestamp == 0 ? meta.timestamp : hdr.packet_out.timestamp;
+        if (hdr.packet_out.operation == OPERATION_READ_CELL || hdr.packet_out.timestamp != 0) {
+            meta.timestamp = hdr.packet_out.timestamp;
+        }
     }
     action answer_reading() {
         hdr.packet_in.setValid();
@@ -53,8 +55,13 @@ control FrameIngress(inout headers_t hdr, inout metadata_t meta, inout standard_
         hdr.packet_in.reason = REASON_CELL;
         hdr.packet_in.timestamp = meta.timestamp;
         hdr.packet_in.length = hdr.packet_out.query;
-        hdr.packet_in.sequence = hdr.packet_out.operation == OPERATION_SWEEP ? (bit<32>)meta.sweep.left : meta.cell_count;
-        hdr.packet_in.arrival = meta.cell_epoch - 1;
+        if (hdr.packet_out.operation == OPERATION_SWEEP) {
+            hdr.packet_in.sequence = (bit<32>)meta.sweep.left;
+            hdr.packet_in.arrival = 0;
+        } else {
+            hdr.packet_in.sequence = meta.cell_count;
+            hdr.packet_in.arrival = meta.cell_epoch |-| 1;
+        }
         hdr.packet_in.query_map = meta.overflow;
         standard.egress_spec = CPU_PORT;
     }

@@ -85,7 +85,7 @@ class PacketOuts:
         now = (sweeps != _NO_SWEEP) & (time_us == 0)
         clock = np.where(now, 0, time_us - self._base_us)
         askable = (clock >= 0) & (clock < 1 << _CLOCK_BITS) & np.isin(sweeps, _SWEEPS)
-        clock[~now & (clock == 0)] = 1  # 0 would mean now
+        clock[(sweeps != _NO_SWEEP) & ~now & (clock == 0)] = 1  # 0 would mean now
         if not self._has_source_port:
             askable &= columns["source_port"] == 0
         if not self._can_sweep:

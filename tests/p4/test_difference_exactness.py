@@ -81,7 +81,7 @@ class Host:
         """Before a window's end the host asks for what it is in doubt of."""
         if self.now // WINDOW_US != (self.now + step) // WINDOW_US:
             for window, host in self.doubtful:
-                asked = ask(self.switch, self.now, source=0x0A000000 + host)
+                asked = ask(self.switch, source=0x0A000000 + host, timestamp=self.now)
                 assert asked.window == window
                 self.read[window, host] = asked.count - ZERO
             self.doubtful.clear()

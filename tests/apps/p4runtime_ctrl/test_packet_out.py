@@ -229,7 +229,7 @@ def test_a_sweep_is_asked_for_in_the_place_of_a_cell():
     found = [header_of(packet) for packet in packets]
     assert [header["operation"] for header in found] == [1, 2, 2, 2, 2]
     assert [header["key_length"] for header in found] == [60, 0, 0, 1, 1]
-    assert [header["timestamp"] for header in found] == [1, 0, 1, 7, 0], "0 is now"
+    assert [header["timestamp"] for header in found] == [0, 0, 1, 7, 0], "0 is now for a sweep"
     assert [question_of(packet.payload) for packet in packets] == [0, 1, 2, 3, 4]
     assert refused == 1
 
