@@ -12,8 +12,9 @@ received arrays are read-only views of the received bytes.
 
 import datetime as dt
 import struct
-from collections.abc import Sequence
-from itertools import count
+from collections import deque
+from collections.abc import Iterator, Sequence
+from itertools import count, repeat
 from typing import Any
 
 import msgspec
@@ -56,10 +57,13 @@ class Frame(msgspec.Struct, array_like=True, gc=False):
 
     def items(self) -> list[Item]:
         """The items, in order."""
+        return list(self.stream())
+
+    def stream(self) -> Iterator[Item]:
+        """The items, in order, each made when it is asked for: a callback finds it in the cache."""
         times = self.timestamps if self.event_times is None else self.event_times
-        key, app, instance = self.key, self.app_id, self.instance_id
-        rows = zip(self.values, self.timestamps, times, count(self.sequence), strict=False)
-        return [Item(key, v, t, e, app, instance, s) for v, t, e, s in rows]
+        key, app, instance = repeat(self.key), repeat(self.app_id), repeat(self.instance_id)
+        return map(Item, key, self.values, self.timestamps, times, app, instance, count(self.sequence))
 
 
 def freeze(value: Any) -> Any:
@@ -93,9 +97,17 @@ def decode_value(data: bytes | memoryview) -> Any:
 def encode_frame(frame: Frame) -> bytes:
     """A frame whose values are immutable or frozen, as bytes."""
     try:
-        return _HEADER + _encoder.encode(frame)
+        buffer = _spare.pop()
+    except IndexError:
+        buffer = bytearray(_HEADER)
+    try:
+        _encoder.encode_into(frame, buffer, len(_HEADER))
     except (OverflowError, UnicodeError) as error:
         raise UnsupportedValue(f"a value under {frame.key} cannot be encoded: {error}") from error
+    payload = bytes(buffer)
+    if len(payload) <= _SPARE_BYTES:
+        _spare.append(buffer)
+    return payload
 
 
 def encode_single(head: Frame, value: Any) -> bytes:
@@ -336,6 +348,9 @@ def _field(field: list[Any]) -> tuple[Any, ...]:
     return (field[0], field[1]) if len(field) == 2 else (field[0], field[1], tuple(field[2]))
 
 
+_SPARE_BYTES = 1 << 18
+_spare: deque[bytearray] = deque(maxlen=1)
+"""Where frames are encoded: memory that is in the cache already and needs not grow.  Whoever uses it takes it out."""
 _encoder = msgspec.msgpack.Encoder()
 _value_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Any, ext_hook=_from_extension)
 _frame_decoder = msgspec.msgpack.Decoder(Frame, ext_hook=_from_extension)

@@ -16,6 +16,8 @@ from due.observation import Callback, Observation, Tracker, deliver
 log = logging.getLogger("due")
 
 _ROUTES = 65536
+_REST = 30.0
+"""Seconds without anything to receive; `wake` ends it, and receivers with something to look after do."""
 
 
 class Dispatcher:
@@ -25,6 +27,8 @@ class Dispatcher:
         self.receiver = receiver
         self.tracker = Tracker(shared=shared)
         self.received = 0
+        self.best_effort = 0
+        """Payloads that came without being kept by the server."""
         self.busy_since: float | None = None
         """When the running callbacks were entered, monotonic seconds; None while waiting."""
         self._tries = tries
@@ -51,11 +55,6 @@ class Dispatcher:
     def inside(self) -> bool:
         """Whether the caller is a callback."""
         return threading.current_thread() is self._thread
-
-    @property
-    def observing(self) -> bool:
-        """Whether anything is received."""
-        return bool(self._observations)
 
     def open(self, observation: Observation) -> None:
         """Begin to receive for it."""
@@ -99,7 +98,7 @@ class Dispatcher:
     def _run(self) -> None:
         while not self._closing():
             try:
-                deliveries = self.receiver.receive(1.0)
+                deliveries = self.receiver.receive(_REST)
             except DueError:
                 log.exception("receiving failed")
                 time.sleep(0.1)
@@ -125,8 +124,10 @@ class Dispatcher:
             log.exception("a callback failed")
 
     def _dispatch(self, delivery: Delivery) -> None:
-        if not self._active and not delivery.token:
-            return
+        if not delivery.token:
+            self.best_effort += 1
+            if not self._active:
+                return
         try:
             frame = decode_frame(delivery.payload)
         except DecodeError as error:
@@ -146,9 +147,13 @@ class Dispatcher:
             log.error("a frame of %s ended %d consumers: set aside", frame.key, delivery.tries - 1)
             self.receiver.set_aside(delivery, delivery.payload, "its consumers died")
             return
-        items = frame.items()
-        self.received += len(items)
+        self.received += len(frame.values)
         self._reliable = delivery if delivery.token else None
+        if len(observations) == 1:
+            only = observations[0]
+            deliver(only.thinned(frame.stream()), only.callbacks, self._failed)
+            return
+        items = frame.items()
         for observation in observations:
             deliver(observation.thinned(items), observation.callbacks, self._failed)
 

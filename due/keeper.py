@@ -25,7 +25,9 @@ from due.membership import (
 log = logging.getLogger("due")
 
 _TICK = 0.1
+"""How often to look whether a callback takes long, while best-effort payloads come."""
 _SLOW_TICK = 0.01
+"""How often to take them off the server while one does, and some are found."""
 _LATE = 0.01
 """Who wakes up later than this has to wait for a core."""
 _EASING = 0.8
@@ -33,6 +35,30 @@ _RENEW_SECONDS = 1.0
 _SLOW_CALLBACK = 0.02
 
 Say = Callable[[str, object], None]
+
+
+class Rhythm:
+    """How long the keeper may rest, seconds; each time it gets up costs an app that computes several wake-ups."""
+
+    def __init__(self, longest: float) -> None:
+        self._longest = longest
+        self._tick = _TICK
+        self._slow_tick = _SLOW_TICK
+
+    def rest(self, *, coming: bool, slow: bool) -> float:
+        """`coming`: best-effort payloads came since the last time; `slow`: a callback takes long."""
+        wanted = self._slow_tick if slow else self._tick if coming else self._longest
+        return min(wanted, self._longest)
+
+    def got_up(self, *, late: bool) -> None:
+        """Where cores are short, look at the callbacks more rarely: they need them more."""
+        self._tick = (
+            min(2 * self._tick, max(_TICK, self._longest)) if late else max(_TICK, _EASING * self._tick)
+        )
+
+    def drained(self, *, some: bool) -> None:
+        """Where nothing was found on the server, there is no hurry to look again."""
+        self._slow_tick = _SLOW_TICK if some else min(2 * self._slow_tick, _TICK)
 
 
 class Keeper:
@@ -58,7 +84,8 @@ class Keeper:
         self._seen = -1
         self._renew_at = 0.0
         self._poll_again = 0.0
-        self._tick = _TICK
+        self._rhythm = Rhythm(pause / 3)
+        self._heard = 0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="due-keeper", daemon=True)
 
@@ -110,13 +137,13 @@ class Keeper:
 
     def _listen(self) -> None:
         busy = self._dispatcher.busy_since
-        slow = busy is not None and time.monotonic() - busy > _SLOW_CALLBACK
-        tick = _SLOW_TICK if slow else self._tick if self._dispatcher.observing else self._pause / 4
-        tick = min(tick, self._poll_again)
         began = time.monotonic()
-        wait = min(tick, max(0.0, self.member.next_tick() - began))
+        slow = busy is not None and began - busy > _SLOW_CALLBACK
+        heard, self._heard = self._heard, self._dispatcher.best_effort
+        rest = min(self._rhythm.rest(coming=self._heard != heard, slow=slow), self._poll_again)
+        wait = min(rest, max(0.0, self.member.next_tick() - began))
         deliveries = self._control.receive(wait)
-        self._adapt(late=time.monotonic() - began - wait > _LATE)
+        self._rhythm.got_up(late=time.monotonic() - began - wait > _LATE)
         for delivery in deliveries:
             try:
                 message = Assignments.from_value(decode_frame(delivery.payload).values[-1])
@@ -125,11 +152,6 @@ class Keeper:
                 continue
             with self.lock:
                 self.member.assigned(message, time.monotonic())
-
-    def _adapt(self, *, late: bool) -> None:
-        """Where cores are short, look at the callbacks more rarely: they need them more."""
-        longest = max(_TICK, self._pause / 4)
-        self._tick = min(2 * self._tick, longest) if late else max(_TICK, _EASING * self._tick)
 
     def _turn(self) -> None:
         now = time.monotonic()
@@ -149,7 +171,7 @@ class Keeper:
             self._dispatcher.receiver.renew()
         busy = self._dispatcher.busy_since
         if busy is not None and now - busy > _SLOW_CALLBACK:
-            self._dispatcher.receiver.drain()
+            self._rhythm.drained(some=self._dispatcher.receiver.drain())
 
     def _send(self, message: Registration | Heartbeat) -> None:
         path = REGISTRATION if isinstance(message, Registration) else HEARTBEAT

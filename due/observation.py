@@ -7,7 +7,7 @@ A callback that raises is reported with its key and does not stop the others.  H
 
 import logging
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from reactivex import abc
@@ -87,7 +87,7 @@ class Observation(Subject[Item]):
             self._closed(self)
         super().dispose()
 
-    def thinned(self, items: list[Item]) -> list[Item]:
+    def thinned(self, items: Iterable[Item]) -> Iterable[Item]:
         """The items that stay under the interest's own maximum rate."""
         if not self._period:
             return items
@@ -172,7 +172,7 @@ class Tracker:
             table.popitem(last=False)
 
 
-def deliver(items: list[Item], callbacks: tuple[Callback, ...], failed: Failed) -> None:
+def deliver(items: Iterable[Item], callbacks: tuple[Callback, ...], failed: Failed) -> None:
     """Call every callback with every item."""
     if len(callbacks) == 1:
         only = callbacks[0]

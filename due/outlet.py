@@ -69,7 +69,8 @@ class Outlet:
         """Idle and put away: its numbers live on in its successor."""
         self.filled = 0
         """Frames that were sent because they were full."""
-        self.queued, self.due, self.patience, self.filled_before = False, 0.0, 0.0, 0  # the sender's notes
+        self.queued, self.due, self.ticket = False, 0.0, 0  # the sender's notes
+        self.stay, self.patience, self.filled_before = 0.0, 0.0, 0  # and what it has seen
         self._identity = (key.text, app_id, instance_id)
         self._frame_bytes = frame_bytes
         self._single_bytes = single_bytes
@@ -85,10 +86,15 @@ class Outlet:
         self._big_at = -_CLOSELY_NS
 
     @property
-    def idle(self) -> bool:
+    def empty(self) -> bool:
         """Whether nothing waits here."""
         paced = self.pacer is not None and self.pacer.due() is not None
-        return not (self._values or self._big or self.held or self.queued or paced)
+        return not (self._values or self._big or self.held or paced)
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits here, and no visit of the sender is planned."""
+        return self.empty and not self.queued
 
     def retire(self) -> tuple[int, int] | None:
         """Put it away if it is idle and nobody is writing: the numbers its successor begins with."""
@@ -121,8 +127,7 @@ class Outlet:
         if mode != self._mode or self._big:
             self.cut()
             self._mode = mode
-        if stays and not self._values:
-            self._dirty(self)
+        first = not self._values
         self.sequence += 1
         self._values.append(value)
         self._times.append(now)
@@ -134,6 +139,8 @@ class Outlet:
         if self._size >= self._frame_bytes:
             self.filled += 1
             self.cut()
+        elif first and stays:
+            self._dirty(self)
 
     def cut(self) -> None:
         """Send what is buffered as one frame, or the big values that wait."""

@@ -201,10 +201,10 @@ class Receiver(Protocol):
         """Payloads set aside for this group, oldest first, with reasons."""
         ...
 
-    def drain(self) -> None:
+    def drain(self) -> bool:
         """Take best-effort payloads off the server while the receiving thread is busy; any thread.
 
-        What exceeds the backlog limit is dropped; sequence numbers show it later.
+        Whether there were some.  What exceeds the backlog limit is dropped; sequence numbers show it later.
         """
         ...
 

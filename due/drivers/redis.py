@@ -17,7 +17,15 @@ import hiredis
 from due.backoff import Backoff
 from due.drivers.redis_progress import Question
 from due.drivers.redis_receiver import RedisReceiver, channel_name
-from due.drivers.redis_streams import STREAMS, Entry, StreamLedger, parse_id, stream_name
+from due.drivers.redis_streams import (
+    LEAST_PAUSE,
+    STREAMS,
+    Entry,
+    StreamLedger,
+    next_pause,
+    parse_id,
+    stream_name,
+)
 from due.drivers.redis_wire import Wire, client
 from due.errors import Timeout, UpdatesUnavailable
 
@@ -26,9 +34,10 @@ log = logging.getLogger("due.updates")
 _READ_REPLIES_AT = 16
 _MOST_OUTSTANDING = 1024
 _ASK_SECONDS = 0.02
-_LEAST_PAUSE = _ASK_SECONDS / 8
 _LONGEST_PAUSE = 5 * _ASK_SECONDS
-_POLL_SECONDS = 0.4
+_LONG_WAIT_SHARE = 0.25
+"""Of the window may be full when a writer goes on that waits long each time: so it waits less often."""
+_POLL_SECONDS = 0.5
 _CHANNELS = 65536
 _RECONNECT_SECONDS = 0.05
 
@@ -215,42 +224,53 @@ class RedisPublisher:
             return True
 
     def _wait_for_readers(self, ledger: StreamLedger) -> None:
-        """Back-pressure: until half of the window is free.  Asks less and less often while nothing moves.
+        """Back-pressure: until half of the window is free, and more where readers need long for that.
 
-        Where the last wait was long this one begins with half of that, for each question costs wake-ups.
+        Each question costs wake-ups.  Where the last wait was long we sleep over the answer, for half of that
+        and then for as long as the readers' pace lets expect, and do not wake up for each reply before it.
         """
-        began, kept, pause = time.monotonic(), ledger.kept_bytes, max(_LEAST_PAUSE, ledger.patience)
-        longest = max(_ASK_SECONDS, pause)
+        began = looked = time.monotonic()
+        long = ledger.patience > _ASK_SECONDS
+        longest, share = (ledger.patience, _LONG_WAIT_SHARE) if long else (_ASK_SECONDS, 0.5)
+        pause, kept = max(LEAST_PAUSE, ledger.patience), ledger.kept_bytes
         ledger.waiting = True
         try:
-            while ledger.half_full and ledger.kept and not self._closed:
-                self._await_answer(ledger)
-                if ledger.half_full:
+            while ledger.excess(share) and not self._closed:
+                connected = self._await_answer(ledger, asleep=pause if long else 0.0)
+                if ledger.excess(share) and not (long and connected):
                     time.sleep(pause)
-                pause = max(_LEAST_PAUSE, pause / 2) if ledger.kept_bytes < kept else min(2 * pause, longest)
-                kept = ledger.kept_bytes
+                now = time.monotonic()
+                pause = next_pause(now - looked, kept - ledger.kept_bytes, ledger.excess(share), longest)
+                looked, kept = now, ledger.kept_bytes
         finally:
             ledger.waiting = False
             ledger.patience = min(_LONGEST_PAUSE, (time.monotonic() - began) / 2)
 
-    def _await_answer(self, ledger: StreamLedger) -> None:
-        """Ask how far the readers are and wait a while for the answer, without keeping others out."""
+    def _await_answer(self, ledger: StreamLedger, *, asleep: float) -> bool:
+        """Ask how far the readers are and wait a while for the answer, without keeping others out.
+
+        Returns whether there is a connection.
+        """
         with self._lock:
             wire = self._wire
             if wire is None:
                 self.poll()
-                return
-            if not ledger.asked:
-                self._ask(ledger)
+                return False
+            self._guarded_take(wire)  # the answer to an earlier question says less than a new one
+            self._ask(ledger)
             if self._wire is None:  # lost while asking
-                return
+                return False
             number = wire.fileno()  # taken here: another thread may close the connection while we wait
-        poll = select.poll()
-        poll.register(number, select.POLLIN)
-        poll.poll(1000 * _ASK_SECONDS)
+        if asleep:
+            time.sleep(asleep)
+        else:
+            poll = select.poll()
+            poll.register(number, select.POLLIN)
+            poll.poll(1000 * _ASK_SECONDS)
         with self._lock:
             if self._wire is wire:  # nobody reconnected meanwhile
                 self._guarded_take(wire)
+        return True
 
     def _ask(self, ledger: StreamLedger) -> None:
         with self._lock:

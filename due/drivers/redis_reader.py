@@ -28,12 +28,14 @@ _BLOCK_MS = 1000
 _SILENT_SECONDS = 3.0
 """A member whose lease is older is taken for dead."""
 _LOOK_SECONDS = 1.0
+"""How often to look after the other members; alone in a group, as often as one could be taken for dead."""
 _HOLD_SECONDS = 0.2
 _GONE_SECONDS = 30.0
 """Whoever has not renewed his lease for so long holds no group."""
 _WITHDRAWN_SECONDS = 10.0
 _FORGET_SECONDS = 3600.0
 _ASIDE_LENGTH = 1000
+_SKIP_REPLY = pack((b"CLIENT", b"REPLY", b"SKIP"))
 
 
 def aside_name(group: str) -> str:
@@ -64,6 +66,9 @@ class StreamReader:
         self._held: set[str] = set()
         self._withdrawn: dict[str, float] = {}
         self._look_at = 0.0
+        self._alone = False
+        self._quiet = False
+        """Whether the server can keep the reply to an XACK for itself."""
         self._claimed: deque[Delivery] = deque()
         self._backoff = Backoff()
         self._active = True
@@ -137,7 +142,8 @@ class StreamReader:
             return
         now = time.monotonic()
         if now >= self._look_at:
-            self._look_at = now + (_HOLD_SECONDS if self._held else _LOOK_SECONDS)
+            usual = _SILENT_SECONDS if self._alone else _LOOK_SECONDS
+            self._look_at = now + (_HOLD_SECONDS if self._held else usual)
             self._look_after_the_dead()
         try:
             if self._wire is None and self._backoff.due(now):
@@ -270,6 +276,7 @@ class StreamReader:
     def _connect(self) -> None:
         wire = Wire(self._url)
         self._wire_id = int(wire.call("CLIENT", "ID"))
+        self._quiet = wire.call("CLIENT", "REPLY", "ON") == b"OK"
         self._backoff.succeeded()
         self._wire = wire
         self._expected.clear()
@@ -294,7 +301,7 @@ class StreamReader:
             paths = history or tuple(p for p in self._paths if p not in self._held)
             if not self._active:  # put on standby a moment ago
                 history = paths = ()
-        command = self._packed_acks()
+        command = self._packed_acks(quietly=self._quiet and bool(paths))
         if paths:
             self._requested = paths
             wait = () if history or self._stale else (b"BLOCK", _BLOCK_MS)
@@ -304,7 +311,8 @@ class StreamReader:
         if command:
             wire.send_packed(command)
 
-    def _packed_acks(self) -> bytes:
+    def _packed_acks(self, *, quietly: bool = False) -> bytes:
+        """`quietly`: a read follows, whose reply stands for theirs; each would wake us up before it."""
         command = b""
         while self._acks:
             path = self._acks[0][0]
@@ -312,8 +320,11 @@ class StreamReader:
             while self._acks and self._acks[0][0] == path:
                 self._acks_sent.append(self._acks[0])
                 tokens.append(self._acks.popleft()[1])
+            if quietly:
+                command += _SKIP_REPLY
+            else:
+                self._expected.append("ack")
             command += pack((b"XACK", stream_name(path), self._group, *tokens))
-            self._expected.append("ack")
         return command
 
     def _flush_acks(self) -> None:
@@ -329,9 +340,9 @@ class StreamReader:
         if isinstance(reply, hiredis.ReplyError):
             self._repair(reply)
             return []
+        if "ack" not in self._expected:
+            self._acks_sent.clear()
         if kind == "ack":
-            if "ack" not in self._expected:
-                self._acks_sent.clear()
             return []
         found = [
             Delivery(name.decode()[len("due:stream:") :], fields[1], token.decode())
@@ -358,11 +369,13 @@ class StreamReader:
     def _look_after_the_dead(self) -> None:
         with self._lock:
             paths = list(self._paths)
+        self._alone = True
         for path in paths:
             try:
                 waits = self._claim(path)
             except (redis.RedisError, OSError) as error:
                 log.debug("members of %s could not be looked after: %s", path, error)
+                self._alone = False
                 continue
             if not waits or self._shared:
                 with self._lock:
@@ -373,7 +386,9 @@ class StreamReader:
         """Take the pending entries of dead members; returns whether a live one has some."""
         name = stream_name(path)
         consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(name, self._group)
-        others = [c for c in consumers if c["pending"] and c["name"].decode() != self._consumer]
+        others = [c for c in consumers if c["name"].decode() != self._consumer]
+        self._alone = self._alone and not others
+        others = [c for c in others if c["pending"]]
         if not others:
             return False
         leases = self._commands.hgetall(readers_name(path))

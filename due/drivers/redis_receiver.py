@@ -110,14 +110,16 @@ class RedisReceiver:
         """See `Receiver.aside`."""
         return self._reader.aside()
 
-    def drain(self) -> None:
+    def drain(self) -> bool:
         """See `Receiver.drain`."""
+        some = False
         with self._lock:
             try:
                 while self._pull():
-                    pass
+                    some = True
             except UpdatesUnavailable as error:
                 self._lose(error)
+        return some
 
     def renew(self) -> None:
         """See `Receiver.renew`."""

@@ -14,6 +14,8 @@ from collections import deque
 STREAMS = "due:streams"
 """Set of the paths that are streams, and the channel on which new ones are announced."""
 _OVERHEAD = 200
+LEAST_PAUSE = 0.0025
+"""Seconds between two questions how far the readers are, at least."""
 
 
 def stream_name(path: str) -> str:
@@ -80,6 +82,10 @@ class StreamLedger:
         """Whether a payload of that size fits; a lone big one always does."""
         return not self.kept or self.kept_bytes + size + _OVERHEAD <= self._window
 
+    def excess(self, share: float) -> int:
+        """Bytes that are kept beyond this share of the window."""
+        return max(0, self.kept_bytes - int(share * self._window)) if self.kept else 0
+
     @property
     def half_full(self) -> bool:
         """Time to ask how far the readers are."""
@@ -113,6 +119,12 @@ class StreamLedger:
             self._retained_bytes -= self.retained.popleft().size
             trimmed = True
         return self.retained[0].id if trimmed else None
+
+
+def next_pause(waited: float, freed: int, missing: int, longest: float) -> float:
+    """Seconds until asking again is worth it: `freed` bytes in `waited` seconds, `missing` are to come."""
+    expected = waited * missing / freed if freed > 0 else 2 * waited
+    return min(max(expected, LEAST_PAUSE), longest)
 
 
 def parse_id(text: bytes | str) -> tuple[int, int]:

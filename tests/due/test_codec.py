@@ -142,3 +142,24 @@ def test_items_survive_packing():
     assert (frame.sequence, frame.count) == (7, 3)
     assert (frame.first_timestamp, frame.last_timestamp) == (10, 12)
     assert (frame.first_event_time, frame.last_event_time) == (3, 5)
+
+
+def test_frames_do_not_share_memory_whatever_was_encoded_before():
+    def frame(values):
+        return Frame("a.b", "app", "inst", 0, 1, 0, list(range(len(values))), None, values)
+
+    kinds = [[b"x" * 5000] * 3, [1], [2**64], [b""], [b"y" * 300_000], ["z"]]
+    payloads = []
+    for values in kinds:
+        with suppress(UnsupportedValue):
+            payloads.append((values, encode_frame(frame(values))))
+    assert len(payloads) == 5, "one does not fit into 64 bits"
+    assert all(decode_frame(payload).values == values for values, payload in payloads)
+
+
+def test_items_are_the_same_one_by_one_and_together():
+    for events in (None, [5, 6, 7]):
+        frame = Frame("a.b", "app", "inst", 0, 4, 3, [1, 2, 3], events, ["x", "y", "z"])
+        assert list(frame.stream()) == frame.items()
+        assert [item.sequence for item in frame.stream()] == [4, 5, 6]
+        assert [item.event_time for item in frame.stream()] == (events or [1, 2, 3])

@@ -1,6 +1,19 @@
-"""The sender stays away from busy writers where cores are short."""
+"""The sender stays away from busy writers where cores are short, and from writers that need no help."""
 
-from due.sender import Pressure
+import math
+import threading
+
+import pytest
+
+from due.keys import Key
+from due.outlet import PUBLISH, Outlet
+from due.sender import Agenda, Pressure, Sender
+
+PATIENCE = 30.0
+
+
+def _outlet(sink=lambda *_: None, dirty=lambda _: None) -> Outlet:
+    return Outlet(Key("a.b"), "app", "inst", frame_bytes=1000, single_bytes=300, sink=sink, dirty=dirty)
 
 
 def test_handing_over_the_interpreter_is_no_pressure():
@@ -16,3 +29,89 @@ def test_one_visit_in_time_does_not_end_the_pressure_and_many_do():
     felt = pressure.felt(late=0.03)
     assert 0 < pressure.felt(late=0.0) < felt
     assert min(pressure.felt(late=0.0) for _ in range(100)) < felt / 1000
+
+
+def test_an_outlet_stands_in_the_agenda_once_with_its_newest_time():
+    agenda, one, other = Agenda(), _outlet(), _outlet()
+    for due in (3.0, 5.0, 1.0):
+        agenda.plan(one, due)
+    agenda.plan(other, 2.0)
+    assert agenda.next == 1.0
+    assert agenda.take(1.5) == [(1.0, one)]
+    assert agenda.take(10.0) == [(2.0, other)]
+    assert agenda.next == math.inf
+
+
+def test_who_comes_first_can_be_postponed_and_nobody_is_looked_for_before():
+    agenda, one, other = Agenda(), _outlet(), _outlet()
+    agenda.plan(one, 1.0)
+    agenda.plan(other, 2.0)
+    agenda.postpone(one, 4.0)
+    assert agenda.next == 2.0
+    agenda.postpone(other, 3.0)
+    assert agenda.next == 3.0
+
+
+def test_who_is_postponed_without_coming_first_is_not_visited_before():
+    agenda, one, other = Agenda(), _outlet(), _outlet()
+    agenda.plan(one, 1.0)
+    agenda.plan(other, 2.0)
+    agenda.postpone(other, 9.0)
+    assert agenda.take(5.0) == [(1.0, one)]
+    assert agenda.take(9.0) == [(9.0, other)]
+
+
+@pytest.fixture
+def visits():
+    """A running sender and the batches it was asked to send."""
+    done: list[list[int]] = []
+    come = threading.Event()
+
+    def sink(_outlet, parts, _mode):
+        done.append(parts[0][0].values)
+        come.set()
+
+    def service(outlet, _now):
+        outlet.cut()
+
+    sender = Sender(0.001, service, lambda _outlet: False)
+    sender.start()
+    outlet = _outlet(sink, sender.dirty)
+    outlet.fast = True
+    yield outlet, done, come
+    sender.close()
+
+
+def test_what_waits_is_sent_without_the_writers_help(visits):
+    outlet, done, come = visits
+    for n in range(3):
+        come.clear()
+        with outlet.lock:
+            outlet.put(n, PUBLISH, None, n)
+        assert come.wait(PATIENCE)
+    assert done == [[0], [1], [2]]
+
+
+def test_what_follows_full_frames_is_sent_too(visits):
+    outlet, done, come = visits
+    for n in range(1000):
+        with outlet.lock:
+            outlet.put(n, PUBLISH, None, n)
+    while sum(map(len, done)) < 1000:
+        assert come.wait(PATIENCE)
+        come.clear()
+    assert [n for values in done for n in values] == list(range(1000))
+
+
+def test_a_paced_outlet_is_not_postponed_by_its_writer():
+    sender = Sender(1000.0, lambda *_: None, lambda _: False)
+    outlet = _outlet()
+    sender.dirty(outlet)
+    due, outlet.stay = outlet.due, 1e6
+    outlet.pacer = object()
+    sender.dirty(outlet)
+    assert outlet.due == due
+    outlet.pacer = None
+    sender.dirty(outlet)
+    assert outlet.due > due
+    sender.close()

@@ -1,7 +1,12 @@
 """A reader's place is held by its lease, and the lease ends with the reader."""
 
+import select
+
+import pytest
+
+from due.drivers.base import Delivery
 from due.drivers.redis_reader import StreamReader
-from due.drivers.redis_streams import readers_name
+from due.drivers.redis_streams import readers_name, stream_name
 from due.drivers.redis_wire import client
 
 PATH = "r.lease"
@@ -17,4 +22,49 @@ def test_a_lease_is_not_renewed_after_it_was_given_up(server):
         give_up(reader)
         reader.renew()
         assert commands.hgetall(readers_name(PATH)) == {b"group/one": b"0"}
+    commands.close()
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_was_acknowledged_is_pending_no_more(server, quiet):
+    """Whether or not the server can keep its replies to acknowledgements for itself."""
+    path, commands = f"r.quiet.{quiet}", client(server.url)
+    reader = StreamReader(server.url, commands, "group", "one", shared=False)
+    reader.add(path, "0")
+    reader.care()
+    assert reader._quiet
+    reader._quiet = quiet
+    for number in range(3):
+        commands.xadd(stream_name(path), {"f": str(number)})
+        for delivery in _read(reader):
+            assert delivery.payload == str(number).encode()
+            reader.acknowledge(delivery)
+    assert commands.xpending(stream_name(path), "group")["pending"] == 1, "it goes with the next request"
+    reader.close()
+    assert commands.xpending(stream_name(path), "group")["pending"] == 0
+    commands.close()
+
+
+def _read(reader: StreamReader) -> list[Delivery]:
+    """The next deliveries."""
+    found: list[Delivery] = []
+    while not found:
+        reader.care()
+        ready, _, _ = select.select([reader.fileno()], [], [], 30)
+        found = reader.read(set(ready))
+    return found
+
+
+def test_alone_in_a_group_it_looks_after_the_dead_more_rarely(server):
+    commands = client(server.url)
+    reader = StreamReader(server.url, commands, "alone", "one", shared=False)
+    reader.add("r.alone", "0")
+    reader.care()
+    assert reader._alone
+    commands.xadd(stream_name("r.alone"), {"f": "1"})
+    commands.xreadgroup("alone", "other", {stream_name("r.alone"): ">"})
+    reader._look_at = 0.0
+    reader.care()
+    assert not reader._alone
+    reader.close()
     commands.close()

@@ -1,6 +1,8 @@
 """The ledger keeps what readers still need, within the window, and knows who is alive."""
 
-from due.drivers.redis_streams import StreamLedger, parse_id
+import pytest
+
+from due.drivers.redis_streams import LEAST_PAUSE, StreamLedger, next_pause, parse_id
 
 
 def _ledger(**changes):
@@ -55,3 +57,24 @@ def test_groups_live_by_their_leases_even_after_the_server_lost_them():
 def test_ids_compare_as_numbers():
     assert parse_id(b"9-10") < parse_id("10-2") < parse_id("10-10")
     assert parse_id("5") == (5, 0)
+
+
+def test_excess_is_what_is_kept_beyond_a_share_of_the_window():
+    ledger = _ledger()
+    assert ledger.excess(0.0) == 0, "nothing is kept"
+    _add(ledger, 8)
+    assert ledger.excess(0.5) == ledger.kept_bytes - 2500
+    assert ledger.excess(1.0) == 0
+
+
+@pytest.mark.parametrize(
+    ("waited", "freed", "missing", "seconds"),
+    [
+        (0.02, 1000, 2000, 0.04),  # at the readers' pace
+        (0.02, 0, 2000, 0.04),  # nothing moves: more and more rarely
+        (0.02, 1, 2000, 0.1),  # never longer than the limit
+        (0.02, 1000, 1, LEAST_PAUSE),  # nor so soon that asking is all there is
+    ],
+)
+def test_a_writer_asks_again_when_the_readers_pace_lets_expect_room(waited, freed, missing, seconds):
+    assert next_pause(waited, freed, missing, 0.1) == pytest.approx(seconds)
