@@ -11,10 +11,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.evaluation import SIX, column_of, evaluate
-from apps.sonata_adapter.expressions import Expression, Field, Kind, address_text
+from apps.sonata_adapter.evaluation import FUNCTIONS, SIX, column_of, evaluate
+from apps.sonata_adapter.expressions import (
+    Expression,
+    Field,
+    Kind,
+    Operator,
+    address_text,
+    kind_of,
+    substitute,
+)
 from apps.sonata_adapter.numbering import Numbered, Numbering
 from apps.sonata_adapter.payload import Frames
+from apps.sonata_adapter.query import PACKET_KINDS
 from apps.sonata_adapter.tables import Column, Hashes, Part, combined, hashes, mixed, take, zeros
 from due import RecordBatch
 
@@ -47,16 +56,16 @@ _PORTS: Final = {
 _ADDRESSES: Final = {"ip.src": ("ip_src_hi", "ip_src_lo"), "ip.dst": ("ip_dst_hi", "ip_dst_lo")}
 _DNS: Final = ("dns.response", "dns.qtype", "dns.name")
 _DNS_PORT: Final = 53
+_NO_PORT: Final = -1
+_NO_PORTS: Final = np.array(_NO_PORT)
 _MOST: Final = 4
 """Where more than one in so many of a batch's packets is selected, keys are mixed for all and taken."""
-_MANY: Final = 4_096
-"""For so many rows shared numbers are worth their making."""
 _ALL_PORTS: Final = Field("ports")
 _FLOW: Final = (Field("ip.src"), Field("ip.dst"), _ALL_PORTS)
 
 
-Numberings = dict[tuple[Expression, ...], Numbering]
-"""By the values that keys are made of."""
+Numberings = dict[Expression, Numbering]
+"""By the value that keys are made of."""
 
 
 class Missing:
@@ -70,19 +79,20 @@ class Packets:
     """The packets of a batch: fields, keys and selections are made when first asked for, and once."""
 
     _rows: NDArray[np.intp] | None = None
+    _whole: "Packets | None" = None
 
     def __init__(self, batch: RecordBatch, numberings: Numberings | None = None) -> None:
-        self._numberings: Numberings = {} if numberings is None else numberings
-        self._prepare(batch, len(batch), Missing())
+        self._prepare(batch, len(batch), Missing(), {} if numberings is None else numberings)
 
-    def _prepare(self, batch: RecordBatch, size: int, missing: Missing) -> None:
+    def _prepare(self, batch: RecordBatch, size: int, missing: Missing, numberings: Numberings) -> None:
         self.missing = missing
+        self._numberings = numberings
         self._batch = batch
         self._size = size
         self._columns: dict[str, Column] = {}
         self._terms: dict[Expression, Hashes] = {}
         self._keys: dict[tuple[Expression, ...], Hashes] = {}
-        self._numbered: dict[tuple[Expression, ...], Numbered | None] = {}
+        self._numbered: dict[Expression, Numbered | None] = {}
         self._selections: dict[Expression, Packets] = {}
 
     def __len__(self) -> int:
@@ -100,7 +110,14 @@ class Packets:
     @property
     def _every(self) -> "Packets":
         """All packets of the batch."""
-        return self
+        return self if self._whole is None else self._whole
+
+    def forget(self) -> None:
+        """Selections go: they and these packets would keep each other in memory until somebody looks for cycles."""
+        made, self._selections = self._selections, {}
+        for packets in made.values():
+            if packets is not self:
+                packets.forget()
 
     def at(self, kept: NDArray[np.intp]) -> "Packets":
         """Some of these packets, in the order of `kept`."""
@@ -130,8 +147,8 @@ class Packets:
         return found
 
     def _where(self, condition: Expression) -> "Packets":
-        mask = evaluate(condition, self)
-        return self if mask.all() else self.at(np.flatnonzero(mask))
+        (kept,) = evaluate(condition, self).nonzero()
+        return self if len(kept) == self._size else self.at(kept)
 
     def keys(self, values: tuple[Expression, ...]) -> Hashes:
         found = self._keys.get(values)
@@ -142,22 +159,31 @@ class Packets:
     def _made_keys(self, values: tuple[Expression, ...]) -> Hashes:
         return combined([self._term(value) for value in values], self._size)
 
-    def numbered(self, values: tuple[Expression, ...]) -> Numbered | None:
-        if self._size < _MANY:
-            return None
-        if values not in self._numbered:
-            self._numbered[values] = self._made_numbers(values)
-        return self._numbered[values]
+    def numbered(self, value: Expression) -> Numbered | None:
+        if value not in self._numbered:
+            self._numbered[value] = self._made_numbers(value)
+        return self._numbered[value]
 
-    def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
-        numbering = self._numberings.setdefault(values, Numbering())
-        return numbering.number(self.keys(values))
+    def _made_numbers(self, value: Expression) -> Numbered | None:
+        numbering = self._numberings.get(value)
+        if numbering is None:
+            numbering = self._numberings[value] = Numbering(kind_of(value, PACKET_KINDS))
+        numbering.often |= self is self._every
+        return numbering.number(self.keys((value,)), lambda rows: self.columns_at((value,), rows)[0])
+
+    def _often(self, value: Expression) -> bool:
+        """Whether somebody is likely to ask for numbers in all packets."""
+        numbering = self._numberings.get(value)
+        return numbering is not None and numbering.often
 
     def keys_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> Hashes:
         known = self._every._keys.get(values)  # noqa: SLF001 - of its own kind
         if known is None:
             return self.keys(values)[rows]
         return known[rows if self._rows is None else self._rows[rows]]
+
+    def tuples(self, names: Mapping[str, Expression], rows: NDArray[np.intp]) -> "PacketTuples":
+        return PacketTuples(self.at(rows), names)
 
     def flows(self) -> Hashes:
         """64 bits that the packets of a flow (addresses, protocol, ports) share, and no others."""
@@ -182,6 +208,19 @@ class Packets:
         packed += self._raw("ip_proto")
         return (packed,)
 
+    def compared(self, name: str, operator: Operator, number: int, mask: int) -> NDArray[np.bool_] | None:
+        if name in _PLAIN:
+            values = self._raw(_PLAIN[name])
+            if mask < 0:
+                return np.asarray(FUNCTIONS[operator](values, number))
+            return np.asarray(FUNCTIONS[operator](values & mask, number)) if _fits(mask, values) else None
+        if name not in _PORTS or mask >= 0 or FUNCTIONS[operator](_NO_PORTS, number):
+            return None
+        column, protocol = _PORTS[name]
+        found: NDArray[np.bool_] = FUNCTIONS[operator](self._raw(column), number)
+        found &= self._raw("ip_proto") == protocol
+        return found
+
     def contains(self, pattern: bytes) -> NDArray[np.bool_]:
         frames = self._frames(None)
         return np.zeros(self._size, dtype=np.bool_) if frames is None else frames.payload_contains(pattern)
@@ -203,7 +242,7 @@ class Packets:
     def _port(self, name: str, protocol: int) -> NDArray[np.int64]:
         """The packet's own port: not one that an ICMP error quotes, not one of UDP-Lite."""
         ports = self._raw(name).astype(np.int64)
-        ports[self._raw("ip_proto") != protocol] = -1
+        ports[self._raw("ip_proto") != protocol] = _NO_PORT
         return ports
 
     def _address(self, high_name: str, low_name: str) -> Column:
@@ -239,13 +278,10 @@ class _Part(Packets):
     _rows: NDArray[np.intp]
 
     def __init__(self, source: Packets, rows: NDArray[np.intp]) -> None:
-        self._prepare(source._batch, len(rows), source.missing)  # noqa: SLF001 - of its own kind
+        self._prepare(source._batch, len(rows), source.missing, source._numberings)  # noqa: SLF001 - of its own kind
         self._source = source
+        self._whole = source._every  # noqa: SLF001
         self._rows = rows
-
-    @property
-    def _every(self) -> Packets:
-        return self._source._every  # noqa: SLF001
 
     def between(self, first: int, end: int) -> Packets:
         return _Stretch(self, slice(*np.searchsorted(self._rows, (first, end)).tolist()))
@@ -270,9 +306,19 @@ class _Selection(_Part):
             return every._term(value)[self._rows]  # noqa: SLF001
         return super()._made_term(value)
 
-    def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
-        every = self._every.numbered(values)
-        return every and Numbered(every.table, every.numbers[self._rows])
+    def _made_keys(self, values: tuple[Expression, ...]) -> Hashes:
+        known = self._every._keys.get(values)  # noqa: SLF001
+        return super()._made_keys(values) if known is None else known[self._rows]
+
+    def _made_numbers(self, value: Expression) -> Numbered | None:
+        every, source = self._every, self._source
+        if value in every._numbered or every._often(value):  # noqa: SLF001
+            numbered = every.numbered(value)
+            return numbered and numbered.at(self._rows)
+        if _MOST * self._size > len(source):
+            numbered = source.numbered(value)
+            return numbered and numbered.at(self._kept)
+        return super()._made_numbers(value)
 
 
 class _Stretch(_Part):
@@ -295,12 +341,63 @@ class _Stretch(_Part):
     def _read(self, name: str) -> Column:
         return tuple(part[self._part] for part in self._source.column(name))
 
-    def _made_numbers(self, values: tuple[Expression, ...]) -> Numbered | None:
-        whole = self._source.numbered(values)
-        return whole and Numbered(whole.table, whole.numbers[self._part])
+    def _made_numbers(self, value: Expression) -> Numbered | None:
+        whole = self._source.numbered(value)
+        return whole and whole.at(self._part)
 
     def _made_term(self, value: Expression) -> Hashes:
         return self._source._term(value)[self._part]  # noqa: SLF001
+
+
+class PacketTuples:
+    """Tuples that an operator made of packets: values are read when asked for, keys and numbers are shared."""
+
+    def __init__(self, packets: Packets, names: Mapping[str, Expression]) -> None:
+        self._packets = packets
+        self._names = names
+
+    def __len__(self) -> int:
+        return len(self._packets)
+
+    @property
+    def origin(self) -> NDArray[np.intp]:
+        return self._packets.origin
+
+    def column(self, name: str) -> Column:
+        return column_of(self._names[name], self._packets)
+
+    def compared(self, name: str, operator: Operator, number: int, mask: int) -> None:  # noqa: ARG002
+        return None
+
+    def contains(self, pattern: bytes) -> NDArray[np.bool_]:  # noqa: ARG002
+        raise AssertionError("payload is a field of packets only; checked when the query was built")
+
+    def where(self, condition: Expression) -> "PacketTuples":
+        """The tuples for which the condition holds."""
+        return PacketTuples(self._packets.where(substitute(condition, self._names)), self._names)
+
+    def keys(self, values: tuple[Expression, ...]) -> Hashes:
+        return self._packets.keys(self._of_packets(values))
+
+    def columns_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> list[Column]:
+        return self._packets.columns_at(self._of_packets(values), rows)
+
+    def keys_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> Hashes:
+        return self._packets.keys_at(self._of_packets(values), rows)
+
+    def tuples(self, names: Mapping[str, Expression], rows: NDArray[np.intp]) -> "PacketTuples":
+        meant = dict(zip(names, self._of_packets(tuple(names.values())), strict=True))
+        return PacketTuples(self._packets.at(rows), meant)
+
+    def numbered(self, value: Expression) -> Numbered | None:
+        return self._packets.numbered(substitute(value, self._names))
+
+    def _of_packets(self, values: tuple[Expression, ...]) -> tuple[Expression, ...]:
+        return tuple(substitute(value, self._names) for value in values)
+
+
+def _fits(mask: int, values: Part) -> bool:
+    return mask <= np.iinfo(values.dtype).max
 
 
 class Tuples:
@@ -323,6 +420,9 @@ class Tuples:
     def column(self, name: str) -> Column:
         return self._columns[name]
 
+    def compared(self, name: str, operator: Operator, number: int, mask: int) -> None:  # noqa: ARG002
+        return None
+
     def contains(self, pattern: bytes) -> NDArray[np.bool_]:  # noqa: ARG002
         raise AssertionError("payload is a field of packets only; checked when the query was built")
 
@@ -342,7 +442,11 @@ class Tuples:
     def keys_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> Hashes:
         return self.keys(values)[rows]
 
-    def numbered(self, values: tuple[Expression, ...]) -> None:  # noqa: ARG002
+    def tuples(self, names: Mapping[str, Expression], rows: NDArray[np.intp]) -> "Tuples":
+        columns = self.columns_at(tuple(names.values()), rows)
+        return Tuples(dict(zip(names, columns, strict=True)), len(rows), self.origin[rows])
+
+    def numbered(self, value: Expression) -> None:  # noqa: ARG002
         return None
 
     def take(self, rows: NDArray[np.intp]) -> "Tuples":

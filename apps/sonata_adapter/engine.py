@@ -7,7 +7,7 @@ A window closes when a packet is `lateness_us` beyond its end (at most a quarter
 `advance` or `finish`.  Packets of a closed window are left out and counted in `late`.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from itertools import pairwise
 from typing import Final, Protocol
 
@@ -46,6 +46,8 @@ from due import RecordBatch
 
 DEFAULT_LIMIT: Final = 1 << 20
 DEFAULT_LATENESS_US: Final = 500_000
+_ROOM: Final = 2
+"""So many times what a window before held there is room for: fuller tables take longer."""
 _NEW_FLOWS: Final = PacketSource((), once=True)
 """What all nodes that want the first packets of flows only start from."""
 
@@ -80,6 +82,13 @@ class _Window:
         self._reduces: dict[ReduceNode, ReduceOperator] = {}
         self._reported: dict[str, Reported] = {}
         self._flows = flows
+        self._kept: Set[Node] = frozenset()
+
+    def keep(self, nodes: Set[Node]) -> None:
+        """Tables of these nodes will be asked for."""
+        self._kept = nodes
+        for node, distinct in self._distincts.items():
+            distinct.kept = node in nodes
 
     def feed(self, node: Node, packets: Packets, memo: dict[Node, Rows | Update]) -> Rows | Update:
         """What the packets make of a node; each node takes them once."""
@@ -97,12 +106,14 @@ class _Window:
             distinct = self._distincts.get(node)
             if distinct is None:
                 distinct = self._distincts[node] = DistinctOperator(
-                    node, self._limit, self._expected.get(node, 0)
+                    node, self._limit, _ROOM * self._expected.get(node, 0)
                 )
+                distinct.kept = node in self._kept
             return distinct.take(rows)
         reduce = self._reduces.get(node)
         if reduce is None:
-            reduce = self._reduces[node] = ReduceOperator(node, self._limit, self._expected.get(node, 0))
+            expected = _ROOM * self._expected.get(node, 0)
+            reduce = self._reduces[node] = ReduceOperator(node, self._limit, expected)
         return reduce.take(rows)
 
     def _packets(
@@ -186,6 +197,7 @@ class HostEngine:
         self._closed: dict[int, int] = {}
         self._flows: dict[int, SeenFlows] = {}
         self._numberings: Numberings = {}
+        self._kept: Set[Node] = frozenset()
         self._sizes: dict[int, dict[Node, int]] = {}
         self.watermark_us: int | None = None
         self.packets = 0
@@ -201,6 +213,7 @@ class HostEngine:
     def add(self, query: Query) -> None:
         """Bring a query into force under its name; raises `InvalidQuery`."""
         self._queries[query.name] = _Running(query, self.watermark_us)
+        self._keep_tables()
         for flows in self._flows.values():
             flows.forget()
 
@@ -212,6 +225,13 @@ class HostEngine:
         self._flows = {length: flows for length, flows in self._flows.items() if length in lengths}
         self._sizes = {length: sizes for length, sizes in self._sizes.items() if length in lengths}
         self._numberings.clear()
+        self._keep_tables()
+
+    def _keep_tables(self) -> None:
+        tables = [running for running in self._queries.values() if isinstance(running.outcome, Table)]
+        self._kept = frozenset(node for running in tables for node in running.nodes())
+        for window in self._windows.values():
+            window.keep(self._kept)
 
     def process(self, batch: RecordBatch, *, horizon_us: int | None = None) -> list[Result | Captured]:
         """What the packets bring about, in order.
@@ -229,6 +249,7 @@ class HostEngine:
             for index, packets in self._windows_of(whole, length, first - self.base_us, last - self.base_us):
                 outputs += self._feed(length, index, packets, queries, batch)
         self.without_payload += whole.missing.payloads
+        whole.forget()
         outputs += self.advance(last if horizon_us is None else horizon_us)
         self.results += len(outputs)
         return outputs
@@ -281,6 +302,7 @@ class HostEngine:
             flows = self._flows.setdefault(length, SeenFlows())
             start = self.base_us + index * length
             window = _Window(start, length, self._limit, flows, self._sizes.get(length, {}))
+            window.keep(self._kept)
             self._windows[length, index] = window
         memo: dict[Node, Rows | Update] = {}
         for running in queries:
@@ -306,7 +328,6 @@ class HostEngine:
         if isinstance(found, Update):
             crossed = found.crossed(outcome.threshold, window.reported(running.name))
         else:
-            assert isinstance(found, Tuples)  # noqa: S101 - of a distinct
             crossed = Crossed(found, np.ones(len(found), dtype=np.bool_))
         tuples = crossed.tuples
         if not len(tuples):

@@ -1,6 +1,6 @@
 """Expressions over rows by column: fields, numbers, truth values."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from ipaddress import ip_network
 from typing import Any, Final, Protocol
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.sonata_adapter.expressions import (
+    COMPARISONS,
     Binary,
     Contains,
     Expression,
@@ -24,6 +25,7 @@ from apps.sonata_adapter.tables import Column, Hashes, is_constant
 SIX: Final = 0xFFFF_0000_0000_0001
 """What the upper half of an IPv6 address is XORed with; see `columns`."""
 _ALL_ONES: Final = (1 << 64) - 1
+_ALL_BITS: Final = -1
 
 
 class Rows(Protocol):
@@ -33,6 +35,9 @@ class Rows(Protocol):
 
     def column(self, name: str) -> Column:
         """A field's values."""
+
+    def compared(self, name: str, operator: Operator, number: int, mask: int) -> NDArray[np.bool_] | None:
+        """`field & mask == number` and the like, read as it stands (mask -1: all of it); None: evaluate it."""
 
     def contains(self, pattern: bytes) -> NDArray[np.bool_]:
         """Which packets' payloads contain the pattern."""
@@ -49,8 +54,11 @@ class Rows(Protocol):
     def keys_at(self, values: tuple[Expression, ...], rows: NDArray[np.intp]) -> Hashes:
         """The keys of some of the rows."""
 
-    def numbered(self, values: tuple[Expression, ...]) -> Numbered | None:
-        """Numbers for the keys that others can use as well; None: not worth the effort."""
+    def tuples(self, names: Mapping[str, Expression], rows: NDArray[np.intp]) -> "Rows":
+        """Tuples of these values, under these names, of some of the rows."""
+
+    def numbered(self, value: Expression) -> Numbered | None:
+        """Numbers for keys of one value that others can use as well; None: not worth the effort."""
 
     @property
     def origin(self) -> NDArray[np.intp]:
@@ -78,7 +86,18 @@ def evaluate(expression: Expression, rows: Rows) -> NDArray[Any]:
         case Contains(pattern):
             return rows.contains(pattern)
         case Binary(operator, left, right):
-            return _binary(operator, left, right, rows)
+            found = _compared(operator, left, right, rows) if isinstance(right, Number) else None
+            return _binary(operator, left, right, rows) if found is None else found
+
+
+def _compared(operator: Operator, left: Expression, right: Number, rows: Rows) -> NDArray[np.bool_] | None:
+    if operator in COMPARISONS:
+        match left:
+            case Field(name):
+                return rows.compared(name, operator, right.value, _ALL_BITS)
+            case Binary("&", Field(name), Number(mask)) if mask >= 0:
+                return rows.compared(name, operator, right.value, mask)
+    return None
 
 
 def _binary(operator: Operator, left: Expression, right: Expression, rows: Rows) -> NDArray[Any]:
@@ -88,7 +107,7 @@ def _binary(operator: Operator, left: Expression, right: Expression, rows: Rows)
         return np.asarray(same if operator == "==" else ~same)
     first = evaluate(left, rows)
     second: Any = right.value if isinstance(right, Number) else evaluate(right, rows)
-    return _FUNCTIONS[operator](first, second)
+    return FUNCTIONS[operator](first, second)
 
 
 def _divide(left: NDArray[Any], right: Any) -> NDArray[Any]:
@@ -101,7 +120,7 @@ def _modulo(left: NDArray[Any], right: Any) -> NDArray[Any]:
     return np.where(divisor == 0, 0, left % np.where(divisor == 0, 1, divisor))
 
 
-_FUNCTIONS: Final[dict[Operator, Callable[[NDArray[Any], Any], NDArray[Any]]]] = {
+FUNCTIONS: Final[dict[Operator, Callable[[NDArray[Any], Any], NDArray[Any]]]] = {
     "+": lambda a, b: a + b,
     "-": lambda a, b: a - b,
     "*": lambda a, b: a * b,

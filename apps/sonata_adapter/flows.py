@@ -31,11 +31,11 @@ class SeenFlows:
         """The packets without those of flows that are remembered; these are remembered from now on."""
         keys = packets.flows()
         home = (keys & np.uint64(_SLOTS - 1)).view(np.int64)
-        rest = np.flatnonzero(self._slots[home] != keys)
+        (rest,) = (self._slots[home] != keys).nonzero()
         if not len(rest):
             return packets.at(rest)
         keys, home = keys[rest], home[rest]
-        kept = np.flatnonzero(alike(keys, _SLOTS) == np.arange(len(keys)))
+        (kept,) = (alike(keys, _SLOTS) == np.arange(len(keys))).nonzero()
         self._slots[home[kept]] = keys[kept]
         return packets.at(rest[kept])
 

@@ -1,16 +1,87 @@
-"""Short numbers for keys that come often: looked up once a batch, for all operators that go by these keys."""
+"""Short numbers for keys that come again: looked up once a batch, for all operators and windows.
 
+    keys ─► Numbering ─► Numbered ─┬─► KeyNumbers of a reduce: counts stand under the shared number
+                                   └─► KeyNumbers of a distinct: so do marks of what was seen
+
+An operator that uses them needs no table of its own.  Where they stop it takes what it has into one.
+"""
+
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from apps.sonata_adapter.tables import Hashes, KeyTable, Numbers
+from apps.sonata_adapter.expressions import Kind
+from apps.sonata_adapter.tables import Column, Growing, Hashes, KeyTable, Numbers, Store, take
 
 _KNOWN: Final = 1 << 16
-_NEW_SHARE: Final = 8
-"""Where more than one key in so many is new, looking them up is in vain."""
-_PAUSE: Final = 32
-"""For so many batches then."""
+_ROOM: Final = 1 << 14
+"""For so many keys there is room at once: keys in their own place are found faster."""
+_TRIAL: Final = 1 << 14
+"""Rows by which is judged whether keys come again."""
+_NEW_SHARE: Final = 3
+"""Where more than one row in so many has a new key, numbers are not worth it."""
+_PAUSE: Final = 32 * _TRIAL
+"""For so many rows then."""
+_FIRST_SHARE: Final = 8
+_LEAST_LIMIT: Final = 4 * _KNOWN
+"""Operators with less room than this keep to their own keys: those of others would take too much of it."""
+
+Values = Callable[[NDArray[np.intp]], Column]
+"""What the keys of some rows stand for."""
+
+
+class Known:
+    """Keys by number, and the values that they stand for."""
+
+    def __init__(self, kind: Kind) -> None:
+        self._table = KeyTable(_KNOWN, _ROOM)
+        self._keys = Growing(np.uint64)
+        self._store = Store((kind,))
+
+    @property
+    def size(self) -> int:
+        return self._table.size
+
+    @property
+    def full(self) -> bool:
+        return self._table.size >= _KNOWN
+
+    @property
+    def keys(self) -> Hashes:
+        return self._keys.data
+
+    def columns(self) -> list[Column]:
+        """The values, by number."""
+        return self._store.columns()
+
+    def number(self, keys: Hashes, values: Values) -> Numbers:
+        """The keys' numbers, -1 for those beyond the bound."""
+        begin = 0 if self.size else len(keys) // _FIRST_SHARE
+        if begin:  # a few first: most of the others are the same
+            _, first = self._table.number(keys[:begin])
+            self._learn(keys, first, values)
+        numbers, first = self._table.number(keys)
+        self._learn(keys, first, values)
+        return numbers
+
+    def _learn(self, keys: Hashes, first: NDArray[np.intp], values: Values) -> None:
+        if len(first):
+            self._keys.append(keys[first])
+            self._store.append([values(first)])
+
+
+class Numbered:
+    """The numbers of some rows' keys."""
+
+    def __init__(self, known: Known, numbers: Numbers) -> None:
+        self.known = known
+        self.numbers = numbers
+
+    def at(self, rows: "NDArray[np.intp] | slice") -> "Numbered":
+        """Those of some of the rows."""
+        return Numbered(self.known, self.numbers[rows])
 
 
 class Numbering:
@@ -19,53 +90,91 @@ class Numbering:
     Keys that mostly come once are not worth it: then it pauses.
     """
 
-    def __init__(self) -> None:
-        self._table = KeyTable(_KNOWN)
+    def __init__(self, kind: Kind) -> None:
+        self._kind = kind
+        self._known = Known(kind)
+        self.often = False
+        """Numbers of all packets of a batch were asked for: most likely they will be in the next one."""
         self._pause = 0
+        self._asked = 0
+        self._new = 0
 
-    def number(self, keys: Hashes) -> "Numbered | None":
+    def number(self, keys: Hashes, values: Values) -> Numbered | None:
         """The keys' numbers; None: look for yourself this time."""
-        if self._pause:
-            self._pause -= 1
+        if self._pause > 0:
+            self._pause -= len(keys)
             return None
-        known = self._table.size
-        begin = 0 if known else len(keys) // _NEW_SHARE
-        if begin:  # a few first: most of the others are the same
-            self._table.number(keys[:begin])
-        numbers, _ = self._table.number(keys)
-        if (self._table.size - known) * _NEW_SHARE > len(keys):
-            self._pause = _PAUSE
-        if self._table.size < _KNOWN:
-            return Numbered(self._table, numbers)
-        self._table = KeyTable(_KNOWN)
+        known, before = self._known, self._known.size
+        numbers = known.number(keys, values)
+        self._judge(len(keys), known.size - before)
+        if not known.full:
+            return Numbered(known, numbers)
+        self._known = Known(self._kind)
         return None
 
+    def _judge(self, rows: int, new: int) -> None:
+        self._asked += rows
+        self._new += new
+        if self._asked >= _TRIAL:
+            if self._new * _NEW_SHARE > self._asked:
+                self._pause = _PAUSE
+            self._asked = self._new = 0
 
-class Numbered:
-    """The numbers of a batch's keys, as `table` has them."""
 
-    def __init__(self, table: KeyTable, numbers: Numbers) -> None:
-        self.table = table
-        self.numbers = numbers
+class KeyNumbers:
+    """An operator's numbers for keys: the shared ones while there are any, then its own, which go on from them.
 
+    At most `limit` keys have numbers.
+    """
 
-class Translation:
-    """From those numbers to an operator's own, as far as it knows."""
-
-    def __init__(self) -> None:
+    def __init__(self, kinds: Iterable[Kind], limit: int, expected: int) -> None:
+        self._limit = limit
+        self._expected = expected
+        self._known: Known | None = None
         self._table: KeyTable | None = None
-        self._own = np.empty(0, dtype=np.int64)
+        self._kinds = tuple(kinds)
+        self._store: Store | None = None
 
-    def own(self, numbered: Numbered) -> Numbers:
-        """The operator's numbers; -1: not known."""
-        if self._table is not numbered.table:
-            self._table = numbered.table
-            self._own = np.empty(0, dtype=np.int64)
-        missing = numbered.table.size - len(self._own)
-        if missing > 0:
-            self._own = np.concatenate((self._own, np.full(missing, -1)))
-        return self._own[numbered.numbers]
+    @property
+    def size(self) -> int:
+        """How many numbers there are; some may stand for keys that only others had."""
+        held = self._table or self._known
+        return 0 if held is None else held.size
 
-    def learn(self, numbers: Numbers, own: Numbers) -> None:
-        """What the operator calls them; of the same table as `own` was asked for."""
-        self._own[numbers] = own
+    @property
+    def full(self) -> bool:
+        """Whether some keys may have no number."""
+        return self._table is not None and self._table.size >= self._limit
+
+    def share(self, numbered: Numbered | None) -> Numbers | None:
+        """The shared numbers; None: this operator is on its own now."""
+        if self._table is None and numbered is not None and self._limit >= _LEAST_LIMIT:
+            if self._known is None:
+                self._known = numbered.known
+            if self._known is numbered.known:
+                return numbered.numbers
+        return None
+
+    def number(self, keys: Hashes, columns: Callable[[NDArray[np.intp]], list[Column]]) -> Numbers:
+        """Own numbers, -1 beyond the limit."""
+        if self._table is None or self._store is None:
+            self._table, self._store = self._settled()
+        numbers, first = self._table.number(keys)
+        if len(first):
+            self._store.append(columns(first))
+        return numbers
+
+    def _settled(self) -> tuple[KeyTable, Store]:
+        known, self._known = self._known, None
+        store = Store(self._kinds)
+        if known is None:
+            return KeyTable(self._limit, self._expected), store
+        table = KeyTable(self._limit, max(self._expected, known.size))
+        table.number(known.keys)
+        store.append(known.columns())
+        return table, store
+
+    def columns(self, numbers: Numbers) -> list[Column]:
+        """What these numbers stand for."""
+        held = self._known or self._store or Store(self._kinds)
+        return [take(column, numbers) for column in held.columns()]

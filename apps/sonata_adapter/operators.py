@@ -4,7 +4,7 @@ Each holds at most `limit` keys exactly.  What comes after goes through a sketch
 distinct, Count-Min for reduce), and `error` says so.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,13 @@ from apps.sonata_adapter.columns import NO_TUPLES, Tuples
 from apps.sonata_adapter.dataflow import VALUE, DistinctNode, ReduceNode, kinds_of
 from apps.sonata_adapter.evaluation import Rows, evaluate
 from apps.sonata_adapter.expressions import Expression, Number
-from apps.sonata_adapter.numbering import Translation
+from apps.sonata_adapter.numbering import KeyNumbers
 from apps.sonata_adapter.sketches import Bloom, CountMin
 from apps.sonata_adapter.tables import Growing, Hashes, KeyTable, Numbers, Store
 
 _NO_ROWS: Final = np.empty(0, dtype=np.int64)
+_BUSY: Final = 8
+"""Where a batch has at least a row for so many keys, all are added up at once."""
 
 
 def filtered(rows: Rows, filters: tuple[Expression, ...]) -> Rows:
@@ -33,29 +35,34 @@ class DistinctOperator:
     def __init__(self, node: DistinctNode, limit: int, expected: int = 0) -> None:
         self._node = node
         kinds = kinds_of(node)
-        self._names = list(kinds)
+        self._names = dict(zip(kinds, node.values, strict=True))
+        self._kinds = tuple(kinds.values())
         self._table = KeyTable(limit, expected)
-        self._store = Store(kinds.values())
+        self._store: Store | None = None
+        self._stored = 0
+        self.kept = False
+        """Whether somebody asks for the table; only then the tuples are held, not their keys alone."""
         self._limit = limit
         self._bloom: Bloom | None = None
         self.beyond = 0
 
-    def take(self, rows: Rows) -> Tuples:
+    def take(self, rows: Rows) -> Rows:
         """The new tuples."""
         rows = filtered(rows, self._node.filters)
         if not len(rows):
             return NO_TUPLES
         keys = rows.keys(self._node.values)
         numbers, first = self._table.number(keys)
-        fresh = rows.columns_at(self._node.values, first)
-        if len(first):
-            self._store.append(fresh)
+        fresh = rows.tuples(self._names, first)
+        if self.kept and len(first):
+            self._store = self._store or Store(self._kinds)
+            self._store.append([fresh.column(name) for name in self._names])
+            self._stored += len(first)
         unplaced = np.flatnonzero(numbers < 0) if self._table.size >= self._limit else _NO_ROWS
         if len(unplaced):
             first = np.sort(np.concatenate((first, self._beyond(keys, unplaced))))
-            fresh = rows.columns_at(self._node.values, first)
-        made = dict(zip(self._names, fresh, strict=True))
-        return Tuples(made, len(first), rows.origin[first])
+            fresh = rows.tuples(self._names, first)
+        return fresh
 
     @property
     def size(self) -> int:
@@ -70,8 +77,9 @@ class DistinctOperator:
         return new
 
     def table(self) -> Tuples:
-        """All tuples that are held exactly."""
-        return Tuples(dict(zip(self._names, self._store.columns(), strict=True)), self._table.size)
+        """All tuples that are held exactly, since they are `kept`."""
+        columns = (self._store or Store(self._kinds)).columns()
+        return Tuples(dict(zip(self._names, columns, strict=True)), self._stored)
 
     @property
     def error(self) -> str:
@@ -89,11 +97,14 @@ class ReduceOperator:
         kinds = kinds_of(node)
         del kinds[VALUE]
         self._names = list(kinds)
-        self._table = KeyTable(limit, expected)
-        self._store = Store(kinds.values())
+        self._keys = KeyNumbers(kinds.values(), limit, expected)
         self._limit = limit
         self._values = Growing(np.int64)
-        self._translation = Translation()
+        value = node.value
+        self._each = value.value if isinstance(value, Number) and node.function == "sum" else 0
+        """What every row adds, if it is the same; 0: it is not."""
+        self._seen = Growing(np.bool_)
+        """By number, which keys are held, where that cannot be told from their values."""
         self._sketch: CountMin | None = None
         self.beyond = 0
 
@@ -103,7 +114,8 @@ class ReduceOperator:
         if not len(rows):
             return Update(self, rows, _NO_ROWS)
         numbers = self._number(rows)
-        unplaced = np.flatnonzero(numbers < 0) if self._table.size >= self._limit else _NO_ROWS
+        self._values.extend(self._keys.size)
+        unplaced = np.flatnonzero(numbers < 0) if self._keys.full else _NO_ROWS
         if not len(unplaced):
             self._add(numbers, rows)
             return Update(self, rows, numbers)
@@ -115,33 +127,25 @@ class ReduceOperator:
 
     def _number(self, rows: Rows) -> Numbers:
         """The number of each row's key, -1 beyond the bound."""
-        numbered = rows.numbered(self._node.keys)
-        if numbered is None:
-            numbers, first = self._table.number(rows.keys(self._node.keys))
-            self._keep(rows, first)
-            return numbers
-        numbers = self._translation.own(numbered)
-        rest = (numbers < 0).nonzero()[0]
-        if len(rest):
-            numbers[rest], first = self._table.number(rows.keys_at(self._node.keys, rest))
-            self._translation.learn(numbered.numbers[rest], numbers[rest])
-            self._keep(rows, rest[first])
-        return numbers
-
-    def _keep(self, rows: Rows, first: NDArray[np.intp]) -> None:
-        if len(first):
-            self._store.append(rows.columns_at(self._node.keys, first))
-            self._values.extend(self._table.size)
+        keys = self._node.keys
+        if len(keys) == 1:  # what two make together comes again less often
+            shared = self._keys.share(rows.numbered(keys[0]))
+            if shared is not None:
+                return shared
+        return self._keys.number(rows.keys(keys), lambda first: rows.columns_at(keys, first))
 
     def _add(self, numbers: Numbers, rows: Rows) -> None:
-        data, value = self._values.data, self._node.value
-        if isinstance(value, Number) and self._node.function == "sum" and len(numbers) > len(data):
-            data += np.bincount(numbers, minlength=len(data)) * value.value
+        data = self._values.data
+        if self._each and _BUSY * len(numbers) > len(data):
+            data += np.bincount(numbers, minlength=len(data)) * self._each
         else:
             self._add_at(numbers, self.amounts(rows))
 
     def _add_at(self, numbers: Numbers, amounts: Numbers) -> None:
         (np.add if self._node.function == "sum" else np.maximum).at(self._values.data, numbers, amounts)
+        if not self._each:
+            self._seen.extend(self._keys.size)
+            self._seen.data[numbers] = True
 
     def _beyond(self, keys: Hashes, amounts: Numbers) -> Numbers:
         if self._sketch is None:
@@ -157,7 +161,11 @@ class ReduceOperator:
     @property
     def size(self) -> int:
         """Keys that are held."""
-        return self._table.size
+        return int(np.count_nonzero(self._marks))
+
+    @property
+    def _marks(self) -> NDArray[Any]:
+        return self._values.data if self._each else self._seen.data
 
     def amounts(self, rows: Rows) -> Numbers:
         """What each row adds."""
@@ -173,8 +181,9 @@ class ReduceOperator:
 
     def table(self) -> Tuples:
         """Keys and values that are held exactly."""
-        made = dict(zip(self._names, self._store.columns(), strict=True))
-        return Tuples({**made, VALUE: (self.values.copy(),)}, self._table.size)
+        held = np.flatnonzero(self._marks)
+        made = dict(zip(self._names, self._keys.columns(held), strict=True))
+        return Tuples({**made, VALUE: (self.values[held],)}, len(held))
 
     @property
     def error(self) -> str:
@@ -208,9 +217,13 @@ class Update:
         """Rows in which keys reach the threshold, not reported before; marks them as reported."""
         if not len(self._numbers):
             return _NOTHING
-        done = reported.flags(len(self._operator.values))
-        over = (self._operator.values >= threshold) & ~done
-        if not len(self._unplaced) and not over[self._numbers].any():
+        values = self._operator.values
+        few = values if len(self._numbers) >= len(values) else values[self._numbers]
+        if not len(self._unplaced) and not (few >= threshold).any():
+            return _NOTHING
+        done = reported.flags(len(values))
+        over = (values >= threshold) & ~done
+        if not len(self._unplaced) and not over.any():
             return _NOTHING
         numbers = self._numbers
         placed = np.flatnonzero(numbers >= 0) if len(self._unplaced) else np.arange(len(numbers))
@@ -253,7 +266,7 @@ class Update:
 class Crossed:
     """Keys that reached a threshold, in the order of their packets, and which counts are exact."""
 
-    def __init__(self, tuples: Tuples, exact: NDArray[np.bool_]) -> None:
+    def __init__(self, tuples: Rows, exact: NDArray[np.bool_]) -> None:
         self.tuples = tuples
         self.exact = exact
 

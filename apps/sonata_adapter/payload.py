@@ -30,13 +30,17 @@ class Frames:
     def __init__(self, frame: NDArray[Any], captured: NDArray[Any]) -> None:
         self._width = frame.dtype.itemsize
         self._bytes = np.ascontiguousarray(frame).view(np.uint8).reshape(len(frame), self._width)
-        self._rows = np.arange(len(frame))
+        self._flat = self._bytes.reshape(-1)
+        self._begin = np.arange(0, self._bytes.size, self._width)
         self._captured = np.minimum(captured.astype(np.int64), self._width)
 
     def byte(self, at: Numbers) -> Numbers:
         """The byte at an offset of each frame, 0 where it was not captured."""
         inside = (at >= 0) & (at < self._captured)
-        found = self._bytes[self._rows, np.where(inside, at, 0)].astype(np.int64)
+        if inside.all():
+            whole: Numbers = self._flat[self._begin + at].astype(np.int64)
+            return whole
+        found = self._flat[self._begin + np.where(inside, at, 0)].astype(np.int64)
         found[~inside] = 0
         return found
 
@@ -46,7 +50,7 @@ class Frames:
 
     def _network(self) -> tuple[Numbers, Numbers]:
         """Offset of the header behind VLAN tags, and its EtherType."""
-        at = np.full(len(self._rows), _ETHERNET, dtype=np.int64)
+        at = np.full(len(self._begin), _ETHERNET, dtype=np.int64)
         kind = self.short(at - 2)
         for _ in range(2):
             tagged = np.isin(kind, _VLANS)
@@ -69,7 +73,7 @@ class Frames:
         if self._is_plain():
             total = self._bytes[:, 16].astype(np.int64) << 8 | self._bytes[:, 17]
             end = np.where(total == 0, self._captured, np.minimum(self._captured, _ETHERNET + total))
-            return np.full(len(self._rows), _ETHERNET + 20, dtype=np.int64), end
+            return np.full(len(self._begin), _ETHERNET + 20, dtype=np.int64), end
         at, kind = self._network()
         four, six = kind == 0x0800, kind == 0x86DD
         header = np.where(four, (self.byte(at) & 0xF) * 4, 40)
@@ -95,20 +99,25 @@ class Frames:
 
     def _name_end(self, at: Numbers, end: Numbers, asked: NDArray[np.bool_]) -> Numbers:
         """Offset behind the root label; beyond the captured bytes where the name is cut."""
-        at = at.copy()
-        walking = np.flatnonzero(asked)
+        ends = at.copy()
+        rows = np.flatnonzero(asked)
+        place, limit, begin = at[rows], end[rows], self._begin[rows]
         for _ in range(_LABELS):
-            if not len(walking):
+            sizes = self._flat[begin + np.minimum(place, self._width - 1)].astype(np.int64)
+            sizes[place >= limit] = 0
+            place = place + sizes + 1
+            walking = (sizes > 0) & (place < limit)
+            if not walking.all():
+                ends[rows] = place
+                rows, place, limit, begin = (each[walking] for each in (rows, place, limit, begin))
+            if not len(rows):
                 break
-            sizes = self._bytes[walking, np.minimum(at[walking], self._width - 1)].astype(np.int64)
-            sizes[at[walking] >= end[walking]] = 0
-            at[walking] += sizes + 1
-            walking = walking[(sizes > 0) & (at[walking] < end[walking])]
-        return at
+        ends[rows] = place
+        return ends
 
     def _name_hash(self, start: Numbers, end: Numbers, asked: NDArray[np.bool_]) -> NDArray[np.uint64]:
         """64 bits of the name's captured bytes in lower case; 0 where there is none."""
-        found = np.zeros(len(self._rows), dtype=np.uint64)
+        found = np.zeros(len(self._begin), dtype=np.uint64)
         rows = np.flatnonzero(asked)
         if not len(rows):
             return found
@@ -132,8 +141,8 @@ class Frames:
         transport, end = self.transport()
         size = self._width - len(pattern) + 1
         if not pattern or size <= 0:
-            return np.zeros(len(self._rows), dtype=np.bool_)
-        found = np.ones((len(self._rows), size), dtype=np.bool_)
+            return np.zeros(len(self._begin), dtype=np.bool_)
+        found = np.ones((len(self._begin), size), dtype=np.bool_)
         for place, byte in enumerate(pattern):
             found &= self._bytes[:, place : place + size] == byte
         tcp_header = (self.byte(transport + 12) >> 4) * 4

@@ -1,7 +1,7 @@
 """Steps over whole tables at a window's end: filter, map, distinct, reduce and join."""
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from apps.sonata_adapter.query import Distinct, Filter, JoinKind, Map, Reduce
 from apps.sonata_adapter.tables import Column, Hashes, hashes, take
 
 _MISSING: Final = -1
+_NO_ROWS: Final = np.empty(0, dtype=np.intp)
 
 
 class Relation:
@@ -35,6 +36,8 @@ class Relation:
     def apply(self, step: TableStep, other: "Relation | None" = None) -> "Relation":
         """The table after a step; `other` is the other side of a join."""
         match step:
+            case Filter() | Distinct() if not self.size:
+                return self
             case Filter(condition):
                 return self.take(np.flatnonzero(evaluate(condition, self.tuples)))
             case Map(fields):
@@ -50,6 +53,8 @@ class Relation:
                 return self._join(other, step.keys, step.kind)
 
     def _reduce(self, step: Reduce) -> "Relation":
+        if not self.size:
+            return Relation({**{key: self.columns[key] for key in step.keys}, step.name: (_NO_ROWS,)}, 0)
         _, first, group = np.unique(self.hashes(step.keys), return_index=True, return_inverse=True)
         amounts = evaluate(step.value, self.tuples)
         if step.function == "sum":
@@ -62,6 +67,9 @@ class Relation:
         return Relation({**made, step.name: (values,)}, len(first))
 
     def _join(self, other: "Relation", keys: tuple[str, ...], kind: JoinKind) -> "Relation":
+        if not self.size and kind != "outer":
+            more = {} if kind == "anti" else other.take(_NO_ROWS).columns
+            return Relation({**self.columns, **{n: c for n, c in more.items() if n not in keys}}, 0)
         mine, theirs = self.hashes(keys), other.hashes(keys)
         order = np.argsort(theirs, kind="stable")
         ordered = theirs[order]
@@ -69,33 +77,51 @@ class Relation:
         matches = _matches(ordered, mine, begin)
         if kind == "anti":
             return self.take(np.flatnonzero(matches == 0))
-        counts = matches if kind == "inner" else np.maximum(matches, 1)
-        rows = np.repeat(np.arange(self.size), counts)
-        nth = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        has = matches[rows] > 0
-        partners = np.full(len(rows), _MISSING, dtype=np.intp)
-        partners[has] = order[begin[rows[has]] + nth[has]]
-        if kind == "outer":
-            alone = np.ones(other.size, dtype=np.bool_)
-            alone[partners[has]] = False
-            unmatched = np.flatnonzero(alone)
-            rows = np.concatenate((rows, np.full(len(unmatched), _MISSING)))
-            partners = np.concatenate((partners, unmatched))
-        return self._paired(other, keys, rows, partners)
+        rows, partners = _pairs(order, begin, matches, alone=kind != "inner")
+        if kind != "outer":
+            return self._paired(other, keys, rows, partners)
+        unmatched = np.ones(other.size, dtype=np.bool_)
+        unmatched[partners[partners != _MISSING]] = False
+        rest = np.flatnonzero(unmatched)
+        rows = np.concatenate((rows, np.full(len(rest), _MISSING)))
+        return self._paired(other, keys, rows, np.concatenate((partners, rest)))
 
     def _paired(
         self, other: "Relation", keys: tuple[str, ...], rows: NDArray[np.intp], partners: NDArray[np.intp]
     ) -> "Relation":
+        there = rows != _MISSING
+        whole = bool(there.all())
         made: dict[str, Column] = {}
         for name, column in self.columns.items():
-            if name in keys:
-                made[name] = _either(column, rows, other.columns[name], partners)
+            if whole:
+                made[name] = take(column, rows)
+            elif name in keys:
+                theirs = _picked(other.columns[name], partners)
+                pairs = zip(_picked(column, rows), theirs, strict=True)
+                made[name] = tuple(np.where(there, left, right) for left, right in pairs)
             else:
-                made[name] = tuple(_pick(part, rows) for part in column)
+                made[name] = _picked(column, rows)
         for name, column in other.columns.items():
             if name not in keys:
-                made[name] = tuple(_pick(part, partners) for part in column)
+                made[name] = _picked(column, partners)
         return Relation(made, len(rows))
+
+
+def _pairs(
+    order: NDArray[np.intp], begin: NDArray[np.intp], matches: NDArray[np.intp], *, alone: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of this side with those of the other that match; `alone`: also those that have no match."""
+    counts = np.maximum(matches, 1) if alone else matches
+    if (counts == 1).all():
+        rows = np.arange(len(counts))
+        places = begin
+    else:
+        rows = np.repeat(np.arange(len(counts)), counts)
+        places = begin[rows] + np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    partners = np.full(len(rows), _MISSING, dtype=np.intp)
+    has = matches[rows] > 0
+    partners[has] = order[places[has]]
+    return rows, partners
 
 
 def _matches(ordered: Hashes, wanted: Hashes, begin: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -107,19 +133,15 @@ def _matches(ordered: Hashes, wanted: Hashes, begin: NDArray[np.intp]) -> NDArra
     return np.where(found, 1, 0)
 
 
-def _pick(part: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
+def _picked(column: Column, rows: NDArray[np.intp]) -> Column:
     """Rows of a column, 0 where the row is missing."""
-    picked = np.zeros(len(rows), dtype=part.dtype)
     there = rows != _MISSING
-    picked[there] = part[rows[there]]
-    return picked
-
-
-def _either(mine: Column, rows: NDArray[np.intp], theirs: Column, partners: NDArray[np.intp]) -> Column:
-    return tuple(
-        np.where(rows != _MISSING, _pick(left, rows), _pick(right, partners))
-        for left, right in zip(mine, theirs, strict=True)
-    )
+    found = []
+    for part in column:
+        picked = np.zeros(len(rows), dtype=part.dtype)
+        picked[there] = part[rows[there]]
+        found.append(picked)
+    return tuple(found)
 
 
 def relation_of(table: Table, held: Callable[[Node], Tuples]) -> Relation:

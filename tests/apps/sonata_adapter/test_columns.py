@@ -1,14 +1,15 @@
 """Selections and stretches of packets against plain indexing."""
 
 import random
+import weakref
 
 import numpy as np
 import pytest
 
 from apps.sonata_adapter.columns import Packets
-from apps.sonata_adapter.evaluation import column_of
-from apps.sonata_adapter.expressions import Field
-from apps.sonata_adapter.query import ip, tcp, udp
+from apps.sonata_adapter.evaluation import FUNCTIONS, column_of, evaluate
+from apps.sonata_adapter.expressions import COMPARISONS, Binary, Field, Number
+from apps.sonata_adapter.query import field, icmp, ip, length, tcp, udp
 from tests.apps.sonata_adapter.traffic import batch_of, mixed
 
 VALUES = tuple(map(Field, ("ip.dst", "ip.src", "tcp.dport", "length", "dns.name")))
@@ -53,6 +54,51 @@ def test_parts_of_a_batch_have_their_rows_fields(batch, condition, asked_before)
     same(packets.between(first, end), batch, np.arange(first, end))
     same(packets.between(first, end).at(np.arange(5, 90, 7)), batch, np.arange(first, end)[5:90:7])
     assert not len(packets.where(condition.node).between(end, end).where(TCP.node))
+
+
+@pytest.mark.parametrize("asked_before", [False, True])
+def test_numbers_stand_for_values_in_all_parts(batch, asked_before):
+    """Whether all packets were numbered before or some only, and in tuples that an operator made."""
+    packets, value = Packets(batch), Field("ip.dst")
+    if asked_before:
+        packets.numbered(value)
+    chosen = packets.where(TCP.node)
+    tuples = chosen.tuples({"to": value}, np.arange(0, len(chosen), 5))
+    few, stretch = packets.where(DNS.node), packets.between(50, 700)
+    parts = [(tuples, Field("to")), (few, value), (chosen, value), (stretch, value), (packets, value)]
+    for part, asked in parts:
+        numbered = part.numbered(asked)
+        high, low = numbered.known.columns()[0]
+        expected = Packets(batch).columns_at((value,), part.origin)[0]
+        assert high[numbered.numbers].tolist() == np.asarray(expected[0]).tolist()
+        assert low[numbered.numbers].tolist() == expected[1].tolist()
+
+
+@pytest.mark.parametrize("field", [tcp.dport, udp.sport, tcp.flags, length, field("ip.version"), icmp.type])
+@pytest.mark.parametrize("number", [-2, -1, 0, 16, 53, 300, 70_000])
+def test_comparisons_as_fields_stand_equal_those_of_numbers(batch, field, number):
+    """Of a field and of some of its bits, beyond what the field can hold too."""
+    packets = Packets(batch)
+    values = packets.column(field.node.name)[0]
+    for operator, same in FUNCTIONS.items():
+        if operator not in COMPARISONS:
+            continue
+        plain = Binary(operator, field.node, Number(number))
+        assert evaluate(plain, packets).tolist() == same(values, number).tolist()
+        for mask in (23, 1 << 20):
+            some = Binary(operator, Binary("&", field.node, Number(mask)), Number(number))
+            assert evaluate(some, packets).tolist() == same(values & mask, number).tolist()
+
+
+def test_packets_go_when_nobody_has_them(batch):
+    """Also those that selections were taken from, without a look for cycles."""
+    packets = Packets(batch)
+    packets.where(TCP.node).where((tcp.dport < 1024).node)
+    packets.where((length > 0).node)
+    packets.forget()
+    gone = weakref.ref(packets)
+    del packets
+    assert gone() is None
 
 
 def test_flows_are_the_same_in_all_parts(batch):

@@ -211,3 +211,20 @@ def test_a_query_that_comes_sees_flows_that_others_have_seen_before():
     engine.add(later)
     found = run(engine, frames[50:])
     assert [r.query for r in found] == ["later"] * 50
+
+
+def test_tables_are_complete_from_the_next_window_on():
+    """A query that needs the tuples of a distinct comes when others already share it without them."""
+    pairs = Query("crossing", 1000).map(src=ip.src, dst=ip.dst).distinct()
+    table = pairs.reduce("dst", count=count())
+    frames = syns([10, 400, 1100, 1300]) + syns([1400], "10.0.0.2")
+    alone, shared = HostEngine(), HostEngine()
+    whole = Query("whole", 1000).map(src=ip.src, dst=ip.dst).distinct().join(table, "dst")
+    shared.add(pairs.reduce("dst", count=count()).filter(field("count") >= 1))
+    run(shared, frames[:1])
+    for engine, rest in ((alone, frames), (shared, frames[1:])):
+        engine.add(whole)
+        found = [one for one in run(engine, rest, 1) + engine.finish() if one.query == "whole"]
+        last = [one.fields for one in found if one.window_us == BASE_US + 1_000_000]
+        assert sorted(one["dst"] for one in last) == ["10.0.0.1", "10.0.0.2"]
+        assert [one.partial for one in found[-2:]] == [False, False]
