@@ -24,6 +24,7 @@ from apps.sonata_adapter.query import Query
 from apps.sonata_adapter.results import Result
 from apps.sonata_adapter.tallies import PATIENCE_S
 from apps.sonata_adapter.tally_tables import Key, TallyTables
+from apps.sonata_adapter.window_ends import WindowEnds
 from due import RecordBatch
 
 SETTLE_S: Final = 0.05
@@ -51,7 +52,7 @@ class Differences:
         self._query = query
         self._tables = TallyTables(query, outcome)
         self._base_us = base_us
-        self._since_us = since_us
+        self._ends = WindowEnds(query, base_us, since_us)
         self._entries = {entry.bit: entry for entry in found.entries}
         self._first = found.entries[0]
         self._windows: dict[int, Window] = {}
@@ -106,7 +107,9 @@ class Differences:
         heard = clock.heard_us
         silent = clock.idle_s(now) >= self._query.window_us / 1e6 + PATIENCE_S
         for number, window in self._windows.items():
-            settled = heard is not None and heard >= self._end(number) + self._query.window_us // _PART
+            settled = (
+                heard is not None and heard >= self._ends.end_us(number) + self._query.window_us // _PART
+            )
             if window.over is None and (settled or silent):
                 window.over = now
                 asked += self._ask(number, window)
@@ -156,7 +159,7 @@ class Differences:
         window = self._windows[number]
         window.waiting.discard(question)
         window.read[key] = self._first.value(counted)
-        is_late = (clock.heard_us or 0) >= self._end(number + 1)
+        is_late = (clock.heard_us or 0) >= self._ends.end_us(number + 1)
         if is_late or not counted:
             self.missed += 1
             window.unsure.add(key)
@@ -221,9 +224,10 @@ class Differences:
         return [key for key in window.candidates(self._first.threshold) if key not in window.told]
 
     def _ask(self, number: int, window: Window) -> Iterator[CellRead]:
-        middle_us = self._end(number) - self._query.window_us // 2
         for key in self._unread(window):
-            read = self._tables.question(self._first.bit, self._first.source, key, middle_us)
+            read = self._tables.question(
+                self._first.bit, self._first.source, key, self._ends.middle_us(number)
+            )
             self._questions[read.id] = (number, key)
             window.waiting.add(read.id)
             yield read
@@ -247,7 +251,8 @@ class Differences:
             if total >= self._first.threshold:
                 counts = {0: total}
                 found += [
-                    self._result(number, fields, errors) for fields in self._tables.results([(key, counts)])
+                    self._ends.result(number, fields, errors)
+                    for fields in self._tables.results([(key, counts)])
                 ]
         return found
 
@@ -256,19 +261,3 @@ class Differences:
         closed = [number for number, window in self._windows.items() if not window.is_open]
         for number in sorted(closed)[: max(0, len(self._windows) - _KEPT)]:
             del self._windows[number]
-
-    def _end(self, number: int) -> int:
-        return self._base_us + (number + 1) * self._query.window_us
-
-    def _result(self, number: int, fields: dict[str, int | str], errors: list[str]) -> Result:
-        start = self._base_us + number * self._query.window_us
-        return Result(
-            query=self._query.name,
-            window_us=start,
-            length_us=self._query.window_us,
-            at_us=self._end(number),
-            fields=fields,
-            exact=not errors,
-            partial=self._since_us is not None and self._since_us > start,
-            error="; ".join(errors),
-        )

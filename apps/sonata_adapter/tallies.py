@@ -25,6 +25,7 @@ from apps.sonata_adapter.query import Query
 from apps.sonata_adapter.results import Result
 from apps.sonata_adapter.tally_tables import Key, TallyTables
 from apps.sonata_adapter.tally_window import MOST_KEYS, Window
+from apps.sonata_adapter.window_ends import WindowEnds
 from due import RecordBatch
 
 PATIENCE_S: Final = 10.0
@@ -54,7 +55,7 @@ class Tallies:
         self._query = query
         self._tables = TallyTables(query, outcome)
         self._base_us = base_us
-        self._since_us = since_us
+        self._ends = WindowEnds(query, base_us, since_us)
         self._reduces = {entry.bit: entry for entry in found.entries if entry.role == "reduce"}
         self._windows: dict[int, Window] = {}
         self._closed: int | None = None
@@ -127,7 +128,7 @@ class Tallies:
         length = self._query.window_us
         silent = clock.idle_s(now) >= length / 1e6 + PATIENCE_S
         for number, window in self._windows.items():
-            end = self._end(number)
+            end = self._ends.end_us(number)
             if window.over is None and (heard >= end or silent):
                 self._is_over(window, now)
                 if heard < end:
@@ -182,7 +183,7 @@ class Tallies:
         window.waiting.discard(question)
         least = self._reduces[asked.bit].threshold if place in window.reported else 0
         is_lost = counted < max(least, before or 0)
-        is_late = (clock.heard_us or 0) >= self._end(asked.window + 1)
+        is_late = (clock.heard_us or 0) >= self._ends.end_us(asked.window + 1)
         self.missed += is_lost or is_late
         if (is_lost or is_late) and not (window.early_counts and before is not None and before >= least):
             (window.doubtful if is_lost else window.unsure).add(asked.key)
@@ -195,7 +196,7 @@ class Tallies:
             if window.over is not None and now - window.over >= TIMEOUT_S:
                 self._give_up(window)
             found += self._finished(number, window)
-            is_past = clock.heard_us is not None and clock.heard_us >= self._end(number + 1)
+            is_past = clock.heard_us is not None and clock.heard_us >= self._ends.end_us(number + 1)
             if window.over is not None and not window.pending and not window.waiting and is_past:
                 self._forget(number)
         return found
@@ -230,9 +231,6 @@ class Tallies:
             window.doubtful.add(self._questions.pop(question).key)
         window.waiting.clear()
 
-    def _end(self, number: int) -> int:
-        return self._base_us + (number + 1) * self._query.window_us
-
     def _is_over(self, window: Window, now: float) -> None:
         window.over = now
         if window.beyond:
@@ -245,8 +243,7 @@ class Tallies:
             for entry in self._reduces.values():
                 if (entry.bit, key) in window.apart:
                     continue
-                middle_us = self._end(number) - self._query.window_us // 2
-                read = self._tables.question(entry.bit, entry.source, key, middle_us)
+                read = self._tables.question(entry.bit, entry.source, key, self._ends.middle_us(number))
                 self._questions[read.id] = _Question(number, entry.bit, key, last)
                 if last:
                     window.waiting.add(read.id)
@@ -268,9 +265,9 @@ class Tallies:
         reasons = list(window.errors)
         doubts = reasons or [LATE]
         return [
-            *(self._result(number, fields, reasons) for fields in self._tables.results(sure)),
-            *(self._result(number, fields, doubts) for fields in self._tables.results(unsure)),
-            *(self._result(number, fields, doubts) for fields in self._tables.guesses(doubtful)),
+            *(self._ends.result(number, fields, reasons) for fields in self._tables.results(sure)),
+            *(self._ends.result(number, fields, doubts) for fields in self._tables.results(unsure)),
+            *(self._ends.result(number, fields, doubts) for fields in self._tables.guesses(doubtful)),
         ]
 
     def _is_whole(self, window: Window, key: Key) -> bool:
@@ -290,16 +287,3 @@ class Tallies:
             more = window.apart.get(place, 0) + len(window.tuples.get(place, ()))
             counts[entry.source] = counts.get(entry.source, 0) + cell + more
         return counts
-
-    def _result(self, number: int, fields: dict[str, int | str], errors: list[str]) -> Result:
-        start = self._base_us + number * self._query.window_us
-        return Result(
-            query=self._query.name,
-            window_us=start,
-            length_us=self._query.window_us,
-            at_us=self._end(number),
-            fields=fields,
-            exact=not errors,
-            partial=self._since_us is not None and self._since_us > start,
-            error="; ".join(errors),
-        )

@@ -35,6 +35,8 @@ _GONE_SECONDS = 30.0
 _WITHDRAWN_SECONDS = 10.0
 _FORGET_SECONDS = 3600.0
 _ASIDE_LENGTH = 1000
+_TRIES = 3
+"""How often to try at once to make a group: a connection may just have been cut."""
 _SKIP_REPLY = pack((b"CLIENT", b"REPLY", b"SKIP"))
 
 
@@ -65,6 +67,8 @@ class StreamReader:
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
         self._withdrawn: dict[str, float] = {}
+        self._unmade: dict[str, tuple[str, bool]] = {}
+        """Groups that could not be made, with where they begin: such a stream stays held until it has one."""
         self._look_at = 0.0
         self._alone = False
         self._quiet = False
@@ -106,6 +110,7 @@ class StreamReader:
             for path in gone:
                 del self._paths[path]
                 self._held.discard(path)
+                self._unmade.pop(path, None)
             self._stale = bool(gone)
             self._withdrawn.update(dict.fromkeys(gone, time.monotonic()))
         with self._leases:
@@ -222,6 +227,19 @@ class StreamReader:
             log.debug("leases could not be written: %s", error)
 
     def _create_group(self, path: str, start: str, *, reset: bool = False) -> None:
+        for _ in range(_TRIES):
+            try:
+                self._make_group(path, start, reset=reset)
+            except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
+                failed = error
+                continue
+            self._unmade.pop(path, None)
+            return
+        log.warning("group %s of %s cannot be made now: %s", self._group, path, failed)
+        # what comes from now on is wanted, whenever the group can be made; it begins behind the id it is given
+        self._unmade[path] = (str(int(time.time() * 1000) - 1) if start == "$" else start, reset)
+
+    def _make_group(self, path: str, start: str, *, reset: bool) -> None:
         try:
             self._commands.xgroup_create(stream_name(path), self._group, start, mkstream=True)
         except redis.ResponseError as error:
@@ -229,8 +247,6 @@ class StreamReader:
                 raise
             if reset:
                 self._commands.xgroup_setid(stream_name(path), self._group, start)
-        except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
-            log.warning("group %s of %s cannot be made now: %s", self._group, path, error)
 
     def _drop_groups(self) -> None:
         """Of interests withdrawn a while ago: an app that withdraws them because it ends keeps its place."""
@@ -371,6 +387,9 @@ class StreamReader:
             paths = list(self._paths)
         self._alone = True
         for path in paths:
+            unmade = self._unmade.get(path)
+            if unmade is not None:
+                self._create_group(path, unmade[0], reset=unmade[1])
             try:
                 waits = self._claim(path)
             except (redis.RedisError, OSError) as error:

@@ -1,13 +1,16 @@
 """A reader's place is held by its lease, and the lease ends with the reader."""
 
 import select
+import time
 
 import pytest
+import redis
 
 from due.drivers.base import Delivery
 from due.drivers.redis_reader import StreamReader
 from due.drivers.redis_streams import readers_name, stream_name
 from due.drivers.redis_wire import client
+from tests.due.conftest import wait_for
 
 PATH = "r.lease"
 
@@ -53,6 +56,37 @@ def _read(reader: StreamReader) -> list[Delivery]:
         ready, _, _ = select.select([reader.fileno()], [], [], 30)
         found = reader.read(set(ready))
     return found
+
+
+class _NoGroups:
+    """A client whose connection is cut whenever it makes a group."""
+
+    def __init__(self, commands):
+        self._commands = commands
+
+    def __getattr__(self, name):
+        return getattr(self._commands, name)
+
+    def xgroup_create(self, *_details, **_more):
+        raise redis.ConnectionError("cut")
+
+
+@pytest.mark.parametrize(("start", "found"), [("0", [b"early", b"late"]), ("$", [b"late"])])
+def test_a_group_that_could_not_be_made_is_made_later(server, start, found):
+    """And nothing is lost from the moment it was asked for."""
+    path, commands = f"r.unmade.{len(found)}", client(server.url)
+    commands.xadd(stream_name(path), {"f": "early"})
+    early_ms = int(commands.xinfo_stream(stream_name(path))["last-generated-id"].split(b"-")[0])
+    wait_for(lambda: time.time() * 1000 > early_ms + 3)
+    reader = StreamReader(server.url, _NoGroups(commands), "group", "one", shared=False)
+    reader.add(path, start)
+    commands.xadd(stream_name(path), {"f": "late"})
+    reader.care()
+    reader._commands = commands
+    reader._look_at = 0.0
+    assert [delivery.payload for delivery in _read(reader)] == found
+    reader.close()
+    commands.close()
 
 
 def test_alone_in_a_group_it_looks_after_the_dead_more_rarely(server):
