@@ -182,9 +182,8 @@ class Sender:
         """
         with self._lock:
             if outlet.empty and (outlet.fast or outlet.lock.locked()):
-                outlet.queued = (
-                    False  # its writer is sending, or waits for readers: the next batch will say so
-                )
+                # its writer is sending, or waits for readers: the next batch will say so
+                outlet.queued = False
                 return None
         pressure = self._pressure.felt(late)
         if outlet.filled != outlet.filled_before:

@@ -17,7 +17,6 @@ import numpy as np
 from apps.sonata_adapter.cell_read import LATE, TIMEOUT_S, CellRead
 from apps.sonata_adapter.clock import Clock
 from apps.sonata_adapter.columns import Packets
-from apps.sonata_adapter.dataflow import Table, compile_query
 from apps.sonata_adapter.difference_window import Window
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import Query
@@ -47,10 +46,8 @@ class Differences:
     def __init__(
         self, query: Query, found: QueryPlan, *, base_us: int = 0, since_us: int | None = None
     ) -> None:
-        outcome = compile_query(query)
-        assert isinstance(outcome, Table)  # noqa: S101 - the planner sees to it
         self._query = query
-        self._tables = TallyTables(query, outcome)
+        self._tables = TallyTables(query)
         self._base_us = base_us
         self._ends = WindowEnds(query, base_us, since_us)
         self._entries = {entry.bit: entry for entry in found.entries}
@@ -91,7 +88,7 @@ class Differences:
         """Keys that are over the threshold at the end of their windows, seconds of the caller's clock."""
         self.tuples += len(batch)
         self._ending = now if self._ending is not None else None
-        keys = self._keys(batch)
+        keys = self._tables.told(self._first.source, batch)
         for number, key, counted in zip(batch["window"].tolist(), keys, batch["count"].tolist(), strict=True):
             window = self._window(number)
             if key in window.done:
@@ -194,9 +191,6 @@ class Differences:
 
     def _window(self, number: int) -> Window:
         return self._windows.setdefault(number, Window())
-
-    def _keys(self, batch: RecordBatch) -> list[Key]:
-        return self._tables.told(self._first.source, batch)
 
     def _sweeps(self, now: float) -> int:
         """How many to ask for now: one in a while, more where the switch says that more waits."""

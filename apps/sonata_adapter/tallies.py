@@ -18,7 +18,6 @@ import numpy as np
 from apps.sonata_adapter.cell_read import LATE, TIMEOUT_S, CellRead
 from apps.sonata_adapter.clock import Clock
 from apps.sonata_adapter.columns import Packets
-from apps.sonata_adapter.dataflow import Table, compile_query
 from apps.sonata_adapter.placement import Entry
 from apps.sonata_adapter.planner import QueryPlan
 from apps.sonata_adapter.query import Query
@@ -50,10 +49,8 @@ class Tallies:
     def __init__(
         self, query: Query, found: QueryPlan, *, base_us: int = 0, since_us: int | None = None
     ) -> None:
-        outcome = compile_query(query)
-        assert isinstance(outcome, Table)  # noqa: S101 - the planner sees to it
         self._query = query
-        self._tables = TallyTables(query, outcome)
+        self._tables = TallyTables(query)
         self._base_us = base_us
         self._ends = WindowEnds(query, base_us, since_us)
         self._reduces = {entry.bit: entry for entry in found.entries if entry.role == "reduce"}

@@ -15,6 +15,7 @@ from apps.sonata_adapter.dataflow import (
     Table,
     TableJoin,
     TableStep,
+    compile_query,
     key_fields,
     kinds_of,
     sources,
@@ -45,7 +46,9 @@ _TOLD_ADDRESSES: Final = {"source": "src", "destination": "dst"}
 class TallyTables:
     """What one query makes of the counts of keys: `sources` in the order of `dataflow.sources`."""
 
-    def __init__(self, query: Query, table: Table) -> None:
+    def __init__(self, query: Query) -> None:
+        table = compile_query(query)
+        assert isinstance(table, Table)  # noqa: S101 - the planner sees to it
         self._kinds = query.fields
         self._table = table
         self._open = _unfiltered(table)
