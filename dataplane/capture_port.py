@@ -33,7 +33,7 @@ _PER_FRAME = 16
 _BLOCK_FRAMES = 1024
 _MAX_BLOCK_FRAMES = 1 << 16
 _MAX_BLOCK_BYTES = 1 << 28
-_CHUNK = 1 << 20
+_CHUNK = 1 << 18
 _VERDICTS_WAITING = 1 << 20
 
 
@@ -64,7 +64,7 @@ class BlockReader:
         self._times: list[int] = []
         self._next = 0
 
-    def feed(self, data: bytes) -> None:
+    def feed(self, data: bytes | memoryview) -> None:
         """More bytes.  Raises CaptureError where they are no block."""
         self._bytes += data
         start = 0
@@ -130,6 +130,8 @@ class CapturePort:
         self._listener = _listen(self._path)
         self._feeder: socket.socket | None = None
         self._reader = BlockReader()
+        # kept, because the allocator would map and unmap a new one for each read
+        self._buffer = memoryview(bytearray(_CHUNK))
         self._verdicts = bytearray()
         self._ended = False
 
@@ -168,9 +170,9 @@ class CapturePort:
     def _read(self) -> None:
         assert self._feeder is not None  # noqa: S101 - receive() has seen to it
         try:
-            data = self._feeder.recv(_CHUNK)
-            self._reader.feed(data)
-            self._ended = not data
+            size = self._feeder.recv_into(self._buffer)
+            self._reader.feed(self._buffer[:size])
+            self._ended = not size
         except BlockingIOError:
             return
         except (OSError, CaptureError):
@@ -254,6 +256,7 @@ class CaptureFeed:
         self._socket.setblocking(False)
         self._lock = threading.Lock()
         self._received = bytearray()
+        self._buffer = memoryview(bytearray(_CHUNK))
         # verdicts that `send` took in while it waited leave the socket unreadable: the epoll shows both
         self._kept = Wakeup()
         self._epoll = select.epoll()
@@ -292,14 +295,14 @@ class CaptureFeed:
 
     def _receive(self) -> None:
         try:
-            data = self._socket.recv(_CHUNK)
+            size = self._socket.recv_into(self._buffer)
         except BlockingIOError:
             return
         except OSError as error:
             raise CaptureError(f"the switch closed its capture port: {error.strerror}") from error
-        if not data:
+        if not size:
             raise CaptureError("the switch closed its capture port")
-        self._received += data
+        self._received += self._buffer[:size]
 
     def verdicts(self) -> bytes:
         """The verdicts that arrived since the last call, without waiting.

@@ -2,7 +2,7 @@
 
 packets thread of a connection   packet-ins → record batch → DUE (blocks while consumers are behind)
 worker thread of a switch        decisions first; commands, requests, state: one after the other
-thread of a reading              asks a busy switch for its counters, for tenths of a second perhaps
+thread of a reading              asks a busy switch for its counters, and names them: tenths of a second perhaps
 DUE's dispatcher                 puts work into the worker's bounded queue
 """
 
@@ -353,18 +353,23 @@ class Agent:
         ).start()
 
     def _read_counters(self, session: Session | None, tables: Sequence[int], began: float) -> None:
-        entries: list[Any] = []
+        found: list[dict[str, Any]] = []
         failed: ControllerError | None = None
         try:
             if session is not None:
                 entries = [entry for table in tables for entry in session.read_counters(table)]
+                found = self._switch.readings(entries)
         except ControllerError as error:
             failed = error
         finally:
-            self._put(partial(self._counted, session, entries, began, failed))
+            self._put(partial(self._counted, session, found, began, failed))
 
     def _counted(
-        self, session: Session | None, entries: Sequence[Any], began: float, failed: ControllerError | None
+        self,
+        session: Session | None,
+        found: list[dict[str, Any]],
+        began: float,
+        failed: ControllerError | None,
     ) -> None:
         self._counted_second = self._outbound.second
         self._counted_at = time.monotonic()
@@ -374,7 +379,7 @@ class Agent:
         if failed is not None:
             raise failed
         if session is not None and session is self._session:
-            self._readings.take(self._switch.readings(entries))
+            self._readings.take(found)
             self._write_state()
 
     def _confirm(self, confirmations: Iterable[Confirmation]) -> None:

@@ -60,7 +60,7 @@ def _canonicalise(match: Any) -> None:
     condition = getattr(match, match.WhichOneof("field_match_type"))
     for name in ("value", "mask", "low", "high"):
         data = getattr(condition, name, None)
-        if data:
+        if data and not data[0] and len(data) > 1:
             setattr(condition, name, values.canonical(values.number(data)))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 from apps.messages import Decision, TableCommand, TableUpdate, Target
@@ -43,7 +44,7 @@ class Order:
         """The change that stands for the order in confirmations."""
         return self.changes[0] if self.changes[0].kind == DELETE else self.changes[-1]
 
-    @property
+    @cached_property
     def keys(self) -> set[bytes]:
         return {entry_key(change.entry) for change in self.changes}
 

@@ -121,7 +121,7 @@ class Switch:
         self._clock = clock
         self._classifier = Classifier(program)
         self._book = OrderBook(program, guard or GuardSettings(), self._classifier.table_ids)
-        self._block_tables = {program.table(each).id for each in BLOCK_TABLES}
+        self._blocks = {program.table(each).id: 0 for each in BLOCK_TABLES}
         self._forward = wires_of(program, forward or {})
         self._desired = EntrySet(self._forward)
         self.stations = Stations(program, learn) if learn is not None else None
@@ -135,8 +135,6 @@ class Switch:
         self._unconfirmed: dict[bytes, Order] = {}
         self._telemetry = EntrySet()
         self._secrets = (0, (0,) * len(SECRET_WORDS))
-        self.blocks = 0
-        """Entries that drop traffic."""
 
     @property
     def guards(self) -> bool:
@@ -264,12 +262,20 @@ class Switch:
         return answers
 
     @property
+    def blocks(self) -> int:
+        """Entries that drop traffic."""
+        return sum(self._blocks.values())
+
+    @property
     def counted_tables(self) -> list[int]:
         """Tables with entries that drop traffic."""
-        return sorted({table_id(entry) for entry in self._desired} & self._block_tables)
+        return sorted(table for table, blocks in self._blocks.items() if blocks)
 
     def readings(self, entries: Iterable[Any]) -> list[dict[str, Any]]:
-        """What `read_counters` told of these tables, with the decisions that the entries come from."""
+        """What `read_counters` told of these tables, with the decisions that the entries come from.
+
+        The only method that another thread may call meanwhile: with many entries it takes its time.
+        """
         found = []
         for entry in entries:
             owner = self._owners.get(entry_key(entry))
@@ -339,14 +345,14 @@ class Switch:
             if change.kind == DELETE:
                 self._forget(change.entry)
                 continue
-            if table_id(change.entry) in self._block_tables and change.entry not in self._desired:
-                self.blocks += 1
+            if table_id(change.entry) in self._blocks and change.entry not in self._desired:
+                self._blocks[table_id(change.entry)] += 1
             self._desired.put(change.entry)
             self._owners[entry_key(change.entry)] = order.owner
 
     def _forget(self, entry: Any) -> None:
-        if self._desired.discard(entry) and table_id(entry) in self._block_tables:
-            self.blocks -= 1
+        if self._desired.discard(entry) and table_id(entry) in self._blocks:
+            self._blocks[table_id(entry)] -= 1
         self._owners.pop(entry_key(entry), None)
 
     def _carry_out(self, orders: Sequence[Order], transport: Transport | None) -> list[Confirmation]:
