@@ -57,6 +57,8 @@ class Device:
         self.counts: Counter[str] = Counter()
         self.on_room: Callable[[], None] = _nothing
         self.on_packet_out: Callable[[bytes], None] = _nothing_with
+        self.crowded: Callable[[], bool] = _never
+        """Whether a packet-out would have to wait for others."""
         self._cpu_port, self._backend, self._capacity, self._clock = cpu_port, backend, queue, clock
         self._ports = None if ports is None else tuple(ports)
         self._saved: Pipeline | None = None
@@ -280,3 +282,7 @@ def _nothing() -> None:
 
 def _nothing_with(_: bytes) -> None:
     return
+
+
+def _never() -> bool:
+    return False

@@ -1,22 +1,36 @@
-"""The P4Runtime service of the embedded switch: gRPC in front of a Device."""
+"""The P4Runtime service of the embedded switch: gRPC in front of a Device.
 
+    packet loop ──► Stream ──► event loop (a thread of its own) ◄──► gRPC
+                                   │  ▲
+                       small calls │  │ whatever may take long: a big Write, Read, a pipeline
+                                   ▼  │
+                                  Device
+
+One thread sends and receives everything: with a thread for each call every packet-in would wake three.
+"""
+
+import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import grpc
+import grpc.aio
+import uvloop
 
 from dataplane import messages, status
-from dataplane.device import MAX_STREAMS, Device
+from dataplane.device import Device
 from dataplane.errors import DataplaneError
 from dataplane.status import Refused
 from dataplane.streams import Stream
 from p4rt import add_p4runtime_servicer, p4runtime
 
 API_VERSION = "1.4.0"
-_UNARY_WORKERS = 8
+_WORKERS = 8
+_SMALL_WRITE = 16
+"""Updates; more of them would keep packet-ins waiting for a millisecond and longer."""
 _DETAILS = "grpc-status-details-bin"
 _OPTIONS = (
     ("grpc.max_receive_message_length", 256 << 20),
@@ -36,89 +50,96 @@ _OPTIONS = (
     ("grpc.http2.max_ping_strikes", 0),
 )
 
+_T = TypeVar("_T")
+_Context = Any  # grpc.aio.ServicerContext, generic in request and response, which we serialize ourselves
+
 
 class ServerError(DataplaneError):
     """The server cannot listen where it was told to."""
 
 
 class Servicer:
-    """The six calls of P4Runtime, for one device."""
+    """The six calls of P4Runtime, for one device.
 
-    def __init__(self, device: Device) -> None:
+    pool: for what may take long
+    """
+
+    def __init__(self, device: Device, pool: ThreadPoolExecutor) -> None:
         self._device = device
+        self._pool = pool
 
-    def Write(self, request: Any, context: grpc.ServicerContext) -> Any:  # noqa: N802
+    async def Write(self, request: Any, context: _Context) -> Any:  # noqa: N802
+        run = self._at_once if len(request.updates) <= _SMALL_WRITE else self._aside
         try:
-            results = self._device.write(request)
+            results = await run(self._device.write, request)
         except Refused as error:
-            context.abort(status.grpc_code(error), str(error))
+            await context.abort(status.grpc_code(error), str(error))
         if results:
-            _abort_batch(context, results, "Write")
+            await _abort_batch(context, results, "Write")
         return p4runtime.WriteResponse()
 
-    def Read(self, request: Any, context: grpc.ServicerContext) -> Iterator[Any]:  # noqa: N802
+    async def Read(self, request: Any, context: _Context) -> AsyncIterator[Any]:  # noqa: N802
         try:
-            responses, results = self._device.read(request)
+            responses, results = await self._aside(self._device.read, request)
         except Refused as error:
-            context.abort(status.grpc_code(error), str(error))
-        yield from responses
+            await context.abort(status.grpc_code(error), str(error))
+        for response in responses:
+            yield response
         if results:
-            _abort_batch(context, results, "Read")
+            await _abort_batch(context, results, "Read")
 
-    def SetForwardingPipelineConfig(self, request: Any, context: grpc.ServicerContext) -> Any:  # noqa: N802
+    async def SetForwardingPipelineConfig(self, request: Any, context: _Context) -> Any:  # noqa: N802
         try:
-            self._device.set_pipeline(request)
+            await self._aside(self._device.set_pipeline, request)
         except Refused as error:
-            context.abort(status.grpc_code(error), str(error))
+            await context.abort(status.grpc_code(error), str(error))
         return p4runtime.SetForwardingPipelineConfigResponse()
 
-    def GetForwardingPipelineConfig(self, request: Any, context: grpc.ServicerContext) -> Any:  # noqa: N802
+    async def GetForwardingPipelineConfig(self, request: Any, context: _Context) -> Any:  # noqa: N802
         try:
-            return self._device.get_pipeline(request)
+            return await self._aside(self._device.get_pipeline, request)
         except Refused as error:
-            context.abort(status.grpc_code(error), str(error))
+            await context.abort(status.grpc_code(error), str(error))
 
-    def Capabilities(self, request: Any, context: grpc.ServicerContext) -> Any:  # noqa: N802, ARG002
+    async def Capabilities(self, request: Any, context: _Context) -> Any:  # noqa: N802, ARG002
         return p4runtime.CapabilitiesResponse(p4runtime_api_version=API_VERSION)
 
-    def StreamChannel(self, request_iterator: Any, context: grpc.ServicerContext) -> Iterator[bytes]:  # noqa: N802
+    async def StreamChannel(self, requests: AsyncIterator[Any], context: _Context) -> None:  # noqa: N802
         try:
-            stream = self._device.open_stream()
+            stream = await self._at_once(self._device.open_stream)
         except Refused as error:
-            context.abort(status.grpc_code(error), str(error))
+            await context.abort(status.grpc_code(error), str(error))
+        listener = asyncio.create_task(self._listen(stream, requests))
         try:
-            if not context.add_callback(stream.end):
-                return
-            reader = threading.Thread(target=self._listen, args=(stream, request_iterator), daemon=True)
-            reader.start()
-            yield from stream.messages()
+            await stream.send(context.write)
         finally:
-            self._device.close_stream(stream)
+            listener.cancel()
+            await self._at_once(self._device.close_stream, stream)
         if stream.error is not None:
-            context.abort(status.grpc_code(stream.error), str(stream.error))
+            await context.abort(status.grpc_code(stream.error), str(stream.error))
 
-    def _listen(self, stream: Stream, requests: Any) -> None:
+    async def _listen(self, stream: Stream, requests: AsyncIterator[Any]) -> None:
         """Take in what a controller sends, until it stops or breaks the rules of arbitration."""
         try:
-            for request in requests:
-                self._take(stream, request)
+            async for request in requests:
+                await self._take(stream, request)
         except Refused as error:
             stream.end(error)
-        except grpc.RpcError:
-            stream.end()
-        else:
+        finally:
             stream.end()
 
-    def _take(self, stream: Stream, request: Any) -> None:
+    async def _take(self, stream: Stream, request: Any) -> None:
         kind = request.WhichOneof("update")
         if kind == "arbitration":
-            self._device.arbitrate(stream, request.arbitration)
+            await self._at_once(self._device.arbitrate, stream, request.arbitration)
             return
         try:
             if kind == "packet":
-                self._device.packet_out(stream, request.packet)
+                # where they are crowded the controller is not read on, and only that one waits
+                send = self._aside if self._device.crowded() else _here
+                await send(self._device.packet_out, stream, request.packet)
             elif kind == "digest_ack":
-                self._device.acknowledge(stream, request.digest_ack)
+                await self._at_once(self._device.acknowledge, stream, request.digest_ack)
             else:
                 raise status.InvalidArgument(
                     f"stream message {kind or 'without content'}: this target takes none"
@@ -126,12 +147,28 @@ class Servicer:
         except Refused as error:
             stream.post(messages.stream_error(error, request))
 
+    async def _at_once(self, call: Callable[..., _T], *arguments: Any) -> _T:
+        """In this thread, unless the device is busy with something that takes long."""
+        if not self._device.control.acquire(blocking=False):
+            return await self._aside(call, *arguments)
+        try:
+            return call(*arguments)
+        finally:
+            self._device.control.release()
 
-def _abort_batch(context: grpc.ServicerContext, results: list[Refused | None], what: str) -> None:
+    async def _aside(self, call: Callable[..., _T], *arguments: Any) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self._pool, call, *arguments)
+
+
+async def _here(call: Callable[..., _T], *arguments: Any) -> _T:
+    return call(*arguments)
+
+
+async def _abort_batch(context: _Context, results: list[Refused | None], what: str) -> None:
     packed = status.details(results, what)
     context.set_trailing_metadata(((_DETAILS, packed),))
     failed = [str(error) for error in results if error is not None]
-    context.abort(
+    await context.abort(
         grpc.StatusCode.UNKNOWN, f"{what}: {len(failed)} of {len(results)} failed, first: {failed[0]}"
     )
 
@@ -149,31 +186,49 @@ class P4RuntimeServer:
         self, device: Device, address: str, credentials: grpc.ServerCredentials | None = None
     ) -> None:
         _check(address)
-        self._pool = ThreadPoolExecutor(MAX_STREAMS + _UNARY_WORKERS, thread_name_prefix="p4runtime")
-        self._server = grpc.server(self._pool, options=_OPTIONS)
-        servicer = Servicer(device)
-        # asked first: the stream's responses are protobuf bytes already
-        self._server.add_generic_rpc_handlers((_stream_handler(servicer),))
-        add_p4runtime_servicer(servicer, self._server)
-        try:
-            if credentials is None:
-                port = self._server.add_insecure_port(address)
-            else:
-                port = self._server.add_secure_port(address, credentials)
-        except RuntimeError as error:
-            raise ServerError(
-                f"cannot listen on {address}: {error}; choose another address or port"
-            ) from error
+        self._pool = ThreadPoolExecutor(_WORKERS, thread_name_prefix="p4runtime")
+        self._server, port = _in_loop(_bound(Servicer(device, self._pool), address, credentials))
         self.address = f"{address.rpartition(':')[0]}:{port}"
 
     def start(self) -> None:
         """Begin to serve."""
-        self._server.start()
+        _in_loop(self._server.start())
 
     def stop(self, grace: float = 0.5) -> None:
         """End all calls, at the latest after `grace` seconds."""
-        self._server.stop(grace).wait()
+        _in_loop(self._server.stop(grace))
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+async def _bound(
+    servicer: Servicer, address: str, credentials: grpc.ServerCredentials | None
+) -> tuple[grpc.aio.Server, int]:
+    server = grpc.aio.server(options=_OPTIONS)
+    # asked first: the stream's responses are protobuf bytes already
+    server.add_generic_rpc_handlers((_stream_handler(servicer),))
+    add_p4runtime_servicer(servicer, server)
+    try:
+        if credentials is None:
+            port = server.add_insecure_port(address)
+        else:
+            port = server.add_secure_port(address, credentials)
+    except RuntimeError as error:
+        raise ServerError(f"cannot listen on {address}: {error}; choose another address or port") from error
+    return server, port
+
+
+_loop: asyncio.AbstractEventLoop | None = None
+_starting = threading.Lock()
+
+
+def _in_loop(work: Coroutine[Any, Any, _T]) -> _T:
+    """Run in the event loop of this process: gRPC serves several servers from one, and not from several."""
+    global _loop  # one for the process, as gRPC has one poller
+    with _starting:
+        if _loop is None:
+            _loop = uvloop.new_event_loop()
+            threading.Thread(target=_loop.run_forever, name="p4runtime", daemon=True).start()
+    return asyncio.run_coroutine_threadsafe(work, _loop).result()
 
 
 def _check(address: str) -> None:

@@ -71,6 +71,7 @@ class PacketLoop:
         self._thread = threading.Thread(target=self._run, name="packets", daemon=True)
         device.on_room = self._wakeup.set
         device.on_packet_out = self._put_packet_out
+        device.crowded = self._crowded
 
     def start(self) -> None:
         """Begin to process packets."""
@@ -86,6 +87,9 @@ class PacketLoop:
         for port in self._ports.values():
             port.close()
         self._wakeup.close()
+
+    def _crowded(self) -> bool:
+        return len(self._packet_outs) >= _PACKET_OUTS
 
     def _put_packet_out(self, payload: bytes) -> None:
         with self._space:

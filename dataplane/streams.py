@@ -1,16 +1,20 @@
 """What waits to be sent to controllers: one Stream per StreamChannel, one PacketQueue per role.
 
     packet loop ── put ──► PacketQueue of the role ─┐
-                                                    ├─ Stream.messages() ──► gRPC
+                                                    ├─ Stream.send() ──► gRPC
     arbitration, errors ── post ──► Stream ─────────┘
 
 A queue belongs to its role, not to a stream: what a primary had not been sent when it left goes to the
-next one.  Messages are protobuf bytes, ready to send.
+next one.  Messages are protobuf bytes, ready to send.  `put`, `post`, `end` and `wake` are for any thread,
+`send` for an event loop.
 """
 
+import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from typing import Any
 
 from dataplane.status import Refused
 
@@ -18,6 +22,8 @@ _TAKE = 64
 _UNIT = 2048
 _BEYOND = 4
 _MAX_CONTROL = 4096
+
+Write = Callable[[bytes], Awaitable[Any]]
 
 
 class PacketQueue:
@@ -108,7 +114,8 @@ class Stream:
         self.error: Refused | None = None
         self.dropped = 0
         self._control: deque[bytes] = deque()
-        self._changed = threading.Condition()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ready = asyncio.Event()
         self._sleeping = False
         self._ended = False
 
@@ -128,36 +135,38 @@ class Stream:
         self.wake()
 
     def wake(self) -> None:
-        """Something may be there to send."""
-        if self._sleeping:
-            with self._changed:
-                self._changed.notify()
+        """Something may be there to send; from any thread."""
+        if self._sleeping and self._loop is not None:
+            self._sleeping = False
+            with suppress(RuntimeError):  # the event loop has ended meanwhile
+                self._loop.call_soon_threadsafe(self._ready.set)
 
-    def messages(self) -> Iterator[bytes]:
-        """Everything to be sent, until the stream ends; runs in the stream's own thread."""
+    async def send(self, write: Write) -> None:
+        """Everything to be sent, one message after the other, until the stream ends."""
+        self._loop = asyncio.get_running_loop()
         while True:
-            queue, batch = self._next()
+            queue, batch = await self._next()
             if not batch:
                 return
             position = 0
             try:
                 for message in batch:
                     position += 1
-                    yield message
+                    await write(message)
             finally:
                 if queue is not None and position < len(batch):
                     queue.give_back(batch[position:])
 
-    def _next(self) -> tuple[PacketQueue | None, list[bytes]]:
-        with self._changed:
-            while True:
-                # set before looking: whoever adds something later sees it and wakes us
-                self._sleeping = True
-                found = self._look()
-                if found is not None:
-                    self._sleeping = False
-                    return found
-                self._changed.wait()
+    async def _next(self) -> tuple[PacketQueue | None, list[bytes]]:
+        while True:
+            # set before looking: whoever adds something later sees it and wakes us
+            self._sleeping = True
+            found = self._look()
+            if found is not None:
+                self._sleeping = False
+                return found
+            await self._ready.wait()
+            self._ready.clear()
 
     def _look(self) -> tuple[PacketQueue | None, list[bytes]] | None:
         if self._control:

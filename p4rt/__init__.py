@@ -12,6 +12,7 @@ descriptors out of the wheel's source text, without running it, and registers th
 Nothing here is ours but the registering; both ends import it, as both would import generated code.
 """
 
+from p4rt import polling as polling  # isort: skip  # before anything loads gRPC
 from p4rt.messages import p4data, p4info, p4runtime, p4types, status
 from p4rt.service import P4RuntimeStub, add_p4runtime_servicer
 

@@ -3,6 +3,7 @@
 from typing import Any, Protocol
 
 import grpc
+import grpc.aio
 
 from p4rt.messages import p4runtime
 
@@ -51,7 +52,7 @@ class P4RuntimeServicer(Protocol):
     def StreamChannel(self, request_iterator: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
 
 
-def add_p4runtime_servicer(servicer: P4RuntimeServicer, server: grpc.Server) -> None:
+def add_p4runtime_servicer(servicer: P4RuntimeServicer, server: grpc.Server | grpc.aio.Server) -> None:
     """Register `servicer` for the P4Runtime service of `server`."""
     handlers = {
         name: grpc.unary_unary_rpc_method_handler(
