@@ -1,0 +1,77 @@
+"""The server's one thread waits for nobody: neither for a busy device nor for packet-outs that are crowded."""
+
+import threading
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from p4rt import p4runtime
+from tests.dataplane.controller import TIMEOUT_S, Controller, program_config
+from tests.dataplane.embedded import Embedded
+from tests.dataplane.test_device import PROGRAM, frame, number_of, until
+
+
+@pytest.fixture
+def switch():
+    with Embedded() as made:
+        yield made
+
+
+@pytest.fixture
+def controller(switch):
+    with Controller(switch.address) as made:
+        made.arbitrate()
+        made.set_pipeline(program_config(PROGRAM))
+        yield made
+
+
+@contextmanager
+def held(lock):
+    """Another thread is in the middle of something long."""
+    taken, enough = threading.Event(), threading.Event()
+
+    def hold():
+        with lock:
+            taken.set()
+            enough.wait(TIMEOUT_S)
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    taken.wait(TIMEOUT_S)
+    try:
+        yield
+    finally:
+        enough.set()
+        thread.join()
+
+
+def test_packet_ins_go_on_while_another_controller_waits_for_the_device(switch, controller):
+    with Controller(switch.address, election_id=2) as other:
+        with held(switch.device.control):
+            other.ask_for_arbitration()
+            switch.memory[1].inject(*map(frame, range(50)))
+            came = [number_of(controller.packets.get(timeout=TIMEOUT_S)) for _ in range(50)]
+            assert other.arbitrations.empty()
+        assert came == list(range(50))
+        assert other.arbitrations.get(timeout=TIMEOUT_S).status.code == 0
+
+
+def test_other_calls_go_on_while_packet_outs_are_crowded_and_none_of_those_is_lost(switch, controller):
+    most = 10_000
+    with held(switch.device.running):
+        for _ in range(most):
+            controller.packet_out(frame(), {1: b"\x03", 2: b"\x00"})
+        until(switch.device.crowded)
+        time.sleep(0.05)
+        assert len(switch.loop._packet_outs) < most
+        assert controller.stub.Capabilities(p4runtime.CapabilitiesRequest(), timeout=TIMEOUT_S)
+    until(lambda: len(switch.memory[3].outgoing) == most)
+
+
+def test_servers_come_and_go_in_one_process():
+    for _ in range(3):
+        with Embedded() as one, Embedded() as two, Controller(one.address) as first:
+            with Controller(two.address) as second:
+                assert first.arbitrate().status.code == second.arbitrate().status.code == 0
+            first.set_pipeline(program_config(PROGRAM))
