@@ -17,6 +17,7 @@ from p4rt import P4RuntimeStub, p4runtime
 _FIRST_PAUSE: Final = 0.05
 _DEPUTY_WAITS_S: Final = 0.5
 _LONGEST_LINGER_S: Final = 0.01
+_SHARE: Final = 4
 _PRIMARY, _NO_PRIMARY = 0, 5
 
 
@@ -36,7 +37,7 @@ class Connection:
 
     Packet-ins and digests are handed over in lists, each in its order: as soon as the listener is free again and at most
     `linger_s` after the first of them, never more than `batch` at once.  Where the listener needs long for a list
-    the next one lingers twice as long, 10 ms at most: each list costs milliseconds however short it is, and under
+    the next one lingers four times as long, 10 ms at most: each list costs milliseconds however short it is, and under
     a flood many short ones would keep packets from being read.  While the listener is busy at most four batches
     wait; then reading stops and gRPC's flow control holds the switch.
     """
@@ -222,7 +223,7 @@ class Connection:
                 while not self._gathered and not self._closing.is_set():
                     self._changed.wait(timeout=1)
                 if len(self._gathered) < self._batch:
-                    self._changed.wait(timeout=max(self._linger_s, min(2 * spent, _LONGEST_LINGER_S)))
+                    self._changed.wait(timeout=max(self._linger_s, min(_SHARE * spent, _LONGEST_LINGER_S)))
             began = time.monotonic()
             while self._gathered and not self._closing.is_set():
                 # appends go to the same list from the other thread; both slices are atomic
