@@ -21,7 +21,7 @@ import grpc.aio
 import uvloop
 
 from dataplane import messages, status
-from dataplane.device import Device
+from dataplane.device import MAX_STREAMS, Device
 from dataplane.errors import DataplaneError
 from dataplane.status import Refused
 from dataplane.streams import Stream
@@ -29,6 +29,7 @@ from p4rt import add_p4runtime_servicer, p4runtime
 
 API_VERSION = "1.4.0"
 _WORKERS = 8
+_MOST_CALLS = 256
 _SMALL_WRITE = 16
 """Updates; more of them would keep packet-ins waiting for a millisecond and longer."""
 _DETAILS = "grpc-status-details-bin"
@@ -186,7 +187,8 @@ class P4RuntimeServer:
         self, device: Device, address: str, credentials: grpc.ServerCredentials | None = None
     ) -> None:
         _check(address)
-        self._pool = ThreadPoolExecutor(_WORKERS, thread_name_prefix="p4runtime")
+        # each stream may hold one up while packet-outs are crowded
+        self._pool = ThreadPoolExecutor(MAX_STREAMS + _WORKERS, thread_name_prefix="p4runtime")
         self._server, port = _in_loop(_bound(Servicer(device, self._pool), address, credentials))
         self.address = f"{address.rpartition(':')[0]}:{port}"
 
@@ -203,7 +205,7 @@ class P4RuntimeServer:
 async def _bound(
     servicer: Servicer, address: str, credentials: grpc.ServerCredentials | None
 ) -> tuple[grpc.aio.Server, int]:
-    server = grpc.aio.server(options=_OPTIONS)
+    server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=_MOST_CALLS)
     # asked first: the stream's responses are protobuf bytes already
     server.add_generic_rpc_handlers((_stream_handler(servicer),))
     add_p4runtime_servicer(servicer, server)
