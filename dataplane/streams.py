@@ -30,7 +30,7 @@ class PacketQueue:
     """Packet-ins and digest lists of one role, bounded by what `room` says.
 
     capacity: packet-ins; a long digest list counts for as many as it has `_UNIT` bytes
-    on_room: called (from a stream's thread) when a queue that was full has room again
+    on_room: called (where a stream is sent) when a queue that was full has room again
     """
 
     def __init__(self, capacity: int, on_room: Callable[[], None]) -> None:
