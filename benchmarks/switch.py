@@ -3,6 +3,8 @@
 `python -m benchmarks.switch --json FILE`; the figures' meaning stands in the docstrings of switch_*.py.
 """
 
+import p4rt  # noqa: F401  # isort: skip  # before anything loads gRPC: it says how gRPC waits
+
 import sys
 import tempfile
 from pathlib import Path

@@ -5,6 +5,8 @@ it; it also ends when the process that started it does.  It starts without a pip
 pushes one.
 """
 
+import p4rt  # noqa: F401  # isort: skip  # before anything loads gRPC: it says how gRPC waits
+
 import argparse
 import ctypes
 import gc

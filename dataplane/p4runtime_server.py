@@ -136,9 +136,10 @@ class Servicer:
             return
         try:
             if kind == "packet":
-                # where they are crowded the controller is not read on, and only that one waits
-                send = self._aside if self._device.crowded() else _here
-                await send(self._device.packet_out, stream, request.packet)
+                if self._device.crowded():  # this controller is not read on, and only this one waits
+                    await self._aside(self._device.packet_out, stream, request.packet)
+                else:
+                    self._device.packet_out(stream, request.packet)
             elif kind == "digest_ack":
                 await self._at_once(self._device.acknowledge, stream, request.digest_ack)
             else:
@@ -159,10 +160,6 @@ class Servicer:
 
     async def _aside(self, call: Callable[..., _T], *arguments: Any) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._pool, call, *arguments)
-
-
-async def _here(call: Callable[..., _T], *arguments: Any) -> _T:
-    return call(*arguments)
 
 
 async def _abort_batch(context: _Context, results: list[Refused | None], what: str) -> None:

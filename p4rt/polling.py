@@ -1,4 +1,4 @@
-"""How gRPC waits for its sockets; to be said before gRPC is loaded.
+"""How gRPC waits for its sockets; to be said before gRPC is loaded, so programs import p4rt first of all.
 
 gRPC 1.80 gave Python's channels and servers threads of their own for that (its EventEngine).  Whoever waits
 for a message is then woken by a thread that was woken by the socket: a stream of small messages, as

@@ -12,5 +12,3 @@ is the comparison, `p4info` and `values` turn names into P4Runtime's numbers, `b
 overlapping conditions.  `service` owns DUE and the threads, `connection` and `session` the sockets;
 everything else is data in, data out.
 """
-
-import p4rt as p4rt  # before anything here loads gRPC: it says how gRPC waits

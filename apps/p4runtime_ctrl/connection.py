@@ -18,6 +18,7 @@ _FIRST_PAUSE: Final = 0.05
 _DEPUTY_WAITS_S: Final = 0.5
 _LONGEST_LINGER_S: Final = 0.01
 _SHARE: Final = 4
+"""A list lingers for so many times what the one before it took."""
 _PRIMARY, _NO_PRIMARY = 0, 5
 
 

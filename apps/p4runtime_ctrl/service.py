@@ -1,5 +1,7 @@
 """The P4Runtime controller: between DUE and one agent per switch."""
 
+import p4rt  # noqa: F401  # isort: skip  # before anything loads gRPC: it says how gRPC waits
+
 import logging
 import sys
 import threading

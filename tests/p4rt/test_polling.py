@@ -34,15 +34,15 @@ def test_a_choice_of_the_user_stays(monkeypatch):
     assert os.environ[polling.VARIABLE] == "-tcp_rcv_lowat"
 
 
-@pytest.mark.parametrize("package", ["p4rt", "dataplane", "apps.p4runtime_ctrl"])
-def test_it_is_said_before_grpc_is_loaded_and_grpc_does_not_complain(package):
+@pytest.mark.parametrize("module", ["p4rt", "dataplane.__main__", "apps.p4runtime_ctrl.service"])
+def test_it_is_said_before_grpc_is_loaded_and_grpc_does_not_complain(module):
     program = (
         "import os, sys\n"
         "class Watch:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         f"        if name == 'grpc': print(os.environ.get({polling.VARIABLE!r}))\n"
         "sys.meta_path.insert(0, Watch())\n"
-        f"import {package}, grpc\n"
+        f"import {module}, grpc\n"
         "grpc.insecure_channel('127.0.0.1:1').close()\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != polling.VARIABLE}
