@@ -1,16 +1,160 @@
-"""What the network apps say to each other: alerts, decisions, commands and confirmations.
+"""The messages between the network apps: alerts, decisions, commands and confirmations.
 
     kitsune ──Alert──► firewall ──Decision──► p4runtime_ctrl ──Confirmation──► firewall, reports
     any app ──TableCommand──► p4runtime_ctrl ──Confirmation──► that app
-    people ──Instruction──► firewall ──Answer──► people
+    operators ──Instruction──► firewall ──Answer──► operators
 
-Every message travels as the value of a DUE item: `to_value()` makes the map, `from_value()` checks
-one that came from the wire.  Times are capture time, integer nanoseconds since the epoch (UTC).
+Every message travels as the value of a DUE item: `to_value()` makes the map, `from_value()` checks one that
+was received.  Times are capture time, integer nanoseconds since the epoch (UTC).
+
+Received values are untrusted: they are decoded before any other code uses them, and decoders raise nothing
+but `MessageError`.  `Intake` counts what is refused.
 """
 
-from typing import Any, Literal, Self
+import ipaddress
+import logging
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import msgspec
+from msgspec import Meta
+
+from due import Item
+
+Cause = Literal["shape", "fields", "size", "range", "sender", "columns", "time"]
+"""Why a message is refused: no map or batch; a wrong field; too large or too deep; a number out of range; written by
+another app than its key says; a wrong column; a time that cannot be."""
+
+LONGEST_BLOCK_S: Final = 30 * 86_400
+"""The longest block that people may ask for."""
+LATEST_NS: Final = 1 << 62
+"""No time of a message is later (the year 2116), so that lengths of time can be added to it."""
+MOST_DEPTH: Final = 12
+MOST_PARTS: Final = 200_000
+"""Values in one message, at all depths."""
+MOST_TEXT: Final = 4 << 20
+"""Characters and bytes in one message."""
+
+Time = Annotated[int, Meta(ge=0, le=LATEST_NS)]
+Number = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+Port = Annotated[int, Meta(ge=0, le=65_535)]
+Name = Annotated[str, Meta(max_length=256, pattern=r"^[^\x00-\x1f\x7f]*\Z")]
+"""An identifier; no control characters, since it is shown and logged."""
+Text = Annotated[str, Meta(max_length=65_536)]
+"""Words for people; `one_line` before it is logged."""
+Words = Annotated[str, Meta(max_length=4_096)]
+"""Shorter, since it becomes a part of other texts."""
+Rate = Annotated[float, Meta(ge=0, le=1e18)]
+
+_MAC: Final = re.compile(r"[0-9a-fA-F]{2}(:[0-9a-fA-F]{2}){5}")
+_ATOMS: Final = (bool, int, float, type(None))
+_SHOWN: Final = 300
+_PAGE: Final = 5_000
+_SAY_EVERY_S: Final = 60.0
+_WRITERS: Final = {"sonata": "sonata_adapter", "firewall_kept": "firewall"}
+"""App segments of keys that are not the name of the app that writes them."""
+
+
+class MessageError(ValueError):
+    """A value is not the message that its key promises.
+
+    Args:
+        cause: the counter under which the refusal is reported.
+        text: what is wrong; shortened to one line.
+    """
+
+    def __init__(self, cause: Cause, text: str) -> None:
+        super().__init__(one_line(text))
+        self.cause: Cause = cause
+
+
+def one_line(text: str) -> str:
+    """Make a text fit for a log.
+
+    Args:
+        text: any text.
+
+    Returns:
+        One line without control characters, of 300 characters at most.
+    """
+    shown = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+    return "".join(char if char.isprintable() else f"\\x{ord(char):02x}" for char in shown)
+
+
+def check_plain(value: object, what: str) -> None:
+    """Refuse a value that holds anything but maps, lists and atoms, or too much of them.
+
+    It does not recurse, because a sender may nest values as deeply as it likes.
+
+    Args:
+        value: a decoded value.
+        what: what it should be, for the error message.
+
+    Raises:
+        MessageError: the value holds other types, is too deep or too large.
+    """
+    waiting: list[tuple[object, int]] = [(value, 0)]
+    parts = text = 0
+    while waiting:
+        part, depth = waiting.pop()
+        kind = type(part)
+        if isinstance(part, str | bytes):
+            text += len(part)
+        elif isinstance(part, dict | list | tuple):
+            parts += len(part)
+            if depth == MOST_DEPTH or parts > MOST_PARTS:
+                raise MessageError(
+                    "size", f"{what}: nested deeper than {MOST_DEPTH} or over {MOST_PARTS:,} values"
+                )
+            if isinstance(part, dict):
+                text += sum(len(name) for name in part if isinstance(name, str))
+            waiting.extend((each, depth + 1) for each in (part.values() if isinstance(part, dict) else part))
+        elif kind not in _ATOMS:
+            raise MessageError("shape", f"{what}: {kind.__name__} is no plain value")
+        if text > MOST_TEXT:
+            raise MessageError("size", f"{what}: over {MOST_TEXT:,} characters")
+
+
+def as_map(value: object, what: str) -> dict[str, Any]:
+    """Check that a value is a map of plain values.
+
+    Args:
+        value: a decoded value.
+        what: what it should be, for the error message.
+
+    Returns:
+        The same map.
+
+    Raises:
+        MessageError: it is no map, or `check_plain` refuses it.
+    """
+    if type(value) is not dict:
+        raise MessageError("shape", f"{what}: a map is expected, not {type(value).__name__}")
+    check_plain(value, what)
+    return value
+
+
+def address_in(text: object, what: str) -> str:
+    """Read an IP address.
+
+    Args:
+        text: IPv4 or IPv6 address as text.
+        what: where it comes from, for the error message.
+
+    Returns:
+        The address in its canonical spelling.
+
+    Raises:
+        MessageError: it is not an IP address.
+    """
+    try:
+        return str(ipaddress.ip_address(text if isinstance(text, str) else ""))
+    except ValueError:
+        raise MessageError("range", f"{what}: {str(text)[:80]!r} is no IP address") from None
+
 
 Role = Literal["host", "gateway", "dns", "dhcp", "multicast"]
 Action = Literal["block", "unblock", "protect", "unprotect"]
@@ -18,148 +162,363 @@ TargetKind = Literal["ip", "mac"]
 State = Literal["installed", "exists", "removed", "expired", "failed"]
 
 
+def writer_of(key: str) -> str:
+    """The app that may write a key `network.<kind>.<app>.…`.
+
+    Args:
+        key: a key, with or without specs.
+
+    Returns:
+        The app id; empty if the key has fewer than three segments.
+    """
+    parts = key.partition(":")[0].split(".")
+    named = parts[2] if len(parts) > 2 else ""
+    return _WRITERS.get(named, named)
+
+
+def sender_of(item: Item) -> str:
+    """The app that wrote an item, which must be the one named in its key: `network.<kind>.<app>.…`.
+
+    Args:
+        item: a received item.
+
+    Returns:
+        The app's id.
+
+    Raises:
+        MessageError: another app wrote the item.
+    """
+    if item.app_id != writer_of(item.key):
+        raise MessageError("sender", f"{item.key}: written by {item.app_id}, which is not the app of the key")
+    return item.app_id
+
+
+_T = TypeVar("_T")
+
+
+class Intake:
+    """Refusals of received messages: counted by cause, and logged once a minute for each kind and cause.
+
+    Args:
+        log: logger for the refusals.
+        clock: monotonic time, seconds.
+    """
+
+    def __init__(self, log: logging.Logger, clock: Callable[[], float] = time.monotonic) -> None:
+        self._log = log
+        self._clock = clock
+        self._causes: Counter[Cause] = Counter()
+        self._said: dict[tuple[str, Cause], float] = {}
+
+    def read(self, kind: str, decode: Callable[[Item], _T], item: Item) -> _T | None:
+        """Decode an item.
+
+        Args:
+            kind: kind of message, to group the log lines.
+            decode: makes the message; may raise `MessageError` and nothing else.
+            item: the received item.
+
+        Returns:
+            The message; None if it was refused.
+        """
+        try:
+            return decode(item)
+        except MessageError as error:
+            self.refuse(kind, error, item.key)
+            return None
+
+    def reading(
+        self, kind: str, decode: Callable[[Item], _T], act: Callable[[Item, _T], None]
+    ) -> Callable[[Item], None]:
+        """Make a callback for an observation.
+
+        Args:
+            kind: kind of message, to group the log lines.
+            decode: makes the message; may raise `MessageError` and nothing else.
+            act: called with each item and its message, unless refused.
+
+        Returns:
+            The callback.
+        """
+
+        def callback(item: Item) -> None:
+            message = self.read(kind, decode, item)
+            if message is not None:
+                act(item, message)
+
+        return callback
+
+    def refuse(self, kind: str, error: MessageError, where: str) -> None:
+        """Count a refusal; log it unless one of this kind and cause was logged within the last minute.
+
+        Args:
+            kind: kind of message.
+            error: why it is refused.
+            where: key under which it arrived.
+        """
+        self._causes[error.cause] += 1
+        now, name = self._clock(), (kind, error.cause)
+        if now - self._said.get(name, now - _SAY_EVERY_S) >= _SAY_EVERY_S:
+            self._said[name] = now
+            text = "refused a message under %s (%s): %s; further ones are only counted"
+            self._log.warning(text, one_line(where), error.cause, error)
+
+    def health(self) -> dict[str, Any]:
+        """Counters of the refusals.
+
+        Returns:
+            `refused_messages`, and `refused_by_cause`: cause to count.
+        """
+        return {"refused_messages": sum(self._causes.values()), "refused_by_cause": dict(self._causes)}
+
+
+Find = Callable[[Mapping[str, Any], int], Sequence[Item]]
+"""Data Archives: a query, and how many of the youngest items that match are wanted; oldest first."""
+
+
+def youngest(find: Find, query: Mapping[str, Any], since: int, most: int) -> list[Item]:
+    """Read the youngest matching items from the archive, page by page.
+
+    Args:
+        find: reads one page from Data Archives.
+        query: query in MongoDB's dialect.
+        since: only items written after this time, ns since the epoch.
+        most: number of items at most.
+
+    Returns:
+        Items, oldest first.
+    """
+    pages: list[list[Item]] = []
+    left, before = most, (1 << 63) - 1
+    while left > 0:
+        asked = min(_PAGE, left)
+        page = list(find({**query, "timestamp": {"$gt": since, "$lt": before}}, asked))
+        if len(page) == asked and page[0].timestamp != page[-1].timestamp:
+            # others of the oldest moment may be left: all of that moment come with the next page
+            before = page[0].timestamp + 1
+            page = [item for item in page if item.timestamp >= before]
+        elif page:
+            before = page[0].timestamp
+        pages.append(page)
+        left -= len(page)
+        if not page or before <= since:
+            break
+    return [item for page in reversed(pages) for item in page]
+
+
 class Message(msgspec.Struct, frozen=True, kw_only=True):
-    """Base of all messages: checked on the way in, plain maps on the way out."""
+    """Base of all messages: checked when received, plain maps when sent."""
 
     def to_value(self) -> dict[str, Any]:
-        """The message as a map of plain values, fit for `due.write`."""
+        """The message as a map of plain values, as `due.write` takes it.
+
+        Returns:
+            Field name to value.
+        """
         value = msgspec.to_builtins(self)
         assert isinstance(value, dict)  # noqa: S101 - a Struct always becomes a map
         return value
 
     @classmethod
     def from_value(cls, value: object) -> Self:
-        """Read a message from a DUE value; raises `msgspec.ValidationError` naming the wrong field."""
-        return msgspec.convert(value, cls)
+        """Read a message from the value of an item.
+
+        Args:
+            value: a decoded value.
+
+        Returns:
+            The checked message.
+
+        Raises:
+            MessageError: the value is no such message; the text names the wrong field.
+        """
+        plain = as_map(value, cls.__name__)
+        try:
+            message = msgspec.convert(plain, cls)
+        except (msgspec.ValidationError, RecursionError, OverflowError) as error:
+            raise MessageError("fields", f"{cls.__name__}: {error}") from None
+        message.check()
+        return message
+
+    def check(self) -> None:
+        """Check what the types of the fields do not express; the base class checks nothing.
+
+        Raises:
+            MessageError: a field has an impossible value.
+        """
 
 
 class Sender(Message, frozen=True, kw_only=True):
     """Who sent a frame, as the switch saw it."""
 
-    switch: str
-    port: int
-    mac: str
+    switch: Name
+    port: Port
+    mac: Name
     """Lower case, colons."""
-    ip: str = ""
+    ip: Name = ""
     """IPv4 dotted or IPv6 compressed; empty for frames without an address."""
+
+    def check(self) -> None:
+        """Check the MAC address and, unless empty, the IP address.
+
+        Raises:
+            MessageError: one of them is not an address.
+        """
+        if not _MAC.fullmatch(self.mac):
+            raise MessageError("range", f"sender: {self.mac[:80]!r} is no MAC address")
+        if self.ip:
+            address_in(self.ip, "sender")
 
 
 class Alert(Message, frozen=True, kw_only=True):
-    """A sender was anomalous for one more second of capture time (a 'hot' second)."""
+    """A sender had one more anomalous second."""
 
-    id: str
+    id: Name
     sender: Sender
-    event_time: int
-    """End of the hot second."""
-    first_packet: int
-    """Arrival number at the switch of the first packet over the line in this second."""
-    packets: int
+    event_time: Time
+    """End of the anomalous second."""
+    first_packet: Number
+    """Arrival number at the switch of the first packet above the threshold in this second."""
+    packets: Number
     """Packets charged to the sender in this second."""
-    over: int
-    """How many of them scored over the line."""
+    over: Number
+    """How many of them scored above the threshold."""
     peak_score: float
-    hot_seconds: int
-    """Hot seconds among the last ten, this one included."""
-    rate: float
+    anomalous_seconds: Number
+    """Anomalous seconds among the last ten, this one included."""
+    rate: Rate
     """Packets a second charged to the sender in this second."""
-    training_rate: float
+    training_rate: Rate
     """The highest rate of any second of training; 0 for a sender never seen in training."""
-    mac_addresses: int
+    mac_addresses: Number
     """How many IP addresses were seen behind the sender's MAC."""
     role: Role = "host"
     """Gateways, DNS, DHCP and multicast speakers alert but are not blocked unless configured."""
-    reason: str
+    reason: Words
+
+    def check(self) -> None:
+        """Check the sender.
+
+        Raises:
+            MessageError: an address is invalid.
+        """
+        self.sender.check()
 
 
 class Target(Message, frozen=True, kw_only=True):
     """What a block matches: an address, or a MAC on a port of the switch."""
 
     kind: TargetKind
-    address: str
-    port: int | None = None
+    address: Name
+    port: Port | None = None
+
+    def check(self) -> None:
+        """Check that the address fits `kind`: an IP address or prefix, or a MAC address.
+
+        Raises:
+            MessageError: it does not.
+        """
+        if self.kind == "mac":
+            if not _MAC.fullmatch(self.address):
+                raise MessageError("range", f"target: {self.address[:80]!r} is no MAC address")
+            return
+        try:
+            ipaddress.ip_network(self.address)
+        except ValueError:
+            raise MessageError("range", f"target: {self.address[:80]!r} is no IP address or prefix") from None
 
 
 class Evidence(Message, frozen=True, kw_only=True):
-    """An archived item that a decision rests on."""
+    """An archived item that supports a decision."""
 
-    key: str
-    timestamp: int
+    key: Annotated[str, Meta(max_length=4096)]
+    timestamp: Number
     """`timestamp` of the item in Data Archives, so that it can be found again."""
-    summary: str
+    summary: Text
 
 
 class Decision(Message, frozen=True, kw_only=True):
     """What the firewall wants the switch to do, and why."""
 
-    id: str
+    id: Name
     action: Action
-    switch: str
+    switch: Name
     target: Target
-    reason: str
-    evidence: tuple[Evidence, ...] = ()
-    event_time: int
-    expires: int
+    reason: Text
+    evidence: Annotated[tuple[Evidence, ...], Meta(max_length=1000)] = ()
+    event_time: Time
+    expires: Time
     """0 = never."""
-    level: int = 0
+    level: Annotated[int, Meta(ge=0, le=1000)] = 0
     """Escalation step: 0 for a first offence."""
     dry_run: bool = False
-    first_packet: int = 0
+    first_packet: Number = 0
     """Arrival number of the packet that tipped the scales."""
+
+    def check(self) -> None:
+        """Check the target.
+
+        Raises:
+            MessageError: its address is invalid.
+        """
+        self.target.check()
 
 
 class Confirmation(Message, frozen=True, kw_only=True):
-    """What became of a decision or command in the switch."""
+    """The outcome of a decision or command at the switch."""
 
-    id: str
+    id: Name
     """The id of the decision or command."""
-    switch: str
+    switch: Name
     state: State
-    action: str
+    action: Name
     target: Target | None = None
-    handle: str = ""
+    handle: Text = ""
     """The entry as the switch knows it: table and match, e.g. `ingress.block_mac[port=1,mac=..]`."""
-    cause: str = ""
-    event_time: int
-    arrival: int = 0
+    cause: Text = ""
+    event_time: Time
+    arrival: Number = 0
     """Arrival number of the newest packet that the controller had seen when the switch answered."""
 
 
 class Instruction(Message, frozen=True, kw_only=True):
-    """`network.instruction.<app>.firewall`: what a person wants of the firewall."""
+    """`network.instruction.<app>.firewall`: what an operator asks of the firewall."""
 
-    id: str
+    id: Name
     verb: Literal["block", "unblock", "allow", "disallow", "panic"]
-    subject: str = ""
+    subject: Name = ""
     """An address or MAC to block; a decision's id or an address to unblock; an allow-list entry."""
-    reason: str = ""
-    seconds: int = 600
+    reason: Words = ""
+    seconds: Annotated[int, Meta(ge=1, le=LONGEST_BLOCK_S)] = 600
     """Length of a block."""
+    expires: int = 0
+    """Wall time, ns since the epoch, after which it must not be carried out any more; 0 = never."""
 
 
 class Answer(Message, frozen=True, kw_only=True):
-    """`network.answer.firewall.<app>`: what became of an instruction."""
+    """`network.answer.firewall.<app>`: the outcome of an instruction."""
 
-    id: str
+    id: Name
     """The instruction's."""
     done: bool
-    text: str
+    text: Text
 
 
 class TableUpdate(Message, frozen=True, kw_only=True):
     """One table update by name; checked by the controller against p4info."""
 
     kind: Literal["insert", "modify", "delete"]
-    table: str
-    match: dict[str, Any] = {}
+    table: Name
+    match: Annotated[dict[str, Any], Meta(max_length=64)] = {}
     """Field name to value: int, str address, `[value, mask]`, `[value, prefix length]` or `[low, high]`."""
-    action: str = ""
-    params: dict[str, Any] = {}
-    priority: int = 0
-    idle_timeout_ns: int = 0
+    action: Name = ""
+    params: Annotated[dict[str, Any], Meta(max_length=64)] = {}
+    priority: Annotated[int, Meta(ge=0, le=(1 << 31) - 1)] = 0
+    idle_timeout_ns: Time = 0
 
 
 class TableCommand(Message, frozen=True, kw_only=True):
     """`network.p4_command.<app>.<switch>`: any table update, confirmed under the same id."""
 
-    id: str
-    updates: tuple[TableUpdate, ...]
+    id: Name
+    updates: Annotated[tuple[TableUpdate, ...], Meta(max_length=20_000)]

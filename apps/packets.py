@@ -1,4 +1,4 @@
-"""The packet record: one row per frame, in columns, as packet headers travel on DUE.
+"""The packet record: packet headers as columns of a record batch, one row per frame.
 
 A `RecordBatch` with the columns of `PACKET_COLUMNS` is the value of every item under
 `network.packets.p4runtime_ctrl.<switch>.<port>`.  Field semantics are those of tshark with
@@ -6,12 +6,13 @@ A `RecordBatch` with the columns of `PACKET_COLUMNS` is the value of every item 
 addresses.  Absent is -1 for signed columns and 0 where the text says so.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from apps.messages import LATEST_NS, MessageError
 from due import RecordBatch
 
 PACKET_COLUMNS: Final[dict[str, str]] = {
@@ -57,6 +58,19 @@ PACKET_COLUMNS: Final[dict[str, str]] = {
 }
 """Column name to numpy dtype. All columns of a batch have the same length."""
 
+MOST_ROWS: Final = 1 << 20
+"""Most rows in one received batch."""
+_LATEST_US: Final = LATEST_NS // 1000
+_PORTS: Final = (-1, 65_535)
+_BOUNDS: Final[dict[str, tuple[int, int]]] = {
+    "time_us": (0, _LATEST_US),
+    **dict.fromkeys(("eth_src", "eth_dst", "arp_src_mac", "arp_dst_mac"), (0, (1 << 48) - 1)),
+    **dict.fromkeys(("tcp_sport", "tcp_dport", "udp_sport", "udp_dport"), _PORTS),
+    **dict.fromkeys(("arp_op", "vlan", "icmp_type", "icmp_code", "icmp6_type", "icmp6_code"), _PORTS),
+    "ip_proto": (-1, 255),
+}
+"""Smallest and largest value of columns whose type allows more."""
+
 _VLAN_TAGS: Final = np.array([0x8100, 0x88A8, 0x9100], np.uint16)
 _EXTENSIONS: Final = np.array([0, 43, 44, 51, 60], np.uint8)
 _MAX_VLAN_TAGS: Final = 2
@@ -68,6 +82,112 @@ _ICMP6_ERRORS: Final = np.array([1, 2, 3, 4], np.int32)
 
 _Array = npt.NDArray[Any]
 _Numbers = Sequence[int] | npt.NDArray[Any]
+
+
+def read_columns(value: object, kinds: Mapping[str, str], what: str) -> RecordBatch:
+    """Check a received record batch: columns of these names and types, within the bounds of packet columns.
+
+    Columns of other types are converted if every value fits; columns not in `kinds` are left out.
+    Raises `MessageError`.
+    """
+    if not isinstance(value, RecordBatch):
+        raise MessageError("shape", f"{what}: a record batch is expected, not {type(value).__name__}")
+    if len(value) > MOST_ROWS:
+        raise MessageError("size", f"{what}: {len(value):,} rows; {MOST_ROWS:,} at most")
+    missing = [name for name in kinds if name not in value]
+    if missing:
+        raise MessageError("columns", f"{what}: no column {', '.join(missing)}")
+    columns = {name: as_column(value[name], kind, f"{what}: {name}") for name, kind in kinds.items()}
+    if len(value):
+        _check_bounds(columns, what)
+    return RecordBatch(columns)
+
+
+def as_column(column: object, kind: str, what: str) -> _Array:
+    """A one-dimensional array of numbers as this type; raises `MessageError`."""
+    dtype = np.dtype(kind)
+    if not isinstance(column, np.ndarray) or column.ndim != 1 or column.dtype.kind not in "iu":
+        found = (
+            f"{column.dtype} of {column.ndim}" if isinstance(column, np.ndarray) else type(column).__name__
+        )
+        raise MessageError("columns", f"{what}: a row of whole numbers is expected, not {found} dimensions")
+    if column.dtype == dtype:
+        return column
+    limits = np.iinfo(dtype)
+    if len(column) and not limits.min <= int(column.min()) <= int(column.max()) <= limits.max:
+        raise MessageError("range", f"{what}: a value does not fit into {dtype}")
+    return column.astype(dtype)
+
+
+def _check_bounds(columns: Mapping[str, _Array], what: str) -> None:
+    for name, column in columns.items():
+        low, high = _BOUNDS.get(name, (0, 0))
+        if high and not low <= int(column.min()) <= int(column.max()) <= high:
+            raise MessageError("range", f"{what}: {name} is not within {low} to {high}")
+    if "ip_version" not in columns:
+        return
+    for name in ("ip_src_lo", "ip_dst_lo"):
+        if name in columns and (columns[name][columns["ip_version"] == 4] >> np.uint64(32)).any():
+            raise MessageError("range", f"{what}: {name} is over 32 bits where ip_version is 4")
+
+
+class SteadyTime:
+    """Capture time that is robust against single wrong time stamps.
+
+    A time further than `most` from the newest accepted one is rejected until a few in a row agree: a long
+    silence and a clock change look like that, a forged or damaged packet does not.
+
+    Args:
+        most: the largest step that is accepted at once, in units of the times.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.now: int | None = None
+        """The newest accepted time."""
+        self.doubted = 0
+        """Number of rejected times."""
+        self._most = most
+        self._doubt: int | None = None
+        self._agreed = 0
+
+    def hear(self, time: int) -> bool:
+        """Whether this time is accepted; it may be older than others."""
+        now = self.now
+        if now is None or -self._most <= time - now <= self._most:
+            self.now = time if now is None else max(now, time)
+            self._agreed = 0
+            return True
+        agrees = self._agreed and self._doubt is not None and abs(time - self._doubt) <= self._most
+        self._doubt, self._agreed = time, self._agreed + 1 if agrees else 1
+        if self._agreed >= (_AGREE_AHEAD if time > now else _AGREE_BEHIND):
+            self.now, self._agreed = time, 0
+            return True
+        self.doubted += 1
+        return False
+
+    def fit(self, time: int) -> int:
+        """This time, or the newest accepted one if it is too far ahead of that; past times stay unchanged."""
+        if self.now is not None and time < self.now - self._most:
+            return time
+        return time if self.hear(time) or self.now is None else self.now
+
+    def believed(self, times: _Array) -> npt.NDArray[np.bool_] | None:
+        """Mask of the accepted times, in order; None: all of them."""
+        if not len(times):
+            return None
+        low, high, now = int(times.min()), int(times.max()), self.now
+        if high - low <= self._most and (
+            now is None or (now - self._most <= low and high <= now + self._most)
+        ):
+            self.now, self._agreed = high if now is None else max(now, high), 0
+            return None
+        found = np.fromiter((self.hear(time) for time in times.tolist()), np.bool_, len(times))
+        return None if found.all() else found
+
+
+_AGREE_AHEAD: Final = 5
+_AGREE_BEHIND: Final = 20
+"""More than for times ahead: late packets are common, and several switches may disagree."""
 
 
 def read_frames(
@@ -82,8 +202,8 @@ def read_frames(
     """Ethernet frames (whole, cut or zero-padded) as a record batch with all `PACKET_COLUMNS`.
 
     `lengths` are bytes on the wire, `times_us` absolute capture time in microseconds; the five
-    number columns have one entry per frame (a `ValueError` names one that has not).  No frame is
-    refused: what is missing or malformed is absent in its row.
+    number columns have one entry per frame (otherwise a `ValueError` names the column).  No frame is
+    refused: missing or malformed headers are absent in its row.
 
     Differences from tshark: ports of a fragmented datagram stand in its first fragment (tshark
     reassembles and shows them in the last); the inside of tunnels (IP in IP, GRE, VXLAN, PPPoE,

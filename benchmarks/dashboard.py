@@ -28,7 +28,7 @@ import numpy as np
 from apps.messages import Alert, Sender
 from due import PRODUCER, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
-from sdnator.process import Child
+from sdnator.supervisor import Child
 
 SCORE, ALERT = "network.anomaly.kitsune.score", "network.anomaly.kitsune.alert"
 _PACKETS = 16
@@ -120,7 +120,7 @@ def _alert(number: int) -> Alert:
     sender = Sender(switch="s1", port=1, mac="02:00:00:00:00:01", ip=f"192.0.2.{number % 250}")
     return Alert(
         id=str(number), sender=sender, event_time=time.time_ns(), first_packet=number, packets=100, over=60,
-        peak_score=9.0, hot_seconds=3, rate=100.0, training_rate=5.0, mac_addresses=1,
+        peak_score=9.0, anomalous_seconds=3, rate=100.0, training_rate=5.0, mac_addresses=1,
         reason=f"60 of 100 packets of {sender.ip} scored over 1.0",
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from benchmarks.faults_programs import KEY
-from benchmarks.faults_stage import ArchiveServer, Line, Program, Stage, until
+from benchmarks.faults_stage import ArchiveServer, ChildProgram, FaultStage, Line, until
 from due import DB_ONLY, Engine, Options
 
 Figures = dict[str, float | int | bool]
@@ -23,7 +23,7 @@ AWAY_S = float(os.environ.get("FAULTS_AWAY_S", "20"))
 
 def redis_killed(folder: Path) -> Figures:
     """kill -9 of Data Updates during a reliable stream of 200,000 messages; started again after 0.3 s."""
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         consumer = _consumer(stage, 0)
         producer = stage.start("produce", "reliable", 0, MESSAGES, 50)
         producer.wait(lambda line: line.get("written", 0) >= MESSAGES // 4)
@@ -43,7 +43,7 @@ def redis_killed(folder: Path) -> Figures:
 def producer_killed(folder: Path) -> Figures:
     """kill -9 of the producer after `flush`, and a new one at once: nothing that was flushed is lost."""
     count = 20_000
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         consumer = _consumer(stage, 50)
         first = stage.start("produce", "reliable", 0, count, 50)
         first.wait(lambda line: "flushed" in line)
@@ -56,7 +56,7 @@ def producer_killed(folder: Path) -> Figures:
 def consumer_killed(folder: Path) -> Figures:
     """kill -9 of the consumer in the middle; a new one goes on where it stopped."""
     count = 50_000
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         first = _consumer(stage, 100)
         producer = stage.start("produce", "reliable", 0, count, 50)
         first.wait(lambda line: line.get("received", 0) > count // 10)
@@ -73,7 +73,7 @@ def consumer_killed(folder: Path) -> Figures:
 
 def coordinator_killed(folder: Path) -> Figures:
     """kill -9 of the Coordinator: data flows on; a new one knows all again."""
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         coordinator = stage.coordinator()
         listener, pair = _speakers(stage, 0.5)
         _hears(listener, 100)
@@ -100,7 +100,7 @@ def coordinator_killed(folder: Path) -> Figures:
 
 def instance_killed(folder: Path) -> Figures:
     """Failover from a killed active instance at 10 Hz heartbeats."""
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         stage.coordinator()
         listener, pair = _speakers(stage, 0.1)
         active = _hears(listener, 100)[-1]["speaker"]
@@ -111,7 +111,7 @@ def instance_killed(folder: Path) -> Figures:
 
 def instance_paused(folder: Path) -> Figures:
     """SIGSTOP of the active instance, SIGCONT after the failover: the old one must not speak again."""
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         stage.coordinator()
         listener, pair = _speakers(stage, 0.1)
         active = _hears(listener, 100)[-1]["speaker"]
@@ -128,7 +128,7 @@ def instance_paused(folder: Path) -> Figures:
 def archive_away(folder: Path) -> Figures:
     """A MongoDB-speaking archive server (nx-27017) is away under load; frames wait on disk meanwhile."""
     server = ArchiveServer(folder)
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         options = Options(
             updates=stage.server.url, archive=server.start(), directory=str(folder), coordinated=False
         )
@@ -191,7 +191,7 @@ def slow_consumer_best_effort(folder: Path) -> Figures:
 
 
 def _slow(folder: Path, delivery: str, count: int, delay_us: int) -> Figures:
-    with Stage(folder) as stage:
+    with FaultStage(folder) as stage:
         consumer = _consumer(stage, delay_us)
         producer = stage.start("produce", delivery, 0, count, 1000)
         peak = 0
@@ -217,18 +217,18 @@ def _slow(folder: Path, delivery: str, count: int, delay_us: int) -> Figures:
     }
 
 
-def _consumer(stage: Stage, delay_us: int) -> Program:
+def _consumer(stage: FaultStage, delay_us: int) -> ChildProgram:
     program = stage.start("consume", delay_us)
     program.wait(lambda line: "ready" in line)
     return program
 
 
-def _received_all(consumer: Program, count: int) -> dict[str, float]:
+def _received_all(consumer: ChildProgram, count: int) -> dict[str, float]:
     until(lambda: any(line.get("received", 0) >= count for line in consumer.lines()))
     return consumer.finish()
 
 
-def _settled(consumer: Program) -> dict[str, float]:
+def _settled(consumer: ChildProgram) -> dict[str, float]:
     """When nothing more comes for two seconds."""
     while time.monotonic() - consumer.lines()[-1]["at"] < 2.0:
         time.sleep(0.1)
@@ -239,7 +239,7 @@ def _sums(end: dict[str, float], sent: int) -> Figures:
     return {"sent": sent, "lost": sent - int(end["numbers"]), "again": int(end["again"])}
 
 
-def _speakers(stage: Stage, heartbeat: float) -> tuple[Program, dict[str, Program]]:
+def _speakers(stage: FaultStage, heartbeat: float) -> tuple[ChildProgram, dict[str, ChildProgram]]:
     listener = stage.start("listen")
     listener.wait(lambda line: "ready" in line)
     programs = [stage.start("speak", heartbeat) for _ in range(2)]
@@ -249,11 +249,11 @@ def _speakers(stage: Stage, heartbeat: float) -> tuple[Program, dict[str, Progra
     return listener, pair
 
 
-def _words(listener: Program) -> list[Line]:
+def _words(listener: ChildProgram) -> list[Line]:
     return [line for line in listener.lines() if "word" in line]
 
 
-def _hears(listener: Program, count: int) -> list[Line]:
+def _hears(listener: ChildProgram, count: int) -> list[Line]:
     return until(lambda: words if len(words := _words(listener)) >= count else None)
 
 

@@ -19,7 +19,7 @@ Line = dict[str, Any]
 T = TypeVar("T")
 
 
-class Program:
+class ChildProgram:
     """A started program and what it has said."""
 
     def __init__(self, output: Path, *arguments: object, module: str = "benchmarks.faults_programs") -> None:
@@ -59,13 +59,13 @@ class Program:
         return at
 
 
-class Stage:
+class FaultStage:
     """One Data Updates server and the programs that use it; a context manager."""
 
     def __init__(self, folder: Path, *, durable: bool = False) -> None:
         self.folder = folder
         self._stack = ExitStack()
-        self._programs: list[Program] = []
+        self._programs: list[ChildProgram] = []
         self.server = EmbeddedServer(folder / "updates", durable=durable)
 
     def __enter__(self) -> Self:
@@ -79,11 +79,11 @@ class Stage:
             program.kill()
         self._stack.close()
 
-    def start(self, name: str, *arguments: object) -> Program:
+    def start(self, name: str, *arguments: object) -> ChildProgram:
         """Start one of `benchmarks.faults_programs`."""
         return self._started(name, self.server.url, *arguments)
 
-    def coordinator(self) -> Program:
+    def coordinator(self) -> ChildProgram:
         """Start a Coordinator and wait until it is ready; `.wait` finds its ready line with the API's URL."""
         archive = f"sqlite://{self.folder / 'archive.db'}"
         options = ("--updates", self.server.url, "--archive", archive, "--log", "warning")
@@ -98,9 +98,9 @@ class Stage:
         wire.close()
         return int(next(x for x in info.splitlines() if x.startswith("used_memory:")).split(":")[1])
 
-    def _started(self, *arguments: object, **options: Any) -> Program:
+    def _started(self, *arguments: object, **options: Any) -> ChildProgram:
         output = self.folder / f"program{len(self._programs)}.jsonl"
-        self._programs.append(Program(output, *arguments, **options))
+        self._programs.append(ChildProgram(output, *arguments, **options))
         return self._programs[-1]
 
 

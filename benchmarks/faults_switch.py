@@ -15,13 +15,14 @@ from typing import Final
 import numpy as np
 
 from apps.p4runtime_ctrl.errors import SwitchError
-from apps.p4runtime_ctrl.session import Address, Pipeline, Session
-from dataplane.capture_port import CaptureFeed
+from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram, P4RuntimeSession
+from dataplane.ports.capture_port import CaptureFeed
 from due import Capability, Engine
 from p4rt import P4RuntimeStub
-from tests.apps.p4runtime_ctrl.cable import Cable
-from tests.apps.p4runtime_ctrl.programs import program
-from tests.apps.p4runtime_ctrl.stage import PACKETS, Heard, Stage, block, frame, wait_for
+from sdnator.testing.cable import Cable
+from sdnator.testing.controller_run import PACKETS, ControllerRun, Heard, block, frame
+from sdnator.testing.product_program import program
+from sdnator.testing.waiting import wait_for
 
 Figures = dict[str, float | int | bool]
 
@@ -61,7 +62,7 @@ class Firewall:
         return bool(self.state().get("connected"))
 
 
-class Traffic:
+class SenderTraffic:
     """`with Traffic(feed):` frames of 80 senders, one after the other, until the end."""
 
     def __init__(self, feed: CaptureFeed) -> None:
@@ -70,7 +71,7 @@ class Traffic:
         self._thread = threading.Thread(target=self._run)
         self.sent = 0
 
-    def __enter__(self) -> "Traffic":
+    def __enter__(self) -> "SenderTraffic":
         self._thread.start()
         return self
 
@@ -94,7 +95,9 @@ def _blocked(address: str) -> frozenset[str] | None:
     where = Address(address, 1, 0)
     table = program().table("ingress.block_src").id
     with where.channel() as channel:
-        session = Session(P4RuntimeStub(channel), where, Pipeline(b"", program().message), None)
+        session = P4RuntimeSession(
+            P4RuntimeStub(channel), where, CompiledProgram(b"", program().message), None
+        )
         try:
             return frozenset(program().describe(entry) for entry in session.read_counters(table))
         except SwitchError:
@@ -124,9 +127,11 @@ def _until(address: str, wanted: frozenset[str], firewall: Firewall) -> Figures:
 
 
 @contextmanager
-def _ready(folder: Path, kind: str = "embedded", **options: object) -> Iterator[tuple[Stage, Firewall]]:
+def _ready(
+    folder: Path, kind: str = "embedded", **options: object
+) -> Iterator[tuple[ControllerRun, Firewall]]:
     """Everything started, packets wanted, the first blocks in force."""
-    with Stage(folder, kind=kind) as stage:
+    with ControllerRun(folder, kind=kind) as stage:
         stage.controller(**options)
         firewall = Firewall(stage.engine(capabilities=(_DECISIONS,)))
         wait_for(lambda: firewall.state().get("telemetry") == ["packets"], _LONGEST_S, why=stage.log)
@@ -140,7 +145,7 @@ def _change_mind(firewall: Firewall) -> None:
     firewall.decide(_LATE)
 
 
-def _verdicts(stage: Stage) -> Figures:
+def _verdicts(stage: ControllerRun) -> Figures:
     """Frames of every sender: how many met the wrong fate."""
     feed = stage.feed()
     senders = range(1, 81)
@@ -193,7 +198,7 @@ def switch_killed_bmv2(folder: Path) -> Figures:
 def controller_killed(folder: Path) -> Figures:
     """kill -9 of the controller under traffic; `restart_s` from the start of the next one's process,
     `restored_s` from when it is connected."""
-    with _ready(folder) as (stage, firewall), Traffic(stage.feed()):
+    with _ready(folder) as (stage, firewall), SenderTraffic(stage.feed()):
         before = firewall.state()["brought_up_ms"]
         stage.kill(stage.processes[-1])
         _change_mind(firewall)
@@ -210,14 +215,14 @@ def controller_killed(folder: Path) -> Figures:
 
 def cable_cut(folder: Path) -> Figures:
     """No byte between controller and switch for 10 s, under traffic; seconds from when the cable is whole."""
-    with Stage(folder) as stage, Cable(stage.target.address) as cable:
+    with ControllerRun(folder) as stage, Cable(stage.target.address) as cable:
         stage.switch_options["address"] = cable.address
         stage.controller()
         firewall = Firewall(stage.engine(capabilities=(_DECISIONS,)))
         wait_for(lambda: firewall.state().get("telemetry") == ["packets"], _LONGEST_S, why=stage.log)
         firewall.decide(_BEFORE)
         wait_for(lambda: _blocked(stage.target.address) == _names(_BEFORE), _LONGEST_S, why=stage.log)
-        with Traffic(stage.feed()) as traffic:
+        with SenderTraffic(stage.feed()) as traffic:
             cable.cut()
             began = time.monotonic()
             _change_mind(firewall)
@@ -233,12 +238,14 @@ def cable_cut(folder: Path) -> Figures:
 
 def closed_after_kill(folder: Path) -> Figures:
     """fail = closed: seconds from kill -9 of the controller until its wires are out of the switch."""
-    with Stage(folder, fail="closed") as stage:
+    with ControllerRun(folder, fail="closed") as stage:
         stage.controller()
         wires = program().table("ingress.forward_port").id
         where = Address(stage.target.address, 1, 0)
         with where.channel() as channel:
-            session = Session(P4RuntimeStub(channel), where, Pipeline(b"", program().message), None)
+            session = P4RuntimeSession(
+                P4RuntimeStub(channel), where, CompiledProgram(b"", program().message), None
+            )
             wait_for(lambda: list(session.read_counters(wires)), _LONGEST_S, why=stage.log)
             stage.kill(stage.processes[-1])
             began = time.monotonic()

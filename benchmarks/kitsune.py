@@ -1,8 +1,8 @@
 """How fast Kitsune is, beside the published way of doing it: `python -m benchmarks.kitsune --json FILE`.
 
-Needs the test data (SDNATOR_TEST_DATA).  One core, processor time, medians of rounds in which all
-peers take turns.  Ordinary traffic is the 38,363 real packets; the naive version is tests/naive, line
-for line as eager as the published code.
+Needs the test data (--data, SDNATOR_TEST_DATA).  One core, processor time, medians of rounds in which all
+peers take turns.  Ordinary traffic is the 38,363 real packets; the naive version is sdnator/testing/oracles,
+line for line as eager as the published code.
 """
 
 import argparse
@@ -28,15 +28,15 @@ from apps.kitsune.kernel import load_kernel
 from apps.kitsune.kitnet import KitNet
 from apps.packets import PACKET_COLUMNS
 from benchmarks import measure
-from sdnator.captures import Capture
+from benchmarks.data_folder import add_data_option, data_file
+from sdnator.capture.captures import Capture
+from sdnator.capture.packet_sources import BATCH, Batch, CaptureSource, frame_batch
 from sdnator.datasets.mirai_like import make_mirai_like
 from sdnator.datasets.rebuild import rebuild
-from sdnator.detect import DetectOptions, detect
-from sdnator.packet_sources import BATCH, Batch, CaptureSource, frame_batch
-from tests.apps.kitsune.traffic import tsv_rows
-from tests.naive.afterimage import AfterImage as NaiveAfterImage
-from tests.naive.kitnet import KitNet as NaiveKitNet
-from tests.requirements import shared_data
+from sdnator.detect.run import DetectOptions, detect
+from sdnator.testing.oracles.afterimage import NaiveAfterImage
+from sdnator.testing.oracles.kitnet import NaiveKitNet
+from sdnator.testing.packet_rows import tsv_rows
 
 FM_GRACE, AD_GRACE = 2_000, 10_000
 SNAP = 200
@@ -52,13 +52,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--naive-rounds", type=int, default=1, help="rounds of the naive version (a minute each)"
     )
+    add_data_option(parser)
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     chosen = parser.parse_args(argv)
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     if chosen.worker:
         print(json.dumps(memory_growth(int(chosen.worker))))
         return 0
-    figures = {"machine": measure.machine(), **figures_of(chosen.rounds, chosen.naive_rounds, chosen.scale)}
+    found = figures_of(chosen.data, chosen.rounds, chosen.naive_rounds, chosen.scale)
+    figures = {"machine": measure.machine(), **found}
     rows = [(name, value) for name, value in figures.items() if isinstance(value, int | float)]
     measure.table(("figure", "value"), rows)
     for name in ("seeds", "modes"):
@@ -67,12 +69,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def figures_of(rounds: int, naive_rounds: int, scale: float) -> dict[str, Any]:
+def figures_of(data: Path, rounds: int, naive_rounds: int, scale: float) -> dict[str, Any]:
     """All figures; a scale below 1 takes fewer packets in the hub, memory and naive parts."""
-    batches = whole_batches()
-    figures: dict[str, Any] = speeds(batches, rounds)
-    figures |= {f"snap{SNAP}_{name}": value for name, value in speeds(snapped_batches(), rounds).items()}
-    naive = naive_speeds(naive_rounds, int(38_363 * min(scale, 1.0)))
+    batches = whole_batches(data)
+    figures: dict[str, Any] = speeds(batches, rounds, data)
+    snapped = speeds(snapped_batches(data), rounds, data)
+    figures |= {f"snap{SNAP}_{name}": value for name, value in snapped.items()}
+    naive = naive_speeds(data, naive_rounds, int(38_363 * min(scale, 1.0)))
     figures |= naive
     for prefix in ("", f"snap{SNAP}_"):
         figures[f"{prefix}ratio_features"] = figures[f"{prefix}features_pps"] / naive["naive_features_pps"]
@@ -84,16 +87,16 @@ def figures_of(rounds: int, naive_rounds: int, scale: float) -> dict[str, Any]:
     return figures
 
 
-def whole_batches() -> list[Batch]:
+def whole_batches(data: Path) -> list[Batch]:
     """The real packets as batches of columns."""
-    return list(CaptureSource(shared_data("kitsune/mirai_38k.tsv.gz")))
+    return list(CaptureSource(data_file(data, "kitsune/mirai_38k.tsv.gz")))
 
 
-def snapped_batches() -> list[Batch]:
+def snapped_batches(data: Path) -> list[Batch]:
     """The same out of frames that were cut at 200 bytes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mirai.pcap"
-        rebuild(shared_data("kitsune/mirai_38k.tsv.gz"), path)
+        rebuild(data_file(data, "kitsune/mirai_38k.tsv.gz"), path)
         return [_cut(batch, start) for start, batch in _frames(path)]
 
 
@@ -126,7 +129,7 @@ def features_of(batches: Sequence[Batch], mode: Mode = "reference") -> npt.NDArr
     return np.concatenate([afterimage.update(batch) for batch in batches])
 
 
-def speeds(batches: Sequence[Batch], rounds: int) -> dict[str, Any]:
+def speeds(batches: Sequence[Batch], rounds: int, data: Path) -> dict[str, Any]:
     """Features, execute phase, and equality with the reference vectors."""
     packets = sum(len(batch["length"]) for batch in batches)
     features = features_of(batches)
@@ -154,16 +157,19 @@ def speeds(batches: Sequence[Batch], rounds: int) -> dict[str, Any]:
         {name: functools.partial(timed, work) for name, work in peers.items()}, rounds
     )
     scores = network.score(features[first:])[0]
-    return figures | accuracy(features, network.feature_map, scores)
+    return figures | accuracy(data, features, network.feature_map, scores)
 
 
 def accuracy(
-    features: npt.NDArray[np.float64], feature_map: list[list[int]], scores: npt.NDArray[np.float64]
+    data: Path,
+    features: npt.NDArray[np.float64],
+    feature_map: list[list[int]],
+    scores: npt.NDArray[np.float64],
 ) -> dict[str, Any]:
     """Equality with what the published code computed."""
-    wanted = np.load(shared_data("kitsune/features_first3000_f64.npz"))["features"]
-    published = np.load(shared_data("kitsune/scores.npz"))["fm2000_ad10000_m10"][-len(scores) :]
-    map_text = shared_data("kitsune/feature_map_fm2000_ad10000_m10.json").read_text()
+    wanted = np.load(data_file(data, "kitsune/features_first3000_f64.npz"))["features"]
+    published = np.load(data_file(data, "kitsune/scores.npz"))["fm2000_ad10000_m10"][-len(scores) :]
+    map_text = data_file(data, "kitsune/feature_map_fm2000_ad10000_m10.json").read_text()
     return {
         "differing_cells": int(np.count_nonzero(features[: len(wanted)] != wanted)),
         "feature_map_equal": feature_map == json.loads(map_text),
@@ -171,9 +177,9 @@ def accuracy(
     }
 
 
-def naive_speeds(rounds: int, packets: int) -> dict[str, float]:
+def naive_speeds(data: Path, rounds: int, packets: int) -> dict[str, float]:
     """The published way: features eagerly, then one numpy call per step and autoencoder."""
-    rows = list(tsv_rows(packets))
+    rows = list(tsv_rows(data_file(data, "kitsune/mirai_38k.tsv.gz"), packets))
     per_feature, per_total = [], []
     for _ in range(rounds):
         naive, network = NaiveAfterImage(), NaiveKitNet(100, 10, packets // 20, packets // 4)

@@ -27,15 +27,15 @@ from typing import Any
 
 import numpy as np
 
-from apps.sonata_adapter.catalogue import CATALOGUE
-from apps.sonata_adapter.engine import HostEngine
+from apps.sonata_adapter.host.engine import HostEngine
+from apps.sonata_adapter.query.catalogue import CATALOGUE
 from benchmarks import measure
+from benchmarks.data_folder import add_data_option, data_file
 from benchmarks.sonata_stage import QUERIES, SonataStage, equal_to_naive
 from benchmarks.sonata_traffic import ATTACKS, MINUTE_PACKETS, Traffic, traffic
 from due import RecordBatch
-from sdnator.captures import Capture
-from tests.apps.sonata_adapter.traffic import BASE_US, Frame, attack, batch_of, mixed, office, tcp
-from tests.requirements import shared_data
+from sdnator.capture.captures import Capture
+from sdnator.testing.query_traffic import BASE_US, TimedFrame, attack, batch_of, mixed, office, tcp
 
 _PARTS = ("host", "correctness", "reduction", "responsiveness", "bmv2")
 CAPTURES = ("synflood_spoofed", "synflood_one_source", "ssh_guessing", "ftp_bruteforce")
@@ -62,11 +62,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     traffics = ("all attacks", *CATALOGUE, *CAPTURES)
     parser.add_argument("--traffic", nargs="+", choices=traffics, default=traffics, help="of correctness")
     parser.add_argument("--packets", type=int, default=3_600_000, help="of the run for `reduction`")
+    add_data_option(parser)
     chosen = parser.parse_args(argv)
     figures: dict[str, Any] = {"machine": measure.machine()}
     parts: dict[str, Callable[[], dict[str, Any]]] = {
         "host": lambda: host_figures(chosen.rounds),
-        "correctness": lambda: correctness(chosen.traffic),
+        "correctness": lambda: correctness(chosen.traffic, chosen.data),
         "reduction": lambda: reduction(int(chosen.packets * chosen.scale)),
         "responsiveness": lambda: responsiveness(chosen.rounds),
         "bmv2": bmv2,
@@ -116,7 +117,7 @@ def _dense() -> list[RecordBatch]:
     ]
 
 
-def _office(seed: int) -> list[Frame]:
+def _office(seed: int) -> list[TimedFrame]:
     return office(_BLOCK_S, random.Random(seed), long=True)[:12_000]
 
 
@@ -131,12 +132,12 @@ def _cost(names: Sequence[str], batches: Sequence[RecordBatch]) -> float:
     return time.process_time() - begin
 
 
-def correctness(traffics: Sequence[str]) -> dict[str, Any]:
+def correctness(traffics: Sequence[str], data: Path) -> dict[str, Any]:
     """Every query on every traffic; a query is correct when it is so on all."""
     wrong: dict[str, list[str]] = {}
     estimates: Counter[str] = Counter()
     late_reads = 0
-    for name, frames in _traffics(traffics):
+    for name, frames in _traffics(traffics, data):
         with tempfile.TemporaryDirectory() as folder, SonataStage(Path(folder)) as stage:
             stage.declare(QUERIES.values())
             stage.play(frames, faster=_pace(frames))
@@ -153,7 +154,7 @@ def correctness(traffics: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _pace(frames: Sequence[Frame]) -> float:
+def _pace(frames: Sequence[TimedFrame]) -> float:
     """How many times as fast as it came traffic is played: dense traffic as it came."""
     densest = max(Counter(frame.time_us // 10**6 for frame in frames).values())
     return min(_EXACT, max(1.0, _DENSE / densest))
@@ -173,11 +174,11 @@ def bmv2() -> dict[str, Any]:
     return {"bmv2": {"correct_queries": len(CATALOGUE) - len(wrong), "wrong": wrong, "results": found}}
 
 
-def _traffics(names: Sequence[str]) -> Iterator[tuple[str, list[Frame]]]:
+def _traffics(names: Sequence[str], folder: Path) -> Iterator[tuple[str, list[TimedFrame]]]:
     for name in names:
         if name in CAPTURES:
-            with Capture(shared_data(f"captures/{name}.pcap")) as capture:
-                yield name, [Frame(time_ns // 1000, length, data) for time_ns, length, data in capture]
+            with Capture(data_file(folder, f"captures/{name}.pcap")) as capture:
+                yield name, [TimedFrame(time_ns // 1000, length, data) for time_ns, length, data in capture]
         elif name in CATALOGUE:
             rng = random.Random(7)
             yield name, sorted(office(8, rng, long=True) + attack(name, BASE_US + 10_000, rng))

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.catalogue import CATALOGUE
+from apps.sonata_adapter.query.catalogue import CATALOGUE
 from benchmarks.sonata_traffic import Traffic
-from dataplane.bmv2 import Bmv2
 from due import Item
-from sdnator.wire import Feed, VethPair, WireFeed
-from tests.apps.p4runtime_ctrl.stage import BASE_US, PACKETS, Heard, Stage, end, wait_for
-from tests.apps.p4runtime_ctrl.targets import Target
-from tests.apps.sonata_adapter.traffic import Frame
-from tests.naive import sonata
+from sdnator.capture.interfaces import Feed, VethPair, WireFeed
+from sdnator.testing.controller_run import BASE_US, PACKETS, ControllerRun, Heard, end
+from sdnator.testing.oracles import sonata
+from sdnator.testing.query_traffic import TimedFrame
+from sdnator.testing.waiting import wait_for
 
 PREFIX = "network.traffic_query.sonata"
 QUERIES = {name: f"{PREFIX}.{name}" for name in CATALOGUE}
@@ -30,25 +29,7 @@ _IN_FLIGHT = 20_000
 _PACE_S = 0.002
 
 
-class _Bmv2Target(Target):
-    """BMv2 as it is installed: builds differ in the options that they have."""
-
-    def __init__(self, kind: str, folder: Path, *, far: str) -> None:
-        super().__init__(kind, folder)
-        self._far = far
-
-    @property
-    def address(self) -> str:
-        return self._bmv2.address
-
-    def start(self) -> None:
-        self._bmv2 = Bmv2({1: self._far})
-
-    def stop(self) -> None:
-        self._bmv2.close()
-
-
-class SonataStage(Stage):
+class SonataStage(ControllerRun):
     """Switch, controller, Coordinator and adapter; `with SonataStage(folder) as stage`.
 
     `kind`: embedded, or bmv2 behind a veth pair, which needs root and has a clock of its own.
@@ -59,9 +40,7 @@ class SonataStage(Stage):
     def __init__(self, folder: Path, kind: str = "embedded") -> None:
         self._cable = ExitStack()
         self._wire = VethPair.make(self._cable, "so") if kind == "bmv2" else None
-        super().__init__(folder)
-        if self._wire is not None:
-            self.target = _Bmv2Target("bmv2", folder, far=self._wire.far)
+        super().__init__(folder, kind=kind, veth=self._wire.far if self._wire is not None else "")
 
     def __enter__(self) -> "SonataStage":
         super().__enter__()
@@ -86,7 +65,7 @@ class SonataStage(Stage):
     @property
     def _telemetry(self) -> list[str]:
         states = self._states.values("network.switch")
-        return list(states[-1]["telemetry"]) if states else []  # type: ignore[call-overload]
+        return list(states[-1]["telemetry"]) if states else []
 
     def declare(self, keys: Iterable[str]) -> None:
         """Observe keys; returns when the switch has all that they need."""
@@ -97,7 +76,7 @@ class SonataStage(Stage):
     def _settled(self) -> bool:
         """The adapter's bits are those that the switch has."""
         health = self._health.values("health")
-        bits = health[-1]["app"]["bits"] if health else 0  # type: ignore[index]
+        bits = health[-1]["app"]["bits"] if health else 0
         return bool(bits) and len(self._telemetry) == bits
 
     def note_times(self) -> None:
@@ -106,18 +85,20 @@ class SonataStage(Stage):
         self._noted = Heard(self._observer, PACKETS)
         wait_for(lambda: len(self._telemetry) > before, 30, self.log)
 
-    def stamped(self, frames: Sequence[Frame]) -> list[Frame]:
+    def stamped(self, frames: Sequence[TimedFrame]) -> list[TimedFrame]:
         """The frames with the switch's times, after `note_times` and `play`; all must have been noted."""
         wait_for(lambda: len(self._noted.arrivals()) >= len(frames), 30, self.log)
         batches = [item.value for item in self._noted.items if item.key == PACKETS]
         times = np.concatenate([batch["time_us"] for batch in batches])
         order = np.argsort(self._noted.arrivals(), kind="stable")
         return [
-            Frame(time_us, frame.length, frame.data)
+            TimedFrame(time_us, frame.length, frame.data)
             for time_us, frame in zip(times[order].tolist(), frames, strict=True)
         ]
 
-    def play(self, frames: Sequence[Frame] | Traffic, *, faster: float = 0.0, zero: int | None = None) -> int:
+    def play(
+        self, frames: Sequence[TimedFrame] | Traffic, *, faster: float = 0.0, zero: int | None = None
+    ) -> int:
         """Send all frames; returns their number.
 
         `faster`: so many times as fast as they were captured, 0 = as fast as the switch takes them.
@@ -261,7 +242,10 @@ def blocks(times_us: NDArray[np.int64], span_us: int) -> Iterator[slice]:
 
 
 def equal_to_naive(
-    frames: Sequence[Frame], results: dict[str, list[dict[str, Any]]], base_us: int, zero: int | None = None
+    frames: Sequence[TimedFrame],
+    results: dict[str, list[dict[str, Any]]],
+    base_us: int,
+    zero: int | None = None,
 ) -> list[str]:
     """Queries whose results differ from the naive evaluator's; `zero`: as of `SonataStage.play`."""
     zero = frames[0].time_us // 10**6 * 10**6 if zero is None else zero

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.catalogue import CATALOGUE
-from tests.apps.sonata_adapter.traffic import (
+from apps.sonata_adapter.query.catalogue import CATALOGUE
+from sdnator.testing.query_traffic import (
     ACK,
     BASE_US,
     FIN,
     PSH,
     SYN,
-    Frame,
+    TimedFrame,
     attack,
     office,
     tcp,
@@ -52,7 +52,7 @@ class Traffic:
     data: Sequence[bytes]
 
     @classmethod
-    def of(cls, frames: Sequence[Frame]) -> "Traffic":
+    def of(cls, frames: Sequence[TimedFrame]) -> "Traffic":
         """The frames, in their order."""
         times, lengths = ([getattr(frame, name) for frame in frames] for name in ("time_us", "length"))
         return cls(np.array(times), np.array(lengths), [frame.data for frame in frames])
@@ -100,7 +100,7 @@ class _Made:
     def traffic(self) -> Traffic:
         return Traffic.merged(self._parts, self._contents)
 
-    def add(self, frames: Iterable[Frame]) -> None:
+    def add(self, frames: Iterable[TimedFrame]) -> None:
         for time_us, length, data in frames:
             self._repeat(data, np.array([time_us]), np.array([length]))
 
@@ -119,30 +119,30 @@ class _Made:
         turns = round(min(6_000.0, 240 * rng.paretovariate(1.5)))
         times = start + 900 + np.cumsum(self._random.integers(200, 10_000, turns))
         last = int(times[-1])
-        self.add((Frame(start, 60, tcp(*there, SYN, seq=100)),))
-        self.add((Frame(start + 400, 60, tcp(*back, SYN | ACK, seq=900, ack=101)),))
-        self.add((Frame(start + 800, 60, acknowledge), Frame(start + 900, 300, request)))
+        self.add((TimedFrame(start, 60, tcp(*there, SYN, seq=100)),))
+        self.add((TimedFrame(start + 400, 60, tcp(*back, SYN | ACK, seq=900, ack=101)),))
+        self.add((TimedFrame(start + 800, 60, acknowledge), TimedFrame(start + 900, 300, request)))
         sizes = _HEAD + self._random.integers(200, 1_460, turns)
         self._repeat(tcp(*back, PSH | ACK, bytes(_PAYLOAD), seq=901, ack=101), times, sizes)
         self._repeat(acknowledge, times[1::2] + 150, np.full(len(times[1::2]), 60))
-        self.add((Frame(last + 1_000, 60, tcp(*there, FIN | ACK, seq=401, ack=999)),))
-        self.add((Frame(last + 1_400, 60, tcp(*back, FIN | ACK, seq=999, ack=402)),))
+        self.add((TimedFrame(last + 1_000, 60, tcp(*there, FIN | ACK, seq=401, ack=999)),))
+        self.add((TimedFrame(last + 1_400, 60, tcp(*back, FIN | ACK, seq=999, ack=402)),))
 
 
-def _is_small_talk(frame: Frame) -> bool:
+def _is_small_talk(frame: TimedFrame) -> bool:
     """DNS, ARP, ICMP and broken frames: what is not a connection of its own."""
     kind, is_tcp = frame.data[12:14], len(frame.data) > 23 and 6 in (frame.data[20], frame.data[23])
     return kind not in (b"\x08\x00", b"\x86\xdd") or not is_tcp
 
 
-def _ipv6(seconds: int) -> Iterator[Frame]:
+def _ipv6(seconds: int) -> Iterator[TimedFrame]:
     """One connection that stays."""
     for now in range(BASE_US, BASE_US + seconds * 10**6, _IPV6_GAP_US):
-        yield Frame(now, 374, tcp("2001:db8::10", "2001:db8::1", 9_000, 443, ACK, bytes(_PAYLOAD)))
+        yield TimedFrame(now, 374, tcp("2001:db8::10", "2001:db8::1", 9_000, 443, ACK, bytes(_PAYLOAD)))
 
 
-def _telnet(seconds: int, rng: random.Random) -> Iterator[Frame]:
+def _telnet(seconds: int, rng: random.Random) -> Iterator[TimedFrame]:
     """Somebody types into an old device, key by key."""
     for now in range(BASE_US, BASE_US + seconds * 10**6, _TELNET_GAP_US):
         key = bytes([rng.randrange(97, 123)])
-        yield Frame(now, 60, tcp("10.0.0.12", "192.0.2.7", 41_000, 23, PSH | ACK, key))
+        yield TimedFrame(now, 60, tcp("10.0.0.12", "192.0.2.7", 41_000, 23, PSH | ACK, key))

@@ -6,15 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from apps.messages import Decision, Target
-from benchmarks.switch_stage import BLOCK_KEY, PACKETS_KEY, Stage, Switch, frame, primary, program
-from dataplane.capture_port import COPIED, CaptureFeed
+from benchmarks.switch_stage import (
+    BLOCK_KEY,
+    PACKETS_KEY,
+    SwitchProcess,
+    SwitchStage,
+    frame,
+    primary,
+    program,
+)
+from dataplane.ports.capture_port import COPIED, CaptureFeed
 from due import NO_WAIT, Capability
-from tests.dataplane.controller import Controller, Names, delete, insert
+from sdnator.testing.p4runtime_client import EntryBuilder, P4RuntimeClient, delete, insert
 
 _PATIENCE_S = 5.0
 
 
-def _update(names: Names, number: int) -> Any:
+def _update(names: EntryBuilder, number: int) -> Any:
     match = {field.name: 0 for field in names.tables["ingress.block_src"].match_fields}
     match |= {"src": 0x0B000000 + number}
     if "is_ipv4" in match:
@@ -22,7 +30,7 @@ def _update(names: Names, number: int) -> Any:
     return names.entry("ingress.block_src", match, _drop_action(names))
 
 
-def _drop_action(names: Names) -> Any:
+def _drop_action(names: EntryBuilder) -> Any:
     actions = {action.preamble.id: action for action in names.info.actions}
     table = names.tables["ingress.block_src"]
     default = table.initial_default_action.action_id or table.const_default_action_id
@@ -31,9 +39,9 @@ def _drop_action(names: Names) -> Any:
     )
 
 
-def writes(controller: Controller, count: int, batch: int, rounds: int) -> dict[str, float]:
+def writes(controller: P4RuntimeClient, count: int, batch: int, rounds: int) -> dict[str, float]:
     """Inserts per second in batches, and the 99th percentile of single ones in ms."""
-    names = Names(program().p4info)
+    names = EntryBuilder(program().p4info)
     entities = [_update(names, number) for number in range(count)]
     rates = []
     for _ in range(rounds):
@@ -60,7 +68,7 @@ def writes(controller: Controller, count: int, batch: int, rounds: int) -> dict[
 
 def entries(folder: Path, rounds: int, count: int, batch: int = 500) -> dict[str, float]:
     """`writes` on the embedded switch."""
-    switch = Switch(folder)
+    switch = SwitchProcess(folder)
     controller = primary(switch.address)
     try:
         return writes(controller, count, batch, rounds)
@@ -71,7 +79,7 @@ def entries(folder: Path, rounds: int, count: int, batch: int = 500) -> dict[str
 
 def block_latency(folder: Path, rounds: int) -> dict[str, float]:
     """From a decision on DUE to the first frame that makes no copy any more, ms; one frame under way at a time."""
-    stage = Stage(folder)
+    stage = SwitchStage(folder)
     try:
         block = Capability(BLOCK_KEY, delivery="reliable", archive="always")
         firewall = stage.engine("firewall", capabilities=[block])

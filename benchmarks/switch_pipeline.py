@@ -13,10 +13,10 @@ from random import Random
 from typing import Any
 
 from benchmarks import measure
-from dataplane.program import load
-from dataplane.switch import Backend, Replica, Switch
-from dataplane.tables import Exact, Lpm, Range, TableEntry, Ternary
-from dataplane.tree import Program
+from dataplane.v1model.program import load
+from dataplane.v1model.switch import Backend, Replica, Switch
+from dataplane.v1model.tables import Exact, Lpm, Range, TableEntry, Ternary
+from dataplane.v1model.tree import Program
 
 _PROGRAM = Path(__file__).resolve().parent.parent / "p4" / "sdnator.json"
 _BATCH = 1024

@@ -10,12 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import worker
-from dataplane.capture_port import CaptureFeed
+from dataplane.ports.capture_port import CaptureFeed
 from due import CONSUMER, PRODUCER, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
-from sdnator.process import Child
-from tests.dataplane.controller import Controller, Names, clone_session, insert, modify, program_config
+from sdnator.supervisor import Child
+from sdnator.testing.p4runtime_client import (
+    EntryBuilder,
+    P4RuntimeClient,
+    clone_session,
+    insert,
+    modify,
+    program_config,
+)
 
 PACKETS_KEY = "network.packets.p4runtime_ctrl.s1.all"
 BLOCK_KEY = "network.block.firewall.ipv4"
@@ -40,7 +47,7 @@ def program() -> Any:
     return program_config(p4_program.find().bmv2_json.with_suffix(""))
 
 
-class Switch:
+class SwitchProcess:
     """The embedded switch as a process, port 1 fed by `socket`."""
 
     def __init__(self, folder: Path, ports: Sequence[str] = ()) -> None:
@@ -56,15 +63,15 @@ class Switch:
         self.child.stop()
 
 
-def primary(address: str) -> Controller:
+def primary(address: str) -> P4RuntimeClient:
     """A controller with the product's program in force on the switch."""
-    controller = Controller(address, election_id=next(_ids))
+    controller = P4RuntimeClient(address, election_id=next(_ids))
     controller.arbitrate()
     controller.set_pipeline(program())
     return controller
 
 
-def every_packet(controller: Controller, names: Names, *, copies: bool, digests: bool) -> None:
+def every_packet(controller: P4RuntimeClient, names: EntryBuilder, *, copies: bool, digests: bool) -> None:
     """Query 0 matches everything, and wants packet-ins, digests or both."""
     controller.write(insert(clone_session(COPY_SESSION, CPU_PORT)))
     actions = {action.preamble.id: action for action in names.info.actions}
@@ -112,7 +119,7 @@ def process(target: Any, *arguments: Any) -> Iterator[Any]:
             running.join()
 
 
-class Stage:
+class SwitchStage:
     """Data Updates, Coordinator, switch and controller as processes; engines here."""
 
     def __init__(self, folder: Path) -> None:
@@ -123,7 +130,7 @@ class Stage:
         self._server.__enter__()
         self._archive = f"sqlite://{folder / 'archive.db'}"
         self._engines: list[Engine] = []
-        self.switch = Switch(folder / "switch")
+        self.switch = SwitchProcess(folder / "switch")
         coordinator = self._app("coordinator", "coordinator.service", {})
         coordinator.wait_ready()
         compiled = p4_program.find()
@@ -158,7 +165,7 @@ class Stage:
         self._server.__exit__(None, None, None)
 
 
-class Count:
+class ArrivalCounter:
     """Counts what arrives, and tells when there are enough."""
 
     def __init__(self) -> None:

@@ -10,9 +10,9 @@ import grpc
 
 from benchmarks.switch_stage import (
     PACKETS_KEY,
-    Count,
-    Stage,
-    Switch,
+    ArrivalCounter,
+    SwitchProcess,
+    SwitchStage,
     every_packet,
     feed_process,
     frame,
@@ -21,7 +21,7 @@ from benchmarks.switch_stage import (
     program,
 )
 from p4rt import P4RuntimeStub, p4runtime
-from tests.dataplane.controller import Controller, Names, insert
+from sdnator.testing.p4runtime_client import EntryBuilder, P4RuntimeClient, insert
 
 WARM_UP = 2_000
 DIGEST_LIST = 500
@@ -92,8 +92,8 @@ def raw_rate(port: int) -> float:
 
 def packet_in(folder: Path, rounds: int, count: int) -> dict[str, float]:
     """Packet-ins through gRPC and the controller to a DUE consumer, in turn with the bare stream."""
-    stage = Stage(folder)
-    seen = Count()
+    stage = SwitchStage(folder)
+    seen = ArrivalCounter()
     try:
         subscription = (
             stage.engine("bench").observe(PACKETS_KEY).subscribe(lambda item: seen.add(len(item.value)))
@@ -112,7 +112,7 @@ def packet_in(folder: Path, rounds: int, count: int) -> dict[str, float]:
     }
 
 
-def _settle(feed: Any, seen: Count) -> None:
+def _settle(feed: Any, seen: ArrivalCounter) -> None:
     """Feed until all frames of a round arrive: the request for packets is then in force."""
     for _ in range(50):
         seen.expect(WARM_UP)
@@ -126,7 +126,7 @@ def _settle(feed: Any, seen: Count) -> None:
     raise RuntimeError("the controller does not publish packets")
 
 
-def _rate(feed: Any, seen: Count, count: int) -> float:
+def _rate(feed: Any, seen: ArrivalCounter, count: int) -> float:
     seen.expect(count)
     feed.send(count)
     end = seen.wait("packets")
@@ -135,14 +135,14 @@ def _rate(feed: Any, seen: Count, count: int) -> float:
 
 def bare(folder: Path, rounds: int, count: int, *, digests: bool) -> float:
     """Packet-ins, or samples in digest lists, that reach a plain P4Runtime client per second."""
-    switch = Switch(folder)
+    switch = SwitchProcess(folder)
     controller = primary(switch.address)
     try:
-        names = Names(program().p4info)
+        names = EntryBuilder(program().p4info)
         every_packet(controller, names, copies=not digests, digests=digests)
         if digests:
             controller.write(insert(digest_entry(names)))
-        seen = Count()
+        seen = ArrivalCounter()
         count_stream(controller, seen)
         with process(feed_process, switch.socket, [frame()]) as feed:
             _settle(feed, seen)
@@ -152,7 +152,7 @@ def bare(folder: Path, rounds: int, count: int, *, digests: bool) -> float:
         switch.close()
 
 
-def digest_entry(names: Names) -> Any:
+def digest_entry(names: EntryBuilder) -> Any:
     """Lists of 500, or what there is after 5 ms."""
     entity = p4runtime.Entity()
     frames = next(d for d in names.info.digests if d.preamble.name == "frame_digest_t")
@@ -162,7 +162,7 @@ def digest_entry(names: Names) -> Any:
     return entity
 
 
-def count_stream(controller: Controller, seen: Count) -> None:
+def count_stream(controller: P4RuntimeClient, seen: ArrivalCounter) -> None:
     """Count instead of keeping what arrives."""
 
     class Counter:

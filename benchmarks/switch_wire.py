@@ -17,15 +17,23 @@ from typing import Any
 
 from benchmarks.switch_control import writes
 from benchmarks.switch_pipeline import block_entries
-from benchmarks.switch_stage import Count, Switch, every_packet, frame, primary, process, program
+from benchmarks.switch_stage import (
+    ArrivalCounter,
+    SwitchProcess,
+    every_packet,
+    frame,
+    primary,
+    process,
+    program,
+)
 from benchmarks.switch_streams import count_stream, digest_entry
 from dataplane.bmv2 import PROGRAM, Bmv2
-from dataplane.program import load
-from dataplane.schema import bind
-from dataplane.table_codec import TableCodec
+from dataplane.p4runtime.schema import bind
+from dataplane.p4runtime.table_codec import TableCodec
+from dataplane.v1model.program import load
 from p4rt import p4runtime
-from sdnator.wire import VethPair
-from tests.dataplane.controller import Controller, Names, insert
+from sdnator.capture.interfaces import VethPair
+from sdnator.testing.p4runtime_client import EntryBuilder, P4RuntimeClient, insert
 
 RATES = (
     2_000,
@@ -82,7 +90,7 @@ def wire(kind: str, folder: Path, seconds: float) -> dict[str, float]:
         with ExitStack() as stack:
             entry, leave = VethPair.make(stack, "bi"), VethPair.make(stack, "bo")
             controller = _switch(kind, folder / what, entry.far, leave.near, stack)
-            names = Names(program().p4info)
+            names = EntryBuilder(program().p4info)
             seen = _prepare(what, controller, names, leave.far)
             pipe = stack.enter_context(process(send_process, entry.near))
             figures[what] = _highest(pipe, seen, seconds)
@@ -92,11 +100,11 @@ def wire(kind: str, folder: Path, seconds: float) -> dict[str, float]:
     return figures
 
 
-def _switch(kind: str, folder: Path, one: str, two: str, stack: ExitStack) -> Controller:
+def _switch(kind: str, folder: Path, one: str, two: str, stack: ExitStack) -> P4RuntimeClient:
     if kind == "bmv2":
         address = stack.enter_context(Bmv2({1: one, 2: two})).address
     else:
-        switch = Switch(folder, (f"1=veth:{one}", f"2=veth:{two}"))
+        switch = SwitchProcess(folder, (f"1=veth:{one}", f"2=veth:{two}"))
         stack.callback(switch.close)
         address = switch.address
     controller = primary(address)
@@ -104,7 +112,7 @@ def _switch(kind: str, folder: Path, one: str, two: str, stack: ExitStack) -> Co
     return controller
 
 
-def _prepare(what: str, controller: Controller, names: Names, out: str) -> Callable[[], int]:
+def _prepare(what: str, controller: P4RuntimeClient, names: EntryBuilder, out: str) -> Callable[[], int]:
     """Set the switch up; a counter of what has come through."""
     if what.startswith("forward_pps"):
         _block(controller, *((10, 10) if what == "forward_pps" else (10_000, 1_000)))
@@ -116,12 +124,12 @@ def _prepare(what: str, controller: Controller, names: Names, out: str) -> Calla
     every_packet(controller, names, copies=what == "packet_in_pps", digests=what == "digest_pps")
     if what == "digest_pps":
         controller.write(insert(digest_entry(names)))
-    seen = Count()
+    seen = ArrivalCounter()
     count_stream(controller, seen)
     return lambda: seen.total
 
 
-def _block(controller: Controller, blocks: int, ternary: int) -> None:
+def _block(controller: P4RuntimeClient, blocks: int, ternary: int) -> None:
     config = program()
     schema = bind(config.p4info, load(bytes(config.p4_device_config)))
     codecs = {name: TableCodec(schema.table_of(name)) for name in ("ingress.block_src", "ingress.block")}

@@ -30,14 +30,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks.data_folder import add_data_option
 from benchmarks.measure import arguments, machine, table, write_json
 from benchmarks.syn_flood_innocent import decisions_on, generated_day, public_capture
-from sdnator.syn_flood import VOID_FROM, guard, median, named, start_product, terminable
-from sdnator.syn_flood_frames import Sources
-from sdnator.syn_flood_lab import PLANS, Lab
-from sdnator.syn_flood_records import success
-from sdnator.syn_flood_stage import Stage
-from sdnator.syn_flood_trial import Field, Outcome, Trial
+from sdnator.demos.syn_flood.demo import VOID_FROM, guard, median, named, start_product, terminable
+from sdnator.demos.syn_flood.frames import Sources
+from sdnator.demos.syn_flood.lab import PLANS, Lab
+from sdnator.demos.syn_flood.records import success
+from sdnator.demos.syn_flood.stage import FloodStage
+from sdnator.demos.syn_flood.trial import Trial, TrialHosts, TrialOutcome
 
 KINDS: Final[dict[str, Sources]] = {
     "one_source": "one",
@@ -76,7 +77,6 @@ CROWD_RATE, CROWD_S = 250.0, 4.0
 LEARNING, CROWD, RECORDED, UNPROTECTED, ARMED, FOUND = 1, 2, 3, 5, 20, 120
 """Numbers of the victim's services; rounds count on from theirs."""
 _ROUNDS_MOST: Final = 10
-_DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @dataclass
@@ -84,8 +84,8 @@ class Kind:
     """What was seen of one kind of flood in one IP version."""
 
     unprotected: float | None = None
-    armed: list[Outcome] = field(default_factory=list)
-    found: list[Outcome] = field(default_factory=list)
+    armed: list[TrialOutcome] = field(default_factory=list)
+    found: list[TrialOutcome] = field(default_factory=list)
     entries_peak: int = 0
 
     def figures(self) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def median_or_endless(values: Sequence[float | None]) -> float | None:
 class Bench:
     """The rounds, on a running stage; none begins after `last`, monotonic seconds."""
 
-    def __init__(self, field: Field, names: Sequence[str], rounds: int, data: Path, last: float) -> None:
+    def __init__(self, field: TrialHosts, names: Sequence[str], rounds: int, data: Path, last: float) -> None:
         self._field = field
         self._last = last
         self._names = names
@@ -137,8 +137,8 @@ class Bench:
         self.kinds = {(version, name): Kind() for version in PLANS for name in names}
         self.settled = 0
         """Rounds that began with an idle product."""
-        self.looped: Outcome | None = None
-        self.recorded: Outcome | None = None
+        self.looped: TrialOutcome | None = None
+        self.recorded: TrialOutcome | None = None
 
     def unprotected(self) -> None:
         """Every kind once, before the product is there."""
@@ -219,7 +219,7 @@ class Bench:
             capture=self._capture if name == "real_capture" else "",
         )
 
-    def _run(self, trial: Trial) -> Outcome:
+    def _run(self, trial: Trial) -> TrialOutcome:
         outcome = self._field.run(trial)
         say = f"known {outcome.known_success}, new {outcome.new_success} of {outcome.tried}"
         when = f"challenged {outcome.challenged_ms}, rule {outcome.mitigated_ms} ms"
@@ -236,9 +236,9 @@ class Bench:
 
 
 @contextlib.contextmanager
-def running(folder: Path) -> Iterator[Stage]:
+def running(folder: Path) -> Iterator[FloodStage]:
     """The stage, without firewall and adapter."""
-    with terminable(), Lab() as lab, Stage(lab, folder, switch="embedded", guard=guard(5000)) as stage:
+    with terminable(), Lab() as lab, FloodStage(lab, folder, switch="embedded", guard=guard(5000)) as stage:
         yield stage
 
 
@@ -250,7 +250,7 @@ def measure(names: Sequence[str], rounds: int, data: Path, keep: Path | None) ->
         running(keep or Path(made)) as stage,
     ):
         services = [plan.service(number) for plan in PLANS.values() for number in range(1, 200)]
-        field = Field(stage, services)
+        field = TrialHosts(stage, services)
         bench = Bench(field, names, rounds, data, begun + _LAST_ROUND_S)
         bench.unprotected()
         stage.lab.flush_metrics()
@@ -294,7 +294,7 @@ def _innocent(data: Path) -> dict[str, Counter[str]]:
     }
 
 
-def _short(outcome: Outcome | None) -> dict[str, Any] | None:
+def _short(outcome: TrialOutcome | None) -> dict[str, Any] | None:
     if outcome is None:
         return None
     names = ("known_success", "new_success", "new_connect_ms_p50", "half_open_peak", "challenged_ms")
@@ -306,7 +306,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run all kinds; 1 where a run was void."""
     parser = arguments("syn_flood", __doc__, rounds=5)
     parser.add_argument("--only", choices=sorted(KINDS), action="append", help="only this kind; repeatable")
-    parser.add_argument("--data", type=Path, default=_DATA, help="folder of the tests' data")
+    add_data_option(parser)
     parser.add_argument("--keep", type=Path, help="folder to keep logs and reports in")
     chosen = parser.parse_args(argv)
     if not 1 <= chosen.rounds <= _ROUNDS_MOST:

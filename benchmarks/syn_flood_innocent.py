@@ -1,7 +1,7 @@
 """Innocent traffic before the firewall's SYN logic: how many decisions does it make?  No block, one hopes.
 
 The firewall service runs as it is, without backends, on the traffic's own clock: what the Sonata adapter
-would publish is pushed into it.  The generated days have devices whose server is gone, and which send it
+would publish is pushed into it.  The generated 50 minutes have devices whose server is gone, and which send it
 840 SYNs a second for a while: a service may be guarded for that, nobody may be blocked.  The public capture's
 table has no TCP flags, so all its TCP packets count as SYNs that nobody answers: worse than they were.
 """
@@ -19,8 +19,8 @@ from apps.firewall import service
 from apps.firewall.settings import Settings
 from apps.packets import read_frames
 from due import Item, RecordBatch
+from sdnator.capture.tshark_tsv import read_batches
 from sdnator.datasets import mirai_like
-from sdnator.tshark_tsv import read_batches
 
 _ROWS = 64
 _TICK_S = 0.05
@@ -106,7 +106,7 @@ def public_capture(table: Path) -> Iterator[RecordBatch]:
 def generated_day(seconds: float, seed: int) -> Iterator[RecordBatch]:
     """SYNs and SYN-ACKs of generated benign traffic."""
     frames = list(
-        mirai_like.generate(mirai_like.Options(seed=seed, benign_seconds=seconds, attack_seconds=0))
+        mirai_like.generate(mirai_like.MiraiLikeOptions(seed=seed, benign_seconds=seconds, attack_seconds=0))
     )
     number = np.arange(len(frames))
     batch = read_frames(

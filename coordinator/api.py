@@ -3,23 +3,24 @@
     GET /apps /instances /capabilities /interests /assignments /flow /health /metrics /openapi.json
     GET /apps/{app_id}/history      what happened to one app, from the archive
     GET /get?key=…                  items from the archive
-    WebSocket /observe?key=…        items as they come; a slow reader misses some and is told how many
+    WebSocket /observe?key=…        live items; a slow reader misses some and is told how many
 
-Requests whose Host or Origin is another site's are refused, so that no web page reads along.
+Requests with the Host or Origin of another site are refused, so that web pages cannot read the API.
+At most two archive queries run at a time, for at most 10 s each; an answer has at most 10,000 items or 16 MiB.
 """
 
 import asyncio
-import json
 import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 from urllib.parse import urlsplit
 
+import msgspec
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -35,14 +36,29 @@ from coordinator.metrics import render
 from coordinator.openapi import document
 from coordinator.registry import Registry
 from due import DueError, Engine, Item
-from due.errors import BackendError, InvalidQuery
+from due.drivers.query_time import time_limit
+from due.errors import BackendError, InvalidQuery, Timeout
 
 _MAX_ITEMS = 10_000
 _DEFAULT_ITEMS = 1000
+_MAX_ANSWER_BYTES = 16 << 20
+_MAX_QUERY_BYTES = 32 << 10
+_QUERIES = 2
+"""Concurrent archive queries; the rest of the Coordinator needs CPU time, too."""
+_QUERY_S = 10.0
+_WAIT_S = 5.0
+_MAX_OBSERVERS = 64
+_MAX_CONNECTIONS = 256
+_MAX_MESSAGE_BYTES = 4096
+"""Clients of /observe send nothing."""
 _QUEUE_ITEMS = 1000
 _STOP_S = 5.0
 _WINDOWS_NS = (60 * 10**9, 3600 * 10**9, 86_400 * 10**9, 2**62)
 _POLICY_VIOLATION = 1008
+_TRY_AGAIN_LATER = 1013
+_INT64_DIGITS = 20
+_JSON = {True: b"true", False: b"false"}
+_TYPE = "application/json"
 
 
 @dataclass(frozen=True)
@@ -59,7 +75,7 @@ class Northbound:
 
 
 class Api:
-    """The server, in a thread of its own.  Raises OSError where the address cannot be had."""
+    """The server, in a thread of its own.  Raises OSError if it cannot listen on the address."""
 
     def __init__(self, northbound: Northbound, host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -67,13 +83,18 @@ class Api:
         bound = self._socket.getsockname()[1]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
         config = uvicorn.Config(
-            application(northbound, host), log_level="warning", lifespan="off", access_log=False
+            application(northbound, host),
+            log_level="warning",
+            lifespan="off",
+            access_log=False,
+            limit_concurrency=_MAX_CONNECTIONS,
+            ws_max_size=_MAX_MESSAGE_BYTES,
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._run, name="coordinator-api", daemon=True)
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Start serving."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -99,7 +120,7 @@ def application(northbound: Northbound, host: str = "127.0.0.1") -> Starlette:
 
 
 async def _explain(_request: Request, error: Exception) -> Response:
-    """What the user asked wrongly is 400, what a backend cannot do now 503."""
+    """A wrong request gets 400, an unavailable backend 503."""
     status = 503 if isinstance(error, BackendError) else 400
     return JSONResponse({"error": type(error).__name__, "detail": str(error)}, status)
 
@@ -107,6 +128,8 @@ async def _explain(_request: Request, error: Exception) -> Response:
 class _Handlers:
     def __init__(self, northbound: Northbound) -> None:
         self._north = northbound
+        self._queries = asyncio.Semaphore(_QUERIES)
+        self._observers = 0
 
     def routes(self) -> list[BaseRoute]:
         shown = [Route(path, self._show(view), methods=["GET"]) for path, view in views.VIEWS.items()]
@@ -129,44 +152,64 @@ class _Handlers:
         return handler
 
     def health(self, _request: Request) -> Response:
-        """Of the Coordinator, and what every app last said of itself."""
+        """Health of the Coordinator, and the last health report of every app."""
         shown = self._north.health() | {"apps": views.value(self._north.apps_health())}
         return JSONResponse(shown)
 
-    def history(self, request: Request) -> Response:
-        """Joining, leaving, activation and incompatible wishes of one app."""
+    async def history(self, request: Request) -> Response:
+        """Events of one app: joining, leaving, activation and incompatible interests."""
         query = {"dataKey": self._north.events_key, "value.app_id": request.path_params["app_id"]}
-        return self._answer(query, request)
+        async with self._turn():
+            return await run_in_threadpool(self._answer, query, request)
 
-    def get(self, request: Request) -> Response:
+    async def get(self, request: Request) -> Response:
         """Items of a key, or of a query in the MongoDB dialect."""
-        query: dict[str, Any] = {}
-        if "query" in request.query_params:
-            query = json.loads(request.query_params["query"])
-            if not isinstance(query, dict):
-                raise InvalidQuery("query is a JSON object in the MongoDB dialect")
+        query = _query(request.query_params.get("query"))
         if "key" in request.query_params:
             query = {"$and": [query, {"dataKey": request.query_params["key"]}]} if query else _of_key(request)
         if not query:
             raise InvalidQuery("name a key (?key=…) or a query (?query={…})")
-        return self._answer(query, request)
+        async with self._turn():
+            return await run_in_threadpool(self._answer, query, request)
+
+    @asynccontextmanager
+    async def _turn(self) -> AsyncIterator[None]:
+        """Keep the event loop and the threads of other answers from waiting for the archive."""
+        try:
+            await asyncio.wait_for(self._queries.acquire(), _WAIT_S)
+        except TimeoutError:
+            raise Timeout(f"{_QUERIES} archive queries are running: try again later") from None
+        try:
+            yield
+        finally:
+            self._queries.release()
 
     def metrics(self, _request: Request) -> Response:
-        """For Prometheus."""
+        """Metrics for Prometheus."""
         health = self._north.health()
         with self._north.lock:
             text, kind = render(self._north.registry, health, time.monotonic())
         return Response(text, media_type=kind)
 
     def openapi(self, _request: Request) -> Response:
-        """This API, described."""
+        """The OpenAPI document."""
         return JSONResponse(document())
 
     async def observe(self, socket: WebSocket) -> None:
-        """Items of a key as they come."""
+        """Live items of a key."""
         if not _same_site(socket):
             await socket.close(_POLICY_VIOLATION, "requests from other sites are refused")
             return
+        if self._observers >= _MAX_OBSERVERS:
+            await socket.close(_TRY_AGAIN_LATER, f"{_MAX_OBSERVERS} observers are connected already")
+            return
+        self._observers += 1
+        try:
+            await self._observe(socket)
+        finally:
+            self._observers -= 1
+
+    async def _observe(self, socket: WebSocket) -> None:
         await socket.accept()
         feed = _Feed(asyncio.get_running_loop())
         try:
@@ -184,25 +227,77 @@ class _Handlers:
     def _answer(self, query: dict[str, Any], request: Request) -> Response:
         """The youngest `limit` items, oldest first; `since` and `until` are ns.
 
-        Looks at the last minute first and farther back while there is too little: the archive may be large.
+        Searches the last minute first and goes back until there are enough: the archive may be large.
         """
-        since = int(request.query_params.get("since", 0))
-        until = int(request.query_params.get("until", time.time_ns() + 1))
-        limit = min(max(int(request.query_params.get("limit", _DEFAULT_ITEMS)), 1), _MAX_ITEMS)
+        since = _number(request, "since", 0)
+        until = _number(request, "until", None)
+        limit = min(max(_number(request, "limit", _DEFAULT_ITEMS), 1), _MAX_ITEMS)
+        with time_limit(_QUERY_S):
+            found, start = self._found(query, since, until, limit)
+        shown = list(_shown(found[-limit:]))
+        more = len(found) > len(shown) or start > since
+        return Response(
+            b'{"items":[%b],"more":%b}' % (b",".join(reversed(shown)), _JSON[more]), media_type=_TYPE
+        )
+
+    def _found(
+        self, query: dict[str, Any], since: int, until: int | None, limit: int
+    ) -> tuple[list[Item], int]:
+        """Items, and the time from which on all were searched.
+
+        Without `until` there is no upper bound, because a host's clock may be ahead of ours.
+        """
         found: list[Item] = []
-        start = until
+        start = end = time.time_ns() + 1 if until is None else until
         for window in _WINDOWS_NS:
-            start = max(since, until - window)
-            bounds = {"timestamp": {"$gte": start, "$lt": until}}
-            found = self._north.engine.get({"$and": [query, bounds]}, limit=limit + 1)
+            start = max(since, end - window)
+            bounds = {"$gte": start} if until is None else {"$gte": start, "$lt": until}
+            found = self._north.engine.get({"$and": [query, {"timestamp": bounds}]}, limit=limit + 1)
             if len(found) >= limit or start == since:
                 break
-        shown = [views.item(one) for one in found[-limit:]]
-        return JSONResponse({"items": shown, "more": len(found) > limit or start > since})
+        return found, start
+
+
+def _shown(items: Sequence[Item]) -> Iterator[bytes]:
+    """Items as JSON, youngest first, as many as fit into an answer."""
+    size = 0
+    for item in reversed(items):
+        text = JSONResponse(views.item(item)).body
+        size += len(text)
+        if size > _MAX_ANSWER_BYTES:
+            return
+        yield bytes(text)
+
+
+def _query(text: str | None) -> dict[str, Any]:
+    if text is None:
+        return {}
+    if len(text) > _MAX_QUERY_BYTES:
+        raise InvalidQuery(f"the query has {len(text)} characters: at most {_MAX_QUERY_BYTES}")
+    try:
+        query = msgspec.json.decode(text)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise InvalidQuery(f"query is not valid JSON: {error}") from None
+    if not isinstance(query, dict):
+        raise InvalidQuery("query is a JSON object in the MongoDB dialect")
+    return query
+
+
+@overload
+def _number(request: Request, name: str, default: int) -> int: ...
+@overload
+def _number(request: Request, name: str, default: None) -> int | None: ...
+def _number(request: Request, name: str, default: int | None) -> int | None:
+    text = request.query_params.get(name)
+    if text is None:
+        return default
+    if not (text.lstrip("-").isdecimal() and len(text) < _INT64_DIGITS):
+        raise InvalidQuery(f"{name} is a whole number, not {text[:40]!r}")
+    return int(text)
 
 
 class _Feed:
-    """From the engine's thread to the event loop; bounded, the oldest items give way."""
+    """Queue from the engine's thread to the event loop; bounded, the oldest items are dropped."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -219,11 +314,11 @@ class _Feed:
             self._items.append(item)
             wake = len(self._items) == 1
         if wake:
-            with suppress(RuntimeError):  # the loop has ended: nobody reads any more
+            with suppress(RuntimeError):  # the event loop has ended: there is no reader any more
                 self._loop.call_soon_threadsafe(self._ready.set)
 
     async def take(self) -> tuple[list[Item], int]:
-        """What has come, and how many items were missed since the last call."""
+        """Received items, and how many were missed since the last call."""
         await self._ready.wait()
         self._ready.clear()
         with self._lock:
@@ -262,6 +357,6 @@ def _of_key(request: Request) -> dict[str, Any]:
 
 
 def _same_site(socket: WebSocket) -> bool:
-    """Browsers name the page's origin; programs name none."""
+    """Whether the Origin is ours: browsers send the page's origin, programs send none."""
     origin = socket.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == socket.headers.get("host")

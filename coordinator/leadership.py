@@ -1,30 +1,35 @@
 """Which of several Coordinators leads.  Pure: time is an argument (s, monotonic).
 
-    listening ──no leader for 3 intervals──► leading ──a better claim, or I was stopped──► listening
+    listening ──no leader for 3 intervals──► leading ──a better claim, or suspended──► listening
 
-All announce themselves every interval.  One that starts or was stopped listens before it leads, so it
+All announce themselves every interval.  One that starts or was suspended listens before it leads, so it
 never contradicts a leader that is there; of two leaders the one with the higher term stays, at equal
 terms the one that started first.
 """
 
+from typing import Annotated
+
 import msgspec
 
 _PATIENCE = 3.0
+_MOST_TERM = 2**53
+_TERM_STEP = 1 << 32
+"""A claim with a term further ahead is refused."""
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
-    """What a Coordinator says of itself."""
+    """The announcement of a Coordinator."""
 
     instance_id: str
-    started: int
-    """UTC, ns."""
-    term: int = 0
+    started: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    """UTC, ns.  Only breaks ties, so wrong clocks do no harm."""
+    term: Annotated[int, msgspec.Meta(ge=0, le=_MOST_TERM)] = 0
     """Grows with each change of the leader."""
     leading: bool = False
 
     @property
     def rank(self) -> tuple[int, int, str]:
-        """The smaller one has precedence."""
+        """Sort key; the smaller claim has precedence."""
         return -self.term, self.started, self.instance_id
 
 
@@ -45,14 +50,14 @@ class Leadership:
         return self.claim.leading
 
     def heard(self, other: Claim, now: float) -> None:
-        """Another's claim arrived."""
+        """Note the claim of another Coordinator."""
         mine = self.claim
-        if other.instance_id == mine.instance_id:
+        if other.instance_id == mine.instance_id or other.term > mine.term + _TERM_STEP:
             return
         if other.leading and (not mine.leading or other.rank < mine.rank):
             self._listen(now, leader=other.instance_id)
         elif other.instance_id == self.leader and not mine.leading:
-            # it steps down: no need to wait in full
+            # it steps down, so waiting in full is not needed
             self.leader = ""
             self._quiet_since = now - (_PATIENCE - 1) * self._interval
         elif not other.leading and not mine.leading and other.rank < mine.rank and not self.leader:
@@ -78,7 +83,7 @@ class Leadership:
         return self.claim
 
     def resigned(self) -> Claim:
-        """The last word of one that stops."""
+        """The last announcement of a Coordinator that stops."""
         return msgspec.structs.replace(self.claim, leading=False)
 
     def _listen(self, now: float, *, leader: str) -> None:

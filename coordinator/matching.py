@@ -1,10 +1,10 @@
-"""Who gets what from whom, and how often.  Pure.
+"""Which consumer gets which data from which producer, and at what rate.  Pure.
 
     declarations of the apps that live ──match()──► assignments per producer, 'incompatible' per consumer
 
 The rate of an assignment is the highest of the consumers' minimum rates, capped by what the producer
-can make; a consumer that wants no more than less is thinned out by its own DUE.  A consumer without
-a rate takes what comes, so the producer goes as fast as it can.
+can make; the DUE of a consumer with a lower maximum drops items above it.  A consumer without
+a rate takes every item, so the producer writes as fast as it can.
 """
 
 from collections import defaultdict
@@ -19,7 +19,7 @@ from due.messages import Assignment, Capability, Frequency, Interest
 
 @dataclass(frozen=True, slots=True)
 class Declarations:
-    """What the live instances of one app declare together."""
+    """The union of what the live instances of one app declare."""
 
     capabilities: tuple[Capability, ...] = ()
     interests: tuple[Interest, ...] = ()
@@ -27,7 +27,7 @@ class Declarations:
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """One consumer that gets one of its interests from one producer's capability."""
+    """One interest of a consumer, served by one capability of a producer."""
 
     producer: str
     consumer: str
@@ -37,7 +37,7 @@ class Flow:
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """The outcome for all apps; an app without an entry has none."""
+    """The result for all apps; an app without an entry gets nothing."""
 
     assignments: Mapping[str, tuple[Assignment, ...]] = field(default_factory=dict)
     incompatible: Mapping[str, tuple[Incompatible, ...]] = field(default_factory=dict)

@@ -9,15 +9,21 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.registry import Collector
 
-from coordinator.registry import Registry, State
+from coordinator.registry import InstanceState, Registry
 
 _COUNTERS = {
     "registrations": "Registrations received",
     "heartbeats": "Heartbeats received",
-    "misunderstood": "Membership messages that were not understood",
+    "misunderstood": "Membership messages that could not be decoded",
+    "refused": "Membership messages refused as implausible, or beyond the limits of apps, instances or keys",
     "assignments_sent": "Assignments sent",
-    "retention_deleted": "Items deleted from the archive for their age or its size",
-    "failovers": "Changes of the working instance because the former was lost",
+    "retention_deleted": "Items deleted from the archive because of its limits of age and size",
+    "failovers": "Changes of the active instance because the former one was lost",
+}
+_SIZES = {
+    "apps": "Apps that are listed",
+    "declared_keys": "Capabilities and interests of all instances",
+    "epochs": "Apps whose epoch is remembered",
 }
 
 
@@ -31,11 +37,13 @@ class _Snapshot(Collector):
         """The families."""
         yield GaugeMetricFamily(
             "sdnator_coordinator_leading",
-            "1 where this Coordinator leads",
+            "1 if this Coordinator leads",
             value=float(self._health["leading"]),
         )
         for name, text in _COUNTERS.items():
             yield CounterMetricFamily(f"sdnator_coordinator_{name}", text, value=float(self._health[name]))
+        for name, text in _SIZES.items():
+            yield GaugeMetricFamily(f"sdnator_coordinator_{name}", text, value=float(self._health[name]))
         yield self._instances()
         yield from self._per_app()
         yield from self._per_instance()
@@ -44,7 +52,7 @@ class _Snapshot(Collector):
         family = GaugeMetricFamily("sdnator_instances", "Instances by app and state", labels=["app", "state"])
         counts = Counter((one.registration.app_id, state) for one, state in self._registry.instances())
         for app in sorted({app for app, _ in counts}):
-            for state in State:
+            for state in InstanceState:
                 family.add_metric([app, state.value], float(counts[app, state]))
         return family
 
@@ -60,7 +68,7 @@ class _Snapshot(Collector):
                 "Interests that cannot be met",
                 {a: len(m.incompatible) for a, m in told.items()},
             ),
-            ("epoch", "Epoch of the working instance", {a: m.epoch for a, m in told.items()}),
+            ("epoch", "Epoch of the active instance", {a: m.epoch for a, m in told.items()}),
         ):
             family = GaugeMetricFamily(f"sdnator_{name}", f"{text}, by app", labels=["app"])
             for app, count in counts.items():
@@ -70,7 +78,7 @@ class _Snapshot(Collector):
     def _per_instance(self) -> Iterator[Metric]:
         labels = ["app", "instance"]
         silent = GaugeMetricFamily(
-            "sdnator_instance_silent_seconds", "Since the last sign of life", labels=labels
+            "sdnator_instance_silent_seconds", "Seconds since the last heartbeat", labels=labels
         )
         written = CounterMetricFamily("sdnator_instance_items_written", "Items written", labels=labels)
         received = CounterMetricFamily("sdnator_instance_items_received", "Items received", labels=labels)

@@ -1,14 +1,15 @@
-"""Who is here, which instance works, and what each app is told.  Pure: time is an argument (s, monotonic).
+"""Known instances, active instances, and assignments.  Pure: time is an argument (s, monotonic).
 
     Registration, Heartbeat, expire(now) ──► Registry ──► outgoing(): Assignments to send
                                                      └──► events(): what changed, for the archive
 
-All of it is soft: an unknown instance that shows a sign of life is told so and registers again, and an
-instance that already works is kept (its heartbeats say so), so a Coordinator that starts or takes over
-changes nothing that is well.
+All state is soft: an unknown instance that sends a heartbeat is told so and registers again, and an
+instance that is already active stays so (its heartbeats tell), so a Coordinator that starts or takes over
+does not disturb a working pipeline.
 """
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -20,19 +21,22 @@ from coordinator.selection import Strategy, at_random
 from due.membership import Assignments, Heartbeat, Registration
 
 _SILENCE = 3.0
+_MOST_EPOCHS = 4096
+"""Apps whose epochs are remembered after they have ended; the oldest is forgotten first."""
+_MOST_EVENTS = 10_000
 
 
-class State(Enum):
-    """Of an instance."""
+class InstanceState(Enum):
+    """State of an instance."""
 
     ACTIVE = "active"
-    """Works."""
+    """It is active."""
     IDLE = "idle"
-    """Lives and waits: another instance of its app works."""
+    """A standby: another instance of its app is active."""
     UNRESPONSIVE = "unresponsive"
-    """No sign of life for longer than its heartbeat allows."""
+    """No heartbeat for longer than its interval allows."""
     OFFLINE = "offline"
-    """It said good-bye."""
+    """It sent its offline heartbeat."""
 
 
 @dataclass(slots=True)
@@ -42,7 +46,7 @@ class Instance:
     registration: Registration
     seen: float
     beat: Heartbeat | None = None
-    gone: State | None = None
+    gone: InstanceState | None = None
 
     @property
     def alive(self) -> bool:
@@ -68,18 +72,18 @@ class Event:
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
-    """The registry's knowledge worth keeping."""
+    """The part of the registry that is worth archiving."""
 
     epochs: dict[str, int]
-    """Of every app ever seen."""
+    """Epoch of every app ever seen."""
     active: dict[str, str]
-    """App id to its working instance."""
+    """App id to its active instance."""
     registrations: tuple[Registration, ...]
-    """Of the live instances."""
+    """Registrations of the live instances."""
 
 
 class _App:
-    """The instances of one app and what they were last told."""
+    """The instances of one app and their last assignments."""
 
     def __init__(self, epoch: int) -> None:
         self.instances: dict[str, Instance] = {}
@@ -104,7 +108,7 @@ class _App:
         )
 
     def claim(self) -> str:
-        """The live instance that already works by an earlier Coordinator's word, or ""."""
+        """The live instance that an earlier Coordinator made active, or ""."""
         claims = [
             one.beat for one in self.alive if one.beat is not None and one.beat.active and one.beat.version
         ]
@@ -112,11 +116,11 @@ class _App:
 
 
 class Registry:
-    """The Coordinator's knowledge.  Not thread-safe.
+    """The Coordinator's state.  Not thread-safe.
 
     `missed`: heartbeats an instance may miss before it counts as unresponsive.
-    `forget_s`: seconds after which an instance that is gone is no longer listed.
-    `first_epoch`, `version`: the least to begin with; higher than those of any earlier Coordinator.
+    `forget_s`: seconds after which an instance that has ended is not listed any more.
+    `first_epoch`, `version`: the first to use; higher than those of any earlier Coordinator.
     """
 
     def __init__(
@@ -150,7 +154,7 @@ class Registry:
         self._looked: float | None = None
         self._dirty = False
         self._answers: dict[str, None] = {}
-        self._events: list[Event] = []
+        self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
 
     # --- what comes in -------------------------------------------------------------------------
 
@@ -172,10 +176,10 @@ class Registry:
             self._answer(message.app_id)
 
     def beat(self, message: Heartbeat, now: float) -> None:
-        """A sign of life, or the good-bye."""
+        """Take a heartbeat, or the last one."""
         app = self._app(message.app_id)
         if message.epoch > app.epoch:
-            # what is older than it knows an instance does not obey
+            # an instance ignores an epoch older than the one it knows
             app.epoch, self._dirty = message.epoch, True
         remembered = self._remembered.get(message.instance_id)
         if remembered is not None:
@@ -183,8 +187,8 @@ class Registry:
         known = app.instances.get(message.instance_id)
         self._hear(known, now)
         if message.state == "offline":
-            if known is not None and known.gone is not State.OFFLINE:
-                self._lost(message.app_id, known, State.OFFLINE)
+            if known is not None and known.gone is not InstanceState.OFFLINE:
+                self._lost(message.app_id, known, InstanceState.OFFLINE)
                 known.seen = now
             return
         if known is None or known.registration.revision != message.revision:
@@ -199,22 +203,22 @@ class Registry:
             self._answer(message.app_id)
 
     def recall(self, checkpoint: Checkpoint) -> None:
-        """Take what an earlier Coordinator left as a hint; what is known already stays."""
+        """Use an earlier Coordinator's checkpoint as a hint; known instances stay as they are."""
         for name, epoch in checkpoint.epochs.items():
-            self._epochs[name] = max(epoch, self._epochs.get(name, 0))
+            self._remember_epoch(name, epoch)
             if name in self._apps and self._apps[name].epoch < epoch:
                 self._apps[name].epoch, self._dirty = epoch, True
-        self._remembered.update({one.instance_id: one for one in checkpoint.registrations})
-        self._preferred.update(checkpoint.active)
+        self._remembered = {one.instance_id: one for one in checkpoint.registrations}
+        self._preferred = dict(checkpoint.active)
 
     def checkpoint(self) -> Checkpoint:
-        """What to leave for the next Coordinator."""
+        """The checkpoint for the next Coordinator."""
         alive = [one.registration for app in self._apps.values() for one in app.alive]
         active = {name: app.active for name, app in self._apps.items() if app.active}
         return Checkpoint(epochs=self.epochs(), active=active, registrations=tuple(alive))
 
     def expire(self, now: float) -> None:
-        """Find who has been silent too long, and drop who has been gone for long.  Call often."""
+        """Mark silent instances unresponsive, and drop those that ended long ago.  Call often."""
         paused = now - self._looked if self._looked is not None else 0.0
         self._looked = now
         for name, app in list(self._apps.items()):
@@ -223,28 +227,28 @@ class Registry:
                     instance.seen += paused
                 silent = now - instance.seen
                 if instance.alive and silent > self._patience(instance, now):
-                    self._lost(name, instance, State.UNRESPONSIVE)
+                    self._lost(name, instance, InstanceState.UNRESPONSIVE)
                 elif not instance.alive and silent > self._forget_s:
                     del app.instances[instance.registration.instance_id]
             if not app.instances and name not in self._answers:
-                self._epochs[name] = max(app.epoch, self._epochs.get(name, 0))
+                self._remember_epoch(name, app.epoch)
                 del self._apps[name]
 
     def lead(self) -> None:
-        """From now on this Coordinator decides; working instances keep working."""
+        """This Coordinator leads from now on; active instances stay active."""
         self.leading = True
         for app in self._apps.values():
             app.active = ""
         self._dirty = True
 
     def follow(self) -> None:
-        """Another Coordinator decides: listen only."""
+        """Another Coordinator leads: only listen."""
         self.leading = False
 
     # --- what goes out -------------------------------------------------------------------------
 
     def outgoing(self) -> list[Assignments]:
-        """What to send now: answers, and what changed since the last call."""
+        """Assignments to send now: answers, and changes since the last call."""
         if self._dirty and self.leading:
             self._dirty = False
             self.changes += 1
@@ -261,12 +265,13 @@ class Registry:
 
     def events(self) -> list[Event]:
         """What changed since the last call."""
-        events, self._events = self._events, []
+        events = list(self._events)
+        self._events.clear()
         return events
 
     # --- what is known -------------------------------------------------------------------------
 
-    def instances(self) -> Iterator[tuple[Instance, State]]:
+    def instances(self) -> Iterator[tuple[Instance, InstanceState]]:
         """Every instance that is listed, and its state."""
         for name in sorted(self._apps):
             app = self._apps[name]
@@ -278,8 +283,30 @@ class Registry:
         return {name: self._apps[name].declarations() for name in sorted(self._apps)}
 
     def assignments(self) -> dict[str, Assignments]:
-        """What each app was last told."""
+        """The last assignments of each app."""
         return {name: app.sent for name, app in sorted(self._apps.items()) if app.sent is not None}
+
+    def known(self, app: str) -> Collection[str] | None:
+        """Instance ids of a listed app."""
+        return self._apps[app].instances.keys() if app in self._apps else None
+
+    def app_count(self) -> int:
+        """Listed apps."""
+        return len(self._apps)
+
+    def declared_keys(self, *, besides: str = "") -> int:
+        """Capabilities and interests of all instances but one."""
+        return sum(
+            len(one.registration.capabilities) + len(one.registration.interests)
+            for app in self._apps.values()
+            for name, one in app.instances.items()
+            if name != besides
+        )
+
+    def epoch(self, app: str) -> int:
+        """The highest epoch of this app, at least the first epoch."""
+        known = self._apps[app].epoch if app in self._apps else self._epochs.get(app, 0)
+        return max(known, self._first_epoch)
 
     def epochs(self) -> dict[str, int]:
         """The highest epoch of every app ever seen."""
@@ -292,16 +319,21 @@ class Registry:
             self._apps[name] = _App(self._epochs.get(name, 0))
         return self._apps[name]
 
+    def _remember_epoch(self, name: str, epoch: int) -> None:
+        self._epochs[name] = max(epoch, self._epochs.pop(name, 0))
+        if len(self._epochs) > _MOST_EPOCHS:
+            del self._epochs[next(iter(self._epochs))]
+
     def _timeout(self, instance: Instance) -> float:
         return max(self._missed * instance.registration.heartbeat, self._shortest_timeout_s)
 
     def _patience(self, instance: Instance, now: float) -> float:
-        """Longer while nobody at all is heard: then the connection is the likelier culprit."""
+        """Seconds to wait for a heartbeat; longer while no instance is heard, as then the connection is suspect."""
         timeout = self._timeout(instance)
         return timeout if self._heard is None or now - self._heard <= timeout else _SILENCE * timeout
 
     def _hear(self, sender: Instance | None, now: float) -> None:
-        """When known ones speak again after a silence of all, nobody is blamed for the silence."""
+        """Note a heartbeat; after a silence of all instances, none is marked unresponsive for it."""
         heard, self._heard = self._heard, now
         if heard is None or sender is None or now - heard <= self._shortest_timeout_s:
             return
@@ -309,7 +341,7 @@ class Registry:
         blamed = [
             one
             for one in known
-            if one.gone is not State.OFFLINE and heard - one.seen <= _SILENCE * self._timeout(one)
+            if one.gone is not InstanceState.OFFLINE and heard - one.seen <= _SILENCE * self._timeout(one)
         ]
         timeouts = [self._timeout(one) for one in blamed if one.registration.heartbeat < self._forget_s]
         if not timeouts or now - heard <= max(timeouts):
@@ -320,18 +352,18 @@ class Registry:
                 one.gone = None
                 self._dirty = True
 
-    def _lost(self, name: str, instance: Instance, state: State) -> None:
+    def _lost(self, name: str, instance: Instance, state: InstanceState) -> None:
         instance.gone = state
         self._dirty = True
         self._note(state.value, name, instance.registration.instance_id)
 
-    def _state(self, app: _App, instance: Instance) -> State:
+    def _state(self, app: _App, instance: Instance) -> InstanceState:
         if instance.gone is not None:
             return instance.gone
         waits = (
             instance.registration.instances == "standby" and app.active != instance.registration.instance_id
         )
-        return State.IDLE if waits else State.ACTIVE
+        return InstanceState.IDLE if waits else InstanceState.ACTIVE
 
     def _elect(self) -> None:
         for name, app in self._apps.items():
@@ -350,12 +382,12 @@ class Registry:
             self._note("activated", name, app.active, f"epoch {app.epoch}")
 
     def _former(self, name: str, app: _App) -> str:
-        """The instance that worked by the checkpoint, if it lives."""
+        """The active instance of the checkpoint, if it is alive."""
         known = app.instances.get(self._preferred.pop(name, ""))
         return known.registration.instance_id if known is not None and known.alive else ""
 
     def _return_of(self, remembered: Registration, message: Heartbeat, now: float) -> None:
-        """The checkpoint's registration spares an instance to register again, if it still holds."""
+        """Use a registration from the checkpoint, if it is still valid, instead of asking for a new one."""
         if message.state == "online" and remembered.revision == message.revision:
             self.registered(remembered, now)
 
@@ -387,7 +419,7 @@ class Registry:
         )
 
     def _question(self, name: str, epoch: int) -> Assignments:
-        """Not an order: an instance that does not find itself in it registers again."""
+        """Assignments without content: an instance that is not listed in them registers again."""
         return Assignments(
             app_id=name, coordinator=self.coordinator, version=self._version, epoch=epoch, revisions={}
         )

@@ -31,15 +31,15 @@ class Retention:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator-retention", daemon=True)
         self.deleted = 0
-        """Items so far."""
+        """Items deleted so far."""
 
     def start(self) -> None:
-        """Begin, where there is a limit."""
+        """Start the thread if there is a limit."""
         if self._age_s > 0 or self._max_bytes > 0:
             self._thread.start()
 
     def stop(self) -> None:
-        """End; a prune on its way is finished first."""
+        """Stop; a running prune is finished first."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -56,8 +56,8 @@ class Retention:
         try:
             deleted = archive.prune(before=before, max_bytes=self._max_bytes or None)
         except DueError as error:
-            log.warning("the archive could not be pruned: %s; trying again in %g s", error, self._every_s)
+            log.warning("the archive could not be pruned: %s; retrying in %g s", error, self._every_s)
             return
         self.deleted += deleted
         if deleted:
-            log.info("%d items were beyond the archive's age or size and are deleted", deleted)
+            log.info("deleted %d items that exceeded the archive's limit of age or size", deleted)

@@ -1,4 +1,4 @@
-"""Which instance of a standby app works.  A strategy picks once; the registry keeps its choice.
+"""Which instance of a standby app becomes active.  A strategy picks once; the registry keeps its choice.
 
 The Coordinator's setting `selection` names one of `STRATEGIES`, or one of your own as `module:function`.
 """
@@ -15,17 +15,17 @@ Strategy = Callable[[Sequence[Candidate]], Candidate]
 
 
 def at_random(candidates: Sequence[Candidate]) -> Candidate:
-    """Any, with equal chances."""
+    """Any candidate, with equal probability."""
     return random.choice(candidates)
 
 
 def oldest(candidates: Sequence[Candidate]) -> Candidate:
-    """The one that started first."""
+    """The candidate that started first."""
     return min(candidates, key=lambda candidate: candidate[0].started)
 
 
 def least_busy(candidates: Sequence[Candidate]) -> Candidate:
-    """The one that has written and received least so far."""
+    """The candidate that has written and received the fewest items."""
     return min(candidates, key=lambda candidate: _work(candidate[1]))
 
 

@@ -1,4 +1,4 @@
-"""The Coordinator: who is here, who wants what, who makes what, at what rate.
+"""The Coordinator: registers apps, matches interests with capabilities, and assigns rates.
 
     due.registration.*, due.heartbeat.* ──► Registry ──► due.assignment.<app>
     due.leader.coordinator ◄──────────────► Leadership
@@ -6,7 +6,7 @@
     Retention ──► Data Archives, where a limit of age or size is set
     Checkpoints ◄──► Data Archives: what the next Coordinator may know from its start
 
-Run it with `python -m coordinator.service`; it is an app like any other and registers with itself.
+Run it with `python -m coordinator.service`; like any app it registers, with itself.
 """
 
 import logging
@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from coordinator.admission import Admission
 from coordinator.api import Api, Northbound
 from coordinator.checkpoint import Checkpoints
 from coordinator.leadership import Claim, Leadership
@@ -28,6 +29,7 @@ from coordinator.selection import find as find_strategy
 from due import NO_WAIT, PUB_ONLY, Capability, DueError, Engine, Interest, Item
 from due import service as due_service
 from due.backends import default_archive, open_archive
+from due.codec import encode_value
 from due.errors import InvalidOption
 from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
 
@@ -37,11 +39,12 @@ INTERESTS = (
     Interest("due.leader.coordinator"),
     Interest("due.health.*"),
 )
-# due.assignment.<app> and due.leader.coordinator are written as well, undeclared: nobody has to ask for them
+# due.assignment.<app> and due.leader.coordinator are not declared, so they are written without an interest
 CAPABILITIES = (Capability("due.event.coordinator", archive="always", index=True),)
 
 EVENTS = "due.event.coordinator"
 _LEADER = "due.leader.coordinator"
+_HEALTH_BYTES = 256 << 10
 
 log = logging.getLogger("coordinator")
 
@@ -62,18 +65,18 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     selection: str = "random"
     """How the working instance of a standby app is chosen: random, oldest, least_busy or `module:function`."""
     missed_heartbeats: float = 4.0
-    """So many heartbeats late, an instance is unresponsive."""
+    """An instance is unresponsive after this many missed heartbeats."""
     forget_s: float = 300.0
-    """Seconds after which an instance that is gone is no longer listed."""
+    """Seconds after which an instance that has ended is no longer listed."""
     leader_interval_s: float = 0.2
     """Seconds between announcements; a leader silent for three of them is replaced."""
 
     retain_s: float = 0.0
-    """Items older than so many seconds are deleted from the archive; 0: never."""
+    """Age in seconds from which items are deleted from the archive; 0: never."""
     retain_bytes: int = 0
-    """Beyond this size of the archive the oldest items are deleted; 0: no limit."""
+    """Size of the archive in bytes beyond which the oldest items are deleted; 0: no limit."""
     retain_every_s: float = 60.0
-    """Seconds between two looks at age and size."""
+    """Seconds between two checks of age and size."""
 
     def __post_init__(self) -> None:
         find_strategy(self.selection)
@@ -94,14 +97,16 @@ class CoordinatorService:
             select=find_strategy(settings.selection),
             missed=settings.missed_heartbeats,
             forget_s=settings.forget_s,
-            # both grow from one Coordinator to the next, so neither has to be remembered
+            # both grow from one Coordinator to the next, so neither has to be stored
             first_epoch=started // 1_000_000_000,
             version=started // 1_000_000,
         )
+        self._admission = Admission(self._registry)
         self._leadership = Leadership(
             engine.instance_id, started, time.monotonic(), interval=settings.leader_interval_s
         )
-        self._counts = {"registrations": 0, "heartbeats": 0, "misunderstood": 0, "assignments_sent": 0}
+        counts = ("registrations", "heartbeats", "misunderstood", "assignments_sent", "health_refused")
+        self._counts = dict.fromkeys(counts, 0)
         self._apps_health: dict[str, Any] = {}
         self._api: Api | None = None
         self._checkpoints = Checkpoints(engine)
@@ -114,7 +119,7 @@ class CoordinatorService:
         )
 
     def start(self) -> None:
-        """Listen; raises InvalidOption if the HTTP address cannot be had."""
+        """Start listening; raises InvalidOption if the HTTP address is not available."""
         for key, handler in (
             (f"{REGISTRATION}.*", self._registered),
             (f"{HEARTBEAT}.*", self._beat),
@@ -128,11 +133,11 @@ class CoordinatorService:
         self._checkpoints.find(self._recall)
 
     def ready(self) -> dict[str, str]:
-        """Where the HTTP API is."""
+        """The URL of the HTTP API."""
         return {"http": self._api.url} if self._api is not None else {}
 
     def tick(self) -> None:
-        """Announce, look for the silent, send what changed."""
+        """Announce this Coordinator, find silent instances, send changes."""
         now = time.monotonic()
         with self._lock:
             led = self._leadership.leading
@@ -141,7 +146,7 @@ class CoordinatorService:
             self._obey(led)
             messages = self._registry.outgoing()
             leading = self._leadership.leading
-            # while nobody leads yet they wait: the leader to be writes them, all others would repeat them
+            # wait while nobody leads: the future leader writes them, and the others would repeat them
             events = self._registry.events() if leading or self._leadership.leader else []
         if claim is not None:
             self._write(_LEADER, msgspec.to_builtins(claim))
@@ -155,7 +160,7 @@ class CoordinatorService:
             self._checkpoints.write(self._registry.changes, self._checkpoint, now)
 
     def stop(self) -> None:
-        """Stop serving; a last word lets another Coordinator lead at once."""
+        """Stop serving; a last announcement lets another Coordinator lead at once."""
         if self._leadership.leading:
             self._write(_LEADER, msgspec.to_builtins(self._leadership.resigned()))
         if self._api is not None:
@@ -175,6 +180,11 @@ class CoordinatorService:
                 "failovers": self._registry.failovers,
                 "http": self._api.url if self._api is not None else "",
                 "retention_deleted": self._retention.deleted,
+                "apps": self._registry.app_count(),
+                "declared_keys": self._registry.declared_keys(),
+                "epochs": len(self._registry.epochs()),
+                "refused": self._admission.refused,
+                "last_refused": [msgspec.to_builtins(one) for one in self._admission.last],
                 **self._counts,
             }
 
@@ -184,7 +194,7 @@ class CoordinatorService:
             registry=self._registry,
             lock=self._lock,
             health=self.health,
-            apps_health=lambda: dict(self._apps_health),
+            apps_health=lambda: self._apps_health,
             events_key=EVENTS,
         )
         try:
@@ -200,7 +210,7 @@ class CoordinatorService:
             Path(self._settings.address_file).write_text(self._api.url)
 
     def _obey(self, led: bool) -> None:
-        """Carry a change of leadership over to the registry."""
+        """Apply a change of leadership to the registry."""
         leading = self._leadership.leading
         if leading and not self._registry.leading:
             log.info("this Coordinator leads")
@@ -212,7 +222,7 @@ class CoordinatorService:
 
     def _recall(self, checkpoint: Checkpoint) -> None:
         with self._lock:
-            self._registry.recall(checkpoint)
+            self._registry.recall(self._admission.checkpoint(checkpoint))
 
     def _checkpoint(self) -> Checkpoint:
         with self._lock:
@@ -223,14 +233,16 @@ class CoordinatorService:
         if message is not None:
             self._counts["registrations"] += 1
             with self._lock:
-                self._registry.registered(message, time.monotonic())
+                if self._admission.registration(message, item.app_id):
+                    self._registry.registered(message, time.monotonic())
 
     def _beat(self, item: Item) -> None:
         message = self._understood(item, Heartbeat)
         if message is not None:
             self._counts["heartbeats"] += 1
             with self._lock:
-                self._registry.beat(message, time.monotonic())
+                if self._admission.heartbeat(message, item.app_id):
+                    self._registry.beat(message, time.monotonic())
 
     def _claimed(self, item: Item) -> None:
         claim = self._understood(item, Claim)
@@ -244,7 +256,12 @@ class CoordinatorService:
                 log.warning("another Coordinator (%s) leads: waiting", self._leadership.leader)
 
     def _healthy(self, item: Item) -> None:
-        self._apps_health[item.app_id] = {"instance_id": item.instance_id, "health": item.value}
+        with self._lock:
+            self._apps_health = {a: h for a, h in self._apps_health.items() if self._registry.known(a)}
+            if self._registry.known(item.app_id) and _fits(item.value):
+                self._apps_health[item.app_id] = {"instance_id": item.instance_id, "health": item.value}
+            else:
+                self._counts["health_refused"] += 1
 
     def _understood(self, item: Item, kind: type[M]) -> M | None:
         try:
@@ -253,7 +270,10 @@ class CoordinatorService:
             self._counts["misunderstood"] += 1
             if self._counts["misunderstood"] == 1:
                 log.warning(
-                    "%s from %s was not understood: %s; more are counted only", item.key, item.app_id, error
+                    "%s from %s was refused: %s; further ones are only counted",
+                    item.key,
+                    item.app_id,
+                    error,
                 )
             return None
 
@@ -262,6 +282,14 @@ class CoordinatorService:
             self._engine.write(key, value, [PUB_ONLY, NO_WAIT])
         except DueError as error:
             log.warning("%s could not be sent: %s", key, error)
+
+
+def _fits(value: Any) -> bool:
+    """Whether an app's health is small enough to keep."""
+    try:
+        return len(encode_value(value)) <= _HEALTH_BYTES
+    except DueError:
+        return False
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""What the registry knows, as JSON for people and programs northbound.  Pure."""
+"""The registry as JSON for the HTTP API.  Pure."""
 
 import base64
 import datetime as dt
@@ -15,7 +15,7 @@ from due.messages import Item
 
 
 def instances(registry: Registry, now: float) -> list[dict[str, Any]]:
-    """Every instance with its state; `silent_s` is how long ago it showed a sign of life."""
+    """Every instance with its state; `silent_s`: seconds since its last heartbeat."""
     return [
         {
             "app_id": known.registration.app_id,
@@ -35,7 +35,7 @@ def instances(registry: Registry, now: float) -> list[dict[str, Any]]:
 
 
 def apps(registry: Registry, now: float) -> list[dict[str, Any]]:
-    """One entry per app: which instance works, its epoch, and how many instances are in which state."""
+    """One entry per app: its active instance, its epoch, and the number of instances in each state."""
     told = registry.assignments()
     found: dict[str, dict[str, Any]] = {}
     for one in instances(registry, now):
@@ -50,7 +50,7 @@ def apps(registry: Registry, now: float) -> list[dict[str, Any]]:
 
 
 def capabilities(registry: Registry, _now: float) -> list[dict[str, Any]]:
-    """What live apps can make."""
+    """Capabilities of live apps."""
     return [
         {"app_id": app} | msgspec.to_builtins(capability)
         for app, declared in registry.declarations().items()
@@ -59,7 +59,7 @@ def capabilities(registry: Registry, _now: float) -> list[dict[str, Any]]:
 
 
 def interests(registry: Registry, _now: float) -> list[dict[str, Any]]:
-    """What live apps want."""
+    """Interests of live apps."""
     return [
         {"app_id": app} | msgspec.to_builtins(interest)
         for app, declared in registry.declarations().items()
@@ -68,7 +68,7 @@ def interests(registry: Registry, _now: float) -> list[dict[str, Any]]:
 
 
 def assignments(registry: Registry, _now: float) -> list[dict[str, Any]]:
-    """What each producer was told to make, and which wishes cannot be met."""
+    """Assignments of each producer, and interests that cannot be met."""
     return [
         {
             "app_id": app,
@@ -83,7 +83,7 @@ def assignments(registry: Registry, _now: float) -> list[dict[str, Any]]:
 
 
 def flow(registry: Registry, _now: float) -> list[dict[str, Any]]:
-    """Who gets what from whom."""
+    """Which consumer gets which data from which producer."""
     return [_flow(one) for one in registry.matched.flows]
 
 

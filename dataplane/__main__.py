@@ -1,8 +1,9 @@
-"""The embedded switch as a process: `python -m dataplane --grpc 127.0.0.1:0 --port 1=capture:/run/s.sock`.
+"""The embedded switch as a process: `python -m dataplane --grpc unix:/run/me/s.sock --port 1=capture:/run/c.sock`.
 
-Prints one JSON line {"ready": true, "grpc": "HOST:PORT", "pid": …} when it serves; SIGTERM or SIGINT ends
-it; it also ends when the process that started it does.  It starts without a pipeline: the controller
-pushes one.
+Prints one JSON line {"ready": true, "grpc": ADDRESS, "pid": …, "base_us": …} when it serves; SIGTERM or SIGINT
+ends it; it also ends when the process that started it does, and with exit code 1 when one of its threads dies.
+It starts without a pipeline: the controller pushes one.  Restarted with the same ports, address and
+--base-us, it continues as the same switch; the controller restores its entries.
 """
 
 import p4rt  # noqa: F401  # isort: skip  # before anything loads gRPC: it says how gRPC waits
@@ -21,12 +22,16 @@ from typing import Any
 
 import grpc
 
-from dataplane.device import Device
 from dataplane.errors import DataplaneError
-from dataplane.p4runtime_server import P4RuntimeServer, ServerError
+from dataplane.faults import Faults
+from dataplane.heartbeat import LivenessPipe, Turning
+from dataplane.p4runtime.device import Device
+from dataplane.p4runtime.listening import default_address
+from dataplane.p4runtime.server import P4RuntimeServer, ServerError
+from dataplane.p4runtime.trust import TrustedPrograms, default_file
 from dataplane.packet_loop import PacketClock, PacketLoop
-from dataplane.port_options import FORMS, captures, open_ports
-from dataplane.ports import Port
+from dataplane.ports.port import Port
+from dataplane.ports.port_options import FORMS, captures, open_ports
 from dataplane.stop import Stop
 
 _GC_ALLOCATIONS = 50_000
@@ -37,21 +42,42 @@ def options() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m dataplane", description="The embedded P4Runtime switch.")
     add = parser.add_argument
-    add("--grpc", default="127.0.0.1:0", metavar="HOST:PORT", help="where to serve P4Runtime; port 0 = any")
+    add(
+        "--grpc",
+        default="",
+        metavar="ADDRESS",
+        help="address of the P4Runtime server: unix:/PATH, or HOST:PORT (0: any)",
+    )
     add("--device-id", type=int, default=1, help="P4Runtime device id (default 1)")
-    add("--cpu-port", type=int, default=510, help="port number of the CPU (default 510)")
+    add("--cpu-port", type=int, default=510, help="number of the port to the controller (default 510)")
     add("--port", action="append", default=[], metavar="N=KIND", help=f"a port; kinds: {FORMS}")
-    add("--backend", choices=("auto", "c", "python"), default="auto", help="how programs are run")
+    add("--backend", choices=("auto", "c", "python"), default="auto", help="compiler target of programs")
     add("--queue", type=int, default=4096, help="packet-ins that may wait for the controller (default 4096)")
     add("--tls-cert", type=Path, help="PEM certificate chain of the server; with --tls-key")
     add("--tls-key", type=Path, help="PEM private key of the server")
     add("--tls-client-ca", type=Path, help="PEM certificates of CAs; clients must then show a certificate")
-    add("--state-json", metavar="FILE", help="write counts there at the end; - = standard output")
+    add("--trust", action="append", default=[], metavar="SHA256", help="allow this program, too")
+    add(
+        "--trust-file",
+        type=Path,
+        default=default_file(),
+        metavar="FILE",
+        help="file of allowed programs, one hash per line",
+    )
+    add("--base-us", type=int, metavar="N", help="zero of the packets' clock: µs since boot (default: now)")
+    add(
+        "--heartbeat-fd",
+        type=int,
+        metavar="N",
+        help="write a byte per second there while all threads make progress",
+    )
+    add("--role", action="append", default=[], metavar="NAME", help="a role that controllers may claim")
+    add("--state-json", metavar="FILE", help="write counters there at the end; - = standard output")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run until a signal comes; 0, 2 where an option cannot be met, 1 after a fault of our own."""
+    """Run until a signal; returns 0, 2 for a wrong option, 1 after an internal error."""
     arguments = options().parse_args(argv)
     _end_with_parent()
     stop = Stop((signal.SIGTERM, signal.SIGINT))
@@ -63,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> int:
-    clock = PacketClock(driven=captures(arguments.port))
+    clock = PacketClock(driven=captures(arguments.port), base_us=arguments.base_us)
     credentials = _credentials(arguments)
     ports = open_ports(arguments.port, arguments.cpu_port, clock.now)
     device = Device(
@@ -73,37 +99,53 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
         queue=arguments.queue,
         ports=ports,
         clock=clock.now,
+        programs=TrustedPrograms(arguments.trust, arguments.trust_file),
+        roles=arguments.role,
     )
+    loop = PacketLoop(device, ports, clock, on_end=stop.set)
     try:
-        server = P4RuntimeServer(device, arguments.grpc, credentials)
-    except ServerError:
+        address = arguments.grpc or default_address(f"switch-{arguments.device_id}-{os.getpid()}.sock")
+        server = P4RuntimeServer(device, address, credentials)
+        heartbeat = _heartbeat(arguments.heartbeat_fd, server, loop)
+    except DataplaneError:
         for port in ports.values():
             port.close()
         raise
-    loop = PacketLoop(device, ports, clock, on_end=stop.set)
-    # entries are many, live long and form no cycles: looking through them again and again costs a third of a write
+    faults = Faults(stop)
+    # entries are many, long-lived and without cycles: scanning them repeatedly costs a third of a write
     gc.freeze()
     gc.set_threshold(_GC_ALLOCATIONS, 50, 100)
     loop.start()
     server.start()
-    print(json.dumps({"ready": True, "grpc": server.address, "pid": os.getpid()}), flush=True)
+    if heartbeat is not None:
+        heartbeat.start()
+    ready = {"ready": True, "grpc": server.address, "pid": os.getpid(), "base_us": clock.base_us}
+    print(json.dumps(ready), flush=True)
     stop.wait()
-    failed = loop.failed
+    if loop.failed or faults.died:
+        faults.end_soon()
+    if heartbeat is not None:
+        heartbeat.stop()
     server.stop()
     loop.stop()
     if arguments.state_json:
         _write(arguments.state_json, state(device, loop, ports))
     device.close()
-    return 1 if failed else 0
+    return 1 if loop.failed or faults.died else 0
+
+
+def _heartbeat(descriptor: int | None, *loops: Turning) -> LivenessPipe | None:
+    return None if descriptor is None else LivenessPipe(descriptor, loops)
 
 
 def state(device: Device, loop: PacketLoop, ports: Mapping[int, Port]) -> dict[str, Any]:
-    """Counts of everything that passed or was lost."""
+    """Counters of frames and messages, passed or lost."""
     pipeline = device.pipeline
     return {
         **device.counts,
         **loop.counts,
         "switch": {} if pipeline is None else pipeline.switch.statistics(),
+        "out_of_range": {} if pipeline is None else pipeline.switch.out_of_range(),
         "ports": {number: asdict(port.counters) for number, port in ports.items()},
     }
 
@@ -133,11 +175,11 @@ def _credentials(arguments: argparse.Namespace) -> grpc.ServerCredentials | None
 def _end_with_parent() -> None:
     if sys.platform != "linux":
         return
-    # told by whoever starts us, for it may die while we are still importing
+    # set by the parent, since it may die while we are still importing
     parent = int(os.environ.pop("DUE_PARENT", "0")) or os.getppid()
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
-        # it died before the kernel knew of our wish
+        # it died before prctl took effect
         os.kill(os.getpid(), signal.SIGTERM)
 
 

@@ -78,7 +78,7 @@ class Bmv2:
         return self._process.pid
 
     def check(self) -> None:
-        """Raise Bmv2Error with its last words if it has ended."""
+        """Raise Bmv2Error with the end of its output if it has ended."""
         code = self._process.poll()
         if code is not None:
             raise Bmv2Error(f"{PROGRAM} ended with exit code {code}; it said: {self._last_words()}")
@@ -117,7 +117,7 @@ class Bmv2:
 
 
 def unshared(program: str, folder: Path) -> list[str]:
-    """Options for what instances would share otherwise; builds of BMv2 differ in having it."""
+    """Options that separate instances; not all builds of BMv2 have them."""
     offered = subprocess.run([program, "--help"], capture_output=True, text=True, check=False).stdout
     options = []
     if "--thrift-port" in offered:

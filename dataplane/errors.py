@@ -6,8 +6,8 @@ DataplaneError
 ├── CompilerError        the generated C could not be built (compiler/)
 ├── InvalidIndex         an index outside a counter, meter or register array (externs.py)
 └── TableError           a table operation that was refused
-    ├── AlreadyExists    insert of a key that is there
-    ├── NotFound         modify, delete or read of a key that is not
+    ├── AlreadyExists    insert of an existing key
+    ├── NotFound         modify, delete or read of a missing key
     ├── TableFull        the program's `size` is reached
     └── InvalidEntry     wrong kind, width, action, parameter, priority or a constant table
 """

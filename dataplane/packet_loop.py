@@ -1,8 +1,8 @@
 """The one thread that moves packets: ports in, switch, ports and controllers out.
 
-A lossless port (a replay's) is read only as far as the controllers' queues have room; when they have
-none, or no controller is primary, its frames wait where they are.  Other ports are always read, and the
-packet-ins that nobody can take are counted.
+A lossless port (a replay's) is read only while the controllers' queues have room and a controller is
+primary; otherwise its frames wait.  Other ports are always read, and packet-ins that cannot be queued are
+counted.
 """
 
 import select
@@ -11,10 +11,11 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 
-from dataplane.device import Device
-from dataplane.pipeline import Pipeline
-from dataplane.ports import Port, Wakeup
-from dataplane.switch import Result
+from dataplane.errors import DataplaneError
+from dataplane.p4runtime.device import Device
+from dataplane.p4runtime.pipeline import ForwardingPipeline
+from dataplane.ports.port import Port, Wakeup
+from dataplane.v1model.switch import FrameResult
 
 _CHUNK = 256
 _IDLE_MS = 100
@@ -25,20 +26,38 @@ def _nothing() -> None:
     return
 
 
-class PacketClock:
-    """µs for packets: of the capture where one drives the switch, else since the start."""
+def _machine_us() -> int:
+    """µs since the machine was booted; continues during sleep, and is independent of the wall clock."""
+    return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)) // 1000
 
-    def __init__(self, *, driven: bool) -> None:
+
+class ClockError(DataplaneError):
+    """The clock's zero is in the future."""
+
+
+class PacketClock:
+    """µs for packets: of the capture where one drives the switch, else since `base_us`.
+
+    base_us: the clock's zero on CLOCK_BOOTTIME, so that a restarted switch continues the previous
+        clock; None = now
+
+    Raises ClockError.
+    """
+
+    def __init__(self, *, driven: bool, base_us: int | None = None) -> None:
         self._driven = driven
-        self._start_ns = time.monotonic_ns()
+        now = _machine_us()
+        self.base_us = now if base_us is None else base_us
+        if not 0 <= self.base_us <= now:
+            raise ClockError(f"the clock cannot begin at {base_us} µs after boot: it is {now} µs now")
         self._last_us = 0
 
     def now(self) -> int:
         """The packets' time, µs."""
-        return self._last_us if self._driven else (time.monotonic_ns() - self._start_ns) // 1000
+        return self._last_us if self._driven else _machine_us() - self.base_us
 
     def advance(self, time_us: int) -> None:
-        """A frame of a capture was stamped so."""
+        """Set the time to that of a frame of a capture."""
         self._last_us = time_us
 
 
@@ -65,8 +84,10 @@ class PacketLoop:
         self._packet_outs: deque[bytes] = deque()
         self._space = threading.Condition()
         self._stopping = False
+        self.turns = 0
+        """Rounds made so far."""
         self.failed = False
-        """The thread has ended without having been stopped."""
+        """Whether the thread has ended without being stopped."""
         self._on_end = on_end
         self._thread = threading.Thread(target=self._run, name="packets", daemon=True)
         device.on_room = self._wakeup.set
@@ -77,8 +98,12 @@ class PacketLoop:
         """Begin to process packets."""
         self._thread.start()
 
+    def ask(self) -> None:
+        """Make a round soon, even without frames."""
+        self._wakeup.set()
+
     def stop(self) -> None:
-        """Finish the frames in hand, then close the ports."""
+        """Finish the frames in progress, then close the ports."""
         self._stopping = True
         self._wakeup.set()
         with self._space:
@@ -93,7 +118,7 @@ class PacketLoop:
 
     def _put_packet_out(self, payload: bytes) -> None:
         with self._space:
-            # the controller's stream is not read on while too many wait
+            # the controller's stream is not read while too many wait
             self._space.wait_for(lambda: len(self._packet_outs) < _PACKET_OUTS or self._stopping)
             self._packet_outs.append(payload)
         self._wakeup.set()
@@ -107,6 +132,7 @@ class PacketLoop:
 
     def _move(self) -> None:
         while not self._stopping:
+            self.turns += 1
             ready = self._wait()
             with self._device.running:
                 pipeline = self._device.pipeline
@@ -164,7 +190,7 @@ class PacketLoop:
                 self.counts["without_pipeline"] += len(frames)
                 port.done(bytes(len(frames)))
 
-    def _send_packet_outs(self, pipeline: Pipeline) -> None:
+    def _send_packet_outs(self, pipeline: ForwardingPipeline) -> None:
         while self._packet_outs:
             payload = self._packet_outs.popleft()
             result = pipeline.switch.packet_out(payload, self._clock.now())
@@ -172,7 +198,7 @@ class PacketLoop:
             with self._space:
                 self._space.notify_all()
 
-    def _receive(self, pipeline: Pipeline, number: int, port: Port) -> None:
+    def _receive(self, pipeline: ForwardingPipeline, number: int, port: Port) -> None:
         limit = _CHUNK
         if port.lossless:
             limit = min(limit, self._device.room())
@@ -189,7 +215,7 @@ class PacketLoop:
         self._hand_out(pipeline, result, lossless=port.lossless)
         port.done(result.verdicts)
 
-    def _hand_out(self, pipeline: Pipeline, result: Result, *, lossless: bool) -> None:
+    def _hand_out(self, pipeline: ForwardingPipeline, result: FrameResult, *, lossless: bool) -> None:
         for number, frame in result.outputs:
             port = self._ports.get(number)
             if port is None:

@@ -1,8 +1,8 @@
-"""How a process of ours is told to end: by a signal, or by one of its threads.
+"""Waits until a signal or a thread asks the process to end.
 
 Neither a handler that sets a threading.Event nor `Event.wait` without a time limit is safe for this: the
-handler may run while the main thread holds the event's own lock, and a signal that comes just before the
-thread sleeps does not wake it.  A pipe has neither fault: CPython writes to it as the signal comes.
+handler may run while the main thread holds the event's own lock, and a signal just before the thread sleeps
+does not wake it.  A pipe has neither problem: CPython writes to it when the signal arrives.
 """
 
 import os
@@ -13,7 +13,7 @@ from types import FrameType
 
 
 class Stop:
-    """Until one of `signals` comes, or `set` is called.  For the main thread, and once a process.
+    """Waits for one of `signals`, or for `set`.  For the main thread, once per process.
 
     stop = Stop((signal.SIGTERM, signal.SIGINT))
     stop.wait()

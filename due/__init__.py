@@ -1,9 +1,11 @@
 """DUE, the Data Ubiquity Engine: one small API over Data Updates (Redis) and Data Archives.
 
-    engine.write(key, value) ──► whoever observes the key, in other processes, and the archive
-    engine.observe(key)      ──► a ReactiveX Subject of items        engine.get(key or query) ──► the past
+    engine.write(key, value) ──► observers of the key, in other processes, and the archive
+    engine.observe(key)      ──► a ReactiveX Subject of items
+    engine.get(key or query) ──► archived items
 
-Read `due/engine.py` first, `due/keys.py` for what data is called, `docs/wire-format.md` for the bytes.
+Start with `due/engine.py`. `due/keys.py` defines the grammar of keys, `docs/wire-format.md` the encoding.
+`__all__` is the public interface of this package.
 """
 
 from due.config import Options

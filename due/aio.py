@@ -1,9 +1,9 @@
 """DUE from asyncio: `async for item in items(engine, key)`.
 
-    dispatcher thread ──call_soon_threadsafe──► bounded queue ──► the coroutine
+    dispatcher thread ──call_soon_threadsafe──► bounded queue ──► coroutine
 
-A full queue makes the dispatcher wait, so a slow coroutine holds back reliable producers like a slow
-callback does.  Calls that wait (`flush`, `get`, `close`) belong into `asyncio.to_thread`.
+A full queue makes the dispatcher wait, so a slow coroutine holds back reliable producers as a slow callback
+does.  Run blocking calls (`flush`, `get`, `close`) with `asyncio.to_thread`.
 """
 
 import asyncio
@@ -17,7 +17,20 @@ _PATIENCE = 0.1
 
 
 async def items(engine: Engine, key: str, *, most: int = 10_000) -> AsyncGenerator[Item, None]:
-    """The items under `key`, for ever; at most `most` wait.  Leaving the loop withdraws the interest."""
+    """Receive the items under a key until the loop is left, which withdraws the interest.
+
+    Args:
+        engine: an initialised engine with the role CONSUMER.
+        key: wildcards and lists are allowed.
+        most: items that may wait in the queue; beyond that the dispatcher waits.
+
+    Yields:
+        Items in the order received.
+
+    Raises:
+        InvalidKey: the key breaks the grammar.
+        NotAllowed: the engine was not given the role CONSUMER.
+    """
     loop = asyncio.get_running_loop()
     queue: asyncio.Queue[Item] = asyncio.Queue()
     room = threading.Semaphore(most)

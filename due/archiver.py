@@ -1,11 +1,12 @@
-"""The way into Data Archives: a bounded queue and one thread, so that archive writes do not block `write`.
+"""Writing to Data Archives: a bounded queue and one thread, so that archive writes do not block `write`.
 
     put ──► queue (bytes bounded) ──► thread ──► archive        batches of at least `archive_batch` items
                                         └──► spool ──► archive  while the archive is away
 
 Policy: while the archive is away, frames go to disk up to the spool's size, beyond it they are lost and
-counted; without a spool they wait.  Only when the queue is full, because archive and disk are slower
-than the writers, does `put` wait.  Nothing is lost silently: see `statistics`.
+counted; without a spool they wait.  Where the spool's disk takes nothing, as where a full disk holds both, they
+wait as long as the queue has room, and are lost and counted then.  Only when the queue is full, because archive
+and disk are slower than the writers, does `put` wait.  Nothing is lost silently: see `statistics`.
 """
 
 import logging
@@ -15,8 +16,10 @@ from collections import deque
 
 from due.backoff import Backoff
 from due.drivers.base import ArchiveDriver, Spool
-from due.errors import ArchiveUnavailable, DueError, Timeout
+from due.errors import ArchiveUnavailable, BackendError, DueError, Timeout
+from due.logs import LogLimit
 from due.messages import PackedFrame
+from due.threads import Failed, LoudThread
 
 log = logging.getLogger("due.archive")
 
@@ -35,6 +38,7 @@ class Archiver:
         queue_bytes: int = 64 << 20,
         batch: int = 1000,
         linger: float = 0.02,
+        failed: Failed | None = None,
     ) -> None:
         self._archive = archive
         self._spool = spool
@@ -53,7 +57,11 @@ class Archiver:
         self._away = False
         self._adopt_at = 0.0
         self._counts = {"archived": 0, "spooled": 0, "lost": 0, "refused": 0, "held_back": 0}
-        self._thread = threading.Thread(target=self._run, name="due-archiver", daemon=True)
+        self._failed = failed
+        self._errors = LogLimit(log)
+        self.turned = time.monotonic()
+        """Start of the thread's last loop iteration, monotonic seconds."""
+        self._thread = LoudThread("due-archiver", self._run, self._died)
         self._thread.start()
 
     def put(self, frame: PackedFrame) -> None:
@@ -102,8 +110,18 @@ class Archiver:
         if self._spool is not None:
             self._spool.close()
 
+    def _died(self, error: BaseException) -> None:
+        """The thread has died: release writers that wait for room in the queue."""
+        with self._condition:
+            self._closing = True
+            self._counts["lost"] += sum(frame.count for frame in self._queue)
+            self._condition.notify_all()
+        if self._failed is not None:
+            self._failed(error)
+
     def _run(self) -> None:
         while True:
+            self.turned = time.monotonic()
             frames = self._next()
             if frames:
                 self._store(frames)
@@ -118,7 +136,7 @@ class Archiver:
                 self._spool_failed(error)
 
     def _next(self) -> list[PackedFrame]:
-        """Wait for a batch; [] now and then, so that the spool gets its turn."""
+        """Wait for a batch; returns [] from time to time so that the spool is emptied, too."""
         with self._condition:
             if not self._queue and not self._closing:
                 self._condition.wait(0.0 if self._can_drain() else 0.2)
@@ -135,18 +153,30 @@ class Archiver:
 
     def _store(self, frames: list[PackedFrame]) -> None:
         while not self._insert(frames):
+            self.turned = time.monotonic()
             if self._spool is not None:
-                lost = self._spool.put(frames)  # what a disk refuses counts as lost
-                self._counts["lost"] += lost
-                self._counts["spooled"] += sum(f.count for f in frames) - lost
-                return
-            if self._closing:
+                lost = self._spooled(self._spool, frames)
+                if lost is not None:
+                    self._counts["lost"] += lost
+                    self._counts["spooled"] += sum(f.count for f in frames) - lost
+                    return
+            elif self._closing:
                 self._counts["lost"] += sum(f.count for f in frames)
                 return
             time.sleep(min(0.05, self._backoff.wait(time.monotonic())))
 
+    def _spooled(self, spool: Spool, frames: list[PackedFrame]) -> int | None:
+        """How many items did not fit; None: its disk takes nothing now, and there is room to wait."""
+        try:
+            return spool.put(frames)
+        except BackendError as error:
+            self._errors.error("%s", error)
+            if self._closing or self._bytes > self._queue_bytes:
+                return sum(f.count for f in frames)
+            return None
+
     def _insert(self, frames: list[PackedFrame]) -> bool:
-        """Whether the archive took them, or will never."""
+        """Store frames; False if another attempt may help."""
         if not self._backoff.due(time.monotonic()):
             return False
         count = sum(f.count for f in frames)
@@ -155,18 +185,19 @@ class Archiver:
         except ArchiveUnavailable as error:
             delay = self._backoff.failed(time.monotonic())
             if not self._away:
-                log.warning("Data Archives is away: %s; trying again in %.1f s", error, delay)
+                log.warning("Data Archives cannot be reached: %s; retrying in %.1f s", error, delay)
             self._away = True
             return False
-        except DueError as error:
-            # one bad frame shall not cost the others of its batch
+        except (DueError, OverflowError, ValueError) as error:
+            # one bad frame must not discard the rest of its batch; client libraries raise errors of their own
+            # for numbers beyond 64 bits and for text that is not Unicode
             if len(frames) > 1:
                 return all(self._insert([frame]) for frame in frames)
             self._counts["refused"] += count
-            log.error("Data Archives refused %d items of %s: %s", count, frames[0].key, error)  # noqa: TRY400
+            self._errors.error("Data Archives refused %d items of %s: %s", count, frames[0].key, error)
             return True
         if self._away:
-            log.warning("Data Archives is back")
+            log.warning("Data Archives can be reached again")
         self._away = False
         self._backoff.succeeded()
         self._counts["archived"] += count
@@ -189,6 +220,6 @@ class Archiver:
             self._spool.done(len(frames))
 
     def _spool_failed(self, error: DueError) -> None:
-        """A broken disk must not end the thread; what is in the spool stays there."""
+        """A broken disk must not end the thread; frames in the spool stay there."""
         delay = self._backoff.failed(time.monotonic())
-        log.error("%s; trying again in %.1f s", error, delay)
+        log.error("%s; retrying in %.1f s", error, delay)

@@ -1,4 +1,4 @@
-"""From a URL to a driver, and what is used where no URL is given."""
+"""The driver for a URL, and the defaults where no URL is given."""
 
 import os
 from pathlib import Path
@@ -11,6 +11,16 @@ from due.errors import InvalidOption
 
 def open_updates(url: str, options: Options) -> UpdatesDriver:
     """The Data Updates driver of a URL; raises `InvalidOption`."""
+    if url.startswith("memory:"):
+        from due.drivers.memory_updates import MemoryUpdates
+
+        return MemoryUpdates(
+            url,
+            window=options.window_bytes,
+            retain=options.retain_bytes,
+            group_timeout=options.group_timeout,
+            backlog=options.backlog_bytes,
+        )
     return RedisUpdates(
         url,
         window=options.window_bytes,
@@ -30,7 +40,13 @@ def open_archive(url: str) -> ArchiveDriver:
         from due.drivers.mongodb import MongoArchive
 
         return MongoArchive(url)
-    raise InvalidOption(f"Data Archives URL {url!r}: use sqlite:///path/file.db or mongodb://host/database")
+    if url.startswith("memory:"):
+        from due.drivers.memory_archive import MemoryArchive
+
+        return MemoryArchive(url)
+    raise InvalidOption(
+        f"Data Archives URL {url!r}: use sqlite:///path/file.db, mongodb://host/database or memory://"
+    )
 
 
 def open_spool(folder: Path, options: Options) -> Spool | None:

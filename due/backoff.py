@@ -20,7 +20,7 @@ class Backoff:
         return delay
 
     def succeeded(self) -> None:
-        """Begin anew."""
+        """Start again with the first delay."""
         self._delay = self._first
         self._at = 0.0
 

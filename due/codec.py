@@ -8,59 +8,91 @@ msgpack throughout; types that msgpack lacks are extensions:
 
 Big values and columns are copied once on the way out (into the payload) and not at all on the way in:
 received arrays are read-only views of the received bytes.
+
+Decoded bytes are untrusted: within the limits below decoding returns a value, beyond them it raises `DecodeError`
+and nothing else.  Encoding refuses what decoding would refuse.
 """
 
 import datetime as dt
+import operator
 import struct
 from collections import deque
 from collections.abc import Iterator, Sequence
 from itertools import count, repeat
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from due.arrays import array_body, batch_body, read_array, read_batch
 from due.errors import DecodeError, NewerVersion, UnsupportedValue
+from due.keys import MAX_BYTES
 from due.messages import Item, PackedFrame, RecordBatch
 
 VERSION = 1
 MAGIC = b"DUE"
 _HEADER = MAGIC + bytes([VERSION])
-_ALIGNMENT = 16
 
 _NAIVE_DATETIME, _DATETIME64, _ARRAY, _BATCH = 1, 2, 3, 4
 _EPOCH = dt.datetime(1970, 1, 1)  # noqa: DTZ001 - naive on purpose
 _MICROSECOND = dt.timedelta(microseconds=1)
-_KINDS = frozenset("biufcSUMmV")
+_FIRST_MICROSECOND = (dt.datetime.min - _EPOCH) // _MICROSECOND  # noqa: DTZ901 - naive, as _EPOCH
+_LAST_MICROSECOND = (dt.datetime.max - _EPOCH) // _MICROSECOND  # noqa: DTZ901 - the same
+_INT64 = struct.Struct("<q")
 
 _ATOMS = frozenset((type(None), bool, float, bytes))
-"""Types whose values neither change nor fail to encode: they may wait in a buffer as they are."""
+"""Immutable types that always encode: buffered without a copy."""
 _PLAIN = _ATOMS | {int, str}
+
+
+MAX_PAYLOAD = 64 << 20
+"""Bytes of a frame or value."""
+MAX_ITEMS = 1 << 20
+"""Items of a frame."""
+MAX_DEPTH = 64
+"""Lists and maps within each other, in what is written.  A reader's limit is the interpreter's stack: to count would
+cost more than to decode."""
+MAX_NUMBER = 2**62 - 1
+"""Limit of `sequence` and `before`, also after the last item of a frame."""
+MAX_EPOCH = 2**32 - 1
+"""Epochs begin at the unix time of the first Coordinator's start and grow by one with each change of the active
+instance."""
+MAX_TIME = 2**63 - 1
+"""ns, either side of 1970."""
+MAX_ID = 64
+"""Characters of an app id or instance id."""
+
+_Number = Annotated[int, msgspec.Meta(ge=0, le=MAX_NUMBER - MAX_ITEMS)]
+_Epoch = Annotated[int, msgspec.Meta(ge=0, le=MAX_EPOCH)]
+_Time = Annotated[int, msgspec.Meta(le=MAX_TIME)]
+_Id = Annotated[str, msgspec.Meta(max_length=MAX_ID)]
+_KeyText = Annotated[str, msgspec.Meta(max_length=MAX_BYTES)]
+_Some = msgspec.Meta(min_length=1, max_length=MAX_ITEMS)
 
 
 class Frame(msgspec.Struct, array_like=True, gc=False):
     """A decoded frame: consecutive items of one (instance, key)."""
 
-    key: str
-    app_id: str
-    instance_id: str
-    epoch: int
-    sequence: int
+    key: _KeyText
+    app_id: _Id
+    instance_id: _Id
+    epoch: _Epoch
+    sequence: _Number
     """Of the first item."""
-    before: int
+    before: _Number
     """How many items of this (instance, key) were published before this frame: shows gaps and repeats."""
-    timestamps: list[int]
-    event_times: list[int] | None
+    timestamps: Annotated[list[_Time], _Some]
+    event_times: Annotated[list[_Time], _Some] | None
     """None where they equal the timestamps."""
-    values: list[Any]
+    values: Annotated[list[Any], _Some]
 
     def items(self) -> list[Item]:
         """The items, in order."""
         return list(self.stream())
 
     def stream(self) -> Iterator[Item]:
-        """The items, in order, each made when it is asked for: a callback finds it in the cache."""
+        """The items, in order, created one by one, so that each is cached when its callback runs."""
         times = self.timestamps if self.event_times is None else self.event_times
         key, app, instance = repeat(self.key), repeat(self.app_id), repeat(self.instance_id)
         return map(Item, key, self.values, self.timestamps, times, app, instance, count(self.sequence))
@@ -88,10 +120,12 @@ def encode_value(value: Any) -> bytes:
 
 def decode_value(data: bytes | memoryview) -> Any:
     """The inverse of `encode_value`; raises `DecodeError`.  Arrays are read-only views of `data`."""
+    if len(data) > MAX_PAYLOAD:
+        raise DecodeError(f"not a DUE value: {len(data)} bytes, at most {MAX_PAYLOAD} are read")
     try:
         return _value_decoder.decode(data)
     except _DAMAGED as error:
-        raise DecodeError(f"not a DUE value: {error}") from error
+        raise DecodeError(f"not a DUE value: {error}") from None
 
 
 def encode_frame(frame: Frame) -> bytes:
@@ -104,6 +138,7 @@ def encode_frame(frame: Frame) -> bytes:
         _encoder.encode_into(frame, buffer, len(_HEADER))
     except (OverflowError, UnicodeError) as error:
         raise UnsupportedValue(f"a value under {frame.key} cannot be encoded: {error}") from error
+    _check_size(len(buffer), frame.key)
     payload = bytes(buffer)
     if len(payload) <= _SPARE_BYTES:
         _spare.append(buffer)
@@ -113,23 +148,30 @@ def encode_frame(frame: Frame) -> bytes:
 def encode_single(head: Frame, value: Any) -> bytes:
     """A frame of one value, which is copied once; `head.values` must be empty."""
     prefix = _HEADER + _encoder.encode(head)[:-1] + b"\x91"
-    return b"".join((prefix, *_value_parts(value, len(prefix))))
+    parts = (prefix, *_value_parts(value, len(prefix)))
+    _check_size(sum(map(len, parts)), head.key)
+    return b"".join(parts)
 
 
-_DAMAGED = (msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError, struct.error)
-"""What reading bytes that are no values may raise; the last two of our own extensions."""
+_DAMAGED = (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError)
+"""What msgspec raises on bytes that are no values: text that is not UTF-8, maps under names that cannot be names,
+nesting beyond the interpreter's stack, lengths beyond memory.  Our own extensions raise `DecodeError`."""
 
 
 def decode_frame(payload: bytes) -> Frame:
     """The inverse of `encode_frame`; raises `NewerVersion` or `DecodeError`."""
-    if payload[:4] != _HEADER:
-        if payload[:3] == MAGIC and len(payload) > 4:
+    if not payload.startswith(_HEADER):
+        if payload.startswith(MAGIC) and len(payload) > 4:
             raise NewerVersion(f"wire format version {payload[3]}, this DUE reads version {VERSION}")
         raise DecodeError(f"not a DUE frame: begins with {payload[:8]!r}")
+    size = len(payload)
+    if size > MAX_PAYLOAD:
+        raise DecodeError(f"damaged DUE frame: {size} bytes, at most {MAX_PAYLOAD} are read")
     try:
-        frame = _frame_decoder.decode(memoryview(payload)[4:])
+        # copying a few bytes is faster than making a view of them
+        frame = _frame_decoder.decode(payload[4:] if size <= _COPIED_BELOW else memoryview(payload)[4:])
     except _DAMAGED as error:
-        raise DecodeError(f"damaged DUE frame: {error}") from error
+        raise DecodeError(f"damaged DUE frame: {error}") from None
     times = len(frame.timestamps) if frame.event_times is None else len(frame.event_times)
     if not len(frame.values) == len(frame.timestamps) == times:
         raise DecodeError("damaged DUE frame: values and times differ in number")
@@ -153,7 +195,7 @@ def pack(items: Sequence[Item], *, index: bool = False) -> PackedFrame:
 
 
 def packed(frame: Frame, payload: bytes, *, index: bool = False) -> PackedFrame:
-    """The head of `frame`, whose encoded form is `payload`, for an archive."""
+    """`frame` with its encoded form `payload`, in the form that archives store."""
     times = frame.timestamps
     events = times if frame.event_times is None else frame.event_times
     return PackedFrame(
@@ -169,6 +211,24 @@ def packed(frame: Frame, payload: bytes, *, index: bool = False) -> PackedFrame:
         index,
         payload,
     )
+
+
+def checked_time(time: int) -> int:
+    """An event time as it can travel; raises `UnsupportedValue`."""
+    try:
+        number = operator.index(time)
+    except TypeError:
+        raise UnsupportedValue(f"an event time is an int of ns, not {type(time).__name__}") from None
+    if not -MAX_TIME - 1 <= number <= MAX_TIME:
+        raise UnsupportedValue(f"event time {number} does not fit into 64 bits; it is in ns since 1970")
+    return number
+
+
+def _check_size(size: int, key: str) -> None:
+    if size > MAX_PAYLOAD:
+        raise UnsupportedValue(
+            f"a value under {key} makes a frame of {size} bytes, more than {MAX_PAYLOAD}: write it in parts"
+        )
 
 
 def _checked_int(value: int) -> int:
@@ -195,24 +255,22 @@ def _value_parts(value: Any, offset: int) -> list[bytes | memoryview]:
     if kind is np.ndarray:
         return _array_parts(value, offset)
     try:
-        return [_encoder.encode(value if kind in _PLAIN else _checked(value))]
+        return [_encoder.encode(value if kind in _PLAIN else _checked(value, MAX_DEPTH))]
     except (OverflowError, UnicodeError) as error:
         raise UnsupportedValue(f"{kind.__name__} cannot be encoded: {error}") from error
-    except RecursionError:
-        raise UnsupportedValue(f"{kind.__name__} is nested too deeply or contains itself") from None
 
 
-def _checked(value: Any) -> Any:
-    """`value` with what msgspec would silently turn into text or numbers replaced or refused."""
+def _checked(value: Any, levels: int) -> Any:
+    """`value` without anything that msgspec would silently turn into text or numbers."""
     kind = type(value)
     if kind in _PLAIN:
         return value
     if kind in (list, tuple):
-        return value if _PLAIN.issuperset(map(type, value)) else [_checked(v) for v in value]
+        return value if _PLAIN.issuperset(map(type, value)) else _checked_list(value, levels)
     if kind is dict:
         if not all(type(name) is str for name in value):
             raise UnsupportedValue("names in a map are str; found " + _first_other(value))
-        return value if _PLAIN.issuperset(map(type, value.values())) else _checked_map(value)
+        return value if _PLAIN.issuperset(map(type, value.values())) else _checked_map(value, levels)
     if isinstance(value, np.generic):
         return _scalar(value)
     if kind is dt.datetime:
@@ -227,8 +285,19 @@ def _checked(value: Any) -> Any:
     )
 
 
-def _checked_map(value: dict[str, Any]) -> dict[str, Any]:
-    return {name: _checked(v) for name, v in value.items()}
+def _checked_list(value: Sequence[Any], levels: int) -> list[Any]:
+    _check_levels(levels)
+    return [_checked(v, levels - 1) for v in value]
+
+
+def _checked_map(value: dict[str, Any], levels: int) -> dict[str, Any]:
+    _check_levels(levels)
+    return {name: _checked(v, levels - 1) for name, v in value.items()}
+
+
+def _check_levels(left: int) -> None:
+    if left <= 1:
+        raise UnsupportedValue(f"a value is nested over {MAX_DEPTH} levels deep, or contains itself")
 
 
 def _first_other(value: dict[Any, Any]) -> str:
@@ -238,71 +307,34 @@ def _first_other(value: dict[Any, Any]) -> str:
 def _scalar(value: np.generic) -> Any:
     if isinstance(value, np.datetime64):
         ns = value.astype("datetime64[ns]").astype(np.int64)
-        return msgspec.msgpack.Ext(_DATETIME64, struct.pack("<q", int(ns)))
+        return msgspec.msgpack.Ext(_DATETIME64, _INT64.pack(int(ns)))
     if isinstance(value, np.bool_ | np.integer | np.floating | np.str_ | np.bytes_):
         return value.item() if not isinstance(value, np.longdouble) else float(value)
     raise UnsupportedValue(f"numpy.{type(value).__name__} is no DUE type; send an array of it")
 
 
 def _naive(value: dt.datetime) -> msgspec.msgpack.Ext:
-    return msgspec.msgpack.Ext(_NAIVE_DATETIME, struct.pack("<q", (value - _EPOCH) // _MICROSECOND))
+    return msgspec.msgpack.Ext(_NAIVE_DATETIME, _INT64.pack((value - _EPOCH) // _MICROSECOND))
 
 
 def _extension(value: Any) -> Any:
     if isinstance(value, msgspec.Raw):
         return value
-    parts = _batch_body(value, 0) if isinstance(value, RecordBatch) else _array_body(value, 0)
+    parts = batch_body(value, 0) if isinstance(value, RecordBatch) else array_body(value, 0)
     return msgspec.msgpack.Ext(_BATCH if isinstance(value, RecordBatch) else _ARRAY, b"".join(parts))
 
 
 def _array_parts(array: npt.NDArray[Any], offset: int) -> list[bytes | memoryview]:
-    body = _array_body(array, offset + _EXT_HEADER)
+    body = array_body(array, offset + _EXT_HEADER)
     return [_ext_header(_ARRAY, body), *body]
 
 
 def _batch_parts(batch: RecordBatch, offset: int) -> list[bytes | memoryview]:
-    body = _batch_body(batch, offset + _EXT_HEADER)
+    body = batch_body(batch, offset + _EXT_HEADER)
     return [_ext_header(_BATCH, body), *body]
 
 
-def _array_body(array: npt.NDArray[Any], offset: int) -> list[bytes | memoryview]:
-    """u32 length of the head, head = [dtype, shape], padding to the alignment, bytes in C order."""
-    return _body([_dtype_text(array.dtype), list(array.shape)], [array], offset)
-
-
-def _batch_body(batch: RecordBatch, offset: int) -> list[bytes | memoryview]:
-    """u32 length of the head, head = [rows, [name, dtype]…], then each column with padding before it."""
-    columns = [batch[name] for name in batch.columns]
-    head = [len(batch), [[n, _dtype_text(c.dtype)] for n, c in zip(batch.columns, columns, strict=True)]]
-    return _body(head, columns, offset)
-
-
-def _body(head: Any, arrays: Sequence[npt.NDArray[Any]], offset: int) -> list[bytes | memoryview]:
-    """Padding makes the data of each array start at a multiple of 16 bytes in the whole payload."""
-    text = _encoder.encode(head)
-    padding = -(offset + 5 + len(text)) % _ALIGNMENT
-    parts: list[bytes | memoryview] = [struct.pack("<IB", len(text), padding), text, bytes(padding)]
-    for array in arrays:
-        data = _raw(array)
-        parts += (data, bytes(-len(data) % _ALIGNMENT))
-    return parts
-
-
-def _raw(array: npt.NDArray[Any]) -> memoryview | bytes:
-    if array.nbytes <= _COPIED_BELOW:
-        return array.tobytes()
-    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-
-
-def _dtype_text(dtype: np.dtype[Any]) -> Any:
-    if dtype.hasobject or dtype.kind not in _KINDS or dtype.itemsize == 0:
-        raise UnsupportedValue(f"arrays of dtype {dtype} cannot travel; use numbers, bytes or times")
-    return dtype.str if dtype.names is None else [list(field) for field in dtype.descr]
-
-
 _EXT_HEADER = 6
-_COPIED_BELOW = 512
-"""Bytes of an array that are copied sooner than a view of them is made."""
 
 
 def _ext_header(code: int, body: list[bytes | memoryview]) -> bytes:
@@ -314,43 +346,26 @@ def _bin_header(length: int) -> bytes:
 
 
 def _from_extension(code: int, data: memoryview) -> Any:
-    if code == _NAIVE_DATETIME:
-        return _EPOCH + struct.unpack("<q", data)[0] * _MICROSECOND
-    if code == _DATETIME64:
-        return np.datetime64(struct.unpack("<q", data)[0], "ns")
-    if code not in (_ARRAY, _BATCH):
-        raise ValueError(f"extension type {code} is unknown")
-    length, padding = struct.unpack_from("<IB", data)
-    head = msgspec.msgpack.decode(data[5 : 5 + length])
-    at = 5 + length + padding
     if code == _ARRAY:
-        array, _ = _read_array(data, at, head[0], int(np.prod(head[1], dtype=np.int64)))
-        return array.reshape(head[1])
-    columns = {}
-    for name, dtype in head[1]:
-        columns[name], at = _read_array(data, at, dtype, head[0])
-    return RecordBatch(columns)
+        return read_array(data)
+    if code == _BATCH:
+        return read_batch(data)
+    if code not in (_NAIVE_DATETIME, _DATETIME64):
+        raise DecodeError(f"extension type {code} is unknown")
+    if len(data) != _INT64.size:
+        raise DecodeError(f"a time has {_INT64.size} bytes, not {len(data)}")
+    number: int = _INT64.unpack(data)[0]
+    if code == _DATETIME64:
+        return np.datetime64(number, "ns")
+    if not _FIRST_MICROSECOND <= number <= _LAST_MICROSECOND:
+        raise DecodeError(f"a time of {number} µs is beyond the calendar")
+    return _EPOCH + number * _MICROSECOND
 
 
-def _read_array(data: memoryview, at: int, dtype: Any, size: int) -> tuple[npt.NDArray[Any], int]:
-    kind = np.dtype(dtype if isinstance(dtype, str) else [_field(f) for f in dtype])
-    if kind.hasobject or size < 0 or kind.itemsize == 0:
-        raise ValueError(f"array of dtype {kind} is not allowed")
-    array = np.frombuffer(data, kind, size, at) if size else np.empty(0, kind)
-    if not array.flags.aligned:
-        array = array.copy()
-        array.flags.writeable = False
-    length = size * kind.itemsize
-    return array, at + length + -length % _ALIGNMENT
-
-
-def _field(field: list[Any]) -> tuple[Any, ...]:
-    return (field[0], field[1]) if len(field) == 2 else (field[0], field[1], tuple(field[2]))
-
-
+_COPIED_BELOW = 512
 _SPARE_BYTES = 1 << 18
 _spare: deque[bytearray] = deque(maxlen=1)
-"""Where frames are encoded: memory that is in the cache already and needs not grow.  Whoever uses it takes it out."""
+"""A buffer for encoding frames, reused because it is cached and large enough; taken out while in use."""
 _encoder = msgspec.msgpack.Encoder()
 _value_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Any, ext_hook=_from_extension)
 _frame_decoder = msgspec.msgpack.Decoder(Frame, ext_hook=_from_extension)

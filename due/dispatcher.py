@@ -8,40 +8,51 @@ from collections.abc import Callable
 
 from due.codec import Frame, decode_frame, encode_frame, freeze
 from due.drivers.base import Delivery, Receiver
-from due.errors import DecodeError, DueError
+from due.errors import DecodeError, DueError, NewerVersion, RefusedFrame
 from due.keys import Key
+from due.logs import LogLimit
 from due.messages import Item
-from due.observation import Callback, Observation, Tracker, deliver
+from due.observation import Callback, Observation, deliver
+from due.routes import Routes
+from due.threads import Failed, LoudThread
+from due.tracker import Tracker
 
 log = logging.getLogger("due")
 
-_ROUTES = 65536
+_REFUSALS = ("undecodable", "newer_version", "misplaced", "foreign", "out_of_range")
+"""Causes for which frames are refused, as counted in `health`."""
+_REFUSED_BYTES = 4096
+"""Bytes of a refused frame that are kept for diagnosis."""
+_REASON = 512
 _REST = 30.0
-"""Seconds without anything to receive; `wake` ends it, and receivers with something to look after do."""
+"""Longest wait for data, seconds; `wake` ends it, and receivers with periodic work end it earlier."""
 
 
 class Dispatcher:
     """Owns the receiver and the observations."""
 
-    def __init__(self, receiver: Receiver, *, shared: bool, tries: int) -> None:
+    def __init__(self, receiver: Receiver, *, shared: bool, tries: int, failed: Failed | None = None) -> None:
         self.receiver = receiver
         self.tracker = Tracker(shared=shared)
         self.received = 0
         self.best_effort = 0
-        """Payloads that came without being kept by the server."""
+        """Best-effort payloads received."""
         self.busy_since: float | None = None
         """When the running callbacks were entered, monotonic seconds; None while waiting."""
+        self.answered = 0.0
+        """When the last answered question was asked, monotonic seconds."""
+        self._asked = 0.0
         self._tries = tries
-        self._observations: tuple[Observation, ...] = ()
-        self._routes: dict[str, tuple[Observation, ...]] = {}
+        self._routes = Routes()
         self._tasks: deque[Callable[[], None]] = deque()
-        self._lock = threading.Lock()
+        self._errors = LogLimit(log)
         self._closed = False
+        self._halted = False
         self._active = True
         self._reading = True
-        self._counts = {"undecodable": 0, "newer_version": 0, "callback_errors": 0, "set_aside": 0}
+        self._counts = dict.fromkeys((*_REFUSALS, "callback_errors", "set_aside"), 0)
         self._reliable: Delivery | None = None
-        self._thread = threading.Thread(target=self._run, name="due-dispatcher", daemon=True)
+        self._thread = LoudThread("due-dispatcher", self._run, failed)
 
     def start(self) -> None:
         """Begin to receive."""
@@ -52,24 +63,31 @@ class Dispatcher:
         self._tasks.append(task)
         self.receiver.wake()
 
+    def ask(self) -> None:
+        """Ask the thread to answer between two frames; has no effect while a question is open."""
+        if self.answered == self._asked:
+            self._asked = time.monotonic()
+        self.receiver.wake()
+
+    def unanswered(self) -> float:
+        """Seconds for which the question of `ask` has been open; 0.0 once it is answered."""
+        asked = self._asked
+        return time.monotonic() - asked if self.answered != asked else 0.0
+
     def inside(self) -> bool:
         """Whether the caller is a callback."""
         return threading.current_thread() is self._thread
 
     def open(self, observation: Observation) -> None:
         """Begin to receive for it."""
-        with self._lock:
-            self._observations = (*self._observations, observation)
-            self._routes = {}
+        self._routes.change(lambda there: (*there, observation))
         self.receiver.follow(observation.key.path, start=observation.start)
         self.receiver.subscribe(observation.key.path)
 
     def shut(self, observation: Observation) -> None:
         """Stop receiving for it."""
-        with self._lock:
-            self._observations = tuple(o for o in self._observations if o is not observation)
-            self._routes = {}
-            rest = self._observations
+        self._routes.change(lambda there: tuple(o for o in there if o is not observation))
+        rest = self._routes.observations
         self.receiver.unsubscribe(observation.key.path)
         if observation.key.path not in {o.key.path for o in rest}:
             self.receiver.unfollow(observation.key.path)
@@ -80,12 +98,19 @@ class Dispatcher:
         self._active = active
         if reading != self._reading:
             self._reading = reading
+            if reading:
+                self.post(self.tracker.rested)
             self.receiver.activate(reading, take_over=take_over)
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
-        tracked = {"gaps": self.tracker.gaps, "repeats": self.tracker.repeats, "fenced": self.tracker.fenced}
+        tracked = {name: getattr(self.tracker, name) for name in ("gaps", "repeats", "fenced", "refuted")}
         return {"received": self.received, **tracked, **self._counts, **self.receiver.statistics()}
+
+    def halt(self) -> None:
+        """Callbacks cannot work any more: stop, and leave undelivered items to the next process."""
+        self._halted = self._closed = True
+        self.receiver.wake()
 
     def close(self) -> None:
         """Stop after the running callback."""
@@ -99,16 +124,18 @@ class Dispatcher:
         while not self._closing():
             try:
                 deliveries = self.receiver.receive(_REST)
-            except DueError:
-                log.exception("receiving failed")
+            except DueError as error:
+                self._errors.error("receiving failed", error=error)
                 time.sleep(0.1)
                 continue
             self.busy_since = time.monotonic()
-            # first, for what is forgotten here may have begun anew with these
+            self.answered = self._asked
+            # first: a key that is forgotten here may be observed again by these tasks
             while self._tasks and not self._closing():
                 self._run_task(self._tasks.popleft())
             for delivery in deliveries:
                 self._dispatch(delivery)
+                self.answered = self._asked
                 if self._closing():
                     break
             self.busy_since = None
@@ -119,9 +146,9 @@ class Dispatcher:
     def _run_task(self, task: Callable[[], None]) -> None:
         try:
             task()
-        except Exception:
+        except Exception as error:  # noqa: BLE001 - a callback may raise anything; it is reported
             self._counts["callback_errors"] += 1
-            log.exception("a callback failed")
+            self._errors.error("a callback failed", error=error)
 
     def _dispatch(self, delivery: Delivery) -> None:
         if not delivery.token:
@@ -130,21 +157,28 @@ class Dispatcher:
                 return
         try:
             frame = decode_frame(delivery.payload)
+            route = self._routes.known.get(frame.key)
+            if route is not None and route[0] == delivery.path and route[1] == frame.app_id:
+                observations = route[2]
+            else:
+                observations = self._routes.find(frame.key, frame.app_id, delivery.path)
+            new = bool(observations) and self.tracker.admit(frame, reliable=bool(delivery.token))
+        except NewerVersion as error:
+            self._count("newer_version", delivery, error)
         except DecodeError as error:
-            self._undecodable(delivery, error)
+            self._refuse("undecodable", delivery, error)
+        except RefusedFrame as error:
+            self._refuse(error.cause, delivery, error)
         else:
-            observations = self._routes.get(frame.key)
-            if observations is None:
-                observations = self._route(frame.key)
-            if observations and self.tracker.admit(frame, reliable=bool(delivery.token)):
+            if new:
                 self._deliver(delivery, frame, observations)
-        if delivery.token:
+        if delivery.token and not self._halted:
             self.receiver.acknowledge(delivery)
 
     def _deliver(self, delivery: Delivery, frame: Frame, observations: tuple[Observation, ...]) -> None:
         if delivery.tries > self._tries + 1:
             self._counts["set_aside"] += len(frame.values)
-            log.error("a frame of %s ended %d consumers: set aside", frame.key, delivery.tries - 1)
+            log.error("a frame of %s killed %d consumers and is set aside", frame.key, delivery.tries - 1)
             self.receiver.set_aside(delivery, delivery.payload, "its consumers died")
             return
         self.received += len(frame.values)
@@ -158,8 +192,10 @@ class Dispatcher:
             deliver(observation.thinned(items), observation.callbacks, self._failed)
 
     def _failed(self, callback: Callback, item: Item, error: Exception) -> None:
-        """Report, try again on reliable keys, and set the item aside in the end."""
+        """Report the failure; on reliable keys retry, and finally set the item aside."""
         self._counts["callback_errors"] += 1
+        if self._halted:
+            return
         tries = 1
         while self._reliable is not None and tries < self._tries:
             tries += 1
@@ -169,29 +205,23 @@ class Dispatcher:
                 error = again
             else:
                 return
-        log.error("a callback failed on %s (sequence %d)", item.key, item.sequence, exc_info=error)
+        self._errors.error("a callback failed on %s (sequence %d)", item.key, item.sequence, error=error)
         if self._reliable is not None:
             self._counts["set_aside"] += 1
             self.receiver.set_aside(self._reliable, _alone(item), f"{type(error).__name__}: {error}")
 
-    def _undecodable(self, delivery: Delivery, error: DecodeError) -> None:
-        kind = "newer_version" if type(error) is not DecodeError else "undecodable"
-        self._counts[kind] += 1
-        if self._counts[kind] == 1:
-            log.error("skipped what arrived under %s: %s; more are counted only", delivery.path, error)
+    def _refuse(self, cause: str, delivery: Delivery, error: DueError) -> None:
+        """Count the refusal; a frame from a stream is set aside, so that it is not read again."""
+        self._count(cause, delivery, error)
+        if delivery.token:
+            self.receiver.set_aside(
+                delivery, delivery.payload[:_REFUSED_BYTES], f"{cause}: {error}"[:_REASON]
+            )
 
-    def _route(self, text: str) -> tuple[Observation, ...]:
-        """The observations that want this key; remembered until they change."""
-        with self._lock:
-            try:
-                key = Key(text)
-            except DueError:
-                return ()
-            found = tuple(o for o in self._observations if o.key.matches(key))
-            if len(self._routes) >= _ROUTES:
-                self._routes = {}
-            self._routes[text] = found
-            return found
+    def _count(self, cause: str, delivery: Delivery, error: DueError) -> None:
+        self._counts[cause] += 1
+        if self._counts[cause] == 1:
+            log.error("refused a frame under %s: %s; further ones are only counted", delivery.path, error)
 
 
 def _alone(item: Item) -> bytes:

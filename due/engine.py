@@ -1,32 +1,37 @@
-"""The engine: what an app holds in its hand.
+"""The engine: the object through which an app writes and receives data.
 
-    write ──► Gate ──► Outlet (numbers, batches) ──► Publisher ──► Data Updates    sender thread: what lingers
-               ▲                              └────► Archiver ───► Data Archives   archiver thread
-               │ permission, pace
-             Member ◄── Keeper (heartbeats, assignments)                           keeper thread
+    write ──► WriteAdmission ──► KeyWriter (numbers, batches) ──► driver ──► Data Updates    sender thread
+                 ▲                                         └────► Archiver ─► Data Archives  archiver thread
+                 │ assignments, rates
+             Membership ◄── HeartbeatThread (heartbeats, assignments, leases)                heartbeat thread
 
-    observe ──► Observation ◄── Dispatcher ◄── Receiver ◄── Data Updates           dispatcher thread
+    observe ──► Observation ◄── Dispatcher ◄── driver ◄── Data Updates                       dispatcher thread
 
-`Engine` is the face; `Session` holds the parts between `init` and `close`.
+`Engine` is the public API; `Session` holds the parts between `init` and `close`.
 """
 
 import atexit
 import os
+import re
 import socket
 import threading
 import time
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 from uuid import uuid4
 
+import msgspec
+
 from due.backends import default_archive, default_updates
-from due.codec import freeze, unpack
+from due.codec import MAX_ID, checked_time, freeze, unpack
 from due.config import Options
-from due.errors import BackendError, InvalidKey, InvalidOption, NotAllowed, NotInitialised
+from due.errors import BackendError, DecodeError, InvalidKey, InvalidOption, NotAllowed, NotInitialised
+from due.key_writer import ARCHIVE, BOTH, PUBLISH, KeyWriter
 from due.keys import Key
-from due.membership import Registration
+from due.liveness import Liveness
+from due.membership import APP_ID, Registration
 from due.messages import (
     Assignment,
     AssignmentCallback,
@@ -38,7 +43,6 @@ from due.messages import (
     Role,
 )
 from due.observation import Observation
-from due.outlet import ARCHIVE, BOTH, PUBLISH, Outlet
 from due.session import Session
 
 _MODES = (BOTH, PUBLISH, ARCHIVE, 0, BOTH, PUBLISH, ARCHIVE, 0)
@@ -54,6 +58,13 @@ class Engine:
     >>> engine.init("thermometer", PRODUCER)                   # doctest: +SKIP
     >>> engine.write("house.climate.thermometer.attic", 21.5)  # doctest: +SKIP
     True
+
+    Args:
+        options: all options of the engine; None takes the defaults.
+
+    Raises:
+        InvalidOption: an option is out of bounds.
+        EngineFailed: from every method but `close`, after a thread of the engine has died.
     """
 
     def __init__(self, options: Options | None = None) -> None:
@@ -62,27 +73,55 @@ class Engine:
         self._archive_url = default_archive(self.options)
         self._registration: Registration | None = None
         self._session: Session | None = None
-        self._outlets: dict[str, Outlet] = {}
+        self._broken: Session | None = None
+        """The session after one of its threads died, until `close`."""
+        self._outlets: dict[str, KeyWriter] = {}
         self._lock = threading.RLock()
+        self.when_failed: Callable[[], None] = lambda: None
+        """Called by a thread that dies; `due.service` ends the process."""
         _engines.add(self)
 
     @property
     def app_id(self) -> str:
-        """As given to `init`; empty before."""
+        """The app id given to `init`; empty before."""
         return self._registration.app_id if self._registration else ""
 
     @property
     def instance_id(self) -> str:
-        """Of this engine; new with each `init`."""
+        """16 hexadecimal digits that identify this process; new with each `init`."""
         return self._registration.instance_id if self._registration else ""
 
+    @property
+    def failed(self) -> BaseException | None:
+        """The error that killed a thread of the engine; None while all run."""
+        return self._broken.failure if self._broken is not None else None
+
+    @property
+    def liveness(self) -> Liveness:
+        """Whether the engine's threads still make progress, for a supervisor."""
+        return self._require().liveness
+
     def set_pubsub(self, url: str) -> None:
-        """Which Data Updates server to use: redis://, rediss:// or unix://; before `init`."""
+        """Choose the Data Updates server; call it before `init`.
+
+        Args:
+            url: redis://, rediss://, unix:// or memory://.
+
+        Raises:
+            InvalidOption: the engine is already initialised.
+        """
         self._before_init("set_pubsub")
         self._updates_url = url
 
     def set_db(self, url: str) -> None:
-        """Which Data Archives to use: sqlite:///path/file.db or mongodb://host/database; before `init`."""
+        """Choose the Data Archives; call it before `init`.
+
+        Args:
+            url: sqlite:///path/file.db, mongodb://host/database or memory://.
+
+        Raises:
+            InvalidOption: the engine is already initialised.
+        """
         self._before_init("set_db")
         self._archive_url = url
 
@@ -95,14 +134,27 @@ class Engine:
         capabilities: Iterable[Capability] = (),
         instances: Instances = "standby",
     ) -> None:
-        """Connect and register.  Raises `InvalidKey`, `InvalidOption`, `UpdatesUnavailable`."""
+        """Connect to Data Updates and register with the Coordinator.
+
+        Args:
+            app_id: name of the app, A-Z a-z 0-9 _ - only.
+            role: PRODUCER, CONSUMER, or both.
+            interests: the keys this app wants; `observe` adds more.
+            capabilities: the keys this app can write; other keys may be written, too.
+            instances: "standby": one instance works and the others wait; "shared": all of them work.
+
+        Raises:
+            InvalidKey: a key breaks the grammar.
+            InvalidOption: the app id, `instances` or a declaration is wrong, or `init` was called before.
+            UpdatesUnavailable: Data Updates did not answer within `Options.connect_timeout`.
+        """
         self._before_init("init")
-        if Key(app_id).segments != (app_id,) or "*" in app_id:
-            raise InvalidOption(f"app id {app_id!r}: one segment of A-Z a-z 0-9 _ -")
+        if not isinstance(app_id, str) or not re.fullmatch(APP_ID, app_id):
+            raise InvalidOption(f"app id {app_id!r}: 1 to {MAX_ID} characters of A-Z a-z 0-9 _ -")
         if instances not in ("standby", "shared"):
             raise InvalidOption(f"instances {instances!r}: 'standby' or 'shared'")
         self._start(
-            Registration(
+            _checked_registration(
                 app_id=app_id,
                 instance_id=uuid4().hex[:16],
                 instances=instances,
@@ -123,11 +175,28 @@ class Engine:
     ) -> bool:
         """Publish and archive one value under a concrete key.
 
-        `flags`: PUB_ONLY, DB_ONLY, NO_WAIT (send at once).  `event_time`: ns.  Returns False if nobody
-        wants it (then it is archived only under `archive="always"`) or this instance is not the active
-        one.  Waits only for back-pressure: a reliable stream whose readers are behind (so a callback must
-        not fill a reliable stream that its own app reads).  A RecordBatch is encoded at once, other
-        mutable values too.  Raises `InvalidKey`, `UnsupportedValue`, `NotAllowed`.
+        It waits only under back-pressure, when the readers of a reliable stream are behind. A callback must
+        therefore not fill a reliable stream that its own app reads. Mutable values and a RecordBatch are
+        encoded before this returns.
+
+        Args:
+            key: a key without wildcards and lists.
+            value: a plain value (None, bool, int, float, str, bytes, datetime), a list or map of them, a
+                numpy array or a RecordBatch.
+            flags: PUB_ONLY, DB_ONLY, NO_WAIT (send at once instead of waiting for a full frame).
+            event_time: when the described event happened, ns since the epoch; None takes the time of writing.
+
+        Returns:
+            False if nobody wants the item or this instance is not the active one. The item is then archived
+            only if the capability says `archive="always"`.
+
+        Raises:
+            InvalidKey: the key breaks the grammar or has wildcards.
+            InvalidOption: the flags exclude each other, or the event time is out of bounds.
+            UnsupportedValue: the value is of no DUE type.
+            NotAllowed: `init` was not given the role PRODUCER.
+            NotInitialised: called before `init` or after `close`.
+            EngineFailed: a thread of the engine has died.
         """
         outlet = self._outlets.get(key) or self._outlet(key)
         now = time.time_ns()
@@ -137,6 +206,8 @@ class Engine:
         mode = _MODES[bits]
         if not mode:
             raise InvalidOption(f"write({key!r}): PUB_ONLY and DB_ONLY exclude each other")
+        if event_time is not None:
+            event_time = checked_time(event_time)
         session = self._session or self._require()
         if now > session.keeper.alive_until:
             session.keeper.check_pause()
@@ -154,21 +225,40 @@ class Engine:
         return self.write(key, value, (bits,), event_time=event_time)
 
     def flush(self, timeout: float = _FLUSH_SECONDS) -> None:
-        """Return when all written so far is in the backends; raises `Timeout` (seconds).
+        """Wait until everything written so far has reached the backends.
 
         For reliable keys this is the producer's acknowledgement.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            Timeout: it took longer.
         """
         self._require().flush(timeout)
 
     def observe(
         self, key: str, *, frequency: Frequency = None, since: int | datetime | str | None = None
     ) -> Observation:
-        """A ReactiveX Subject of the items under `key` (wildcards allowed); subscribe to receive.
+        """Receive the items under a key, through a ReactiveX Subject.
 
-        Callbacks run one at a time in the dispatcher thread; a slow one holds back the producers of
-        reliable keys.  The place in a reliable key is kept while the app is away; it is given up soon
-        after its last subscription is disposed.  `since` replays reliable keys from a time (int ns, datetime) or a stream id, as
-        far as they are kept.  Raises `InvalidKey`, `NotAllowed`.
+        Callbacks run one at a time in the dispatcher thread; a slow one holds back the producers of reliable
+        keys. The position in a reliable stream is kept while the app is away, and dropped soon after the last
+        subscription is disposed.
+
+        Args:
+            key: wildcards and lists are allowed.
+            frequency: the rate that is wanted, Hz, or (least, most); None takes items as they come.
+            since: replay a reliable key from this time (int ns, datetime) or stream id, as far as it is
+                retained.
+
+        Returns:
+            The Subject; nothing is received before `subscribe`.
+
+        Raises:
+            InvalidKey: the key breaks the grammar.
+            NotAllowed: `init` was not given the role CONSUMER.
+            NotInitialised: called before `init` or after `close`.
         """
         session = self._require()
         if not session.keeper.member.registration.consumer:
@@ -176,12 +266,20 @@ class Engine:
         return Observation(Key.parse(key), frequency, _start_id(since), session.opened, session.closed)
 
     def get(self, query: str | Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
-        """Items from Data Archives, oldest first: of a key (wildcards allowed) or a MongoDB-dialect query.
+        """Read items from Data Archives, after this engine's own archive writes have been flushed.
 
-        Of more than `limit` the youngest.
+        Args:
+            query: a key (wildcards allowed), or a query in MongoDB's dialect.
+            limit: return at most this many, the youngest; None returns all.
 
-        Flushes this engine's own archive writes first.  Raises `InvalidKey`, `InvalidQuery`,
-        `ArchiveUnavailable`.
+        Returns:
+            Items, oldest first.
+
+        Raises:
+            InvalidKey: the key breaks the grammar.
+            InvalidQuery: the query has an unknown operator or a wrong operand.
+            ArchiveUnavailable: the archive cannot be reached.
+            Timeout: own archive writes could not be flushed within 30 s.
         """
         session = self._require()
         if isinstance(query, str):
@@ -190,57 +288,87 @@ class Engine:
         return session.archive.find(query, limit=limit)
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
-        """Call back, in the dispatcher thread, when what is wanted of this app changes, and once now."""
+        """Call back whenever this app's assignments change, and once immediately.
+
+        Args:
+            callback: gets all current assignments; called in the dispatcher thread.
+        """
         self._require().on_assignments(callback)
 
     def assignments(self) -> tuple[Assignment, ...]:
-        """What is wanted of this app now."""
+        """The current assignments of this app.
+
+        Returns:
+            One per capability and matching interest; empty while nobody wants anything.
+        """
         return self._require().keeper.member.assignments
 
     def wanted(self, key: str) -> bool:
-        """Whether somebody wants what `key` names; True while no Coordinator is there to ask."""
+        """Ask whether anybody wants what a key names.
+
+        Args:
+            key: the key of an item, or of several.
+
+        Returns:
+            True also while no Coordinator can be asked.
+
+        Raises:
+            InvalidKey: the key breaks the grammar.
+        """
         keeper = self._require().keeper
         with keeper.lock:
             return keeper.member.wanted(Key.parse(key))
 
     def set_aside(self) -> list[tuple[Item, str]]:
-        """Items of reliable keys that this app's callbacks kept failing on, and why, oldest first."""
+        """Items of reliable keys on which this app's callbacks kept failing.
+
+        Returns:
+            Pairs of item and cause, oldest first. Refused frames are included as far as they can be decoded.
+        """
         return [
             (item, reason)
             for payload, reason in self._require().dispatcher.receiver.aside()
-            for item in unpack(payload)
+            for item in _readable(payload)
         ]
 
     def health(self) -> dict[str, Any]:
-        """Counters and states, for people and metrics."""
+        """Counters and states of the engine.
+
+        Returns:
+            A map of plain values; the same figures are exported to Prometheus.
+        """
         return self._require().health()
 
     def close(self) -> None:
-        """Send what waits, say goodbye to the Coordinator, disconnect.  Safe to call twice."""
+        """Send what is still queued, sign off from the Coordinator and disconnect.  Safe to call twice."""
         with self._lock:
-            session, self._session, self._registration = self._session, None, None
+            session = self._session or self._broken
+            self._session = self._broken = self._registration = None
             self._outlets = {}
         if session is not None:
             session.close()
 
     def after_fork(self) -> None:
-        """In a forked child: leave the parent's connections alone; the next call makes our own.
+        """Drop the parent's connections in a forked child; the next call opens new ones.
 
         Observations and their callbacks stay with the parent.
         """
-        if self._session is not None:
-            _inherited.append(self._session)
-        self._session = None
+        _inherited.extend(session for session in (self._session, self._broken) if session is not None)
+        self._session = self._broken = None
         self._outlets = {}
         self._lock = threading.RLock()
 
     def _before_init(self, what: str) -> None:
-        if self._session is not None:
+        if self._session is not None or self._broken is not None:
             raise InvalidOption(f"{what} comes before init; close() first")
 
     def _start(self, registration: Registration) -> None:
         self._session = Session(
-            self.options, registration, updates_url=self._updates_url, archive_url=self._archive_url
+            self.options,
+            registration,
+            updates_url=self._updates_url,
+            archive_url=self._archive_url,
+            failed=self._fail,
         )
         self._registration = registration
         try:
@@ -249,9 +377,18 @@ class Engine:
             self._session = self._registration = None
             raise
 
+    def _fail(self, error: BaseException) -> None:
+        """A thread has died: hide the session from all calls.  No lock: a waiting thread may hold it."""
+        if self._session is not None and self._session.failure is error:
+            self._broken, self._session = self._session, None
+            self._outlets = {}
+            self.when_failed()
+
     def _require(self) -> Session:
         session = self._session
         if session is None:
+            if self._broken is not None:
+                self._broken.check()
             with self._lock:
                 old = self._registration
                 if self._session is None and old is not None:  # forked
@@ -261,7 +398,7 @@ class Engine:
             raise NotInitialised("the engine is not initialised: call init(app_id, role) first")
         return session
 
-    def _outlet(self, text: str) -> Outlet:
+    def _outlet(self, text: str) -> KeyWriter:
         session = self._require()
         key = Key.parse(text)
         if not key.concrete:
@@ -275,6 +412,22 @@ class Engine:
             self._outlets = {}
         self._outlets[text] = outlet
         return outlet
+
+
+def _checked_registration(**fields: Any) -> Registration:
+    registration = Registration(**fields)
+    try:
+        Registration.from_value(registration.to_value())
+    except msgspec.ValidationError as error:  # it would be refused by the Coordinator
+        raise InvalidOption(f"init: {error}") from None
+    return registration
+
+
+def _readable(payload: bytes) -> list[Item]:
+    try:
+        return unpack(payload)
+    except DecodeError:
+        return []
 
 
 def _reborn(old: Registration) -> Registration:

@@ -1,4 +1,4 @@
-"""Everything that DUE raises.
+"""Every error that DUE raises.
 
     DueError
     ├── InvalidKey            a key breaks the grammar (also a ValueError)
@@ -7,12 +7,14 @@
     ├── InvalidOption         an option or URL is wrong (also a ValueError)
     ├── NotInitialised        the engine was used before `init` or after `close`
     ├── NotAllowed            the engine's role does not include the operation
-    ├── DecodeError           bytes from a backend are no frame or value of ours
+    ├── DecodeError           bytes from a backend are not a valid frame or value
     │   └── NewerVersion      ... because a newer DUE wrote them
-    └── BackendError          a backend refused or failed
+    ├── RefusedFrame          a frame does not belong on its channel, or its numbers are impossible
+    ├── EngineFailed          a thread of the engine has died: nothing is sent or received any more
+    └── BackendError          a backend refused a request or failed
         ├── UpdatesUnavailable    Data Updates cannot be reached (now)
         ├── ArchiveUnavailable    Data Archives cannot be reached (now)
-        └── Timeout               it did not answer in time
+        └── Timeout               a backend did not answer in time
 
 Drivers turn the errors of their client libraries into `BackendError`s: callers see this tree only.
 """
@@ -34,7 +36,7 @@ class InvalidKey(DueError, ValueError):
 
 
 class UnsupportedValue(DueError, TypeError):
-    """A value cannot travel: it is of no DUE type."""
+    """A value cannot be encoded: it is of no DUE type."""
 
 
 class InvalidQuery(DueError, ValueError):
@@ -42,23 +44,36 @@ class InvalidQuery(DueError, ValueError):
 
 
 class InvalidOption(DueError, ValueError):
-    """An option or a URL is wrong; the text names it and says what is accepted."""
+    """An option or a URL is wrong; the message names it and says what is accepted."""
 
 
 class NotInitialised(DueError):
-    """The engine is not initialised, or already closed."""
+    """The engine is not initialised yet, or already closed."""
 
 
 class NotAllowed(DueError):
-    """The operation needs a role that `init` was not given."""
+    """The operation needs a role that was not given to `init`."""
 
 
 class DecodeError(DueError):
-    """Bytes are not a frame or value of this wire format."""
+    """Bytes are not a valid frame or value of this wire format."""
 
 
 class NewerVersion(DecodeError):
     """Bytes were written by a newer version of the wire format."""
+
+
+class RefusedFrame(DueError):
+    """A frame does not belong on its channel, or its numbers are impossible.  `cause` names the counter in
+    `health`."""
+
+    def __init__(self, cause: str, text: str) -> None:
+        super().__init__(text)
+        self.cause = cause
+
+
+class EngineFailed(DueError):
+    """A thread of the engine has died of a bug: nothing is sent or received any more."""
 
 
 class BackendError(DueError):

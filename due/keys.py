@@ -1,11 +1,11 @@
-"""Keys: what data is called, and which keys match which.
+"""Keys: their grammar, and which keys match which.
 
     key      = segment *("." segment) [":" spec *("," spec)]          at most 1,024 bytes
     segment  = one or more of A-Z a-z 0-9 _ -   | "*" (one segment)   | "**" (last only: any number)
     spec     = name "=" value       : , = % * | and white space in values are percent-encoded
 
-A spec value may be `*` (any) or a list `a|b`: what a capability offers, or what an interest accepts.
-Pure: nothing here touches a backend.
+A spec value may be `*` (any) or a list `a|b`: the values that a capability offers or an interest accepts.
+No I/O.
 """
 
 import re
@@ -28,7 +28,14 @@ Specs = dict[str, frozenset[str]]
 
 
 class Key:
-    """A parsed key.  Equal keys have one canonical `text`; `Key(text)` raises `InvalidKey`."""
+    """A parsed key.  Equal keys have the same canonical `text`.
+
+    Args:
+        text: a key in the grammar above.
+
+    Raises:
+        InvalidKey: the text breaks the grammar; the error names the position.
+    """
 
     __slots__ = ("path", "segments", "specs", "text")
 
@@ -54,12 +61,22 @@ class Key:
 
     @classmethod
     def parse(cls, key: "str | Key") -> "Key":
-        """`key` parsed; the parse of recent texts is remembered."""
+        """Parse a key, with a cache of recent texts.
+
+        Args:
+            key: text, or a Key, which is returned as it is.
+
+        Returns:
+            The parsed key.
+
+        Raises:
+            InvalidKey: the text breaks the grammar.
+        """
         return key if isinstance(key, Key) else _parsed(key)
 
     @property
     def concrete(self) -> bool:
-        """Whether an item can be written under it: no wildcard, no list."""
+        """Whether items can be written under this key: it has no wildcard and no list."""
         return ANY not in self.path and all(len(v) == 1 and ANY not in v for v in self.specs.values())
 
     @property
@@ -68,32 +85,71 @@ class Key:
         return ANY not in self.path
 
     def matches(self, item: "Key") -> bool:
-        """Whether an observer of this key receives items written under the concrete key `item`.
+        """Whether an observer of this key receives items of another.
 
-        The segments match and every spec of this key is in the item's key: fewer specs, more items.
+        The segments must match, and the item's key must have every spec of this key. Fewer specs match more
+        items.
+
+        Args:
+            item: the concrete key of an item.
+
+        Returns:
+            True if the observer receives the item.
         """
         if self.path != item.path and not _overlap(self.segments, item.segments):
             return False
         return _accepts(self.specs, item.specs)
 
     def matches_path(self, path: str) -> bool:
-        """Whether the segments match the concrete `path`."""
+        """Whether the segments match a path.
+
+        Args:
+            path: a concrete path, without specs.
+
+        Returns:
+            True if they match.
+        """
         return self.path == path or _overlap(self.segments, tuple(path.split(".")))
 
     def offers(self, interest: "Key") -> bool:
-        """Whether a capability of this key can satisfy `interest`: wildcards count on both sides."""
+        """Whether a capability of this key can satisfy an interest.
+
+        Args:
+            interest: wildcards count on both sides.
+
+        Returns:
+            True if at least one concrete key belongs to both.
+        """
         if not _overlap(self.segments, interest.segments):
             return False
         return _accepts(interest.specs, self.specs)
 
     def with_specs(self, **specs: str) -> Self:
-        """This path with these specs added; values are plain text and get encoded."""
+        """This key with more specs.
+
+        Args:
+            specs: name to plain text, which gets percent-encoded.
+
+        Returns:
+            A new key.
+
+        Raises:
+            InvalidKey: a name breaks the grammar, or is given twice.
+        """
         parts = [_spec_text(spec) for spec in self.specs.items()]
         parts += [f"{name}={encode(value)}" for name, value in specs.items()]
         return type(self)(f"{self.path}:{','.join(parts)}" if parts else self.path)
 
     def spec(self, name: str, default: str = "") -> str:
-        """The decoded value of a spec that has one value; `default` where there is none."""
+        """The value of a spec.
+
+        Args:
+            name: the name of the spec.
+            default: returned if the key has no such spec.
+
+        Returns:
+            The decoded value; several values are joined by `|`.
+        """
         values = self.specs.get(name)
         return default if values is None else decode("|".join(sorted(values)))
 
@@ -121,7 +177,17 @@ def decode(value: str) -> str:
 
 
 def canonical(key: str) -> str:
-    """The one spelling of `key`; raises `InvalidKey`."""
+    """The canonical spelling of a key.
+
+    Args:
+        key: a key in any spelling.
+
+    Returns:
+        Its canonical text.
+
+    Raises:
+        InvalidKey: the key breaks the grammar.
+    """
     return Key.parse(key).text
 
 

@@ -1,15 +1,15 @@
-"""How an engine and the Coordinator find each other: the messages, and what a member does on them.
+"""The protocol between an engine and the Coordinator: messages, and how a member reacts to them.
 
-    engine ──Registration──► due.registration.<app>   on init and on every change of its declarations
+    engine ──Registration──► due.registration.<app>   at init and at every change of its declarations
     engine ──Heartbeat─────► due.heartbeat.<app>      every `heartbeat` seconds; `offline` once at the end
-    engine ◄──Assignments─── due.assignment.<app>     what is wanted of the app, and which instance is active
+    engine ◄──Assignments─── due.assignment.<app>     its assignments, and which instance is active
 
 All are ordinary best-effort items (PUB_ONLY, NO_WAIT) whose value is `message.to_value()`.
 Rules for the Coordinator:
  - it answers every Registration with Assignments to that app, and sends Assignments again whenever they change;
  - a Heartbeat of an unknown instance, of another `revision` than the registered one or with another
    `version` than the last sent is answered with the current Assignments: the instance sees in `revisions`
-   that it is unknown, registers again and beats at once (so a restarted Coordinator knows all, and who
+   that it is unknown, registers again and sends a heartbeat (so a restarted Coordinator knows all, and who
    was active, within two heartbeats);
  - `epoch` grows with each change of the active instance and never falls: a new Coordinator starts above
    the highest `epoch` in the heartbeats; Assignments with a lower epoch than seen are ignored;
@@ -20,16 +20,36 @@ Rules for the Coordinator:
 """
 
 import enum
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
+from due.codec import MAX_EPOCH, MAX_TIME
+from due.config import MAX_HEARTBEAT
 from due.keys import Key
 from due.messages import Assignment, Capability, Frequency, Instances, Interest
 
 REGISTRATION = "due.registration"
 HEARTBEAT = "due.heartbeat"
 ASSIGNMENT = "due.assignment"
+
+
+APP_ID = r"[A-Za-z0-9_-]{1,64}"
+"""Grammar of app ids and instance ids."""
+_MOST = 16_384
+"""Capabilities, interests, assignments or instances in one message."""
+_MOST_TEXT = 2048
+_MOST_COUNT = 2**62
+_CLAIMED_EPOCH = MAX_EPOCH - 2**24
+"""The Coordinator continues from the epochs that instances claim, so these must leave it room to count."""
+
+_Id = Annotated[str, msgspec.Meta(pattern=rf"\A{APP_ID}\Z")]
+_NoId = Annotated[str, msgspec.Meta(pattern=rf"\A(?:{APP_ID})?\Z")]
+_Text = Annotated[str, msgspec.Meta(max_length=_MOST_TEXT)]
+_Host = Annotated[str, msgspec.Meta(max_length=255)]
+_Count = Annotated[int, msgspec.Meta(ge=0, lt=_MOST_COUNT)]
+_Seconds = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_HEARTBEAT)]
+_Many = msgspec.Meta(max_length=_MOST)
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,88 +60,98 @@ class _Message(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def from_value(cls, value: object) -> Self:
-        """Read one from the wire; raises `msgspec.ValidationError`."""
-        return msgspec.convert(value, cls)
+        """Read one from the wire; raises `msgspec.ValidationError` and nothing else."""
+        try:
+            return msgspec.convert(value, cls)
+        except (
+            ValueError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+        ) as error:  # a number beyond a float's range, say
+            if isinstance(error, msgspec.ValidationError):
+                raise
+            raise msgspec.ValidationError(f"{cls.__name__}: {error}") from None
 
 
 class Registration(_Message, frozen=True, kw_only=True):
-    """What one instance can make and wants."""
+    """The capabilities and interests of one instance."""
 
-    app_id: str
-    instance_id: str
+    app_id: _Id
+    instance_id: _Id
     instances: Instances = "standby"
-    revision: int
-    """Grows with each change of what follows."""
-    capabilities: tuple[Capability, ...] = ()
-    interests: tuple[Interest, ...] = ()
+    revision: _Count
+    """Grows with each change of the following fields."""
+    capabilities: Annotated[tuple[Capability, ...], _Many] = ()
+    interests: Annotated[tuple[Interest, ...], _Many] = ()
     producer: bool = True
     consumer: bool = True
-    heartbeat: float
+    heartbeat: _Seconds
     """Seconds between its heartbeats."""
-    started: int
+    started: Annotated[int, msgspec.Meta(ge=0, le=MAX_TIME)]
     """UTC, ns: the order of instances."""
-    host: str = ""
-    pid: int = 0
+    host: _Host = ""
+    pid: _Count = 0
 
 
 class Heartbeat(_Message, frozen=True, kw_only=True):
     """A sign of life."""
 
-    app_id: str
-    instance_id: str
+    app_id: _Id
+    instance_id: _Id
     state: Literal["online", "offline"] = "online"
-    revision: int
+    revision: _Count
     """Of its registration."""
-    version: int = 0
+    version: _Count = 0
     """Of the Assignments it follows; 0: none yet."""
-    epoch: int = 0
+    epoch: Annotated[int, msgspec.Meta(ge=0, le=_CLAIMED_EPOCH)] = 0
     """The highest seen."""
     active: bool = False
     """Whether it works now (a standby instance that waits says False)."""
-    written: int = 0
+    written: _Count = 0
     """Items written since its start."""
-    received: int = 0
+    received: _Count = 0
     """Items received since its start."""
 
 
 class Incompatible(_Message, frozen=True, kw_only=True):
     """An interest that cannot be satisfied as asked, as DDS reports incompatible QoS."""
 
-    key: str
+    key: _Text
     """The interest's key."""
-    reason: str
+    reason: _Text
 
 
 class Assignments(_Message, frozen=True, kw_only=True):
-    """What the Coordinator wants of all instances of one app."""
+    """What the Coordinator asks of the instances of one app."""
 
-    app_id: str
-    coordinator: str
+    app_id: _Id
+    coordinator: _Id
     """The Coordinator's instance id."""
-    version: int
+    version: _Count
     """Changes with the content; never 0."""
-    epoch: int
-    active: str = ""
+    epoch: Annotated[int, msgspec.Meta(ge=0, le=MAX_EPOCH)]
+    active: _NoId = ""
     """The instance that works; "" = every instance does."""
-    revisions: dict[str, int]
+    revisions: Annotated[dict[_Id, _Count], _Many]
     """The registrations it knows: instance id to revision."""
-    assignments: tuple[Assignment, ...] = ()
-    incompatible: tuple[Incompatible, ...] = ()
+    assignments: Annotated[tuple[Assignment, ...], _Many] = ()
+    incompatible: Annotated[tuple[Incompatible, ...], _Many] = ()
 
 
 class Phase(enum.Enum):
-    """How far the handshake is."""
+    """State of the handshake."""
 
     WAITING = "waiting"
-    """No word from a Coordinator yet: declared keys are buffered."""
+    """No message from a Coordinator yet: declared keys are buffered."""
     ALONE = "alone"
     """The handshake timed out: declared keys are written as if wanted."""
     COORDINATED = "coordinated"
-    """Assignments rule."""
+    """A Coordinator answers: its assignments apply."""
 
 
 class Verdict(enum.Enum):
-    """What becomes of an item under a key."""
+    """How an item under a key is handled."""
 
     OPEN = "open"
     BUFFER = "buffer"
@@ -167,14 +197,14 @@ class Member:
 
     @property
     def active(self) -> bool:
-        """Whether this instance works: speaks for its app, and reads for it."""
+        """Whether this instance is active: writes and reads for its app."""
         if self._fenced:
             return False
         return self.current is None or self.current.active in ("", self.registration.instance_id)
 
     @property
     def asking(self) -> bool:
-        """Whether it was stopped for long and does not know yet if it is still the active one."""
+        """Whether it was suspended for long and does not know yet if it is still active."""
         return self._fenced
 
     @property
@@ -184,7 +214,7 @@ class Member:
 
     @property
     def announced(self) -> bool:
-        """Whether a Coordinator is looked for."""
+        """Whether this instance announces itself to a Coordinator."""
         return self._coordinated
 
     @property
@@ -252,14 +282,14 @@ class Member:
         )
 
     def assigned(self, message: Assignments, now: float) -> bool:
-        """Take the Coordinator's word; returns whether anything changed for this instance."""
+        """Apply the Coordinator's assignments; returns whether anything changed for this instance."""
         if message.app_id != self.registration.app_id or message.epoch < self.epoch:
             return False
         me = self.registration.instance_id
         if message.revisions.get(me) != self.registration.revision:
             self._register_at = min(self._register_at, now)
             if me not in message.revisions:
-                self._beat_at = now  # a new Coordinator shall know at once whether we are the active one
+                self._beat_at = now  # tell a new Coordinator at once whether this instance is active
                 return False
         before = (self.phase, self.active, self.assignments, self.epoch)
         self.current = message
@@ -271,7 +301,7 @@ class Member:
         return changed
 
     def paused(self, now: float) -> bool:
-        """This process was stopped for longer than a Coordinator waits: another may be active by now.
+        """This process was suspended for longer than a Coordinator waits: another may be active by now.
 
         Writes are buffered until the Coordinator says who is active, or stays silent for the handshake
         time-out.  Returns whether this applies (only the active instance of a standby app).
@@ -312,7 +342,7 @@ class Member:
         return next((c for c in self.registration.capabilities if Key.parse(c.key).offers(key)), None)
 
     def wanted(self, key: Key) -> bool:
-        """Whether somebody wants what `key` (wildcards allowed) names, or nobody is there to ask."""
+        """Whether anybody wants what `key` (wildcards allowed) names, or no Coordinator can be asked."""
         if not self.active or self.phase is Phase.WAITING:
             return False
         if self.phase is Phase.ALONE:
@@ -326,5 +356,5 @@ def least(frequency: Frequency) -> float | None:
 
 
 def most(frequency: Frequency) -> float | None:
-    """The maximum rate: of a capability what it can make, of a pair its second number; None: no limit."""
+    """The maximum rate: a capability's number, or the second number of a pair; None: no limit."""
     return frequency[1] if isinstance(frequency, tuple) else frequency

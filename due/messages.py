@@ -1,14 +1,14 @@
-"""What travels on DUE, and what apps declare: items, capabilities, interests, assignments."""
+"""What travels on DUE and what apps declare: items, capabilities, interests, assignments."""
 
 import enum
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from due.errors import UnsupportedValue
+from due.errors import InvalidOption, UnsupportedValue
 from due.keys import Key
 
 Delivery = Literal["best_effort", "reliable"]
@@ -20,6 +20,10 @@ Frequency = float | tuple[float, float] | None
 (least, most); None: as it comes."""
 
 
+_LEAST_HZ = 1e-6
+_MOST_HZ = 1e9
+
+
 class Role(enum.Flag):
     """What an app does: `PRODUCER`, `CONSUMER` or `PRODUCER | CONSUMER`."""
 
@@ -28,7 +32,7 @@ class Role(enum.Flag):
 
 
 class WriteFlag(int):
-    """How one `write` differs from the usual: published and archived, in a batch.
+    """An option of one `write`, which otherwise publishes and archives, in a batch.
 
     An int and no enum: flags are combined on the hot path.
     """
@@ -49,7 +53,7 @@ NO_WAIT = WriteFlag(4)
 
 
 class Item(msgspec.Struct, frozen=True, gc=False):
-    """One written value.  (instance_id, key, sequence) identifies it: use it as the idempotence key."""
+    """One written value.  (instance_id, key, sequence) identifies it; use that as the idempotence key."""
 
     key: str
     """The concrete key it was written under, canonical."""
@@ -64,8 +68,15 @@ class Item(msgspec.Struct, frozen=True, gc=False):
     """Counts the items of (instance, key), from 1."""
 
 
+def _check_rate(what: str, frequency: Frequency) -> None:
+    rates = frequency if isinstance(frequency, tuple) else (frequency,)
+    for rate in rates:
+        if rate and not _LEAST_HZ <= rate <= _MOST_HZ:  # NaN is refused too
+            raise InvalidOption(f"frequency {rate} of {what}: {_LEAST_HZ} to {_MOST_HZ:g} Hz, or None")
+
+
 class Capability(msgspec.Struct, frozen=True):
-    """What an app can produce.  `key` may hold wildcards and offered spec values."""
+    """What an app can produce.  `key` may hold wildcards and the spec values on offer."""
 
     key: str
     frequency: Frequency = None
@@ -74,12 +85,13 @@ class Capability(msgspec.Struct, frozen=True):
     """Archive item by item with an index on `value.*` where the archive has one; else as whole frames."""
     delivery: Delivery = "best_effort"
     archive: Archive = "on_demand"
-    """`always`: archived even when nobody wants it."""
+    """`always`: archived even if nobody wants it."""
     pacing: Pacing = "latest"
     """What happens to items above the assigned rate: the latest value wins, or they queue."""
 
     def __post_init__(self) -> None:
         Key.parse(self.key)
+        _check_rate(self.key, self.frequency)
 
 
 class Interest(msgspec.Struct, frozen=True):
@@ -91,26 +103,37 @@ class Interest(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         Key.parse(self.key)
+        _check_rate(self.key, self.frequency)
 
 
 class Assignment(msgspec.Struct, frozen=True):
-    """What somebody wants of one of my capabilities."""
+    """What the Coordinator asks a producer to write under one of its capabilities."""
 
     key: str
     """The interest's key."""
     frequency: float | None = None
     """Items a second to write; None: unpaced."""
-    epoch: int = 0
+    epoch: Annotated[int, msgspec.Meta(ge=0, lt=2**62)] = 0
     """Grows with each change of the active instance; writes under an older one are refused."""
     capability: str = ""
     """The key of the capability it was matched with."""
+
+    def __post_init__(self) -> None:
+        Key.parse(self.key)
+        _check_rate(self.key, self.frequency)
 
 
 class RecordBatch(Mapping[str, npt.NDArray[Any]]):
     """Named one-dimensional columns of equal length: many records as one value.
 
-    Columns are used as they are, not copied: do not change them after `write`.  Received columns
-    are read-only views of the received bytes.
+    Columns are not copied: do not change them after `write`.  Received columns are read-only views of the
+    received bytes.
+
+    Args:
+        columns: name to array, each of shape (n,), of any numpy dtype without Python objects.
+
+    Raises:
+        UnsupportedValue: a column is not one-dimensional, or the lengths differ.
     """
 
     __slots__ = ("_columns", "_rows")
@@ -125,7 +148,7 @@ class RecordBatch(Mapping[str, npt.NDArray[Any]]):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names, in order."""
+        """Names of the columns, in order."""
         return tuple(self._columns)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
@@ -135,7 +158,7 @@ class RecordBatch(Mapping[str, npt.NDArray[Any]]):
         return iter(self._columns)
 
     def __len__(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return self._rows
 
     def __bool__(self) -> bool:
@@ -158,15 +181,22 @@ class RecordBatch(Mapping[str, npt.NDArray[Any]]):
         return f"RecordBatch({self._rows} rows: {', '.join(self._columns)})"
 
     def take(self, rows: Any) -> "RecordBatch":
-        """The rows of a slice, mask or index array, as a new batch."""
+        """Select rows.
+
+        Args:
+            rows: a slice, a bool mask of shape (n,) or an array of row numbers.
+
+        Returns:
+            A new batch with the same columns.
+        """
         return RecordBatch({n: c[rows] for n, c in self._columns.items()})
 
 
 class PackedFrame(msgspec.Struct, frozen=True, gc=False):
-    """Consecutive items of one (instance, key) as they travel: one encoded payload and its head.
+    """Consecutive items of one (instance, key) in encoded form, with the fields that archives index.
 
-    What archives store: `payload` as it is, the rest in indexed columns; `due.codec.unpack(frame)`
-    gives the items back.
+    Archives store `payload` unchanged and the other fields as columns; `due.codec.unpack(frame)` returns
+    the items.
     """
 
     key: str

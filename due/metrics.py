@@ -27,13 +27,13 @@ class _Family(NamedTuple):
 _ENGINE: dict[str, _Family] = {
     path: _Family(f"due_{name}{'_total' if kind == 'counter' else ''}", kind, text)
     for path, name, kind, text in (
-        ("active", "active", "gauge", "1 where this instance works"),
-        ("asking", "asking", "gauge", "1 while it was stopped and asks whether it still works"),
+        ("active", "active", "gauge", "1 if this instance is active"),
+        ("asking", "asking", "gauge", "1 while it asks after a suspension if it is active"),
         ("epoch", "epoch", "gauge", "Epoch of the assignments it follows"),
         ("written", "written_items", "counter", "Items written"),
         ("unpublished", "unpublished_items", "counter", "Best-effort items lost without a connection"),
         ("unwanted", "unwanted_items", "counter", "Items not published because nobody wants them"),
-        ("refused", "refused_items", "counter", "Items refused because another instance works"),
+        ("refused", "refused_items", "counter", "Items refused because another instance is active"),
         ("held_for_permission", "held_items", "counter", "Items held until the handshake ended"),
         ("replaced", "replaced_items", "counter", "Items replaced by newer ones under pacing"),
         ("outlets", "outlets", "gauge", "Keys that are being written"),
@@ -42,32 +42,55 @@ _ENGINE: dict[str, _Family] = {
         ("updates.lost_disconnected", "updates_lost_messages", "counter", "Messages lost on disconnection"),
         ("updates.reconnects", "updates_reconnects", "counter", "Reconnections of the sender"),
         ("updates.held_back", "updates_held_back_writes", "counter", "Writes that waited for readers"),
-        ("updates.resent", "updates_resent_messages", "counter", "Messages sent again after a restart"),
+        ("updates.resent", "updates_resent_messages", "counter", "Messages resent after a restart"),
         ("updates.kept_bytes", "updates_kept_bytes", "gauge", "Bytes kept until readers acknowledge"),
         ("receiving.received", "received_items", "counter", "Items received"),
-        ("receiving.gaps", "missing_items", "counter", "Items known to be missing"),
-        ("receiving.repeats", "repeated_items", "counter", "Items that came again and were dropped"),
+        ("receiving.gaps", "missing_items", "counter", "Items missing according to their sequence numbers"),
+        ("receiving.repeats", "repeated_items", "counter", "Repeated items that were dropped"),
         ("receiving.fenced", "fenced_items", "counter", "Items of a replaced instance, dropped"),
         ("receiving.undecodable", "undecodable_frames", "counter", "Frames that could not be read"),
         ("receiving.newer_version", "newer_version_frames", "counter", "Frames of a newer version"),
+        ("receiving.misplaced", "misplaced_frames", "counter", "Frames of another key than their channel's"),
+        ("receiving.foreign", "foreign_frames", "counter", "Frames of another app than their key's"),
+        ("receiving.out_of_range", "out_of_range_frames", "counter", "Frames with impossible numbers"),
+        ("receiving.refuted", "refuted_frames", "counter", "Numbers that later frames showed to be false"),
         ("receiving.callback_errors", "callback_errors", "counter", "Exceptions raised by callbacks"),
-        ("receiving.set_aside", "set_aside_items", "counter", "Items that callbacks kept failing on"),
-        ("receiving.dropped_slow", "dropped_slow_frames", "counter", "Frames a slow callback cost"),
+        ("receiving.set_aside", "set_aside_items", "counter", "Items set aside: callbacks kept failing"),
+        (
+            "receiving.dropped_slow",
+            "dropped_slow_frames",
+            "counter",
+            "Frames dropped because a callback was slow",
+        ),
         ("receiving.reconnects", "receiver_reconnects", "counter", "Reconnections of the receiver"),
         ("receiving.claimed", "claimed_frames", "counter", "Frames taken over from dead members"),
+        ("misunderstood_assignments", "refused_assignments", "counter", "Assignments that were refused"),
+        (
+            "liveness.dispatcher_s",
+            "dispatcher_silent_seconds",
+            "gauge",
+            "Seconds since the dispatcher's last answer",
+        ),
+        (
+            "liveness.keeper_s",
+            "keeper_silent_seconds",
+            "gauge",
+            "Seconds since the heartbeat thread's last loop",
+        ),
+        ("liveness.archiver_s", "archiver_silent_seconds", "gauge", "Seconds since the archiver's last loop"),
         ("archive.archived", "archived_items", "counter", "Items archived"),
-        ("archive.spooled", "spooled_items", "counter", "Items spooled while the archive was away"),
-        ("archive.lost", "archive_lost_items", "counter", "Items that fitted neither archive nor spool"),
+        ("archive.spooled", "spooled_items", "counter", "Items spooled while the archive was not reachable"),
+        ("archive.lost", "archive_lost_items", "counter", "Items lost: neither archived nor spooled"),
         ("archive.refused", "archive_refused_items", "counter", "Items the archive refused for good"),
         ("archive.held_back", "archive_held_back_writes", "counter", "Waits for the archive's queue"),
         ("archive.backlog", "archive_backlog_frames", "gauge", "Frames not yet archived"),
-        ("archive.away", "archive_away", "gauge", "1 while the archive is away"),
+        ("archive.away", "archive_away", "gauge", "1 while the archive cannot be reached"),
     )
 }
 
 
 def render(app: str, engine: Mapping[str, Any], health: Mapping[str, Any]) -> str:
-    """Text in Prometheus' format of what an engine and its service say of themselves."""
+    """The health of an engine and its service in Prometheus' text format."""
     instance = str(engine.get("instance", ""))
     lines = list(_engine_lines(engine, {"app": app, "instance": instance}))
     phase = {"app": app, "instance": instance, "phase": str(engine.get("phase", ""))}

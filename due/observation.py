@@ -1,12 +1,11 @@
-"""What `observe` returns, and what happens to a frame on its way to callbacks.
+"""What `observe` returns, and how a frame reaches the callbacks.
 
-    Delivery ──decode──► fence ──► repeat? gap? ──► observations that match the key ──► callbacks
+    Delivery ──decode──► content matches channel? ──► Tracker ──► observations that match the key ──►
+    callbacks
 
-A callback that raises is reported with its key and does not stop the others.  Here, no I/O.
+A callback that raises is reported with its key and does not stop the others.  No I/O.
 """
 
-import logging
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -14,23 +13,27 @@ from reactivex import abc
 from reactivex.disposable import Disposable
 from reactivex.subject import Subject
 
-from due.codec import Frame
 from due.keys import Key
 from due.membership import most
 from due.messages import Frequency, Item
-
-log = logging.getLogger("due")
 
 Callback = Callable[[Item], Any]
 Failed = Callable[[Callback, Item, Exception], None]
 
 
 class Observation(Subject[Item]):
-    """A ReactiveX Subject of the items under a key.
+    """A ReactiveX Subject of the items under a key; made by `Engine.observe`.
 
-    `subscribe(callback)` begins to receive; disposing the last subscription, or the Subject, withdraws
-    the interest.  A callback given to `subscribe` directly survives its own exceptions; behind
-    operators ReactiveX ends the subscription at the first one.
+    `subscribe(callback)` starts receiving; disposing the last subscription, or the Subject, withdraws the
+    interest.  A callback passed to `subscribe` directly survives its own exceptions; behind operators,
+    ReactiveX ends the subscription at the first exception.
+
+    Args:
+        key: the observed key.
+        frequency: the wanted rate, Hz, or (least, most): items above `most` are dropped here.
+        start: stream id from which to replay a reliable key; empty for none.
+        opened: called at the first subscription.
+        closed: called when the last subscription is disposed.
     """
 
     def __init__(
@@ -60,7 +63,20 @@ class Observation(Subject[Item]):
         *,
         scheduler: abc.SchedulerBase | None = None,
     ) -> abc.DisposableBase:
-        """As in ReactiveX; `on_next` is called in the engine's dispatcher thread, one call at a time."""
+        """Start receiving; as in ReactiveX, but calls come from the engine's dispatcher thread, one at a
+        time.
+
+        Args:
+            on_next: called with each item.
+            on_error, on_completed: as in ReactiveX; an Observation itself neither fails nor completes.
+            scheduler: as in ReactiveX.
+
+        Returns:
+            The subscription; `dispose()` ends it.
+
+        Raises:
+            DisposedException: the Subject was disposed.
+        """
         self.check_disposed()
         if callable(on_next) and on_error is None and on_completed is None:
             callback: Callback = on_next
@@ -76,7 +92,11 @@ class Observation(Subject[Item]):
         return Disposable(lambda: self._remove(callback, inner))
 
     def on_next(self, value: Item) -> None:
-        """Hand an item to all callbacks."""
+        """Pass an item to all callbacks.
+
+        Args:
+            value: the item.
+        """
         for callback in self.callbacks:
             callback(value)
 
@@ -88,7 +108,14 @@ class Observation(Subject[Item]):
         super().dispose()
 
     def thinned(self, items: Iterable[Item]) -> Iterable[Item]:
-        """The items that stay under the interest's own maximum rate."""
+        """Limit items to the interest's own maximum rate.
+
+        Args:
+            items: items in the order received.
+
+        Returns:
+            Those that the rate leaves, judged by their `timestamp`.
+        """
         if not self._period:
             return items
         kept = []
@@ -108,70 +135,6 @@ class Observation(Subject[Item]):
                 self._closed(self)
 
 
-class Tracker:
-    """Per (instance, key): have we seen this frame, and is something missing before it?"""
-
-    def __init__(self, *, shared: bool, remember: int = 65536) -> None:
-        self._shared = shared
-        self._remember = remember
-        self._expected: OrderedDict[tuple[str, str], int] = OrderedDict()
-        self._seen: OrderedDict[tuple[str, str, int], None] = OrderedDict()
-        self._epochs: dict[tuple[str, str], int] = {}
-        self.gaps = 0
-        """Items known to be missing."""
-        self.repeats = 0
-        """Items that came again and were dropped."""
-        self.fenced = 0
-        """Items of an instance that is no longer the active one."""
-
-    def admit(self, frame: Frame, *, reliable: bool) -> bool:
-        """Whether to deliver it; counts gaps, repeats and items of an older epoch."""
-        count = len(frame.timestamps)
-        if frame.epoch and not self._current(frame):
-            self.fenced += count
-            return False
-        if reliable and self._shared:
-            return self._unseen(frame, count)
-        name = (frame.instance_id, frame.key)
-        expected = self._expected.get(name)
-        if expected is None:
-            self._make_space(self._expected)
-        elif frame.before < expected:
-            self.repeats += count
-            return False
-        elif frame.before > expected:
-            self.gaps += frame.before - expected
-            if not self.gaps - (frame.before - expected):
-                log.warning("%d items of %s are missing; more are counted only", self.gaps, frame.key)
-        self._expected[name] = frame.before + count
-        return True
-
-    def forget(self, keep: Callable[[str], bool]) -> None:
-        """Forget keys that nobody observes any more: what is missed meanwhile is no gap."""
-        for name in [n for n in self._expected if not keep(n[1])]:
-            del self._expected[name]
-
-    def _current(self, frame: Frame) -> bool:
-        path = (frame.app_id, frame.key.partition(":")[0])
-        if frame.epoch < self._epochs.get(path, 0):
-            return False
-        self._epochs[path] = frame.epoch
-        return True
-
-    def _unseen(self, frame: Frame, count: int) -> bool:
-        name = (frame.instance_id, frame.key, frame.before)
-        if name in self._seen:
-            self.repeats += count
-            return False
-        self._make_space(self._seen)
-        self._seen[name] = None
-        return True
-
-    def _make_space(self, table: OrderedDict[Any, Any]) -> None:
-        if len(table) >= self._remember:
-            table.popitem(last=False)
-
-
 def deliver(items: Iterable[Item], callbacks: tuple[Callback, ...], failed: Failed) -> None:
     """Call every callback with every item."""
     if len(callbacks) == 1:
@@ -179,7 +142,7 @@ def deliver(items: Iterable[Item], callbacks: tuple[Callback, ...], failed: Fail
         for item in items:
             try:
                 only(item)
-            except Exception as error:  # noqa: BLE001 - whatever a callback raises is reported, not ours to die of
+            except Exception as error:  # noqa: BLE001 - a callback may raise anything; it is reported
                 failed(only, item, error)
         return
     for item in items:

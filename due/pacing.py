@@ -1,4 +1,4 @@
-"""Holding a key to its assigned rate without a thread per key.  Pure: time is an argument (ns).
+"""Limiting a key to its assigned rate without a thread per key.  Pure: time is an argument (ns).
 
 `latest`: at most one item each period; a newer value replaces the one that waits.
 `queue`: items leave in order, one each period; `full` tells the writer to wait.
@@ -25,7 +25,7 @@ class Pacer(Generic[T]):
         self._waiting: deque[T] = deque(maxlen=None if queue else 1)
 
     def offer(self, item: T, now: int) -> T | None:
-        """The item if it may leave now, else None: it waits."""
+        """The item if it may be sent now; None if it has to wait."""
         if not self._waiting and now >= self._due:
             self._due = (
                 max(self._due + self._period, now + self._period // 2) if self._due else now + self._period
@@ -36,23 +36,23 @@ class Pacer(Generic[T]):
         return None
 
     def release(self, now: int) -> T | None:
-        """The waiting item whose time has come; None if there is none yet."""
+        """The waiting item that is due; None if there is none."""
         if not self._waiting or now < self._due:
             return None
         self._due = max(self._due + self._period, now + self._period // 2)
         return self._waiting.popleft()
 
     def drain(self) -> list[T]:
-        """Everything that waits, at once."""
+        """Remove and return all waiting items."""
         items = list(self._waiting)
         self._waiting.clear()
         return items
 
     @property
     def full(self) -> bool:
-        """A queue that the writer has to wait for."""
+        """Whether the queue is full, so that the writer has to wait."""
         return len(self._waiting) >= _LONGEST_QUEUE
 
     def due(self) -> int | None:
-        """When the next waiting item may leave; None if none waits."""
+        """When the next waiting item may be sent; None if none waits."""
         return self._due if self._waiting else None

@@ -1,9 +1,9 @@
-"""The thread that sends what waits: batches whose time is up, paced items, items held for permission.
+"""The thread that sends waiting items: lingering batches, paced items, items held until assigned.
 
-    outlet ──dirty──► heap by due time ──► service(outlet): cut the batch, release what is due
+    KeyWriter ──dirty──► heap by due time ──► service(writer): send the batch, release due items
 
-Few wake-ups, for each takes the interpreter from a writer that computes, and costs both several switches: each
-new batch moves the alarm on, so a writer that fills whole frames by itself, or waits for readers, is left alone.
+Each wake-up takes the interpreter from a busy writer and costs several context switches. Therefore each new
+batch postpones the timer: a writer that fills whole frames itself, or waits for readers, is not interrupted.
 """
 
 import logging
@@ -14,52 +14,53 @@ from collections.abc import Callable
 from heapq import heappop, heappush, heapreplace
 from itertools import count
 
-from due.alarm import Alarm, PlainAlarm, new_alarm
 from due.errors import DueError
-from due.outlet import Outlet
+from due.key_writer import KeyWriter
+from due.threads import Failed, LoudThread
+from due.timer import PlainTimer, Timer, new_timer
 
 log = logging.getLogger("due")
 
 _BUSY_LINGER = 0.005
-"""How long a batch lingers at most while its writer fills frames faster than that."""
+"""Longest linger time of a batch while its writer fills frames faster than that."""
 _LONGEST_WAIT = 0.05
 _PRESSED_WAIT = 0.2
-"""The same where cores are so short that a visit comes late by more than handing over the interpreter takes."""
+"""The same on an overloaded machine, where a wake-up is later than a switch of the interpreter takes."""
 _HANDOVER = 0.01
 _EASING = 0.8
 _FRAME_EASING = 0.95
 _FORGET_SECONDS = 1.0
-"""Who has not been visited for so long after it was planned begins anew."""
+"""A writer whose flush is overdue by more than this is rescheduled from now."""
 
-Service = Callable[[Outlet, int], float | None]
+Service = Callable[[KeyWriter, int], float | None]
 
 
 class Pressure:
-    """How rarely to look after writers that need no help: the more rarely, the shorter cores are."""
+    """How long to leave alone writers that fill frames themselves: the longer, the busier the cores are."""
 
     def __init__(self) -> None:
         self._wait = 0.0
 
     def felt(self, late: float) -> float:
-        """Seconds to stay away after a visit that came `late`.  One visit in time does not end it, many do."""
+        """Seconds until the next flush after one that was `late`; decays slowly over punctual ones."""
         self._wait = min(_PRESSED_WAIT, max(_EASING * self._wait, 8 * (late - _HANDOVER)))
         return self._wait
 
 
 class Agenda:
-    """When to visit whom.  Each outlet stands in it once; its newest time counts.  Not thread-safe."""
+    """Due times of flushes.  Holds each writer once, with its newest time.  Not thread-safe."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[float, int, Outlet]] = []
+        self._heap: list[tuple[float, int, KeyWriter]] = []
         self._tickets = count(1)
 
     @property
     def next(self) -> float:
-        """When to look again, at the latest; infinite where nothing is planned."""
+        """The earliest due time; infinite if nothing is scheduled."""
         return self._heap[0][0] if self._heap else math.inf
 
-    def plan(self, outlet: Outlet, due: float) -> None:
-        """Visit it then, and not when it was planned before."""
+    def plan(self, outlet: KeyWriter, due: float) -> None:
+        """Schedule a writer, replacing its earlier due time."""
         outlet.due, outlet.ticket = due, next(self._tickets)
         entry = (due, outlet.ticket, outlet)
         if self._heap and self._heap[0][2] is outlet:
@@ -67,14 +68,14 @@ class Agenda:
         else:
             heappush(self._heap, entry)
 
-    def postpone(self, outlet: Outlet, due: float) -> None:
-        """The same for an outlet that is planned for an earlier time; noted where it does not come first."""
+    def postpone(self, outlet: KeyWriter, due: float) -> None:
+        """Move a writer to a later time; a writer that is not first in the heap is only marked."""
         outlet.due = due
         if self._heap and self._heap[0][1] == outlet.ticket:
             self.plan(outlet, due)
 
-    def take(self, now: float) -> list[tuple[float, Outlet]]:
-        """Whose time has come, and when that was."""
+    def take(self, now: float) -> list[tuple[float, KeyWriter]]:
+        """Remove and return the writers that are due, with their due times."""
         found = []
         while self._heap and self._heap[0][0] <= now:
             _, ticket, outlet = heappop(self._heap)
@@ -87,37 +88,43 @@ class Agenda:
         return found
 
 
-class Sender:
-    """Visits outlets that are dirty, after they have lingered, or when their next paced item is due.
+class BatchSender:
+    """Flushes key writers after their linger time, or when their next paced item is due.
 
     `service` is called with the outlet's lock held and returns after how many seconds to come again, None
     for not before the outlet is dirty again; `blocked` says that the outlet's writer waits for readers.
     """
 
-    def __init__(self, linger: float, service: Service, blocked: Callable[[Outlet], bool]) -> None:
+    def __init__(
+        self,
+        linger: float,
+        service: Service,
+        blocked: Callable[[KeyWriter], bool],
+        failed: Failed | None = None,
+    ) -> None:
         self._linger = linger
         self._service = service
         self._blocked = blocked
         self._lock = threading.RLock()
-        """Guards the agenda and the alarm; taken by holders of an outlet's lock, never the other way round."""
+        """Guards agenda and timer; always taken after a writer's own lock, never before it."""
         self._agenda = Agenda()
-        self._alarm: Alarm = PlainAlarm()  # until it is needed: a better one costs a descriptor
+        self._alarm: Timer = PlainTimer()  # until a better timer is needed, which costs a file descriptor
         self._rings_at = math.inf
         self._pressure = Pressure()
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="due-sender", daemon=True)
+        self._thread = LoudThread("due-sender", self._run, failed)
 
     def start(self) -> None:
         """Begin."""
         with self._lock:
-            self._alarm, self._rings_at = new_alarm(), math.nan
+            self._alarm, self._rings_at = new_timer(), math.nan
             self._set()
         self._thread.start()
 
-    def dirty(self, outlet: Outlet) -> None:
-        """A batch has begun, or an item waits for its pace: visit this outlet later; the caller holds its lock.
+    def dirty(self, outlet: KeyWriter) -> None:
+        """Schedule a flush: a batch has begun or an item is paced.  The caller holds the writer's lock.
 
-        Later is after the linger time, or longer where the writer fills whole frames and cores are short.
+        It comes after the linger time, or later if the writer fills whole frames on an overloaded machine.
         """
         now = time.monotonic()
         with self._lock:
@@ -128,19 +135,19 @@ class Sender:
                 self._agenda.plan(outlet, now + stay)
                 self._set()
             elif outlet.pacer is None and 0.0 < outlet.due < now + stay / 2:
-                # not at each batch, for to set the alarm costs a call of the system
+                # not for each batch: setting the timer is a system call
                 self._agenda.postpone(outlet, now + stay)
                 self._set()
 
-    def hurry(self, outlet: Outlet) -> None:
-        """Visit this outlet now, whatever was planned."""
+    def hurry(self, outlet: KeyWriter) -> None:
+        """Flush this writer now."""
         with self._lock:
             outlet.queued = True
             self._agenda.plan(outlet, 0.0)
             self._set()
 
     def close(self) -> None:
-        """Stop; what waits stays."""
+        """Stop; waiting items are not sent."""
         with self._lock:
             self._stopping = True
             self._set()
@@ -168,21 +175,21 @@ class Sender:
                 ticket = outlet.ticket
                 again = self._visit(outlet, late=now - planned if planned else 0.0)
                 with self._lock:
-                    if again is not None and outlet.ticket == ticket:  # else somebody is in a hurry
+                    if again is not None and outlet.ticket == ticket:  # otherwise `hurry` was called
                         self._agenda.plan(outlet, now + again)
             with self._lock:
-                self._rings_at = math.nan  # it has rung
+                self._rings_at = math.nan  # the timer has fired
                 self._set()
 
-    def _visit(self, outlet: Outlet, late: float) -> float | None:
-        """Seconds until the next visit.  Never waits for a writer that waits for readers.
+    def _visit(self, outlet: KeyWriter, late: float) -> float | None:
+        """Flush one writer; returns seconds until the next flush.  Skips a writer that waits for readers.
 
-        Where cores are so short that we come `late`, we come more rarely: the writers need them more, and
-        each visit to a process that waits for a core costs several wake-ups.
+        If this flush is `late`, the cores are overloaded, and the next ones come less often: the writers need
+        the CPU more, and each flush costs several wake-ups.
         """
         with self._lock:
             if outlet.empty and (outlet.fast or outlet.lock.locked()):
-                # its writer is sending, or waits for readers: the next batch will say so
+                # the writer is sending or waits for readers; its next batch schedules a new flush
                 outlet.queued = False
                 return None
         pressure = self._pressure.felt(late)

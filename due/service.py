@@ -1,11 +1,18 @@
-"""Running an app as a process: options, signals, the ready line, ticks, health, an orderly end.
+"""Running an app as a process: options, signals, the ready line, ticks, health and an orderly shutdown.
 
     python -m apps.kitsune.service --updates URL --archive URL --settings FILE.json
-                                   [--metrics HOST:PORT] [--log-format console|json]
+                                   [--metrics HOST:PORT] [--log-format console|json] [--heartbeat-fd N]
 
-One JSON line on stdout when the app is ready (with "metrics": "HOST:PORT" where asked for, and what the app's
-`ready()` adds), logs on stderr; SIGTERM or SIGINT: `stop()`, flush, offline heartbeat, exit 0.  The process ends with the one that started it (Linux: with the starting thread).
-Exit codes: 2 wrong options, 1 a backend or the app failed.
+The app prints one JSON line on standard output when it is ready, with "metrics": "HOST:PORT" where asked for
+and with what its `ready()` adds. Logs go to standard error. SIGTERM or SIGINT calls `stop()`, flushes, sends
+an offline heartbeat and exits with 0. The process ends when its parent ends (on Linux: the thread that
+started it).
+
+If a thread of the engine dies, the process ends: otherwise its work would silently stop. About once a second
+the main loop writes a byte to `--heartbeat-fd`, but only if the dispatcher and the heartbeat thread have
+answered since the last one. A supervisor that receives no bytes may assume that the process hangs.
+
+Exit codes: 2 wrong options, 1 a backend or the app failed, or a thread died.
 """
 
 import argparse
@@ -14,6 +21,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -25,14 +33,18 @@ from due import logs, metrics
 from due.config import Options
 from due.drivers.embedded_redis import die_with_parent
 from due.engine import Engine
-from due.errors import DueError, InvalidOption
+from due.errors import DueError, EngineFailed, InvalidOption
+from due.liveness import HeartbeatPipe, Liveness
 from due.messages import CONSUMER, PRODUCER, PUB_ONLY, Capability, Instances, Interest
 from due.status_server import StatusServer
 
 log = logging.getLogger("due.service")
 
 TICK_SECONDS = 0.05
-_TICKS_PER_HEALTH = 20
+_HEALTH_SECONDS = 1.0
+_LAST_SECONDS = 15.0
+"""How long a process with a dead thread may take to end in order."""
+_SETTINGS_BYTES = 16 << 20
 HEALTH = "due.health"
 """`due.health.<app>`: the app's and the engine's health, every second, best effort."""
 
@@ -43,31 +55,39 @@ S = TypeVar("S")
 
 
 class Service(Protocol):
-    """What `run` drives; all methods are called in the main thread."""
+    """The methods that `run` calls, all of them in the main thread."""
 
     def start(self) -> None:
-        """The engine is initialised: subscribe."""
+        """Subscribe; the engine is initialised."""
         ...
 
     def tick(self) -> None:
-        """Called about every 50 ms."""
+        """Do periodic work; called about every 50 ms."""
         ...
 
     def stop(self) -> None:
-        """Write what is still to be written."""
+        """Write what is still pending; called once, before the engine closes."""
         ...
 
     def health(self) -> dict[str, Any]:
-        """Counters, for people and metrics."""
+        """Counters of the app.
+
+        Returns:
+            Name to plain value; shown by `sdnator status` and exported to Prometheus.
+        """
         ...
 
 
 @runtime_checkable
 class Announcing(Protocol):
-    """A service with more to say in its ready line."""
+    """A service that adds fields to its ready line."""
 
     def ready(self) -> dict[str, str]:
-        """Fields of the ready line, such as the address of an API; called after `start`."""
+        """Fields for the ready line; called after `start`.
+
+        Returns:
+            Name to value, for instance the address of an API.
+        """
         ...
 
 
@@ -81,7 +101,20 @@ def run(
     *,
     instances: Instances = "standby",
 ) -> int:
-    """Run one app until a signal ends it; returns the exit code."""
+    """Run one app until a signal ends it.
+
+    Args:
+        app_id: name of the app.
+        service: makes the service from the initialised engine and the settings.
+        settings: a msgspec Struct with a default for every field; read from the file given with --settings.
+        interests: declared to the Coordinator.
+        capabilities: declared to the Coordinator.
+        argv: command line without the program's name; None takes that of the process.
+        instances: "standby" or "shared", unless --instances says otherwise.
+
+    Returns:
+        The exit code: 0, 1 or 2 as above.
+    """
     arguments = _parser(app_id).parse_args(argv)
     logs.set_up(app_id, arguments.log, arguments.log_format)
     # told by whoever starts us, for it may die while we are still importing
@@ -90,14 +123,16 @@ def run(
         die_with_parent(signal.SIGTERM)
     status: StatusServer | None = None
     try:
+        heartbeat = HeartbeatPipe(arguments.heartbeat_fd) if arguments.heartbeat_fd >= 0 else None
         chosen = read_struct(arguments.settings, settings)
         status = StatusServer(arguments.metrics) if arguments.metrics else None
         engine = Engine(_options(arguments))
+        engine.when_failed = _end_soon
         chosen_instances = arguments.instances or instances
         roles = PRODUCER | CONSUMER
         engine.init(app_id, roles, interests=interests, capabilities=capabilities, instances=chosen_instances)
     except (DueError, OSError) as error:
-        print(f"{app_id}: {error}", file=sys.stderr)
+        print(f"{app_id}: {logs.without_passwords(str(error))}", file=sys.stderr)
         if status is not None:
             status.close()
         return 2 if isinstance(error, InvalidOption) else 1
@@ -105,7 +140,7 @@ def run(
     if os.getppid() != parent and not arguments.stay:
         stopped.append(signal.SIGTERM)
     try:
-        return _Run(app_id, service(engine, chosen), engine, status).drive(stopped)
+        return _Run(app_id, service(engine, chosen), engine, status, heartbeat).drive(stopped)
     finally:
         engine.close()
         if status is not None:
@@ -113,14 +148,37 @@ def run(
 
 
 def read_struct(path: str, kind: type[S]) -> S:
-    """A JSON file as a settings Struct, all defaults where no file is named; raises `InvalidOption`."""
+    """Read a JSON file as a settings Struct.
+
+    Args:
+        path: the file; empty gives all defaults.
+        kind: a msgspec Struct.
+
+    Returns:
+        The settings.
+
+    Raises:
+        InvalidOption: the file cannot be read or is not valid; the message names the field.
+    """
     try:
-        text = Path(path).read_bytes() if path else b"{}"
+        text = _read(path) if path else b"{}"
         return msgspec.json.decode(text, type=kind)
     except OSError as error:
         raise InvalidOption(f"settings file {path}: {error.strerror}") from None
-    except msgspec.MsgspecError as error:
+    except (
+        msgspec.MsgspecError,
+        ValueError,
+        RecursionError,
+    ) as error:  # text that is not UTF-8, or is nested deeply
         raise InvalidOption(f"settings file {path}: {error}") from None
+
+
+def _read(path: str) -> bytes:
+    with Path(path).open("rb") as file:
+        text = file.read(_SETTINGS_BYTES + 1)
+    if len(text) > _SETTINGS_BYTES:
+        raise InvalidOption(f"settings file {path}: over {_SETTINGS_BYTES} bytes")
+    return text
 
 
 def _parser(app_id: str) -> argparse.ArgumentParser:
@@ -139,6 +197,13 @@ def _parser(app_id: str) -> argparse.ArgumentParser:
         metavar="HOST:PORT",
         help="serve /metrics (Prometheus) and /healthz there; port 0 takes a free one, the ready line names it",
     )
+    parser.add_argument(
+        "--heartbeat-fd",
+        type=int,
+        default=-1,
+        metavar="N",
+        help="an inherited descriptor: a byte is written to it about every second while all threads answer",
+    )
     parser.add_argument("--stay", action="store_true", help="do not end with the parent process")
     return parser
 
@@ -152,7 +217,7 @@ def _options(arguments: argparse.Namespace) -> Options:
 
 
 def _stop_signals() -> list[int]:
-    """The signals that came, as they come."""
+    """A list to which each stop signal is appended as it arrives."""
     came: list[int] = []
     # no threading.Event: the handler may run while the main thread holds the event's own lock, for ever then
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -163,11 +228,19 @@ def _stop_signals() -> list[int]:
 class _Run:
     """One app from start to stop."""
 
-    def __init__(self, app_id: str, app: Service, engine: Engine, status: StatusServer | None) -> None:
+    def __init__(
+        self,
+        app_id: str,
+        app: Service,
+        engine: Engine,
+        status: StatusServer | None,
+        heartbeat: HeartbeatPipe | None,
+    ) -> None:
         self._app_id = app_id
         self._app = app
         self._engine = engine
         self._status = status
+        self._heartbeat = heartbeat
 
     def drive(self, stopped: Sequence[int]) -> int:
         """Start, tick until `stopped` has something in it, end; returns the exit code."""
@@ -176,23 +249,38 @@ class _Run:
         except (DueError, OSError) as error:
             log.error("could not start: %s", error)  # noqa: TRY400 - one clear line
             return 1
+        liveness = self._engine.liveness
         if self._status is not None:
             self._report()
+            self._status.liveness = liveness.state
             self._status.start()
         print(json.dumps(self._ready()), flush=True)
-        ticks = 0
         try:
-            time.sleep(TICK_SECONDS)
-            while not stopped:
-                self._app.tick()
-                ticks += 1
-                if ticks % _TICKS_PER_HEALTH == 0:
-                    self._engine.write(f"{HEALTH}.{self._app_id}", self._report(), [PUB_ONLY])
-                # a signal wakes nobody here: it is noted, and seen a tick later at the most
-                time.sleep(TICK_SECONDS)
+            self._go_round(stopped, liveness)
+        except EngineFailed as error:
+            return self._failed(error)
         finally:
-            self._app.stop()
+            if self._engine.failed is None:
+                self._app.stop()
         return 0
+
+    def _go_round(self, stopped: Sequence[int], liveness: Liveness) -> None:
+        health_at = 0.0
+        while not stopped:
+            # a signal wakes nobody here: it is noted, and seen a tick later at the most
+            time.sleep(TICK_SECONDS)
+            self._app.tick()
+            now = time.monotonic()
+            if now >= health_at:
+                health_at = now + _HEALTH_SECONDS
+                self._engine.write(f"{HEALTH}.{self._app_id}", self._report(), [PUB_ONLY])
+                if liveness.beat() and self._heartbeat is not None:
+                    self._heartbeat.beat()
+
+    def _failed(self, error: EngineFailed) -> int:
+        """A thread has died: end with code 1, so that the supervisor restarts the app."""
+        log.critical("%s ends: %s", self._app_id, error)
+        return 1
 
     def _ready(self) -> dict[str, Any]:
         line: dict[str, Any] = {"ready": True, "app": self._app_id, "pid": os.getpid()}
@@ -203,9 +291,16 @@ class _Run:
         return line
 
     def _report(self) -> dict[str, Any]:
-        """The app's and the engine's health, as of now; the scraper gets the same."""
+        """Health of the app and the engine; also handed to the metrics endpoint."""
         health, engine = self._app.health(), self._engine.health()
         if self._status is not None:
             state = {name: engine[name] for name in ("app", "instance", "phase", "active")}
             self._status.report(metrics.render(self._app_id, engine, health), {**state, "pid": os.getpid()})
         return {"app": health, "engine": engine}
+
+
+def _end_soon() -> None:
+    """End the process if the main thread does not within 15 s: it may be waiting for the dead thread."""
+    last = threading.Timer(_LAST_SECONDS, os._exit, (1,))
+    last.daemon = True
+    last.start()

@@ -1,4 +1,4 @@
-"""What exists between `init` and `close`: the parts of an engine, wired together."""
+"""The parts of an engine between `init` and `close`, wired together."""
 
 import logging
 import threading
@@ -16,30 +16,41 @@ from due.config import Options
 from due.dispatcher import Dispatcher
 from due.drivers.base import ArchiveDriver
 from due.drivers.embedded_redis import EmbeddedServer, shared_server
-from due.errors import DueError, Timeout, UpdatesUnavailable
-from due.gate import Gate
-from due.keeper import Keeper
+from due.errors import DueError, EngineFailed, Timeout, UpdatesUnavailable
+from due.heartbeat_thread import HeartbeatThread
+from due.key_writer import ARCHIVE, PUBLISH, KeyWriter, Sent
 from due.keys import Key
+from due.liveness import Liveness
 from due.membership import Member, Registration
 from due.messages import Assignment, AssignmentCallback, Interest
 from due.observation import Observation
-from due.outlet import ARCHIVE, PUBLISH, Outlet, Sent
-from due.sender import Sender
+from due.sender import BatchSender
+from due.threads import Failed
+from due.write_admission import WriteAdmission
 
 log = logging.getLogger("due")
 
 _KEYS_SHOWN = 32
 _MOST_OUTLETS = 10_000
-"""With so many keys being written, those that are idle are put away."""
+"""With more keys than this, idle key writers are removed."""
 
 
 class Session:
     """The parts, their start and their end."""
 
     def __init__(
-        self, options: Options, registration: Registration, *, updates_url: str, archive_url: str
+        self,
+        options: Options,
+        registration: Registration,
+        *,
+        updates_url: str,
+        archive_url: str,
+        failed: Failed,
     ) -> None:
         self._options = options
+        self.failure: BaseException | None = None
+        """The exception that killed a thread."""
+        self._tell_failure = failed
         self._server: EmbeddedServer | None = None
         if not updates_url:
             updates_url, self._server = shared_server(options.folder())
@@ -48,7 +59,7 @@ class Session:
         app, me = registration.app_id, registration.instance_id
         shared = registration.instances == "shared"
         receiver = self._driver.receiver(app, me, shared=shared)
-        self.dispatcher = Dispatcher(receiver, shared=shared, tries=options.tries)
+        self.dispatcher = Dispatcher(receiver, shared=shared, tries=options.tries, failed=self._died)
         member = Member(
             registration,
             now=time.monotonic(),
@@ -56,22 +67,26 @@ class Session:
             coordinated=options.coordinated,
         )
         control, pause = self._driver.receiver(app, me), options.pause_limit or 3 * options.heartbeat
-        self.keeper = Keeper(member, control, self.publisher, self.dispatcher, pause=pause)
+        self.keeper = HeartbeatThread(
+            member, control, self.publisher, self.dispatcher, pause=pause, failed=self._died
+        )
         self.keeper.say, self.keeper.changed = self._say, self._changed
         self.keeper.written = self._written
-        self.gate = Gate(self.keeper, self.publisher, options.handshake_bytes)
-        self.sender = Sender(options.linger, self.gate.service, self.gate.blocked)
-        self.outlets: dict[str, Outlet] = {}
+        self.gate = WriteAdmission(self.keeper, self.publisher, options.handshake_bytes)
+        self.gate.failed = self.check
+        self.sender = BatchSender(options.linger, self.gate.service, self.gate.blocked, self._died)
+        self.outlets: dict[str, KeyWriter] = {}
         """By canonical key."""
         self.retirements = 0
-        """How often idle outlets were put away."""
+        """How often idle key writers were removed."""
         self._retired: dict[str, tuple[int, int]] = {}
-        """By key: items numbered and items published by outlets that were put away."""
+        """By key: items numbered and published by removed key writers."""
         self._retired_items = 0
-        self._said: dict[str, Outlet] = {}
+        self._said: dict[str, KeyWriter] = {}
         self._observed: list[Observation] = []
         self._declared = registration.interests
         self._archiver: Archiver | None = None
+        self.liveness = Liveness(self.dispatcher, self.keeper, lambda: self._archiver)
         self._archive: ArchiveDriver = open_archive(archive_url)
         self._lock = threading.RLock()
         self._unpublished = 0
@@ -92,10 +107,24 @@ class Session:
         self.keeper.start()
         self.dispatcher.start()
         if any(self._spool_folder().glob("spool*.db")):
-            self._open_archiver()  # an earlier instance left something to archive
+            self._open_archiver()  # an earlier instance left frames in the spool
 
-    def outlet(self, key: Key) -> Outlet:
-        """The outlet of a key."""
+    def check(self) -> None:
+        """Raise `EngineFailed` if a thread has died."""
+        if self.failure is not None:
+            raise EngineFailed(
+                f"a thread of the engine died of {type(self.failure).__name__}: {self.failure} (see the log); "
+                "close() it and call init() again"
+            ) from self.failure
+
+    def _died(self, error: BaseException) -> None:
+        if self.failure is None:
+            self.failure = error
+            self._tell_failure(error)
+            self.dispatcher.halt()
+
+    def outlet(self, key: Key) -> KeyWriter:
+        """The key writer of a key."""
         with self._lock:
             outlet = self.outlets.get(key.text)
             if outlet is None:
@@ -108,7 +137,7 @@ class Session:
             return outlet
 
     def _retire_outlets(self) -> None:
-        """Of many keys most are idle: only their numbers are kept, or a reader would take them for repeats."""
+        """Remove idle key writers, but not their numbers: readers would take new ones for repeats."""
         for text, outlet in list(self.outlets.items()):
             numbers = outlet.retire()
             if numbers is not None:
@@ -121,14 +150,14 @@ class Session:
         return self._retired_items + sum(outlet.sequence for outlet in list(self.outlets.values()))
 
     def _busiest(self) -> dict[str, int]:
-        """Items by key without specs, of the keys that were written to most and not put away."""
+        """Items by key without specs, for the keys with most writes."""
         counts: Counter[str] = Counter()
         for outlet in list(self.outlets.values()):
             counts[outlet.key.path] += outlet.sequence
         return dict(counts.most_common(_KEYS_SHOWN))
 
-    def flush_outlet(self, outlet: Outlet) -> bool:
-        """Send what is buffered; False while items wait for permission or for their pace."""
+    def flush_outlet(self, outlet: KeyWriter) -> bool:
+        """Send what is buffered; False while items wait for an assignment or for their rate."""
         with outlet.lock:
             self.gate.review(outlet)
             outlet.cut()
@@ -139,15 +168,18 @@ class Session:
         deadline = time.monotonic() + timeout
         for outlet in list(self.outlets.values()):
             while not self.flush_outlet(outlet):
+                self.check()
                 if time.monotonic() > deadline:
-                    raise Timeout(f"{outlet.key} still waits for permission or its pace after {timeout} s")
+                    raise Timeout(
+                        f"{outlet.key} still waits for an assignment or for its rate after {timeout} s"
+                    )
                 time.sleep(0.005)
         self.publisher.settle(max(0.1, deadline - time.monotonic()))
         if self._archiver is not None:
             self._archiver.flush(max(0.1, deadline - time.monotonic()))
 
     def flush_archive(self, timeout: float) -> None:
-        """What this engine wrote so far is in the archive."""
+        """Wait until this engine's writes are in the archive."""
         for outlet in list(self.outlets.values()):
             self.flush_outlet(outlet)
         if self._archiver is not None:
@@ -160,13 +192,14 @@ class Session:
 
     def opened(self, observation: Observation) -> None:
         """An observation got its first subscriber."""
+        self.check()
         with self._lock:
             self._observed.append(observation)
         self._declare_interests()
         self.dispatcher.open(observation)
 
     def closed(self, observation: Observation) -> None:
-        """It lost its last."""
+        """An observation lost its last subscriber."""
         with self._lock:
             self._observed.remove(observation)
         self._declare_interests()
@@ -183,6 +216,7 @@ class Session:
         health: dict[str, Any] = {
             "app": member.registration.app_id,
             "instance": member.registration.instance_id,
+            "failed": self.failure is not None,
             "phase": member.phase.value,
             "active": member.active,
             "asking": member.asking,
@@ -194,13 +228,15 @@ class Session:
             **self.gate.counts,
             "updates": self.publisher.statistics(),
             "receiving": self.dispatcher.statistics(),
+            "misunderstood_assignments": self.keeper.misunderstood,
+            "liveness": self.liveness.state(),
         }
         if self._archiver is not None:
             health["archive"] = self._archiver.statistics()
         return health
 
     def close(self) -> None:
-        """Stop everything, in the order in which data flows; what was written is sent first."""
+        """Stop everything, in the order in which data flows; pending writes are sent first."""
         self.dispatcher.close()
         with _reported("what was written last could not be sent"):
             self.flush(5.0)
@@ -216,9 +252,9 @@ class Session:
         if self._server is not None:
             self._server.stop()
 
-    def _new_outlet(self, key: Key) -> Outlet:
+    def _new_outlet(self, key: Key) -> KeyWriter:
         registration = self.keeper.member.registration
-        return Outlet(
+        return KeyWriter(
             key,
             registration.app_id,
             registration.instance_id,
@@ -228,7 +264,7 @@ class Session:
             dirty=self.sender.dirty,
         )
 
-    def _sink(self, outlet: Outlet, sent: list[Sent], mode: int) -> None:
+    def _sink(self, outlet: KeyWriter, sent: list[Sent], mode: int) -> None:
         if mode & PUBLISH:
             self._publish(outlet, sent)
         if mode & ARCHIVE:
@@ -236,7 +272,7 @@ class Session:
             for frame, payload in sent:
                 archiver.put(packed(frame, payload, index=outlet.index))
 
-    def _publish(self, outlet: Outlet, sent: list[Sent]) -> None:
+    def _publish(self, outlet: KeyWriter, sent: list[Sent]) -> None:
         if outlet.reliable:
             for _, payload in sent:
                 self.publisher.append(outlet.key.path, payload)
@@ -257,6 +293,7 @@ class Session:
                     queue_bytes=o.archive_queue_bytes,
                     batch=o.archive_batch,
                     linger=o.archive_linger,
+                    failed=self._died,
                 )
             return self._archiver
 
@@ -264,7 +301,7 @@ class Session:
         return self._options.folder() / "spool" / self.keeper.member.registration.app_id
 
     def _say(self, text: str, value: object) -> None:
-        """Write a membership message, past all permissions."""
+        """Write a membership message, regardless of assignments."""
         outlet = self._said.get(text)
         if outlet is None:
             outlet = self._said[text] = self._new_outlet(Key(text))
@@ -286,7 +323,7 @@ class Session:
             return
         with self.keeper.lock:
             if self.keeper.member.asking:
-                return  # stopped for a moment: nobody has said that less is wanted
+                return  # suspended for a moment: no assignment was withdrawn
             wanted = self.keeper.member.assignments
         if wanted != self._told:
             self._told = wanted

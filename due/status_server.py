@@ -1,35 +1,39 @@
-"""`/metrics` and `/healthz` of one app, over HTTP, for a scraper and for whoever restarts what hangs.
+"""`/metrics` and `/healthz` of one app, over HTTP, for Prometheus and supervisors.
 
     main thread ──report(text, state)──► StatusServer ◄── GET /metrics   the last report
-                                              ◄── GET /healthz  200, or 503 where no report came for long
+    engine's threads ◄──asked── liveness() ──┘      ◄── GET /healthz  200, or 503 if the last report is old
+                                                                     or a thread does not answer
 
-Requests are answered from the last report, so a scraper never runs code of the app.
+Answers come from the last report and from what the engine knows of its threads: a scraper never runs code
+of the app.
 """
 
 import json
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from due.errors import InvalidOption
+from due.liveness import STALLED_SECONDS
 from due.metrics import CONTENT_TYPE
 
-STALLED_SECONDS = 15.0
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _REQUEST_SECONDS = 5.0
 
 
 class StatusServer:
-    """Listens at once, answers from `start` on.  Raises `InvalidOption` where the address cannot be had."""
+    """Listens at once, answers from `start` on.  Raises `InvalidOption` if it cannot listen there."""
 
     def __init__(self, address: str) -> None:
         host, port = parse_address(address)
         self._text = ""
         self._state: Mapping[str, Any] = {}
         self._reported = time.monotonic()
+        self.liveness: Callable[[], Mapping[str, Any]] = dict
+        """The engine's `Liveness.state`; its `status` is "stalled" if a thread hangs."""
         try:
             self._server = _Server((host, port), _Handler)
         except OSError as error:
@@ -47,11 +51,11 @@ class StatusServer:
         return f"[{host!s}]:{port}" if ":" in str(host) else f"{host!s}:{port}"
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Start answering."""
         self._thread.start()
 
     def report(self, text: str, state: Mapping[str, Any]) -> None:
-        """What to answer from now on."""
+        """Set the answer from now on."""
         self._text, self._state, self._reported = text, state, time.monotonic()
 
     def metrics(self) -> tuple[int, str, str]:
@@ -61,9 +65,11 @@ class StatusServer:
     def health(self) -> tuple[int, str, str]:
         """The same of `/healthz`."""
         silent = time.monotonic() - self._reported
-        stalled = silent > STALLED_SECONDS
-        shown = {"status": "stalled" if stalled else "ok", **self._state, "silent_s": round(silent, 1)}
-        return 503 if stalled else 200, "application/json", json.dumps(shown) + "\n"
+        shown = {"status": "ok", **self._state, "silent_s": round(silent, 1), **self.liveness()}
+        if silent > STALLED_SECONDS:
+            shown["status"] = "stalled"
+        healthy = shown["status"] in ("ok", "busy")
+        return 200 if healthy else 503, "application/json", json.dumps(shown) + "\n"
 
     def close(self) -> None:
         """Stop listening."""
@@ -86,7 +92,7 @@ class _Server(ThreadingHTTPServer):
     block_on_close = False
     status: StatusServer
     hosts: tuple[str, ...]
-    """Names under which we may be asked; empty: any.  On loopback no web page shall read along."""
+    """Accepted Host names; empty: any.  On loopback this keeps web pages from reading."""
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
@@ -100,7 +106,7 @@ class _Server(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that goes away is nothing to report."""
+        """A client that disconnects is not worth a report."""
 
 
 class _Handler(BaseHTTPRequestHandler):

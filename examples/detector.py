@@ -1,7 +1,7 @@
 """A stand-in for somebody else's detector: the deviation of a packet's length from the running mean."""
 
 
-class Detector:
+class MeanDetector:
     """Scores one packet at a time."""
 
     def __init__(self) -> None:

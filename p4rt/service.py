@@ -1,9 +1,11 @@
 """The gRPC face of P4Runtime: a client stub and the registration of a server."""
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import grpc
 import grpc.aio
+from google.protobuf.message import DecodeError
 
 from p4rt.messages import p4runtime
 
@@ -52,24 +54,52 @@ class P4RuntimeServicer(Protocol):
     def StreamChannel(self, request_iterator: Any, context: grpc.ServicerContext) -> Any: ...  # noqa: N802
 
 
-def add_p4runtime_servicer(servicer: P4RuntimeServicer, server: grpc.Server | grpc.aio.Server) -> None:
-    """Register `servicer` for the P4Runtime service of `server`."""
+Decode = Callable[[bytes], Any]
+
+
+def strictly(message: Any) -> Decode:
+    """Bytes that are no such message end the call with an exception within gRPC."""
+    decode: Decode = message.FromString
+    return decode
+
+
+def or_none(message: Any) -> Decode:
+    """Bytes that are no such message are None, and the servicer's to refuse."""
+
+    def decode(data: bytes) -> Any:
+        try:
+            return message.FromString(data)
+        except DecodeError:
+            return None
+
+    return decode
+
+
+def add_p4runtime_servicer(
+    servicer: P4RuntimeServicer,
+    server: grpc.Server | grpc.aio.Server,
+    decoder: Callable[[Any], Decode] = strictly,
+) -> None:
+    """Register `servicer` for the P4Runtime service of `server`.
+
+    decoder: `strictly` or `or_none`
+    """
     handlers = {
         name: grpc.unary_unary_rpc_method_handler(
             getattr(servicer, name),
-            request_deserializer=getattr(p4runtime, f"{name}Request").FromString,
+            request_deserializer=decoder(getattr(p4runtime, f"{name}Request")),
             response_serializer=getattr(p4runtime, f"{name}Response").SerializeToString,
         )
         for name in _UNARY
     }
     handlers["Read"] = grpc.unary_stream_rpc_method_handler(
         servicer.Read,
-        request_deserializer=p4runtime.ReadRequest.FromString,
+        request_deserializer=decoder(p4runtime.ReadRequest),
         response_serializer=p4runtime.ReadResponse.SerializeToString,
     )
     handlers["StreamChannel"] = grpc.stream_stream_rpc_method_handler(
         servicer.StreamChannel,
-        request_deserializer=p4runtime.StreamMessageRequest.FromString,
+        request_deserializer=decoder(p4runtime.StreamMessageRequest),
         response_serializer=p4runtime.StreamMessageResponse.SerializeToString,
     )
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, handlers),))

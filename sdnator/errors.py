@@ -1,7 +1,7 @@
 """Errors that the command line turns into one line and an exit code.
 
 SdnatorError
-├── BadInput            what the user gave cannot be used: exit code 2
+├── BadInput            an input of the user cannot be used: exit code 2
 └── PipelineError       a part of the pipeline did not start, or died: exit code 1
 """
 
@@ -13,7 +13,7 @@ class SdnatorError(Exception):
 
 
 class BadInput(SdnatorError):
-    """Something the user gave cannot be used."""
+    """An input of the user cannot be used."""
 
     exit_code = 2
 

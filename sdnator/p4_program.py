@@ -1,10 +1,10 @@
-"""The compiled switch program: where it is, and whether it still belongs to its source.
+"""The compiled switch program: its location, and whether it matches its source.
 
 `python -m sdnator.p4_program compile` runs p4c (where it is installed) and writes the record that
 `check` compares: the hashes of all sources and artefacts and the compiler's version.  Other programs
 than the product's are named with their folder: `compile tests/dataplane/programs features`.
 
-    P4ProgramError (RuntimeError)   artefacts missing, or no longer those of the source
+    P4ProgramError (RuntimeError)   artefacts missing, or not compiled from the present source
 """
 
 import hashlib
@@ -39,7 +39,7 @@ def folder() -> Path:
 
 
 def find() -> P4Program:
-    """The compiled program; raises P4ProgramError where it is missing."""
+    """The compiled program; raises P4ProgramError if it is missing."""
     base = folder()
     program = P4Program(base / f"{PROGRAM}.json", base / f"{PROGRAM}.p4info.txtpb")
     for path in (program.bmv2_json, program.p4info):
@@ -67,7 +67,7 @@ def _record(base: Path, name: str) -> Path:
 
 
 def check(base: Path, name: str = PROGRAM) -> None:
-    """Raise P4ProgramError where source and artefacts no longer belong together."""
+    """Raise P4ProgramError if the artefacts do not match the source."""
     record: dict[str, Any] = json.loads(_record(base, name).read_text(encoding="utf-8"))
     now = hashes(base, name)
     for part in ("sources", "artefacts"):

@@ -1,11 +1,11 @@
 """The reference pages, made from the code: `python -m sdnator.reference docs` writes them.
 
     the Typer application             ─► reference/cli.md
-    sdnator.config_model, its Structs ─► reference/configuration.md
+    sdnator.config.config_model, its Structs ─► reference/configuration.md
     INTERESTS, CAPABILITIES, messages ─► reference/keys.md, images/flow.svg
     the Coordinator's OpenAPI         ─► reference/http-api.md
 
-A test compares what stands in `docs/` with what this makes now.
+A test compares the pages in `docs/` with what this generates.
 """
 
 import inspect
@@ -24,7 +24,7 @@ NOTE = "<!-- made by `python -m sdnator.reference docs`: change the code, not th
 
 def pages() -> dict[str, str]:
     """Path below `docs/` to text, for every generated file."""
-    from sdnator.flow_picture import rows, svg
+    from sdnator.report.flow_picture import rows, svg
 
     return {
         "reference/cli.md": cli(),
@@ -71,24 +71,24 @@ def _code(text: str) -> str:
 
 def cli() -> str:
     """Every command with its arguments, options, defaults and text."""
-    from sdnator.cli import app
+    from sdnator.cli.main import app
 
     intro = (
         "Exit codes: 0 done, 1 a part of the pipeline failed or something is missing, 2 bad input or misuse, "
-        "130 interrupted, 143 terminated. `--json` is there wherever a program might read along."
+        "130 interrupted, 143 terminated. Commands whose output a program may read have `--json`."
     )
     return _page("Commands", intro, _commands(app, ("sdnator",)))
 
 
 def _commands(app: Any, words: tuple[str, ...]) -> Iterator[str]:
-    """Read from what Typer was told, not from what it made of it, which differs between its versions."""
+    """Read from the declarations, not from Typer's result, which differs between its versions."""
     import typer
 
     found: dict[str, Any] = {
         one.name or _dashed(one.callback.__name__): one.callback for one in app.registered_commands
     }
     found |= {one.name: one.typer_instance for one in app.registered_groups}
-    # commands that are imported when they are called have stand-ins until then
+    # commands that are imported on call have stand-ins until then
     for name, place in getattr(app.info.cls, "PLACES", {}).items():
         module, _, attribute = place.partition(":")
         found[name] = getattr(import_module(module), attribute)
@@ -171,15 +171,15 @@ def _dashed(name: str) -> str:
 
 def configuration() -> str:
     """Every option of `sdnator.toml` with its type, default and text."""
-    from sdnator.config_model import SECTIONS, default, fields
+    from sdnator.config.config_model import PRODUCT_SECTIONS, default, fields
 
     intro = (
-        "`sdnator.toml` has one section for each part. What is left out has the default below; an option "
+        "`sdnator.toml` has one section for each part. Options that are left out have the default below; an option "
         "is overridden by the environment variable `SDNATOR_<SECTION>_<OPTION>`. `sdnator config check` names "
         "every wrong option with its line."
     )
     lines: list[str] = []
-    for section, declared in SECTIONS.items():
+    for section, declared in PRODUCT_SECTIONS.items():
         kind = declared.kind()
         lines += [f"## {section}", "", _first_line(kind), ""]
         rows = [
@@ -194,7 +194,7 @@ def configuration() -> str:
 def _options(
     shown: str, kind: Any, struct: Any, name: str, default: Any
 ) -> Iterator[tuple[str, str, str, str]]:
-    from sdnator.config_texts import texts
+    from sdnator.config.config_texts import texts
 
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         inner = get_type_hints(kind)
@@ -219,7 +219,7 @@ def _toml(value: Any) -> str:
 
 
 def type_name(kind: Any) -> str:
-    """A type as people write it, without modules."""
+    """A type as text, without modules."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Literal:
         return " or ".join(f'"{one}"' if isinstance(one, str) else str(one) for one in inner)
@@ -236,7 +236,7 @@ def type_name(kind: Any) -> str:
 
 def keys() -> str:
     """Who writes and wants which key, and what the values hold."""
-    from sdnator.flow_picture import SERVICES
+    from sdnator.report.flow_picture import SERVICES
 
     lines: list[str] = []
     for name, module in {"coordinator": "coordinator.service", **SERVICES}.items():
@@ -268,7 +268,7 @@ def _interests(service: Any) -> Iterator[tuple[Any, str]]:
 def _packets() -> Iterator[str]:
     packets = import_module("apps.packets")
     texts = dict(re.findall(r'^    "(\w+)": "\w+",(?:  # (.*))?$', inspect.getsource(packets), re.MULTILINE))
-    yield "A record batch: one numpy array for each column, all equally long. Absent is -1 where nothing else is said."
+    yield "A record batch: one numpy array for each column, all equally long. -1 means absent, unless stated otherwise."
     yield ""
     rows = (
         (_code(name), _code(dtype), texts.get(name, "")) for name, dtype in packets.PACKET_COLUMNS.items()
@@ -278,7 +278,7 @@ def _packets() -> Iterator[str]:
 
 
 def _fields(kind: Any) -> str:
-    from sdnator.config_texts import texts
+    from sdnator.config.config_texts import texts
 
     own, hints = texts(kind), get_type_hints(kind)
     rows = (

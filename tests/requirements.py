@@ -41,10 +41,10 @@ def require_program(name: str) -> str:
 
 
 def optional_program(name: str) -> str:
-    """Path of a program that is in no package registry; its tests are skipped wherever it is missing."""
+    """Path of a program that CI does not install; its tests are skipped wherever it is missing."""
     found = shutil.which(name)
     if found is None:
-        pytest.skip(f"program {name} is not installed (it is in no package registry)")
+        pytest.skip(f"program {name} is not installed (CI does without it)")
     return found
 
 

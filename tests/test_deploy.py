@@ -10,6 +10,7 @@ import shlex
 import stat
 import subprocess
 import sys
+import time
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +25,7 @@ from due import Engine
 from due import metrics as due_metrics
 from due import service as due_service
 from sdnator.p4_program import find
+from sdnator.supervisor.metrics import part_metrics
 from tests.requirements import optional_program
 
 yaml = pytest.importorskip("yaml", reason="PyYAML, which comes with mkdocs, is not installed")
@@ -163,10 +165,12 @@ def test_prometheus_scrapes_every_part():
 @pytest.fixture(scope="module")
 def exported():
     """Names of all metrics that the Coordinator's API, the engine and each app export."""
-    registry, counters = Registry("here"), dict.fromkeys(coordinator_metrics._COUNTERS, 0)
+    told = (*coordinator_metrics._COUNTERS, *coordinator_metrics._SIZES)
+    registry, counters = Registry("here"), dict.fromkeys(told, 0)
     text, _ = coordinator_metrics.render(registry, {"leading": True, **counters}, 0.0)
     names = set(re.findall(r"^# TYPE (\S+)", text.decode(), re.MULTILINE))
     names |= {f"{name}_total" for name in names}
+    names |= set(re.findall(r"^# TYPE (\S+)", part_metrics((), {}), re.MULTILINE))
     names |= {family.name for family in due_metrics._ENGINE.values()}
     program = find()
     for app, (module, service) in APPS.items():
@@ -225,20 +229,24 @@ def test_dashboard_uses_the_provisioned_data_source():
 
 
 def test_controller_learns_when_the_clock_of_the_switch_began(tmp_path):
-    """start-switch notes the time, start-controller puts it into the settings."""
+    """start-switch notes the time, start-controller puts it into the settings; a second start changes nothing."""
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "$@" >> said\n[ -t 0 ] || cat > given\n', encoding="utf-8")
     python.chmod(python.stat().st_mode | stat.S_IXUSR)
     folders = {"SDNATOR_RUN": str(tmp_path), "SDNATOR_ETC": str(DEPLOY / "settings")}
     environment = os.environ | folders | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    for script, option in (("start-switch", "--grpc=127.0.0.1:0"), ("start-controller", "--stay")):
+    switch = ("start-switch", "--grpc=127.0.0.1:0")
+    for script, option in (switch, switch, ("start-controller", "--stay")):
         subprocess.run(
             [DEPLOY / script, option],
             env=environment, cwd=tmp_path, stdin=subprocess.DEVNULL, check=True, timeout=60,
         )  # fmt: skip
     said = (tmp_path / "said").read_text(encoding="utf-8").splitlines()
-    assert said[0] == "-m dataplane --grpc=127.0.0.1:0"
-    assert said[1] == "-m apps.p4runtime_ctrl.service --stay --settings /dev/stdin"
+    assert said[0] == said[1]
+    zero = re.fullmatch(r"-m dataplane --base-us (\d+) --grpc=127.0.0.1:0", said[0])
+    assert zero
+    assert 0 < int(zero[1]) <= time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1_000
+    assert said[2] == "-m apps.p4runtime_ctrl.service --stay --settings /dev/stdin"
     given = json.loads((tmp_path / "given").read_text(encoding="utf-8"))
     noted = int((tmp_path / "base_us").read_text(encoding="utf-8"))
     assert given["switches"][0]["base_us"] == noted > 1_500_000_000_000_000

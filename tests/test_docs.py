@@ -1,15 +1,20 @@
 """What the documents show is what the product does: every command in them is run."""
 
+import gzip
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from sdnator.datasets.mirai_like import Options, make
-from sdnator.labels import labels_path
+from sdnator.capture.labels import labels_path, read_labels
+from sdnator.datasets.mirai_like import MiraiLikeOptions, make
+from sdnator.replay.packet_accounting import PacketState
 from tests.end_to_end.command import sdnator
 from tests.requirements import optional_program, require_netns
+from tests.sdnator.datasets.publisher import UCI, serving
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -29,12 +34,29 @@ def shell_lines() -> list[tuple[str, str]]:
 def capture(tmp_path_factory):
     """What stands for CAPTURE.pcap and LABELS.csv."""
     path = tmp_path_factory.mktemp("docs") / "capture.pcap"
-    make(Options(seed=2, benign_seconds=120, attack_seconds=20), path)
+    make(MiraiLikeOptions(seed=2, benign_seconds=120, attack_seconds=20), path)
     return path
 
 
+@pytest.fixture(scope="module")
+def fetched(capture, tmp_path_factory):
+    """A mirror with the capture as the data set mirai, and a data folder into which it was fetched."""
+    labels = gzip.compress(
+        "\n".join(str(int(flag)) for flag in read_labels(labels_path(capture)).attack).encode()
+    )
+    home = tmp_path_factory.mktemp("share")
+    with serving() as publisher:
+        publisher.files[f"{UCI}/mirai/Mirai_pcap.pcap.gz"] = gzip.compress(capture.read_bytes())
+        publisher.files[f"{UCI}/mirai/Mirai_labels.csv.gz"] = labels
+        done = sdnator(
+            "dataset", "fetch", "mirai", "--mirror", publisher.url, environment={"XDG_DATA_HOME": str(home)}
+        )
+        assert done.returncode == 0, done.stderr
+        yield publisher.url, home
+
+
 @pytest.mark.parametrize(("document", "line"), shell_lines(), ids=lambda text: text)
-def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch):
+def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch, request):
     """A `make` line names a target; an `sdnator` line runs to a good end on a small capture."""
     words = shlex.split(line)
     if words[0] == "make":
@@ -47,12 +69,41 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
         require_netns()
     if "syn-flood" in words:
         require_netns()
+    if "mirai" in words:
+        mirror, home = request.getfixturevalue("fetched")
+        monkeypatch.setenv("XDG_DATA_HOME", str(home))
+        if "fetch" in words:
+            words += ["--mirror", mirror]
+        if "detect" in words:
+            words += ["--fm-grace", "90", "--ad-grace", "900"]
     values = {"CAPTURE.pcap": str(capture), "LABELS.csv": str(labels_path(capture)), "12000": "1000"}
     arguments = [values.get(word, word) for word in words[1:]]
     if words[1] == "replay" and "--train" not in words:
         arguments += ["--train", "1000"]
     done = sdnator(*arguments)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_the_notebook_of_the_documents_works(capture, tmp_path, monkeypatch, capsys):
+    """The Python block of replay.md runs on a small capture and prints a block and the figures of a detection."""
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/replay.md").read_text("utf-8"), re.DOTALL)
+    assert "train=12_000" in block
+    monkeypatch.chdir(tmp_path)
+    Path("house.pcap").symlink_to(capture)
+    Path("house.labels.csv").symlink_to(labels_path(capture))
+    names: dict[str, Any] = {}
+    exec(block.replace("12_000", "1_000"), names)  # noqa: S102 - our own document
+    result = names["result"]
+    packets = result.figures["packets_in"]
+    assert packets > 1_000
+    assert {len(result.scores), len(result.states), len(result.time_ns), len(result.attack)} == {packets}
+    assert int(np.count_nonzero(result.states == PacketState.TRAIN)) == 1_001
+    assert not np.isnan(result.scores_without_blocking).any()
+    assert np.isnan(result.scores[result.states == PacketState.DROPPED]).all()
+    assert result.figures["packets_dropped"] == int(np.count_nonzero(result.states == PacketState.DROPPED))
+    printed = capsys.readouterr().out
+    assert all(f"{found['address']} {found['reason']}" in printed for found in result.blocks)
+    assert f"{result.figures['auc']} ({packets},)" in printed
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)

@@ -15,8 +15,8 @@ import typer
 from typer.testing import CliRunner
 
 from sdnator import reference
-from sdnator.cli import app
-from sdnator.flow_picture import Row, rows, svg
+from sdnator.cli.main import app
+from sdnator.report.flow_picture import Row, rows, svg
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

@@ -8,6 +8,7 @@ is not read, so the editable installation there stays out of sight.)
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -17,7 +18,8 @@ from pathlib import Path
 
 import pytest
 
-from sdnator.datasets.mirai_like import Options, make
+from sdnator.datasets.mirai_like import MiraiLikeOptions, make
+from tests.end_to_end.test_up import Operator, until
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("due", "coordinator", "apps", "dataplane", "sdnator", "p4rt")
@@ -101,8 +103,57 @@ def test_installed_parts_come_from_the_wheel(environment, tmp_path):
 def test_replay_runs_from_the_wheel(environment, tmp_path):
     """`sdnator replay` trains and scores every packet outside any checkout."""
     capture = tmp_path / "capture.pcap"
-    make(Options(seed=2, benign_seconds=60, attack_seconds=10), capture)
+    make(MiraiLikeOptions(seed=2, benign_seconds=60, attack_seconds=10), capture)
     done = run(environment / "sdnator", "replay", capture, "--train", "1000", "--json", folder=tmp_path)
     figures = json.loads(done.stdout)
     assert figures["packets_in"] > 1000
     assert figures["packets_scored"] + figures["packets_dropped"] == figures["packets_in"]
+
+
+@pytest.fixture(scope="module")
+def with_foreign_app(environment, tmp_path_factory):
+    """The same environment with somebody else's package beside the product."""
+    source = tmp_path_factory.mktemp("foreign") / "packet_counter"
+    shutil.copytree(ROOT / "examples" / "packet_counter", source, ignore=shutil.ignore_patterns(*BUILT))
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", environment / "python")
+    run(*pip, "install", "--no-build-isolation", "--no-deps", "--no-index", source, folder=source.parent)
+    return environment
+
+
+class Installed(Operator):
+    """An operator whose `sdnator` is the installed one."""
+
+    def __init__(self, folder, sdnator):
+        super().__init__(folder)
+        self.sdnator = sdnator
+
+    def command(self, *words):
+        return [str(self.sdnator), *words]
+
+
+def test_an_installed_package_brings_its_app_along(with_foreign_app, tmp_path, monkeypatch):
+    """Somebody else's app is configured, started, shown, logged, and started again when it dies, like ours."""
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    monkeypatch.chdir(tmp_path)
+    operator = Installed(tmp_path, with_foreign_app / "sdnator")
+    settings = tmp_path / "sdnator.toml"
+    settings.write_text("[packet_counter]\nevery = 10\n", encoding="utf-8")
+    assert operator.run("config", "check", str(settings)).returncode == 0
+    assert "every = 1000" in operator.run("config", "example").stdout
+    assert "packet_counter" in operator.run("flow", "--declared").stdout
+    with operator.up("--config", str(settings)) as (_, said):
+        os.kill(said["parts"]["packet_counter"], signal.SIGKILL)
+        again = until(lambda: (now := operator.well()) and now["parts"]["packet_counter"]["restarts"] and now)
+        assert again["parts"]["packet_counter"]["alive"]
+        until(lambda: "active" in operator.figures("status")["apps"]["packet_counter"].split(", "))
+        assert "packet_counter" in operator.run("flow").stdout
+        assert operator.run("logs", "packet_counter").returncode == 0
+
+
+def test_a_wrong_option_of_an_installed_app_is_named(with_foreign_app, tmp_path):
+    """A fault in a foreign app's section is told like one in ours."""
+    settings = tmp_path / "sdnator.toml"
+    settings.write_text("[packet_counter]\nevry = 10\n", encoding="utf-8")
+    done = Installed(tmp_path, with_foreign_app / "sdnator").run("config", "check", str(settings))
+    assert done.returncode == 2
+    assert "evry: there is no such option; did you mean every?" in done.stdout

@@ -1,10 +1,11 @@
 """From evidence and archive history to decisions, with reasons.
 
-alerts ───────────► policy (enough, and may it be blocked?) ─┐
-SYNs, handshakes ─► syn_defence (guard at once, block later) ─┼─► ledger (ids, ends, caps, probation) ──► Decision
-ARP ──────────────► bindings (who claims another's address) ─┤        ▲                ▲
-people ───────────► instructions ────────────────────────────┘   history      confirmations, drop counters
-SYN-ACKs ─────────► half_open ──► RST frames for what a flood left at a server
+alerts ───────────► policy/rules (block this sender?) ───────────────┐
+SYNs, handshakes ─► syn/syn_defence (guard at once, block later) ────┼─► policy/block_lifecycle ──► Decision
+ARP ──────────────► arp/arp_bindings (claims of others' addresses) ──┤        ▲            ▲
+operators ────────► policy/instructions ─────────────────────────────┘   evidence/    confirmations,
+                                                                         history      drop counters
+SYN-ACKs ─────────► syn/syn_ack_buffer ──► RST frames for half-open connections
 
-service, archive and outlets do the I/O.
+`service`, `evidence/archive` and `enforcement/event_sink` do the I/O.
 """

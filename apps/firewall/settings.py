@@ -1,11 +1,11 @@
-"""What the operator can set about the firewall as a whole."""
+"""Options of the firewall as a whole."""
 
 from typing import Literal
 
 import msgspec
 
-from apps.firewall.policy import Rules
-from apps.firewall.syn_policy import SynRules
+from apps.firewall.policy.rules import Rules
+from apps.firewall.syn.syn_policy import SynRules
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -22,27 +22,28 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     known_limit: int = 4000
     """Known sources in the switch, the most recent ones."""
     known_days: int = 30
-    """A handshake counts for so long."""
+    """Days for which a completed handshake makes a source known."""
     allow_surroundings: bool = False
     """Never block this machine's own addresses, gateways, DNS servers and management peers; off in replays,
-    whose captures come from elsewhere."""
+    whose captures come from other networks."""
     arp: Literal["block", "tell", "off"] = "block"
-    """What follows from an ARP claim of another's address while the other is there (needs the Sonata adapter)."""
+    """When a host claims another's address by ARP while the owner is present: block it, only report it, or
+    ignore it (needs the Sonata adapter)."""
     arp_training_s: int = 600
-    """Who has which address is learnt in the first seconds; only claims of these addresses lead to blocks."""
+    """Seconds at the start in which address owners are learnt; only claims of these addresses lead to blocks."""
     arp_settle_s: int = 3600
-    """Later bindings count after this time without another claim; a claim of one is told."""
+    """Seconds without a competing claim after which a later binding counts; a claim of it is only reported."""
     arp_contest_s: int = 60
-    """The owner has to speak within this time after a claim."""
+    """Seconds after a claim within which the owner must send a frame to be taken as present."""
     eve_file: str = ""
-    """Alerts and decisions are appended here as EVE JSON, a line each; empty: nowhere."""
+    """File to which alerts and decisions are appended as EVE JSON, one per line; empty: none."""
     eve_redis: str = ""
-    """Redis URL of a server that takes the same lines in a list; empty: none."""
+    """Redis URL of a server that gets the same lines in a list; empty: none."""
     eve_list: str = "sdnator"
     """Name of that list."""
     webhook: str = ""
-    """URL that gets decisions and notices as JSON by POST; empty: none."""
+    """URL to which decisions and notices are sent as JSON by POST; empty: none."""
     webhook_token: str = ""
     """Bearer token for the webhook."""
     archive_patience_s: float = 5.0
-    """A decision waits this long for what Data Archives know of the sender."""
+    """Seconds that a decision waits for the sender's history from Data Archives."""

@@ -1,8 +1,9 @@
 """Kitsune: packets become anomaly scores, and scores become alerts.
 
     record batch ─► afterimage ─► kitnet ─► threshold ─► senders ─► alerts
-                    100 features  score     the line     hot seconds  reasons
+                    100 features  score     anomalous?   anomalous  reasons
+                                                         seconds
 
-`detector` joins the parts and is pure; `service` is the only file with I/O.
-The method is Kitsune (Mirsky et al., NDSS 2018); the figures follow its published implementation.
+`detector` connects these parts and does no I/O; `service` is the only file with I/O.
+The method is Kitsune (Mirsky et al., NDSS 2018); the parameters follow its published implementation.
 """

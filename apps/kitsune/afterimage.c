@@ -428,7 +428,7 @@ static void prefetch_packet(const AfterImage *self, const Names *names)
 /* Grows with every change of the interface, so that a library left over from before is noticed. */
 int32_t kitsune_kernel_version(void)
 {
-    return 1;
+    return 2;
 }
 
 AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon)
@@ -481,10 +481,18 @@ static void packet(AfterImage *self, const Names *names, double v, double t, dou
     packet_2d(self, &self->table[SOCKETS], &names->socket, &names->peer_socket, v, t, out + 65);
 }
 
-/* Adds n packets in order and writes 100 features for each; -1 when memory is short. */
-int afterimage_update(AfterImage *self, const Columns *columns, long n, double *out)
+/* Adds n packets in order and writes 100 features for each.
+ *
+ * `lengths` are those of the columns, in the order of the struct, `room` is that of `out` in numbers.
+ * -1 when memory is short, -2 when a column or `out` is too short: then nothing was read. */
+int afterimage_update(AfterImage *self, const Columns *columns, const long *lengths, long n, double *out, long room)
 {
     Names names[2];
+    if (n < 0 || n > room / FEATURES)
+        return -2;
+    for (size_t i = 0; i < COLUMNS; i++)
+        if (lengths[i] < n)
+            return -2;
     if (n > 0)
         read_names(columns, 0, &names[0]);
     for (long i = 0; i < n && !self->failed; i++, out += FEATURES) {

@@ -13,14 +13,15 @@ by more than 2e-11; on three generated infections the AUC agrees to six digits a
 same.  Where dozens of hosts all talk to each other, covariances differ visibly, the rest in rounding.
 """
 
-from typing import Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.kernel import PACKET_FIELDS, Columns, Kernel, contiguous
+from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, Columns, Kernel, contiguous
 
 WIDTH: Final = 100
+_TOO_SHORT: Final = -2
 Mode = Literal["reference", "bounded"]
 
 MAX_STREAMS: Final = 65_536
@@ -29,8 +30,8 @@ HORIZON_S: Final = 3_000.0
 """After this idle time a stream's weight at the slowest scale is below 1e-9."""
 
 
-class Engine(Protocol):
-    """What computes features: the C kernel or its Python twin."""
+class FeatureEngine(Protocol):
+    """Computes features: the C kernel or its Python twin."""
 
     def update(self, columns: Columns, out: npt.NDArray[np.float64]) -> None: ...
 
@@ -61,7 +62,7 @@ class AfterImage:
         if max_streams < 2 or max_links < 1:
             raise ValueError(f"max_streams={max_streams}, max_links={max_links}: need at least 2 and 1")
         bounded = mode == "bounded"
-        self._engine: Engine
+        self._engine: FeatureEngine
         if kernel is not None:
             self._engine = _KernelEngine(kernel, bounded, max_streams, max_links, horizon)
         else:
@@ -72,10 +73,10 @@ class AfterImage:
     def update(self, batch: Columns) -> npt.NDArray[np.float64]:
         """Features of each packet of the batch, in order: float64, shape (packets, 100).
 
-        Raises `MemoryError` when the state cannot grow; the object is not usable afterwards.
+        Raises `ColumnError` for columns that are missing, of other lengths, or no numbers; `MemoryError`
+        when the state cannot grow: the object is not usable afterwards.
         """
-        columns = {name: contiguous(batch[name], kind) for name, _, kind in PACKET_FIELDS if name != "time"}
-        columns["time"] = seconds(batch)
+        columns = _columns(batch)
         out = np.empty((len(columns["time"]), WIDTH))
         if len(out):
             self._engine.update(columns, out)
@@ -83,9 +84,22 @@ class AfterImage:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Streams and links held, streams forgotten for age, cells forgotten for lack of room."""
+        """Streams and links held, streams dropped for age, cells dropped for lack of room."""
         names = ("streams", "links", "forgotten_idle", "forgotten_full")
         return dict(zip(names, self._engine.counts(), strict=True))
+
+
+def _columns(batch: Columns) -> dict[str, npt.NDArray[Any]]:
+    """The columns that the engines read, checked for equal length."""
+    try:
+        found = {name: contiguous(batch[name], kind) for name, _, kind in PACKET_FIELDS if name != "time"}
+        found["time"] = seconds(batch)
+    except KeyError as error:
+        raise ColumnError(f"the batch has no column {error}") from None
+    shapes = {name: column.shape for name, column in found.items()}
+    if len(set(shapes.values())) != 1 or found["time"].ndim != 1:
+        raise ColumnError(f"columns of a batch are one-dimensional and equally long, not {shapes}")
+    return found
 
 
 def seconds(batch: Columns) -> npt.NDArray[np.float64]:
@@ -116,7 +130,12 @@ class _KernelEngine:
         struct = kernel.ffi.new("Columns *")
         for name, c_type, _ in PACKET_FIELDS:
             setattr(struct, name, kernel.pointer(f"const {c_type}", columns[name]))
-        if kernel.lib.afterimage_update(self._state, struct, len(out), kernel.pointer("double", out)):
+        lengths = kernel.ffi.new("long[]", [len(columns[name]) for name, _, _ in PACKET_FIELDS])
+        features = kernel.pointer("double", out)
+        failed = kernel.lib.afterimage_update(self._state, struct, lengths, len(out), features, out.size)
+        if failed == _TOO_SHORT:
+            raise ColumnError("columns of a batch are equally long")
+        if failed:
             raise MemoryError("AfterImage: no memory for another stream or link; use mode='bounded'")
 
     def counts(self) -> tuple[int, int, int, int]:

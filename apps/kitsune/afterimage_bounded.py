@@ -1,6 +1,6 @@
-"""Bounded mode of AfterImage's Python twin: ceilings, forgetting, and catching up in one step.
+"""Bounded mode of AfterImage's Python twin: size limits, expiry, and catching up in one step.
 
-A stream with many links (a hub) logs its packets instead of telling all its peers.  A peer replays
+A stream with many links (a hub) logs its packets instead of updating all its peers.  A peer applies
 what it has missed when it is next needed: packet by packet while the log still has it, else in closed
 form from the hub's damped sums.
 """
@@ -11,18 +11,27 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.afterimage_python import LOG_KEPT, SCALES, Link, Stream, Table, damp, factors_of, pair_of
+from apps.kitsune.afterimage_python import (
+    LOG_KEPT,
+    SCALES,
+    DampedStream,
+    Link,
+    StatisticsTable,
+    damp,
+    factors_of,
+    pair_of,
+)
 from apps.kitsune.kernel import Columns
 from apps.kitsune.text_keys import TextKeys, text_keys
 
 HUB_DEGREE: Final = 8
 HUBS_ASKED: Final = 32
 SET_BACK_S: Final = 60.0
-"""A packet this much too old means that the clock was set back."""
+"""A packet older than the newest by this much means that the clock was set back."""
 _FORGET_AT_ONCE: Final = 3
 
 
-class BoundedTable(Table):
+class BoundedTable(StatisticsTable):
     """At most `max_streams` streams and `max_links` links; idle and oldest ones are forgotten."""
 
     def __init__(self, max_streams: int, max_links: int, horizon: float) -> None:
@@ -45,7 +54,7 @@ class BoundedTable(Table):
             self._forget_link(next(iter(self.links.values())))
             self.forgotten_full += 1
 
-    def enter(self, key: str, time: float) -> Stream:
+    def enter(self, key: str, time: float) -> DampedStream:
         if key in self.streams:
             self.streams.move_to_end(key)
         stream = super().enter(key, time)
@@ -55,9 +64,9 @@ class BoundedTable(Table):
     def renew(self, pair: tuple[str, str]) -> None:
         self.links.move_to_end(pair)
 
-    def prepare(self, stream: Stream) -> None:
+    def prepare(self, stream: DampedStream) -> None:
         if len(stream.hub_links) > HUBS_ASKED:
-            return  # too many to ask each: its links wait until they are addressed
+            return  # too many to update each: its links are updated when they are used
         pending = []
         for link in reversed(stream.hub_links):
             far = 1 - link.side(stream)
@@ -76,7 +85,7 @@ class BoundedTable(Table):
         for link, far in dict.fromkeys((link, far) for _, link, far, _, _ in pending):
             _note(link, far)
 
-    def prepare_link(self, link: Link, stream: Stream, far: Stream) -> None:
+    def prepare_link(self, link: Link, stream: DampedStream, far: DampedStream) -> None:
         self.prepare(far)
         if far is not stream:
             near = link.side(stream)
@@ -84,7 +93,7 @@ class BoundedTable(Table):
                 if link.ends[side].is_hub and link.seen[side] != link.ends[side].logged:
                     _account(link, side)
 
-    def tell_peers(self, stream: Stream, residual: list[float], time: float) -> None:
+    def tell_peers(self, stream: DampedStream, residual: list[float], time: float) -> None:
         if not stream.is_hub:
             super().tell_peers(stream, residual, time)
             return
@@ -112,7 +121,7 @@ class BoundedTable(Table):
                 end.spoken = end.last
                 _become_hub(end)
 
-    def _forget_stream(self, stream: Stream) -> None:
+    def _forget_stream(self, stream: DampedStream) -> None:
         for link in list(stream.links):
             self._forget_link(link)
         del self.streams[stream.key]
@@ -124,7 +133,7 @@ class BoundedTable(Table):
             link.ends[1 - side].hub_links.pop(link, None)
 
 
-def _become_hub(hub: Stream) -> None:
+def _become_hub(hub: DampedStream) -> None:
     for link in hub.links:
         near = link.side(hub)
         if link.ends[1 - near] is not hub:
@@ -139,7 +148,7 @@ def _note(link: Link, side: int) -> None:
 
 
 def _account(link: Link, side: int) -> None:
-    """All packets of one end that the link has missed, in one step."""
+    """Apply all packets of one end that the link has missed, in one step."""
     hub = link.ends[side]
     since = factors_of(hub.spoken - link.then[side])
     link.decay(hub.spoken)
@@ -160,7 +169,7 @@ class PythonEngine:
         self._bounded = bounded
         self._clock, self._offset = -math.inf, 0.0
         self._mac_ip, self._hosts, self._jitter, self._sockets = self._tables = [
-            BoundedTable(max_streams, max_links, horizon) if bounded else Table() for _ in range(4)
+            BoundedTable(max_streams, max_links, horizon) if bounded else StatisticsTable() for _ in range(4)
         ]
 
     def update(self, columns: Columns, out: npt.NDArray[np.float64]) -> None:
@@ -186,7 +195,7 @@ class PythonEngine:
         return [value for group in groups for scale in group for value in scale]
 
     def counts(self) -> tuple[int, int, int, int]:
-        """Streams, links, streams forgotten for age, cells forgotten for lack of room."""
+        """Streams, links, streams dropped for age, cells dropped for lack of room."""
         streams, links = sum(len(t.streams) for t in self._tables), sum(len(t.links) for t in self._tables)
         return (
             streams,

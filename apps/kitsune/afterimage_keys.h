@@ -20,6 +20,8 @@ typedef struct {
     const int32_t *tcp_sport, *tcp_dport, *udp_sport, *udp_dport, *icmp_type;
 } Columns;
 
+#define COLUMNS (sizeof(Columns) / sizeof(void *))
+
 typedef struct {
     uint8_t length;
     char text[KEY_BYTES - 1];

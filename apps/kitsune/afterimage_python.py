@@ -1,7 +1,7 @@
 """AfterImage in plain Python: the kernel's twin for machines without a C compiler.
 
 Reference mode does at once, packet by packet, what the kernel defers; bounded mode (`afterimage_bounded`)
-takes the kernel's steps in the kernel's order.  Both give the kernel's bits, which tests hold with
+takes the kernel's steps in the kernel's order.  Both give bit-identical results, which tests check with
 random traffic.
 """
 
@@ -25,7 +25,7 @@ def damp(values: list[float], factors: list[float]) -> None:
         values[k] *= factors[k]
 
 
-class Stream:
+class DampedStream:
     """Damped sums of one key's packets, at five scales."""
 
     def __init__(self, key: str, time: float) -> None:
@@ -67,9 +67,9 @@ class Stream:
 
 
 class Link:
-    """What two streams have in common; `ends[0]` spoke first."""
+    """Joint statistics of two streams; `ends[0]` sent first."""
 
-    def __init__(self, first: Stream, second: Stream, time: float) -> None:
+    def __init__(self, first: DampedStream, second: DampedStream, time: float) -> None:
         self.ends = (first, second)
         self.last = time
         self.cf3 = [0.0] * len(LAMBDAS)
@@ -81,8 +81,8 @@ class Link:
         self.count_then: list[list[float]] = [[], []]
         self.residuals_then: list[list[float]] = [[], []]
 
-    def side(self, stream: Stream) -> int:
-        """Which end a stream is."""
+    def side(self, stream: DampedStream) -> int:
+        """Index of a stream in `ends`."""
         return 0 if self.ends[0] is stream else 1
 
     def decay(self, time: float) -> None:
@@ -112,16 +112,16 @@ class Link:
         return rows
 
 
-class Table:
+class StatisticsTable:
     """Streams by key and links by pair."""
 
     def __init__(self) -> None:
-        self.streams: OrderedDict[str, Stream] = OrderedDict()
+        self.streams: OrderedDict[str, DampedStream] = OrderedDict()
         self.links: OrderedDict[tuple[str, str], Link] = OrderedDict()
         self.forgotten_idle = self.forgotten_full = 0
 
     def packet(self, key: str, value: float, time: float, *, jitter: bool = False) -> list[list[float]]:
-        """A packet of a stream without links; in a jitter table its value is the gap before it."""
+        """A packet of a stream without links; in a jitter table its value is the time since the last packet."""
         self.begin(time)
         stream = self.enter(key, time)
         if jitter:
@@ -146,16 +146,16 @@ class Table:
         return [first + second for first, second in zip(own, link.features(), strict=True)]
 
     def begin(self, time: float) -> None:
-        """Bounded mode makes room here."""
+        """Hook: bounded mode makes room here."""
 
-    def prepare(self, stream: Stream) -> None:
+    def prepare(self, stream: DampedStream) -> None:
         """Bounded mode catches up with what the stream missed."""
 
-    def prepare_link(self, link: Link, stream: Stream, far: Stream) -> None:
+    def prepare_link(self, link: Link, stream: DampedStream, far: DampedStream) -> None:
         """Bounded mode catches up with what the link missed."""
 
-    def tell_peers(self, stream: Stream, residual: list[float], time: float) -> None:
-        """All links of the sender see its packet."""
+    def tell_peers(self, stream: DampedStream, residual: list[float], time: float) -> None:
+        """Update all links of the sender with its packet."""
         for link in stream.links:
             near = link.side(stream)
             far = link.ends[1 - near]
@@ -164,11 +164,11 @@ class Table:
                 far.decay(time)
                 link.update(near, residual, time)
 
-    def enter(self, key: str, time: float) -> Stream:
-        """The stream of a key, new if need be."""
+    def enter(self, key: str, time: float) -> DampedStream:
+        """The stream of a key, created if it is new."""
         stream = self.streams.get(key)
         if stream is None:
-            stream = self.streams[key] = Stream(key, time)
+            stream = self.streams[key] = DampedStream(key, time)
         return stream
 
     def renew(self, pair: tuple[str, str]) -> None:
@@ -179,14 +179,14 @@ class Table:
         for end in link.ends:
             end.links[link] = None
 
-    def _tell(self, stream: Stream, residual: list[float], time: float) -> None:
+    def _tell(self, stream: DampedStream, residual: list[float], time: float) -> None:
         self_link = self.links.get((stream.key, stream.key))
         if self_link is not None:  # listed twice, as published
             self_link.update(0, residual, time)
             self_link.update(0, residual, time)
         self.tell_peers(stream, residual, time)
 
-    def _addressed(self, stream: Stream, peer: Stream, time: float) -> Link:
+    def _addressed(self, stream: DampedStream, peer: DampedStream, time: float) -> Link:
         pair = pair_of(stream, peer)
         link = self.links.get(pair)
         if stream is peer and stream.links:
@@ -201,6 +201,6 @@ class Table:
         return link
 
 
-def pair_of(first: Stream, second: Stream) -> tuple[str, str]:
-    """The key of a link, whoever spoke first."""
+def pair_of(first: DampedStream, second: DampedStream) -> tuple[str, str]:
+    """The key of a link, the same for both directions."""
     return min(first.key, second.key), max(first.key, second.key)

@@ -1,32 +1,39 @@
-"""Who is blocked: answers to a blocked sender are no offence of those who answer.
+"""Blocked senders: hosts that answer a blocked sender are not held responsible for the answers.
 
-The switch makes no copies of a blocked sender's packets, so a conversation that he begins is not seen
-here.  Where his packets reach the other side all the same (in a replay the capture holds the answers
+The switch makes no copies of a blocked sender's packets, so a conversation that it begins is not seen
+here.  If its packets reach the other side all the same (in a replay the capture holds the answers
 to them; on a network, those that were under way), a SYN-ACK, RST, ICMP error or UDP answer would look
-as if nobody had asked for it.
+unsolicited.
 """
 
 from apps.messages import Decision
 
 Address = tuple[int, int, int]
+MOST = 65_536
+"""Most blocks that are remembered; beyond that the oldest is forgotten."""
 
 
 class Blocked:
-    """Blocks in force, as the firewall's decisions say.  Pure."""
+    """The blocks in force according to the firewall's decisions.  Pure."""
 
     def __init__(self) -> None:
         self._by_id: dict[str, tuple[str, str]] = {}
         self._targets: set[tuple[str, str]] = set()
 
     def decide(self, decision: Decision) -> None:
-        """Take a decision of the firewall; a dry run blocks nobody."""
+        """Apply a decision of the firewall; dry runs are ignored."""
         if decision.dry_run or decision.action not in {"block", "unblock"}:
             return
         if decision.action == "block":
             self._by_id[decision.id] = (decision.switch, decision.target.address)
+            if len(self._by_id) > MOST:
+                del self._by_id[next(iter(self._by_id))]
         else:
             self._by_id.pop(decision.id, None)
         self._targets = set(self._by_id.values())
+
+    def __len__(self) -> int:
+        return len(self._by_id)
 
     def __bool__(self) -> bool:
         return bool(self._targets)

@@ -1,8 +1,8 @@
-"""Who began a conversation: replies are charged to him, so that a flood's victim is not blamed.
+"""The initiator of a conversation is responsible for the replies, so that a flood's victim is not blocked.
 
 A reply is a TCP SYN-ACK or RST, an ICMP error, or a UDP packet back, soon after the initiator's last
-packet.  An initiator pays for at most `REPLIES_PER_PACKET` replies per packet of his
-own; more than that is a flood by whoever sends it.
+packet.  An initiator is responsible for at most `REPLIES_PER_PACKET` replies per packet of its
+own; further replies are a flood by the host that sends them.
 """
 
 from typing import Final
@@ -21,7 +21,7 @@ Key = tuple[bool, Address, int, int]
 
 
 def is_tcp_reply(tcp_flags: int) -> bool:
-    """SYN-ACK or RST: nobody begins a conversation with these."""
+    """Whether a packet is a SYN-ACK or RST, which never begin a conversation."""
     return bool(tcp_flags & _RST) or tcp_flags & (_SYN | _ACK) == _SYN | _ACK
 
 
@@ -35,15 +35,15 @@ class _Entry:
 
 
 class Conversations:
-    """Remembers for some seconds who sent from which port to which; two generations bound it."""
+    """Remembers recent initiators by addresses and ports; two generations bound its memory."""
 
     def __init__(self) -> None:
         self._young: dict[Key, _Entry] = {}
         self._old: dict[Key, _Entry] = {}
         self._turned = 0.0
 
-    def payer(self, sender: int, time: float, key: Key, reverse: Key, tcp_flags: int) -> int:
-        """Who pays for a TCP or UDP packet that `sender` sent under `key` at `time` (seconds)."""
+    def responsible(self, sender: int, time: float, key: Key, reverse: Key, tcp_flags: int) -> int:
+        """The sender held responsible for a TCP or UDP packet sent by `sender` under `key` at `time` (seconds)."""
         is_tcp = key[0]
         begun = None if is_tcp and tcp_flags & (_SYN | _ACK) == _SYN else self._find(reverse, time)
         reply = not is_tcp or is_tcp_reply(tcp_flags)
@@ -54,7 +54,7 @@ class Conversations:
         return _charge(begun, sender) if reply else sender
 
     def payer_of_error(self, sender: int, time: float, key: Key) -> int:
-        """Who pays for an ICMP error that quotes a packet sent under `key`."""
+        """The sender held responsible for an ICMP error that quotes a packet sent under `key`."""
         begun = self._find(key, time)
         return sender if begun is None else _charge(begun, sender)
 

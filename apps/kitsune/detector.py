@@ -1,4 +1,4 @@
-"""The whole of Kitsune without I/O: a record batch goes in, scores and alerts come out."""
+"""Kitsune without I/O: takes record batches, returns scores and alerts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from apps.kitsune.kitnet import KitNet
 from apps.kitsune.model_file import Model, NotAModelError, save_model
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.reasons import Explanation, reason
-from apps.kitsune.senders import HotSecond, Senders
+from apps.kitsune.senders import AnomalousSecond, Senders
 from apps.kitsune.threshold import Benign, Calibration
 from apps.kitsune.training_check import TrainingCheck
 from apps.messages import Alert, Sender
@@ -33,14 +33,14 @@ class DetectorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     max_ae: int = 10
     """Most features of one autoencoder."""
     mode: Mode = "bounded"
-    """`reference`: exact as published, state and cost grow; `bounded`: both have a ceiling."""
+    """`reference`: exact as published, state and cost grow; `bounded`: both are limited."""
     threshold: float = 1.0
-    """Packets that score this much or more are over the line (1.0 is the paper's)."""
+    """Packets that score this much or more are above the threshold (1.0 is the paper's)."""
     false_alarms_per_hour: float = 0.0
-    """Greater than 0: once enough packets are scored, the line moves to where so many benign packets an
-    hour would cross it; until then `threshold` holds."""
+    """Greater than 0: once enough packets are scored, the threshold is set so that this many benign packets an
+    hour are expected above it; until then `threshold` applies."""
     calibration_packets: int = 10_000
-    """Scored packets after training, taken for benign, from which benign scores are learnt."""
+    """Scored packets after training that are assumed to be benign and set the threshold."""
     max_streams: int = MAX_STREAMS
     """Bounded mode: most streams in each of four tables."""
     max_links: int = MAX_LINKS
@@ -69,7 +69,7 @@ class DetectorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     @property
     def scale_limit(self) -> float:
-        """`clip` where it applies."""
+        """`clip` in bounded mode; 0 (none) in reference mode."""
         return self.clip if self.mode == "bounded" else 0.0
 
 
@@ -78,7 +78,7 @@ _DEFAULTS: Final = DetectorSettings()
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """What became of a batch, row by row."""
+    """The result for a batch, row by row."""
 
     scores: npt.NDArray[np.float64]
     """RMSE of the output layer; 0.0 for training packets."""
@@ -87,9 +87,9 @@ class Scored:
     features: npt.NDArray[np.float64]
     """The 100 features of each packet."""
     over: int
-    """Packets over the line."""
+    """Packets above the threshold."""
     line: float
-    """The line that was in force."""
+    """The threshold that was applied."""
 
 
 class Detector:
@@ -168,7 +168,7 @@ class Detector:
         return Scored(scores, state, features, over, line), [self._alert(second) for second in hot]
 
     def notes(self) -> dict[str, Any]:
-        """What a model file keeps beside the network."""
+        """The data that a model file keeps besides the network."""
         benign = self.calibration.benign
         return {
             "senders": self.senders.to_state(),
@@ -207,10 +207,10 @@ class Detector:
         return self.settings.threshold
 
     def finish(self) -> list[Alert]:
-        """No more packets: alerts of the second that was still open."""
+        """End of the packets: returns the alerts of the second that was still open."""
         return [self._alert(second) for second in self.senders.finish()]
 
-    def _alert(self, hot: HotSecond) -> Alert:
+    def _alert(self, hot: AnomalousSecond) -> Alert:
         switch, port, mac, address = hot.record.identity
         sender = Sender(switch=switch, port=port, mac=mac_text(mac), ip=ip_text(*address))
         return Alert(
@@ -221,7 +221,7 @@ class Detector:
             packets=hot.tally.packets,
             over=hot.tally.over,
             peak_score=hot.tally.peak,
-            hot_seconds=hot.hot_seconds,
+            anomalous_seconds=hot.anomalous_seconds,
             rate=float(hot.tally.packets),
             training_rate=float(hot.record.training_rate),
             mac_addresses=self.senders.roles.addresses(mac),

@@ -1,4 +1,4 @@
-"""Which features share an autoencoder: correlated ones are clustered, at most `max_size` together."""
+"""The feature map: correlated features share an autoencoder, at most `max_size` together."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ class FeatureMapper:
         """Correlation distance between all pairs of features, 0 to 2."""
         roots = np.sqrt(self._squares)
         scale = np.outer(roots, roots)
-        scale[scale == 0] = _TINY  # a constant feature is like no other
+        scale[scale == 0] = _TINY  # a constant feature correlates with no other
         distance = 1 - self._products / scale
         distance[distance < 0] = 0
         return np.asarray(distance)

@@ -1,4 +1,4 @@
-"""Finds the C kernel, if it was built; without it the Python twins do the same work slowly."""
+"""Loads the C kernel if it was built; otherwise the slower Python twins are used."""
 
 import functools
 import warnings
@@ -16,8 +16,8 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 1
-"""Of the interface; the library says which it has."""
+VERSION: Final = 2
+"""Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
 
@@ -40,7 +40,7 @@ PACKET_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
     ("udp_dport", "int32_t", "i4"),
     ("icmp_type", "int32_t", "i4"),
 )
-"""Columns that features are made of: name, C type, numpy type. `time` is in seconds."""
+"""Columns from which features are computed: name, C type, numpy type. `time` is in seconds."""
 
 _DECLARATIONS: Final = (
     "typedef struct {"
@@ -50,23 +50,27 @@ _DECLARATIONS: Final = (
     typedef struct AfterImage AfterImage;
     AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon);
     void afterimage_free(AfterImage *);
-    int afterimage_update(AfterImage *, const Columns *, long n, double *out);
+    int afterimage_update(AfterImage *, const Columns *, const long *lengths, long n, double *out, long room);
     void afterimage_counts(const AfterImage *, uint64_t *out);
     typedef struct {
         int32_t count, visible, hidden;
         const int32_t *visible_of, *hidden_of, *input;
         double *weights, *hidden_bias, *visible_bias, *low, *high;
     } Layer;
-    void kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width,
-                      double rate, double *scratch);
-    void kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width,
-                      double clip, double *scratch, double *errors, double *scores);
+    int kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width,
+                     double rate, double *scratch);
+    int kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width,
+                     double clip, double *scratch, double *errors, double *scores);
     """
 )
 
 
+class ColumnError(ValueError):
+    """A column of a batch is missing, has another length, or holds no numbers."""
+
+
 class Kernel(NamedTuple):
-    """The loaded library and the cffi instance that speaks to it."""
+    """The loaded library and its cffi instance."""
 
     ffi: Any
     lib: Any
@@ -98,5 +102,10 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
 
 
 def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:
-    """The array as the kernel reads it; copied only when type or layout differ."""
+    """The array as the kernel reads it; copied only when type or layout differ.
+
+    Raises `ColumnError` for what does not hold numbers.
+    """
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufb":
+        raise ColumnError(f"a column holds {getattr(array, 'dtype', type(array).__name__)}, not numbers")
     return np.ascontiguousarray(array, dtype=kind)

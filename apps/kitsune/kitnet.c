@@ -110,14 +110,42 @@ static void train_layer(Layer *layer, const double *input, double rate, double *
     }
 }
 
-/* One pass of gradient descent over n rows, in order; scratch: ensemble count + 2 * (visible + hidden). */
-void kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width, double rate, double *scratch)
+/* Whether no index of the layer leaves its arrays, or a row of `width` numbers. */
+static int is_sound(const Layer *layer, long width)
 {
+    if (layer->count < 1 || layer->visible < 1 || layer->hidden < 1)
+        return 0;
+    for (int a = 0; a < layer->count; a++) {
+        if (layer->visible_of[a] < 0 || layer->visible_of[a] > layer->visible)
+            return 0;
+        if (layer->hidden_of[a] < 0 || layer->hidden_of[a] > layer->hidden)
+            return 0;
+        for (int v = 0; v < layer->visible_of[a]; v++) {
+            int32_t at = layer->input[(long)a * layer->visible + v];
+            if (at < 0 || at >= width)
+                return 0;
+        }
+    }
+    return 1;
+}
+
+static int are_sound(const Layer *ensemble, const Layer *output, long n, long width)
+{
+    return n >= 0 && is_sound(ensemble, width) && output->count == 1 && is_sound(output, ensemble->count);
+}
+
+/* One pass of gradient descent over n rows, in order; scratch: ensemble count + 2 * (visible + hidden).
+ * -2, and nothing done, for layers that do not fit each other or the rows. */
+int kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width, double rate, double *scratch)
+{
+    if (!are_sound(ensemble, output, n, width))
+        return -2;
     double error, *errors = scratch + 2 * (output->visible + output->hidden + ensemble->visible + ensemble->hidden);
     for (long i = 0; i < n; i++) {
         train_layer(ensemble, x + i * width, rate, scratch, errors);
         train_layer(output, errors, rate, scratch, &error);
     }
+    return 0;
 }
 
 /* ---- scoring: LANES packets at a time, so that the compiler can use vector registers ---- */
@@ -201,10 +229,12 @@ static void rmse_lanes(const Layer *layer, int a, double x[][LANES], double y[][
 }
 
 /* RMSE of each autoencoder and of the output layer for n rows, a multiple of LANES; clip > 0 limits scaled
- * inputs.  Scratch: LANES * (visible + hidden) of the wider layer. */
-void kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width, double clip,
+ * inputs.  Scratch: LANES * (visible + hidden) of the wider layer.  -2 as in `kitnet_train`. */
+int kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width, double clip,
                   double *scratch, double *errors, double *scores)
 {
+    if (!are_sound(ensemble, output, n, width) || n % LANES)
+        return -2;
     int visible = ensemble->visible > output->visible ? ensemble->visible : output->visible;
     double(*lanes)[LANES] = (double(*)[LANES])scratch, (*hidden)[LANES] = lanes + visible;
     for (long i = 0; i < n; i += LANES) {
@@ -216,4 +246,5 @@ void kitnet_score(const Layer *ensemble, const Layer *output, const double *x, l
         load(output, 0, row_errors, ensemble->count, clip, lanes);
         rmse_lanes(output, 0, lanes, hidden, scores + i, 1);
     }
+    return 0;
 }

@@ -2,7 +2,7 @@
 
 Training sees every packet once: first a map of features is learnt (`fm_grace` + 1 packets), then the
 autoencoders (`ad_grace` packets), then packets are scored.  Source: Mirsky et al., NDSS 2018, and
-its published implementation, whose numbers are met within 1e-12 given equal features.
+its published implementation; given equal features, scores agree within 1e-12.
 """
 
 import math
@@ -19,6 +19,7 @@ from apps.kitsune.kernel import Kernel, contiguous
 _Array = npt.NDArray[np.float64]
 _SEED = 1234
 _BLOCK = 1024
+_UNSOUND = "KitNET: the layers do not fit each other or the features; train again"
 _LANES = 16
 """Rows that the kernel scores at a time."""
 
@@ -28,7 +29,7 @@ class Layer:
     """Autoencoders of one layer, padded to a common size; `mask_*` are 1 where a unit exists."""
 
     inputs: tuple[tuple[int, ...], ...]
-    """For each autoencoder the numbers of its inputs."""
+    """Feature numbers of each autoencoder's inputs."""
     weights: _Array
     hidden_bias: _Array
     visible_bias: _Array
@@ -166,7 +167,8 @@ class KitNet:
         return np.concatenate([np.zeros(taught), scores]), errors
 
     def learn(self, features: _Array) -> None:
-        """Trains on rows of features, in order."""
+        """Trains on rows of features, in order; raises `ValueError` for rows of another width."""
+        self._check_width(features)
         if not self.feature_map:
             share = features[: self.fm_grace + 1 - self._mapper.packets]
             self._mapper.learn(share)
@@ -184,6 +186,7 @@ class KitNet:
 
     def score(self, features: _Array) -> tuple[_Array, _Array]:
         """Scores rows of features without learning; needs a finished feature map."""
+        self._check_width(features)
         if not len(features):
             return np.zeros(0), np.zeros((0, len(self.feature_map)))
         ensemble, output = self._layers()
@@ -195,6 +198,10 @@ class KitNet:
         ]
         errors = np.concatenate(blocks)
         return output.errors(errors, self.clip)[:, 0], errors
+
+    def _check_width(self, features: _Array) -> None:
+        if features.ndim != 2 or features.shape[1] != self.width:
+            raise ValueError(f"features have the shape {features.shape}; give (packets, {self.width})")
 
     def _layers(self) -> tuple[Layer, Layer]:
         if self.ensemble is None or self.output is None:
@@ -219,9 +226,9 @@ class KitNet:
         scratch = self._scratch()
         layers = [_c_layer(kernel, layer) for layer in (ensemble, output)]
         rows = kernel.pointer("double", features)
-        kernel.lib.kitnet_train(
-            *layers, rows, len(features), self.width, self.learning_rate, kernel.pointer("double", scratch)
-        )
+        work = kernel.pointer("double", scratch)
+        if kernel.lib.kitnet_train(*layers, rows, len(features), self.width, self.learning_rate, work):
+            raise ValueError(_UNSOUND)
 
     def _score_in_kernel(self, kernel: Kernel, features: _Array) -> tuple[_Array, _Array]:
         layers = [_c_layer(kernel, layer) for layer in self._layers()]
@@ -235,7 +242,8 @@ class KitNet:
         rows, work, rmse, out = (
             kernel.pointer("double", array) for array in (features, scratch, errors, scores)
         )
-        kernel.lib.kitnet_score(*layers, rows, len(features), self.width, self.clip, work, rmse, out)
+        if kernel.lib.kitnet_score(*layers, rows, len(features), self.width, self.clip, work, rmse, out):
+            raise ValueError(_UNSOUND)
         return scores[:count], errors[:count]
 
     def _scratch(self) -> _Array:

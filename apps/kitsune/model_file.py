@@ -4,12 +4,13 @@
     ├── NotAModelError      foreign, damaged or truncated
     └── WrongVersionError   written by a version whose files this one does not read
 
-AfterImage's state is not part of it: the statistics of a capture begin anew, as they did in training.
+AfterImage's state is not part of it: the statistics of a capture start empty, as they did in training.
 """
 
 import io
 import json
 import os
+import struct
 import tokenize
 import zipfile
 import zlib
@@ -43,7 +44,7 @@ class WrongVersionError(ModelFileError):
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What a file holds."""
+    """The content of a model file."""
 
     network: KitNet
     notes: dict[str, Any]
@@ -97,8 +98,12 @@ _DAMAGE = (
     tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
+    struct.error,
+    RuntimeError,
+    MemoryError,
+    OverflowError,
 )
-"""What numpy's reader raises on damaged bytes; array headers are Python literals to it."""
+"""Errors of numpy's reader on damaged files; it parses array headers as Python literals."""
 
 
 def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:

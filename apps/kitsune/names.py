@@ -8,13 +8,13 @@ _TEXTS = 65_536
 
 @functools.lru_cache(maxsize=_TEXTS)
 def mac_text(mac: int) -> str:
-    """Lower case, colons."""
+    """A MAC address in lower case with colons."""
     return mac.to_bytes(6, "big").hex(":")
 
 
 @functools.lru_cache(maxsize=_TEXTS)
 def ip_text(version: int, hi: int, lo: int) -> str:
-    """IPv4 dotted, IPv6 compressed, empty for no address."""
+    """An IP address: IPv4 dotted, IPv6 compressed, empty for none."""
     if version == 4:
         return _dotted(lo)
     return _compressed(hi << 64 | lo) if version == 6 else ""

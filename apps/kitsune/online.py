@@ -1,4 +1,4 @@
-"""Kitsune for Python programs, in the manner of online-learning libraries.
+"""Kitsune for Python programs, with the interface of online-learning libraries.
 
 >>> from apps.kitsune.online import Kitsune
 >>> from apps.packets import read_frames
@@ -29,20 +29,28 @@ _KINDS: Final = {name: kind for name, _, kind in PACKET_FIELDS if name != "time"
 
 
 class Kitsune:
-    """Learns from and scores packets, one by one or in batches.
+    """Learn from packets and score them, one by one or in batches.
 
-    A packet is a mapping of `apps.packets.PACKET_COLUMNS` (missing columns count as absent); a batch
-    holds arrays of equal length.  Every packet changes the statistics that later packets are seen
-    against, so give each packet to `learn_*` or to `score_*`, in the order of capture; the same
-    object given to `score_one` and right after to `learn_one` counts once.
+    A packet is a mapping with the columns of `apps.packets.PACKET_COLUMNS`; missing columns count as absent
+    headers. A batch holds arrays of equal length. Every packet changes the statistics against which later
+    packets are scored, so pass each packet either to `learn_*` or to `score_*`, in capture order. A packet
+    object passed to `score_one` and then immediately to `learn_one` is counted once.
 
     Args:
-        fm_grace, ad_grace: packets for the feature map and for the autoencoders.
-        max_ae: most features per autoencoder.
-        mode: "reference" or "bounded", see `AfterImage`.
-        clip: limit of scaled features when scoring, 0 = none as published.
+        fm_grace: packets from which the feature map is learnt, at least 1.
+        ad_grace: packets on which the autoencoders are trained, at least 1.
+        max_ae: largest number of features per autoencoder.
+        mode: "reference" is exact as published, and its memory grows with the traffic; "bounded" limits it.
+        max_streams: bounded mode: most streams in each of four tables, at least 2.
+        max_links: bounded mode: most links in each of two tables, at least 1.
+        horizon: bounded mode: seconds of capture time after which an idle stream is forgotten.
+        clip: limit for scaled features while scoring; 0 means none, as published.
 
-    Source: Mirsky et al., "Kitsune", NDSS 2018.
+    Raises:
+        ValueError: a number is out of bounds.
+
+    Reference:
+        Mirsky et al., Kitsune, NDSS 2018.
     """
 
     def __init__(
@@ -67,42 +75,103 @@ class Kitsune:
 
     @property
     def is_trained(self) -> bool:
-        """Whether the packets of `fm_grace` and `ad_grace` have been learnt."""
+        """Whether fm_grace + ad_grace + 1 packets have been learnt, as many as the published implementation
+        takes."""
         return self.network.is_trained
 
     def features(self, batch: Columns) -> npt.NDArray[np.float64]:
-        """The 100 features of each packet, float64, shape (packets, 100); changes the statistics."""
+        """Compute the features of packets, which updates the statistics.
+
+        Args:
+            batch: n packets, columns of equal length in capture order.
+
+        Returns:
+            The 100 features of each packet, float64, shape (n, 100).
+
+        Raises:
+            ColumnError: a column is missing, has another length or holds no numbers.
+            MemoryError: the statistics cannot grow; this object cannot be used any more.
+        """
         return self._afterimage.update(batch)
 
     def learn_one(self, packet: Mapping[str, int]) -> None:
-        """Learns one packet; raises `ValueError` when a feature is not finite as the map is made."""
+        """Learn from one packet.
+
+        Args:
+            packet: column name to number.
+
+        Raises:
+            ValueError: a feature was not finite when the feature map was due.
+        """
         scored, self._scored = self._scored, None
         known = scored is not None and scored[0] is packet
         self.network.learn(scored[1] if scored is not None and known else self._row(packet))
 
     def learn_many(self, batch: Columns) -> None:
-        """Learns packets in order."""
+        """Learn from packets, in order.
+
+        Args:
+            batch: n packets, columns of equal length in capture order.
+
+        Raises:
+            ColumnError: a column is missing, has another length or holds no numbers.
+            ValueError: a feature was not finite when the feature map was due.
+        """
         self.network.learn(self.features(batch))
 
     def score_one(self, packet: Mapping[str, int]) -> float:
-        """RMSE of one packet, 0 or greater, without bound; 1.0 is the paper's line.
+        """Score one packet.
 
-        Raises `ValueError` until the feature map has been learnt.
+        Args:
+            packet: column name to number.
+
+        Returns:
+            RMSE of the output layer: 0 or greater, without upper bound. The paper's threshold is 1.0.
+
+        Raises:
+            ValueError: the feature map has not been learnt yet.
         """
         row = self._row(packet)
         self._scored = packet, row
         return float(self.network.score(row)[0][0])
 
     def score_many(self, batch: Columns) -> npt.NDArray[np.float64]:
-        """RMSE of each packet, float64, shape (packets,); raises as `score_one`."""
+        """Score packets, in order.
+
+        Args:
+            batch: n packets, columns of equal length in capture order.
+
+        Returns:
+            RMSE of the output layer for each packet, float64, shape (n,).
+
+        Raises:
+            ColumnError: a column is missing, has another length or holds no numbers.
+            ValueError: the feature map has not been learnt yet.
+        """
         return self.network.score(self.features(batch))[0]
 
     def save(self, path: Path, **notes: Any) -> None:
-        """Writes the trained model; raises `ModelFileError`."""
+        """Write the trained model to a file.
+
+        Args:
+            path: file to write; an existing one is replaced.
+            notes: values to keep beside the network, fit for JSON.
+
+        Raises:
+            ModelFileError: training is not complete, or the file cannot be written.
+        """
         save_model(path, self.network, notes)
 
     def load(self, path: Path) -> None:
-        """Takes a saved model; raises `ModelFileError`.  The statistics of packets begin anew."""
+        """Replace the network by a saved model.  The packet statistics are not part of it and stay as they
+        are.
+
+        Args:
+            path: a file written by `save`.
+
+        Raises:
+            ModelFileError: the file cannot be read, is damaged or has another version.
+        """
         self.network = load_model(path, clip=self._clip, kernel=load_kernel()).network
 
     def _row(self, packet: Mapping[str, int]) -> npt.NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Why a second was hot, in words."""
+"""The reason of an alert as text."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -9,7 +9,7 @@ import numpy.typing as npt
 from apps.kitsune.kernel import LAMBDAS
 from apps.kitsune.kitnet import KitNet
 from apps.kitsune.names import ip_text, mac_text
-from apps.kitsune.senders import HotSecond
+from apps.kitsune.senders import AnomalousSecond
 
 _GROUPS: Final = (
     (0, 3, "packets from this MAC and address"),
@@ -28,7 +28,7 @@ _STATISTICS: Final = (
 )
 _GAP_STATISTICS: Final = ("number", "mean", "spread")
 _NOTABLE: Final = 2.0
-"""A rate or fan-out this many times its training maximum is worth a word."""
+"""A rate or fan-out of at least this many times its training maximum is mentioned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +40,15 @@ class Explanation:
 
 
 def feature_words(feature: int) -> str:
-    """What a feature number measures, for people."""
+    """A feature described in words."""
     start, per_scale, group = max(entry for entry in _GROUPS if entry[0] <= feature)
     scale, statistic = divmod(feature - start, per_scale)
     names = _GAP_STATISTICS if start == 50 else _STATISTICS
     return f"{names[statistic]} of {group} over {round(1 / LAMBDAS[scale], 1):g} s"
 
 
-def reason(hot: HotSecond, model: KitNet, line: float) -> str:
-    """One sentence or more: what the sender did, and which autoencoders noticed by which features."""
+def reason(hot: AnomalousSecond, model: KitNet, line: float) -> str:
+    """What the sender did, and the autoencoders and features with the highest errors."""
     tally, record = hot.tally, hot.record
     _, _, mac, address = record.identity
     who = ip_text(*address) or mac_text(mac)
@@ -65,7 +65,8 @@ def reason(hot: HotSecond, model: KitNet, line: float) -> str:
 
 def _comparisons(who: str, packets: int, trained_packets: int, hosts: int, trained_hosts: int) -> list[str]:
     if not trained_packets:
-        return [f"{who} was never seen in training and sends {packets} packets/s to {hosts} hosts"]
+        towards = {0: "", 1: " to 1 host"}.get(hosts, f" to {hosts} hosts")
+        return [f"{who} was never seen in training and sends {packets} packets/s{towards}"]
     parts = []
     if trained_hosts and hosts >= _NOTABLE * trained_hosts:
         parts.append(f"{who} sends to {hosts / trained_hosts:.0f} times more hosts than in training")

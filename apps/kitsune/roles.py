@@ -1,6 +1,6 @@
-"""Which senders serve the house: gateways, DNS, DHCP and multicast speakers alert but are not blocked.
+"""Roles of senders: gateways, DNS, DHCP and multicast speakers alert but are not blocked.
 
-Roles are learnt from the training traffic only, so that an attacker cannot earn one later.
+Roles are learnt from the training traffic only, so that an attacker cannot acquire one later.
 """
 
 import ipaddress
@@ -9,10 +9,10 @@ from typing import Any, Final
 from apps.messages import Role
 
 MOST_ADDRESSES: Final = 1_024
-"""Addresses remembered behind one MAC; counting stops there."""
+"""Most addresses remembered behind one MAC; counting stops there."""
 MOST_MACS: Final = 65_536
 _ROUTED: Final = 3
-"""A MAC from or to which this many addresses outside the house were seen is a gateway."""
+"""A MAC with traffic from or to this many addresses outside the local network is a gateway."""
 _DNS, _DHCP = 53, 67
 _FEW: Final = 4
 
@@ -20,7 +20,7 @@ Address = tuple[int, int, int]
 
 
 class Roles:
-    """Learns roles and which addresses stand behind which MAC."""
+    """Learns roles, and the addresses behind each MAC."""
 
     def __init__(self) -> None:
         self._behind: dict[int, set[Address]] = {}
@@ -38,7 +38,7 @@ class Roles:
     def learn(
         self, address: Address, udp_sport: int, to_mac: int, destination: Address, to_multicast: bool
     ) -> None:
-        """A training packet: what does its sender do, and who carries it further?"""
+        """Learn from a training packet: the role of its sender and of the MAC that forwards it."""
         if destination[0] and not to_multicast:
             _remember(self._towards, to_mac, destination)
         if udp_sport == _DNS and self._serves.get(address) != "dhcp":
@@ -50,7 +50,7 @@ class Roles:
         tally[1] += to_multicast
 
     def close_training(self) -> None:
-        """Training is over: roles are settled."""
+        """End training: roles do not change any more."""
         for mac in self._behind.keys() | self._towards.keys():
             behind = self._behind.get(mac, set())
             routed = behind | self._towards.get(mac, set())
@@ -64,19 +64,19 @@ class Roles:
         self._multicast.clear()
 
     def role(self, mac: int, address: Address) -> Role:
-        """What a sender was in training; an address behind a gateway's MAC but outside is a host."""
+        """A sender's role in training; an outside address behind a gateway's MAC is a host."""
         if address in self._gateway_addresses or (mac in self._gateways and not address[0]):
             return "gateway"
         return self._serves.get(address, "host")
 
     def addresses(self, mac: int) -> int:
-        """How many addresses of one family were seen behind a MAC, link-local ones left out."""
+        """Number of addresses of one family seen behind a MAC, without link-local ones."""
         behind = self._behind.get(mac, set())
         fourth = sum(address[0] == 4 for address in behind)
         return max(fourth, len(behind) - fourth)
 
     def to_state(self) -> dict[str, Any]:
-        """What training taught, as plain values."""
+        """The learnt roles as plain values."""
         return {
             "behind": [[mac, sorted(map(list, addresses))] for mac, addresses in self._behind.items()],
             "serves": [[list(address), role] for address, role in self._serves.items()],
@@ -116,11 +116,11 @@ def _parsed(address: Address) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
 
 
 def is_link_local(address: Address) -> bool:
-    """Every host has such an address beside its own; unspecified ones count as well."""
+    """Whether an address is link-local or unspecified; every host has one besides its own."""
     parsed = _parsed(address)
     return parsed.is_unspecified or (address[0] == 6 and parsed.is_link_local)
 
 
 def is_inside(address: Address) -> bool:
-    """Private or link-local: an address of the house rather than of the internet."""
+    """Whether an address is private or link-local, and so of the local network."""
     return _parsed(address).is_private

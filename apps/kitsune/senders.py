@@ -1,7 +1,7 @@
-"""Scores become hot seconds of senders.
+"""From scores to anomalous seconds of senders.
 
-A sender is an ingress port, a MAC and an address.  A second of capture time is hot for a sender when
-at least three, and at least half, of the packets charged to him score over the line.
+A sender is an ingress port, a MAC and an address.  A second of capture time is anomalous for a sender when
+at least three, and at least half, of the packets for which it is responsible score above the threshold.
 """
 
 import math
@@ -25,19 +25,19 @@ HOT_PACKETS: Final = 3
 HOT_SHARE: Final = 0.5
 HISTORY_S: Final = 10
 MOST_SENDERS: Final = 131_072
-"""When more have been seen, those unknown to training and quiet for `HISTORY_S` are forgotten."""
+"""Beyond this number, senders unknown to training and silent for `HISTORY_S` are forgotten."""
 _BACKWARDS_S: Final = 10
 _GROUP_BIT: Final = 1 << 40
 
 Identity = tuple[str, int, int, Address]
 """Switch, ingress port, MAC, address."""
 Evidence = Callable[[int], Any]
-"""Given a row of the batch: what explains its score."""
+"""Row of the batch to the data that explain its score."""
 
 
 @dataclass(slots=True)
-class Record:
-    """What is known of a sender."""
+class SenderRecord:
+    """The history of a sender."""
 
     identity: Identity
     training_rate: int = 0
@@ -48,7 +48,7 @@ class Record:
 
 @dataclass(slots=True)
 class Tally:
-    """One sender's second."""
+    """The counts of one sender in one second."""
 
     packets: int = 0
     over: int = 0
@@ -59,7 +59,7 @@ class Tally:
     evidence: Any = None
 
     def mark(self, score: float, arrival: int, row: int) -> None:
-        """One more packet over the line."""
+        """One more packet above the threshold."""
         if not self.over:
             self.first_over = arrival
         self.over += 1
@@ -67,13 +67,13 @@ class Tally:
             self.peak, self.peak_row = score, row
 
     def keep(self, evidence: Evidence) -> None:
-        """Takes the peak's evidence out of the batch, which is about to go."""
+        """Copy the peak's evidence, because the batch is about to be released."""
         if self.peak_row >= 0:
             self.evidence, self.peak_row = evidence(self.peak_row), -1
 
 
 class Packet(NamedTuple):
-    """What matters here of one row of a batch."""
+    """The relevant columns of one row of a batch."""
 
     switch: str
     time: float
@@ -93,22 +93,22 @@ class Packet(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class HotSecond:
-    """A sender's second in which too many packets scored over the line."""
+class AnomalousSecond:
+    """A sender's second in which too many packets scored above the threshold."""
 
     second: int
-    record: Record
+    record: SenderRecord
     tally: Tally
-    hot_seconds: int
-    """Hot seconds among the last ten, this one included."""
+    anomalous_seconds: int
+    """Anomalous seconds among the last ten, this one included."""
 
 
 class Senders:
-    """Charges scored packets to senders and closes seconds as capture time passes them."""
+    """Assigns scored packets to responsible senders and closes seconds as capture time passes them."""
 
     def __init__(self, roles: Roles | None = None) -> None:
         self.roles = roles or Roles()
-        self.records: list[Record | None] = []
+        self.records: list[SenderRecord | None] = []
         self.clock_jumps = 0
         self._ids: dict[Identity, int] = {}
         self._free: list[int] = []
@@ -128,23 +128,23 @@ class Senders:
         trained: int,
         line: float,
         evidence: Evidence,
-    ) -> list[HotSecond]:
-        """Takes a batch of which the first `trained` packets were training; returns what became hot."""
-        hot: list[HotSecond] = []
+    ) -> list[AnomalousSecond]:
+        """Takes a batch of which the first `trained` packets were training; returns the seconds that became anomalous."""
+        hot: list[AnomalousSecond] = []
         self._evidence = evidence
         for row, packet in enumerate(_packets(batch, switch)):
             second = int(packet.time)
             if second != self._second:
                 hot += self._turn(second)
             sender = self._sender(packet)
-            payer = self._payer(packet, sender)
-            if payer == sender and self.blocked and self._answers_blocked(packet):
+            responsible = self._responsible(packet, sender)
+            if responsible == sender and self.blocked and self._answers_blocked(packet):
                 continue
-            tally = self._tallies.get(payer)
+            tally = self._tallies.get(responsible)
             if tally is None:
-                tally = self._tallies[payer] = Tally()
+                tally = self._tallies[responsible] = Tally()
             tally.packets += 1
-            if payer == sender:
+            if responsible == sender:
                 tally.destinations.add(packet.destination)
             if row < trained:
                 self.roles.learn(
@@ -160,18 +160,18 @@ class Senders:
             tally.keep(evidence)
         return hot
 
-    def finish(self) -> list[HotSecond]:
+    def finish(self) -> list[AnomalousSecond]:
         """The capture has ended: closes the second that is still open."""
         hot = list(self._close())
         self._second = None
         return hot
 
-    def known(self) -> list[Record]:
+    def known(self) -> list[SenderRecord]:
         """All senders that are remembered."""
         return [record for record in self.records if record is not None]
 
     def to_state(self) -> dict[str, Any]:
-        """What training taught, as plain values."""
+        """The learnt senders as plain values."""
         trained = [record for record in self.known() if record.training_rate]
         return {
             "roles": self.roles.to_state(),
@@ -180,7 +180,7 @@ class Senders:
 
     @classmethod
     def from_state(cls, state: dict[str, Any] | None) -> "Senders":
-        """Senders as a saved model knows them (None: it knows none); training is over.
+        """Senders from a saved model (None: it has none); training is complete.
 
         Raises `KeyError`, `TypeError` or `ValueError` when the state is not one.
         """
@@ -188,7 +188,9 @@ class Senders:
         senders._training = False
         for (switch, port, mac, (version, hi, lo)), rate, destinations in state["records"] if state else ():
             identity = (str(switch), int(port), int(mac), (int(version), int(hi), int(lo)))
-            senders.know(Record(identity, training_rate=int(rate), training_destinations=int(destinations)))
+            senders.know(
+                SenderRecord(identity, training_rate=int(rate), training_destinations=int(destinations))
+            )
         return senders
 
     def _end_training(self) -> None:
@@ -196,22 +198,22 @@ class Senders:
         self._note_rates()
         self.roles.close_training()
 
-    def _turn(self, second: int) -> list[HotSecond]:
+    def _turn(self, second: int) -> list[AnomalousSecond]:
         if self._second is not None and second < self._second:
             if self._second - second <= _BACKWARDS_S:
-                return []  # a late packet counts in the second that is open
+                return []  # a late packet counts towards the open second
             self.clock_jumps += 1
             self._forget_history()
         hot = list(self._close())
         self._second = second
         return hot
 
-    def _close(self) -> Iterator[HotSecond]:
+    def _close(self) -> Iterator[AnomalousSecond]:
         if self._training:
             self._note_rates()
         second = self._second or 0
-        for payer, tally in self._tallies.items():
-            record = self.records[payer]
+        for responsible, tally in self._tallies.items():
+            record = self.records[responsible]
             if record is None:
                 continue
             record.last_second = second
@@ -220,14 +222,14 @@ class Senders:
                 while record.hot[0] <= second - HISTORY_S:
                     record.hot.popleft()
                 tally.keep(self._evidence)
-                yield HotSecond(second, record, tally, len(record.hot))
+                yield AnomalousSecond(second, record, tally, len(record.hot))
         self._tallies = {}
         if len(self._ids) > MOST_SENDERS:
             self._forget(second)
 
     def _note_rates(self) -> None:
-        for payer, tally in self._tallies.items():
-            record = self.records[payer]
+        for responsible, tally in self._tallies.items():
+            record = self.records[responsible]
             if record is not None:
                 record.training_rate = max(record.training_rate, tally.packets)
                 record.training_destinations = max(record.training_destinations, len(tally.destinations))
@@ -240,7 +242,7 @@ class Senders:
                 self._free.append(number)
 
     def _forget_history(self) -> None:
-        """The clock was set back: rates and roles stay, hot seconds do not count any more."""
+        """The clock was set back: keep rates and roles, forget anomalous seconds."""
         for record in self.known():
             record.hot.clear()
 
@@ -248,11 +250,11 @@ class Senders:
         identity = (packet.switch, packet.port, packet.mac, packet.source)
         number = self._ids.get(identity)
         if number is None:
-            number = self.know(Record(identity, last_second=self._second or 0))
+            number = self.know(SenderRecord(identity, last_second=self._second or 0))
         return number
 
-    def know(self, record: Record) -> int:
-        """Takes up a sender, new or from a saved model."""
+    def know(self, record: SenderRecord) -> int:
+        """Add a sender, new or from a saved model."""
         if self._free:
             number = self._free.pop()
             self.records[number] = record
@@ -264,13 +266,13 @@ class Senders:
         return number
 
     def _answers_blocked(self, packet: Packet) -> bool:
-        """An answer to a conversation that could not be seen, because who began it is blocked."""
+        """Whether a packet answers a conversation that was not seen because its initiator is blocked."""
         answer = packet.quoted or packet.udp_sport >= 0 or is_tcp_reply(packet.flags)
         return bool(answer) and self.blocked.covers(
             packet.switch, mac_text(packet.to_mac), ip_text(*packet.destination)
         )
 
-    def _payer(self, packet: Packet, sender: int) -> int:
+    def _responsible(self, packet: Packet, sender: int) -> int:
         if packet.sport < 0:
             return sender
         if packet.quoted:
@@ -278,7 +280,7 @@ class Senders:
             return self._conversations.payer_of_error(sender, packet.time, key)
         key = (packet.is_tcp, packet.source, packet.sport, packet.dport)
         reverse = (packet.is_tcp, packet.destination, packet.dport, packet.sport)
-        return self._conversations.payer(sender, packet.time, key, reverse, packet.flags)
+        return self._conversations.responsible(sender, packet.time, key, reverse, packet.flags)
 
 
 def _packets(batch: Columns, switch: str) -> Iterator[Packet]:
@@ -309,7 +311,7 @@ def _packets(batch: Columns, switch: str) -> Iterator[Packet]:
 
 
 def _addresses(batch: Columns, side: str, is_arp: npt.NDArray[np.bool_]) -> Iterator[Address]:
-    """The IP address of each row, in ARP the one it speaks for."""
+    """The IP address of each row; for ARP the sender or target address in the message."""
     version = np.where(is_arp, 4, batch["ip_version"])
     lo = np.where(is_arp, batch[f"arp_{side}_ip"], batch[f"ip_{side}_lo"])
     return zip(version.tolist(), batch[f"ip_{side}_hi"].tolist(), lo.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""Kitsune as an app: packet batches in, score summaries and alerts out.
+"""Kitsune as an app: receives packet batches, writes scores and alerts.
 
 One instance is active, others stand by: the statistics of a packet depend on all packets before it,
 so instances cannot share one stream without changing scores.
@@ -11,12 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 import due.service
 from apps.kitsune.detector import Detector, DetectorSettings, Scored
-from apps.kitsune.kernel import load_kernel
+from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
-from apps.messages import Alert, Decision
-from due import NO_WAIT, Capability, Engine, Interest, Item
+from apps.messages import Alert, Decision, Intake, sender_of
+from apps.packets import PACKET_COLUMNS, SteadyTime, read_columns
+from due import NO_WAIT, Capability, Engine, Interest, Item, RecordBatch
 
 PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
 BLOCKS: Final = "network.block.firewall.*"
@@ -29,7 +32,30 @@ CAPABILITIES = (
     Capability(ALERT, delivery="reliable", archive="always"),
 )
 
+_USED: Final = {
+    name: PACKET_COLUMNS[name]
+    for name in (
+        *("time_us", "arrival", "port", "quoted", "tcp_flags"),
+        *(name for name, _, _ in PACKET_FIELDS if name != "time"),
+    )
+}
+"""The columns of packets that Kitsune reads."""
+_STEP_US: Final = 86_400_000_000
+"""A longer step of capture time is accepted only after several packets agree."""
+
 _log = logging.getLogger("kitsune")
+
+
+def packets_in(item: Item) -> RecordBatch:
+    """Packets of a switch; raises `MessageError`."""
+    sender_of(item)
+    return read_columns(item.value, _USED, "packets")
+
+
+def decision_in(item: Item) -> Decision:
+    """A block or its end; raises `MessageError`."""
+    sender_of(item)
+    return Decision.from_value(item.value)
 
 
 class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,13 +68,15 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class KitsuneService:
-    """Scores each batch as it comes; a batch that takes long holds back the stream, nothing is dropped."""
+    """Scores each batch on arrival; a slow batch causes back-pressure, and nothing is dropped."""
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
         self._settings = settings
         self._detector = _detector(settings)
         self._told = bool(settings.load_model)
+        self._intake = Intake(_log)
+        self._time = SteadyTime(_STEP_US)
         self._lock = threading.Lock()
         self._packets = 0
         self._alerts = 0
@@ -56,13 +84,14 @@ class KitsuneService:
 
     def start(self) -> None:
         """Subscribes; the engine is initialised."""
+        observe, reading = self._engine.observe, self._intake.reading
         self._subscriptions = [
-            self._engine.observe(BLOCKS).subscribe(self._on_decision),
-            self._engine.observe(PACKETS).subscribe(self._score),
+            observe(BLOCKS).subscribe(reading(BLOCKS, decision_in, self._on_decision)),
+            observe(PACKETS).subscribe(reading(PACKETS, packets_in, self._score)),
         ]
 
     def tick(self) -> None:
-        """Nothing depends on wall time."""
+        """Does nothing: no state depends on wall time."""
 
     def stop(self) -> None:
         """Raises the alerts of the second that is still open."""
@@ -74,7 +103,7 @@ class KitsuneService:
                 self._detector.save(Path(self._settings.save_model))
 
     def health(self) -> dict[str, Any]:
-        """Figures for people and dashboards."""
+        """Counters and settings for metrics and the dashboard."""
         return {
             "packets": self._packets,
             "trained": self._detector.trained,
@@ -83,19 +112,22 @@ class KitsuneService:
             "line": self._detector.line,
             "training_warnings": self._detector.training_warnings,
             "clock_jumps": self._detector.senders.clock_jumps,
+            "times_doubted": self._time.doubted,
+            "blocked": len(self._detector.senders.blocked),
+            **self._intake.health(),
             **self._detector.afterimage.counts,
         }
 
-    def _on_decision(self, item: Item) -> None:
+    def _on_decision(self, _: Item, decision: Decision) -> None:
         with self._lock:
-            self._detector.senders.blocked.decide(Decision.from_value(item.value))
+            self._detector.senders.blocked.decide(decision)
 
-    def _score(self, item: Item) -> None:
-        batch = item.value
+    def _score(self, item: Item, batch: RecordBatch) -> None:
         if not len(batch):
             return
         switch = item.key.split(".")[3]
         with self._lock:
+            batch = self._steady(batch)
             scored, alerts = self._detector.process(batch, switch)
             self._packets += len(batch)
             event_time = int(batch["time_us"][-1]) * 1_000
@@ -103,6 +135,15 @@ class KitsuneService:
             self._write_alerts(alerts)
             if self._detector.model.is_trained and not self._told:
                 self._end_of_training()
+
+    def _steady(self, batch: RecordBatch) -> RecordBatch:
+        """The batch with impossible times replaced by the newest valid one, since every packet is scored."""
+        times, before = batch["time_us"], self._time.now or 0
+        believed = self._time.believed(times)
+        if believed is None:
+            return batch
+        newest = np.maximum.accumulate(np.where(believed, times, before))
+        return RecordBatch({**batch, "time_us": np.where(believed, times, newest)})
 
     def _end_of_training(self) -> None:
         self._told = True

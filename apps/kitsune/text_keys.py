@@ -1,4 +1,4 @@
-"""The text under which AfterImage keeps a packet's streams, for the Python twin of the kernel.
+"""The texts that identify a packet's streams, for the Python twin of the kernel.
 
 Concatenated without a separator, as published: "192.168.2.1" + "10123" and "192.168.2.110" + "123"
 are one stream.

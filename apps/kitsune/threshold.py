@@ -1,7 +1,7 @@
-"""The line between normal and anomalous scores: fixed, or from the tail of benign scores.
+"""The threshold between normal and anomalous scores: fixed, or from the tail of benign scores.
 
-Benign scores are close to log-normal (the published example's own hint), so the line that a given
-number of packets per hour will cross by chance follows from the mean and spread of their logarithms.
+Benign scores are close to log-normal (as the published example suggests), so the threshold that a given
+number of packets per hour exceed by chance follows from the mean and spread of their logarithms.
 """
 
 import math
@@ -20,7 +20,7 @@ _MOST_LOG = 700.0
 
 @dataclass(frozen=True, slots=True)
 class Benign:
-    """What benign scores look like."""
+    """The distribution of benign scores."""
 
     packets: int
     log_mean: float
@@ -31,8 +31,8 @@ class Benign:
     def of(cls, scores: _Array, seconds: float) -> "Benign":
         """Fits scores that were seen within some seconds of capture time; `ValueError` for less than two.
 
-        The spread is the larger of the standard deviation and what the upper hundredth shows,
-        because the upper tail is what counts and is often the heavier one.
+        The spread is the larger of the standard deviation and that of the upper hundredth,
+        because the threshold depends on the upper tail, which is often heavier.
         """
         logs = np.log(scores[np.isfinite(scores) & (scores > 0)])
         if len(logs) < 2:
@@ -43,14 +43,14 @@ class Benign:
         return cls(len(scores), float(logs.mean()), spread, rate)
 
     def line(self, false_alarms_per_hour: float) -> float:
-        """The score that so many benign packets an hour will exceed; raises `ValueError` unless 0 < alarms."""
+        """The score that this many benign packets an hour exceed; raises `ValueError` unless it is above 0."""
         if not false_alarms_per_hour > 0:
             raise ValueError(f"false_alarms_per_hour={false_alarms_per_hour}: must be greater than 0")
         tail = min(false_alarms_per_hour / self.packets_per_hour, 0.5)
         return math.exp(min(self.log_mean - NormalDist().inv_cdf(tail) * self.log_spread, _MOST_LOG))
 
     def drift(self, scores: _Array) -> float:
-        """How far the median of other benign scores has moved, in spreads; 0 = not at all."""
+        """Shift of the median of other benign scores, in spreads; 0 = none."""
         finite = scores[np.isfinite(scores)]
         if not len(finite):
             return 0.0
@@ -89,7 +89,7 @@ class Calibration:
         return True
 
     def close(self, now: float) -> None:
-        """Fits what there is, if it is enough for a fit."""
+        """Fits the scores so far, if they are enough."""
         scores = np.concatenate(self._scores) if self._scores else np.zeros(0)
         if self.benign is None and (np.isfinite(scores) & (scores > 0)).sum() > 1:
             self.benign = Benign.of(scores, abs(now - self._begun))

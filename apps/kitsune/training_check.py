@@ -1,4 +1,4 @@
-"""Signs that the training traffic already held an attack, which the model would then take for normal."""
+"""Signs of an attack in the training traffic, which the model would learn as normal."""
 
 from statistics import median
 from typing import Final
@@ -7,22 +7,22 @@ import numpy as np
 
 from apps.kitsune.kernel import Columns
 from apps.kitsune.names import ip_text, mac_text
-from apps.kitsune.senders import Record
+from apps.kitsune.senders import SenderRecord
 
 _FLOOD_RATE: Final = 500
 """Packets a second from one sender ..."""
 _FLOOD_RATIO: Final = 50
-"""... and so many times the median sender's maximum."""
+"""... and this many times the median sender's maximum."""
 _SCAN_HOSTS: Final = 50
 """Hosts addressed by one sender in one second."""
 _SYN_RATE: Final = 200
-"""SYNs in one second, most of its TCP packets."""
+"""SYNs of one sender in one second, and most of its TCP packets."""
 _SYN_SHARE: Final = 0.5
 _SYN, _ACK, _RST = 0x02, 0x10, 0x04
 
 
 class TrainingCheck:
-    """Counts while training; says afterwards what looks like an attack."""
+    """Counts during training; reports afterwards what looks like an attack."""
 
     def __init__(self) -> None:
         self._second = 0
@@ -43,8 +43,8 @@ class TrainingCheck:
             if self._syn > _SYN_SHARE * self._tcp:
                 self._worst = max(self._worst, self._syn)
 
-    def warnings(self, records: list[Record]) -> list[str]:
-        """One sentence for each suspicion; nothing proves that training was clean."""
+    def warnings(self, records: list[SenderRecord]) -> list[str]:
+        """One sentence for each sign; no sign does not prove that training was clean."""
         found = []
         rates = [record.training_rate for record in records if record.training_rate]
         usual = median(rates) if rates else 0

@@ -1,14 +1,14 @@
 """Switches on one side, DUE on the other: the P4Runtime controller.
 
-    switch ══gRPC══ connection ──packet-ins, digests──► outbound ──record batches──► DUE
-       ▲            (stream)        packet_in, digest_in: messages → columns; progress: losses
+    switch ══gRPC══ connection ──packet-ins, digests──► packet_publisher ──record batches──► DUE
+       ▲            (stream)     packet_in, digest_in: messages → columns; loss_tracker: lost packet-ins
        │
-       └──Write, Read── session ◄── switch ◄── orders     ◄── decisions of the firewall (blocks, guard),
-                        (calls)   (desired                    commands of any app
-                                   state)  ◄── telemetry  ◄── demand ◄── what DUE's consumers want
+       └──Write, Read── session ◄── desired_switch ◄── entry_updates ◄── decisions of the firewall,
+                        (calls)                                          commands of any app
+                                                   ◄── classifier ◄── demand ◄── interests of consumers
 
-`switch` keeps what a switch should hold and brings a real one there, whatever broke; `desired_state`
-is the comparison, `p4info` and `values` turn names into P4Runtime's numbers, `boxes` is the geometry of
-overlapping conditions.  `service` owns DUE and the threads, `connection` and `session` the sockets;
-everything else is data in, data out.
+`state/desired_switch` keeps the desired state of a switch and reconciles the real one with it;
+`state/desired_state` compares the two.  `southbound/p4info` and `values` turn names into P4Runtime's numbers;
+`telemetry/match_regions` intersects overlapping match conditions.  `service` owns DUE, `worker` the thread of
+each switch, `connection` and `session` the sockets; all other modules are without I/O, but for `watchdog`.
 """

@@ -1,12 +1,13 @@
-"""What can go wrong between controller and switch.
+"""Errors between controller and switch.
 
 ControllerError
 ├── ProgramError      the P4 program lacks something that the controller needs
 ├── EntryError        an entry that does not fit the program; never sent to the switch
 ├── TelemetryError    a packet request that the classifier cannot hold
 └── SwitchError       the switch: unreachable, refused, silent
-    ├── NotPrimary    another controller is in charge of it
-    └── Unreachable   no connection, or it broke
+    ├── Malformed     it sent a message that does not fit its program
+    ├── NotPrimary    another controller is primary
+    └── Unreachable   no connection, or the connection was lost
 """
 
 
@@ -14,7 +15,7 @@ class ControllerError(Exception):
     """Base of this app's errors; the text says what, where and what to do."""
 
 
-class ProgramError(ControllerError):
+class P4InfoError(ControllerError):
     """The P4 program lacks a table, action or header that the controller needs."""
 
 
@@ -28,6 +29,10 @@ class TelemetryError(ControllerError):
 
 class SwitchError(ControllerError):
     """The switch answered with an error."""
+
+
+class Malformed(SwitchError):
+    """The switch sent a message that does not fit its program; it is counted and dropped."""
 
 
 class NotPrimary(SwitchError):

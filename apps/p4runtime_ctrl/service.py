@@ -1,4 +1,4 @@
-"""The P4Runtime controller: between DUE and one agent per switch."""
+"""The P4Runtime controller: between DUE and one `SwitchWorker` per switch."""
 
 import p4rt  # noqa: F401  # isort: skip  # before anything loads gRPC: it says how gRPC waits
 
@@ -6,23 +6,32 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import due.service
-from apps.messages import Decision, TableCommand
-from apps.p4runtime_ctrl.agent import Agent
-from apps.p4runtime_ctrl.connection import Connection
-from apps.p4runtime_ctrl.demand import ALL, KINDS, Demand, Offer, demand_for, key_of
-from apps.p4runtime_ctrl.errors import ProgramError
-from apps.p4runtime_ctrl.history import DECISIONS, is_for, read
-from apps.p4runtime_ctrl.p4info import Program
-from apps.p4runtime_ctrl.sentinel import Sentinel
-from apps.p4runtime_ctrl.session import Pipeline, address_of
+from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
+from apps.p4runtime_ctrl.arrivals import (
+    FramesToSend,
+    command_in,
+    decision_in,
+    frames_in,
+    offer_in,
+    questions_in,
+)
+from apps.p4runtime_ctrl.errors import ControllerError, P4InfoError
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
-from due import Assignment, Capability, Engine, Interest, Item
+from apps.p4runtime_ctrl.southbound.connection import Connection
+from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.southbound.session import CompiledProgram, address_of
+from apps.p4runtime_ctrl.state.history import DECISIONS, is_for
+from apps.p4runtime_ctrl.telemetry.classifier import Classifier
+from apps.p4runtime_ctrl.telemetry.demand import ALL, KINDS, Demand, Offer, Offers, demand_for, key_of
+from apps.p4runtime_ctrl.watchdog import FailClosedWatchdog
+from apps.p4runtime_ctrl.worker import SwitchWorker
+from due import Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 INTERESTS = (
     Interest("network.block.firewall.*"),
@@ -46,11 +55,13 @@ _OFFERS: Final = "network.telemetry.*.*"
 _DATA: Final = tuple(key_of(kind, "*", "*") for kind in KINDS)
 _LOG = logging.getLogger(__name__)
 _START_S: Final = 10.0
+_OFFERS_READ: Final = 10_000
+"""Most archived packet requests restored at a start."""
 _LOOK_EVERY_S: Final = 0.25
 
 
 class P4RuntimeCtrlService:
-    """All switches of the settings.  Raises `ProgramError` for a program that cannot be read."""
+    """All switches of the settings.  Raises `P4InfoError` for a program that cannot be read."""
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
@@ -58,39 +69,43 @@ class P4RuntimeCtrlService:
         pipeline = load_pipeline(settings)
         names = [each.name for each in settings.switches]
         if len(set(names)) != len(names):
-            raise ProgramError(f"two switches have one name: {', '.join(sorted(names))}")
+            raise P4InfoError(f"two switches have one name: {', '.join(sorted(names))}")
+        self._intake = Intake(_LOG)
         self._agents = {each.name: self._agent(each, pipeline) for each in settings.switches}
-        self._offers: dict[str, Offer] = {}
+        classifier = Classifier(ProgramInfo(pipeline.p4info))
+        self._offers = Offers(lambda request: classifier.entries((request,)))
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
         self._by_digest = settings.telemetry == "digest"
-        self._sentinel = Sentinel(settings)
-        self._chief = True
+        self._sentinel = FailClosedWatchdog(settings)
+        self._active = True
         self._looked_at = 0.0
 
     def start(self) -> None:
-        """Returns when every switch is under control, or could not be reached at the first attempt."""
+        """Returns when every switch is connected, or its first connection attempt has failed."""
         while self._engine.health()["phase"] == "waiting":
             time.sleep(0.01)
-        self._chief = bool(self._engine.health()["active"])
-        for item in self._engine.get(_OFFERS) if self._settings.restore else ():
-            if item.timestamp > self._settings.restore_since:
-                self._take_offer(item)
+        self._active = bool(self._engine.health()["active"])
+        if self._settings.restore:
+            self._take_up_offers()
         self._sentinel.start()
         for agent in self._agents.values():
-            agent.start(chief=self._chief)
+            agent.start(active=self._active)
+        observe, reading = self._engine.observe, self._intake.reading
         for key in DECISIONS:
-            self._engine.observe(key).subscribe(self._on_decision)
-        self._engine.observe("network.p4_command.*.*").subscribe(self._on_command)
-        self._engine.observe(_OFFERS).subscribe(self._on_offer)
-        self._engine.observe("network.cell_request.*.*").subscribe(self._on_questions)
-        self._engine.observe("network.packet_out.*.*").subscribe(self._on_frames)
+            observe(key).subscribe(reading("decision", decision_in, self._on_decision))
+        observe("network.p4_command.*.*").subscribe(reading("command", command_in, self._on_command))
+        observe(_OFFERS).subscribe(reading("offer", offer_in, self._on_offer))
+        observe("network.cell_request.*.*").subscribe(
+            reading("cell_request", questions_in, self._on_questions)
+        )
+        observe("network.packet_out.*.*").subscribe(reading("packet_out", frames_in, self._on_frames))
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
             agent.settled.wait(max(0.0, deadline - time.monotonic()))
 
-    def _agent(self, mine: SwitchSettings, pipeline: Pipeline) -> Agent:
+    def _agent(self, mine: SwitchSettings, pipeline: CompiledProgram) -> SwitchWorker:
         settings = self._settings
         connect = partial(
             Connection,
@@ -99,7 +114,7 @@ class P4RuntimeCtrlService:
             batch=settings.batch,
             linger_s=settings.linger_ms / 1000,
         )
-        return Agent(self._engine, settings, mine, Program(pipeline.p4info), connect)
+        return SwitchWorker(self._engine, settings, mine, ProgramInfo(pipeline.p4info), connect, self._intake)
 
     def tick(self) -> None:
         for agent in self._agents.values():
@@ -111,17 +126,17 @@ class P4RuntimeCtrlService:
             self._demand_changed()
 
     def _look_at_duty(self) -> None:
-        """DUE says which instance of this app works; that one is the chief of its switches, too."""
+        """The active instance of this app is also the active controller of its switches."""
         health = self._engine.health()
         if health["asking"]:
-            return  # stopped for a moment: nobody has taken over yet, as far as anybody knows
-        chief = bool(health["active"])
-        if chief != self._chief:
-            _LOG.info("%s", "active: claiming the switches" if chief else "standby: leaving the switches")
-            self._chief = chief
+            return  # was stopped for a moment; no takeover is known yet
+        active = bool(health["active"])
+        if active != self._active:
+            _LOG.info("%s", "active: claiming the switches" if active else "standby: leaving the switches")
+            self._active = active
             self._asked.clear()
             for agent in self._agents.values():
-                agent.stand(chief=chief)
+                agent.stand(active=active)
 
     def stop(self) -> None:
         for agent in self._agents.values():
@@ -132,41 +147,49 @@ class P4RuntimeCtrlService:
         return {
             "switches": [agent.health() for agent in self._agents.values()],
             "sentinel": self._sentinel.watches,
+            "offers": len(self._offers),
+            **self._intake.health(),
         }
 
-    def _on_decision(self, item: Item) -> None:
-        decision = read(Decision, item)
-        if decision is None:
-            return
+    def _on_decision(self, _: Item, decision: Decision) -> None:
         for agent in self._agents.values():
             if is_for(decision, agent.name):
                 agent.decide(decision)
 
-    def _on_command(self, item: Item) -> None:
+    def _on_command(self, item: Item, command: TableCommand) -> None:
         agent = self._agents.get(item.key.rpartition(".")[2])
-        command = read(TableCommand, item) if agent is not None else None
-        if agent is not None and command is not None:
+        if agent is not None:
             agent.command(command)
 
-    def _on_questions(self, item: Item) -> None:
+    def _on_questions(self, item: Item, questions: RecordBatch) -> None:
         agent = self._agents.get(item.key.rpartition(".")[2])
         if agent is not None:
-            agent.ask(item.value)
+            agent.ask(questions)
 
-    def _on_frames(self, item: Item) -> None:
+    def _on_frames(self, item: Item, frames: FramesToSend) -> None:
         agent = self._agents.get(item.key.rpartition(".")[2])
         if agent is not None:
-            agent.send(item.value)
+            agent.send(frames)
 
-    def _on_offer(self, item: Item) -> None:
-        self._take_offer(item)
+    def _on_offer(self, item: Item, offered: tuple[str, Offer]) -> None:
+        self._take_offer(item, offered)
         self._demand_changed()
 
-    def _take_offer(self, item: Item) -> None:
-        offer = read(Offer, item)
-        if offer is not None:
+    def _take_offer(self, item: Item, offered: tuple[str, Offer]) -> None:
+        try:
             with self._demand:
-                self._offers[offer.name] = offer
+                self._offers.take(*offered)
+        except MessageError as error:
+            self._intake.refuse("offer", error, item.key)
+
+    def _take_up_offers(self) -> None:
+        def find(query: Mapping[str, Any], limit: int) -> list[Item]:
+            return self._engine.get(query, limit=limit)
+
+        query, since = {"dataKey": _OFFERS}, self._settings.restore_since
+        take = self._intake.reading("offer", offer_in, self._take_offer)
+        for item in youngest(find, query, since, _OFFERS_READ):
+            take(item)
 
     def _on_assignments(self, _: tuple[Assignment, ...]) -> None:
         self._demand_changed()
@@ -174,12 +197,12 @@ class P4RuntimeCtrlService:
             agent.say_again()
 
     def _demand_changed(self) -> None:
-        """Tell agents what is wanted of them; everything while no Coordinator is there to ask.
+        """Pass the demand to the workers; without a Coordinator, demand for everything.
 
-        A standby instance is told nothing of demand, and leaves the switches' telemetry as it is; so does one
-        that was stopped for a moment: frames that pass while it asks who is active are wanted all the same.
+        A standby instance gets no demand, and leaves the switches' telemetry as it is; so does one
+        that was stopped for a moment: frames that pass while it asks who is active are still wanted.
         """
-        if not self._chief:
+        if not self._active:
             return
         with self._demand:
             keys = tuple(each.key for each in self._engine.assignments() if each.capability in _DATA)
@@ -194,16 +217,16 @@ class P4RuntimeCtrlService:
                     agent.want(demand)
 
 
-def load_pipeline(settings: Settings) -> Pipeline:
-    """The compiled program; raises `ProgramError` naming the file that cannot be read."""
+def load_pipeline(settings: Settings) -> CompiledProgram:
+    """The compiled program; raises `P4InfoError` naming the file that cannot be read."""
     try:
         config = Path(settings.program).read_bytes()
         text = Path(settings.p4info).read_text(encoding="utf-8")
     except OSError as error:
-        raise ProgramError(
+        raise P4InfoError(
             f"{error.filename}: {error.strerror}; compile the P4 program or give its path"
         ) from error
-    return Pipeline(config, Program.from_text(text).message)
+    return CompiledProgram(config, ProgramInfo.from_text(text).message)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -211,9 +234,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return due.service.run(
             "p4runtime_ctrl", P4RuntimeCtrlService, Settings, INTERESTS, CAPABILITIES, argv
         )
-    except ProgramError as error:
+    except P4InfoError as error:
         _LOG.error("%s", error)
         return 2
+    except ControllerError as error:
+        _LOG.critical("the controller ends: %s", error)
+        return 1
 
 
 if __name__ == "__main__":

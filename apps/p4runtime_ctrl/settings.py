@@ -4,28 +4,28 @@ from typing import Literal
 
 import msgspec
 
-from apps.p4runtime_ctrl.guard import GuardSettings
-from apps.p4runtime_ctrl.stations import LearnSettings
+from apps.p4runtime_ctrl.state.guard import GuardSettings
+from apps.p4runtime_ctrl.state.mac_learning import LearnSettings
 
 
 class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One switch."""
 
     name: str
-    """As it stands in keys."""
+    """Name of the switch in keys."""
     address: str
-    """Of its P4Runtime server, HOST:PORT."""
+    """Address of its P4Runtime server, HOST:PORT."""
     device_id: int = 1
     base_us: int = 0
     """Absolute time of the switch's clock zero: integer microseconds since the epoch."""
     forward: dict[str, int] = {}
-    """Wires: ingress port to egress port."""
+    """Port forwarding: ingress port to egress port."""
     learn: LearnSettings | None = None
-    """Switch by learnt MAC addresses where there is no wire; off unless ports are named."""
+    """MAC learning on ports without port forwarding; None: off."""
     fail: Literal["open", "closed"] = "open"
-    """While it is not under control: open keeps the wires, closed takes them out, and puts them in last."""
+    """Without a controller: open keeps port forwarding, closed removes it, and restores it last."""
     target: str = ""
-    """What kind of switch it is, for people."""
+    """Kind of switch, for display."""
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -37,27 +37,29 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     p4info: str
     """Its p4info in protobuf text format."""
     telemetry: Literal["packet-in", "digest"] = "packet-in"
-    """Where record batches of packets come from: copied frames, or digests of the switch's parser."""
+    """Source of the packets' record batches: copied frames, or digests with the header fields."""
     batch: int = 1024
     """Most packets in one record batch."""
     linger_ms: float = 2.0
     """How long the first packet of a batch waits for others."""
     rank: int = 1
-    """The controller of the highest rank is primary, the others are backups."""
+    """The controller with the highest rank is primary, the others are backups."""
     copy_session: int = 1
-    """Clone session that the program copies frames to."""
+    """Clone session to which the program copies frames."""
     cpu_port: int = 510
+    """Number of the switch's port to the controller."""
     tls_ca: str = ""
-    """File of the certificate that signed the switches'; empty: no TLS."""
+    """CA certificate that signed the switches' certificates, a file; empty: no TLS."""
     tls_certificate: str = ""
-    """Files of the controller's own certificate and key, where switches ask for them."""
+    """Controller's own certificate, a file, for switches that ask for one."""
     tls_key: str = ""
+    """Key of that certificate, a file."""
     timeout_s: float = 5.0
-    """A switch that does not answer a call for this long is given up and connected again."""
+    """Seconds without an answer to a call after which the connection to a switch is closed and opened again."""
     counters_ms: int = 20
-    """Least wall time between two readings of block counters."""
+    """Least wall time between two reads of the block counters."""
     restore: bool = True
-    """Take up the decisions and commands in Data Archives at start."""
+    """Restore decisions and commands from Data Archives at the start."""
     restore_since: int = 0
-    """... those written after this time only (ns since the epoch)."""
+    """... only those written after this time (ns since the epoch)."""
     guard: GuardSettings = GuardSettings()

@@ -1,35 +1,36 @@
-"""The adapter without I/O: what is wanted → what the switch shall do; what it sends → results.
+"""The adapter without I/O: from interests to entries in the switch, and from its packets to results.
 
 keys wanted ─► requests ─► plan ─► offers (classifier bits) and entries of counting stages
 packets, frames ─► merge ─► host operators ─┐
-reports of counting stages ─────────────────┴─► outputs, each under the keys that asked for it
+reports of counting stages ─────────────────┴─► outputs, each under the keys that requested it
 """
 
 import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
 from apps.messages import TableUpdate
-from apps.sonata_adapter.catalogue import Template
-from apps.sonata_adapter.cell_read import CellRead
-from apps.sonata_adapter.clock import Clock
-from apps.sonata_adapter.dataflow import Table, compile_query
-from apps.sonata_adapter.differences import Differences
-from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.errors import SonataError
-from apps.sonata_adapter.handshake import Handshakes
-from apps.sonata_adapter.keys import HANDSHAKE, Request, request_of
-from apps.sonata_adapter.merge import Merger, patience
-from apps.sonata_adapter.placement import Entry, SwitchLimits
-from apps.sonata_adapter.planner import Plan, QueryPlan
-from apps.sonata_adapter.refinement import Crossings, Refinement
-from apps.sonata_adapter.reports import Reports
-from apps.sonata_adapter.results import Captured, Output, Result
-from apps.sonata_adapter.tallies import Tallies
+from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
+from apps.sonata_adapter.host.handshake import Handshakes
+from apps.sonata_adapter.host.merge import Merger, patience
+from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
+from apps.sonata_adapter.planner.placement import StageEntry, SwitchLimits
+from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans
+from apps.sonata_adapter.planner.refinement import Crossings, Refinement
+from apps.sonata_adapter.query.catalogue import Template
+from apps.sonata_adapter.query.dataflow import WindowTable, compile_query
+from apps.sonata_adapter.results import Captured, Output, QueryResult
+from apps.sonata_adapter.switch.cell_read import CellRead
+from apps.sonata_adapter.switch.clock import Clock
+from apps.sonata_adapter.switch.differences import Differences
+from apps.sonata_adapter.switch.register_reads import RegisterReads
+from apps.sonata_adapter.switch.reports import CountReportReader
 from due import RecordBatch
+from due.errors import DueError
 
 
 class Source(msgspec.Struct, frozen=True, order=True):
@@ -40,8 +41,8 @@ class Source(msgspec.Struct, frozen=True, order=True):
     name: str
 
 
-class Changes(msgspec.Struct, frozen=True):
-    """What to tell the controller, in this order."""
+class ControllerUpdates(msgspec.Struct, frozen=True):
+    """Changes for the controller, in this order."""
 
     withdraw: tuple[dict[str, Any], ...] = ()
     """Offers that end."""
@@ -50,7 +51,7 @@ class Changes(msgspec.Struct, frozen=True):
     offer: tuple[dict[str, Any], ...] = ()
     """Offers that begin or change."""
     refused: tuple[tuple[str, str], ...] = ()
-    """Keys that cannot be served, and what would do."""
+    """Keys that cannot be served, with the reason and what is accepted."""
 
 
 class Written(msgspec.Struct, frozen=True):
@@ -60,23 +61,25 @@ class Written(msgspec.Struct, frozen=True):
     output: Output
 
 
-_Counts = Reports | Tallies | Differences | Crossings
+MOST_KEYS: Final = 1_024
+"""Most keys that are served at a time."""
+_Counts = CountReportReader | RegisterReads | Differences | Crossings
 
 
 class _Lane:
-    """Host operators and the stream that they see; queries on bytes have a lane of their own."""
+    """Host operators and their input stream; queries on frame bytes have a lane of their own."""
 
     def __init__(self, host: WindowEngine) -> None:
         self.host = host
         self.merger = Merger()
         self.names: set[str] = set()
-        """Streams that bring its packets."""
+        """The streams from which its packets come."""
         self.brought: dict[str, int] = {}
         """Packets by stream."""
 
 
 class _Station:
-    """What is kept for one switch."""
+    """The state kept for one switch."""
 
     def __init__(self, engine: Callable[[], WindowEngine], base_us: int) -> None:
         self.headers = _Lane(engine())
@@ -89,9 +92,9 @@ class _Station:
         self.clock = Clock()
 
     @property
-    def asking(self) -> list[Tallies | Differences]:
-        """Counts for which cells of the switch are read."""
-        return [each for each in self.reports.values() if isinstance(each, (Tallies, Differences))]
+    def asking(self) -> list[RegisterReads | Differences]:
+        """The counts for which cells of the switch are read."""
+        return [each for each in self.reports.values() if isinstance(each, (RegisterReads, Differences))]
 
     @property
     def lanes(self) -> tuple[_Lane, _Lane]:
@@ -115,21 +118,21 @@ class Control:
         self._engine = partial(engine, limit=keys_limit, lateness_us=lateness_us)
         self._stations: dict[str, _Station] = {}
         self._refinement = Refinement()
-        self._asked: dict[str, Request] = {}
-        """By identity."""
+        self._asked: dict[str, QueryRequest] = {}
+        """Requests as asked for, by identity."""
         self._keys: dict[str, tuple[str, ...]] = {}
-        """By identity of what is asked for."""
-        self._requests: dict[str, Request] = {}
-        """What is counted for them: the same, but for those that are refined."""
+        """Keys by the identity of their request."""
+        self._requests: dict[str, QueryRequest] = {}
+        """The requests that are counted: the same, except for refined ones."""
         self._outputs: dict[str, tuple[str, ...]] = {}
         self._refused: dict[str, str] = {}
-        self.plan = Plan((), ())
+        self.plan = QueryPlans((), ())
         self._generation = secrets.randbelow(255)
-        """Of the plans: an adapter before this one may have left what waits in the switch."""
+        """Generation of the plans, random at start: an earlier adapter may have left state in the switch."""
 
     @property
-    def requests(self) -> list[Request]:
-        """What is asked for and served."""
+    def requests(self) -> list[QueryRequest]:
+        """The requests that are served."""
         return list(self._asked.values())
 
     @property
@@ -152,11 +155,11 @@ class Control:
         return found
 
     def know(self, templates: Mapping[str, Template]) -> None:
-        """These queries there are from now on; what runs goes on as it is."""
+        """Replace the known queries; running ones continue unchanged."""
         self._templates = templates
 
-    def want(self, keys: Iterable[str]) -> Changes:
-        """These keys are wanted from now on, and no others."""
+    def want(self, keys: Iterable[str]) -> ControllerUpdates:
+        """Replace the set of wanted keys."""
         requests, outputs, refused = self._read(keys)
         new_refusals = tuple((key, why) for key, why in refused.items() if key not in self._refused)
         self._refused = refused
@@ -164,8 +167,8 @@ class Control:
         self._keys = {identity: tuple(sorted(found)) for identity, found in outputs.items()}
         return msgspec.structs.replace(self._planned(), refused=new_refusals)
 
-    def refine(self) -> Changes | None:
-        """What follows from prefixes that crossed, or no longer do; None: nothing does."""
+    def refine(self) -> ControllerUpdates | None:
+        """Changes because prefixes crossed the threshold or no longer do; None: no changes."""
         crossed: dict[str, set[str]] = {}
         for station in self._stations.values():
             for identity, report in station.reports.items():
@@ -173,13 +176,13 @@ class Control:
                     crossed.setdefault(identity, set()).update(report.crossed(station.clock.heard_us))
         return self._planned() if self._refinement.note(crossed) else None
 
-    def everything(self) -> Changes:
-        """All that is in force, for a controller that has just come."""
-        none = Plan((), ())
-        return Changes(updates=self._updates(none), offer=self._offered(none))
+    def everything(self) -> ControllerUpdates:
+        """Everything in force, for a controller that has just started."""
+        none = QueryPlans((), ())
+        return ControllerUpdates(updates=self._updates(none), offer=self._offered(none))
 
     def switch(self, name: str, base_us: int) -> bool:
-        """A switch is there; returns whether it is new."""
+        """Note a switch; returns whether it is new."""
         new = name not in self._stations
         station = self._station(name, base_us)
         station.base_us = base_us
@@ -198,7 +201,7 @@ class Control:
         return written
 
     def busy(self, switch: str, now: float) -> None:
-        """Until `now` no packets of a switch could be taken: silence before means nothing."""
+        """Note that packets of a switch could not be processed until `now`, so earlier silence means nothing."""
         for lane in self._station(switch).lanes:
             lane.merger.busy(now)
 
@@ -215,7 +218,7 @@ class Control:
         return written
 
     def counts(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
-        """Keys whose differences are over the threshold at the end of a window."""
+        """Process keys whose differences are over the threshold at the end of a window."""
         station = self._station(switch)
         bit = int(name[1:])
         written: list[Written] = []
@@ -227,7 +230,7 @@ class Control:
         return written
 
     def reads(self, now: float) -> dict[str, list[CellRead]]:
-        """Questions to the switches about cells of windows that are over, by switch."""
+        """Requests for cells of windows that have ended, by switch."""
         found: dict[str, list[CellRead]] = {}
         for name, station in self._stations.items():
             station.clock.look(now)
@@ -236,9 +239,9 @@ class Control:
         return {name: reads for name, reads in found.items() if reads}
 
     def last_reads(self, now: float) -> dict[str, list[CellRead]]:
-        """Questions about all windows that are open, by switch, for no more packets will come.
+        """Requests for cells of all open windows, by switch, after the last packet.
 
-        To be called again and again while `waits_for_cells`.
+        Call it repeatedly while `waits_for_cells`.
         """
         found = {
             name: [read for counts in station.asking for read in counts.finish(now)]
@@ -252,11 +255,11 @@ class Control:
 
     @property
     def needs_cells(self) -> bool:
-        """Whether answers to such questions are expected."""
+        """Whether such answers are expected."""
         return any(station.asking for station in self._stations.values())
 
     def cells(self, switch: str, numbers: Sequence[int], counts: Sequence[int]) -> list[Written]:
-        """Answers: the count of each question."""
+        """Process answers: the count for each request."""
         station = self._station(switch)
         written: list[Written] = []
         for number, counted in zip(numbers, counts, strict=True):
@@ -266,7 +269,7 @@ class Control:
         return written
 
     def tick(self, now: float) -> list[Written]:
-        """Let go what has waited long enough."""
+        """Release packets and results that have waited long enough."""
         written: list[Written] = []
         for station in self._stations.values():
             for counts in station.asking:
@@ -279,7 +282,7 @@ class Control:
         return written
 
     def advance(self, switch: str, now_us: int) -> None:
-        """Capture time of a switch has come to `now_us`, though no packet may have come here."""
+        """Note that a switch's capture time has reached `now_us`, even without packets."""
         self._station(switch).clock.hear(now_us)
 
     def finish(self) -> list[Written]:
@@ -294,7 +297,7 @@ class Control:
         return written
 
     def close(self) -> None:
-        """Give back what the engines hold."""
+        """Release the resources of the engines."""
         for station in self._stations.values():
             for lane in station.lanes:
                 lane.host.close()
@@ -318,11 +321,12 @@ class Control:
             "reports": sum(report.tuples for station in stations for report in station.reports.values()),
             "late_reads": sum(each.missed for station in stations for each in station.asking),
             "open_windows": sum(each.open for station in stations for each in station.asking),
+            "keys": sum(map(len, self._keys.values())),
             "refused": len(self._refused),
         }
 
     def _tuples(self, one: QueryPlan) -> int:
-        """What reached the host for a query, of all switches."""
+        """Tuples that reached the host for a query, from all switches."""
         found = 0
         for station in self._stations.values():
             lane = station.frames if one.payload else station.headers
@@ -332,18 +336,27 @@ class Control:
         return found
 
     def _overflow(self, one: QueryPlan) -> int:
-        """Those of them that came because a key had no cell."""
+        """Those of them that were sent because a key had no cell."""
         reports = [station.reports.get(one.identity) for station in self._stations.values()]
-        return sum(each.overflow for each in reports if isinstance(each, (Reports, Tallies, Differences)))
+        return sum(
+            each.overflow
+            for each in reports
+            if isinstance(each, (CountReportReader, RegisterReads, Differences))
+        )
 
-    def _read(self, keys: Iterable[str]) -> tuple[dict[str, Request], dict[str, set[str]], dict[str, str]]:
-        requests: dict[str, Request] = {}
+    def _read(
+        self, keys: Iterable[str]
+    ) -> tuple[dict[str, QueryRequest], dict[str, set[str]], dict[str, str]]:
+        requests: dict[str, QueryRequest] = {}
         outputs: dict[str, set[str]] = {}
         refused: dict[str, str] = {}
-        for key in sorted(set(keys)):
+        for place, key in enumerate(sorted(set(keys))):
+            if place >= MOST_KEYS:
+                refused[key] = f"{MOST_KEYS} keys are asked for already; withdraw some"
+                continue
             try:
                 request = request_of(key, self._templates)
-            except SonataError as error:
+            except (SonataError, DueError) as error:
                 refused[key] = str(error)
                 continue
             if request is not None:
@@ -358,8 +371,8 @@ class Control:
             self._refit(station, {})
         return station
 
-    def _planned(self) -> Changes:
-        """Make the plan anew, and what runs that of the plan."""
+    def _planned(self) -> ControllerUpdates:
+        """Compute the plan again and apply it."""
         before, old = self.plan, self._requests
         clocks = {name: station.clock.heard_us for name, station in self._stations.items()}
         self._generation = 1 + self._generation % 255
@@ -370,12 +383,12 @@ class Control:
         self._outputs = {count: self._keys[owner] for count, owner in counts.owners.items()}
         for station in self._stations.values():
             self._refit(station, old)
-        return Changes(
+        return ControllerUpdates(
             withdraw=self._withdrawn(before), updates=self._updates(before), offer=self._offered(before)
         )
 
-    def _refit(self, station: _Station, old: Mapping[str, Request]) -> None:
-        """Make a switch's operators those of the plan."""
+    def _refit(self, station: _Station, old: Mapping[str, QueryRequest]) -> None:
+        """Adapt a switch's operators to the plan."""
         for lane in station.lanes:
             mine = [
                 one
@@ -404,24 +417,24 @@ class Control:
         if request.coarse:
             return Crossings(request, base_us=station.base_us)
         query = request.query
-        kind: type[Reports | Tallies | Differences] = Reports
-        if isinstance(compile_query(query), Table):
-            kind = Differences if one.entries[0].role == "difference" else Tallies
+        kind: type[CountReportReader | RegisterReads | Differences] = CountReportReader
+        if isinstance(compile_query(query), WindowTable):
+            kind = Differences if one.entries[0].role == "difference" else RegisterReads
         return kind(query, one, base_us=station.base_us, since_us=station.clock.heard_us)
 
     def _processed(
         self, station: _Station, lane: _Lane, batch: RecordBatch | None, now: float | None
     ) -> list[Written]:
-        """Run packets through the operators; windows close when all streams have come that far."""
+        """Run packets through the operators; a window closes when all streams have passed its end."""
         horizon = None if now is None else lane.merger.horizon_us(now)
-        outputs: list[Result | Captured] = []
+        outputs: list[QueryResult | Captured] = []
         if batch is not None:
             outputs += lane.host.process(batch, horizon_us=0 if horizon is None else horizon)
         if horizon is not None:
             outputs += lane.host.advance(horizon)
         return self._addressed(station, outputs)
 
-    def _addressed(self, station: _Station, outputs: Sequence[Result | Captured]) -> list[Written]:
+    def _addressed(self, station: _Station, outputs: Sequence[QueryResult | Captured]) -> list[Written]:
         written: list[Written] = []
         for output in outputs:
             keys = self._outputs.get(output.query, ())
@@ -431,12 +444,12 @@ class Control:
                 written.append(Written(keys, output))
         return written
 
-    def _withdrawn(self, before: Plan) -> tuple[dict[str, Any], ...]:
+    def _withdrawn(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:
         now = {**dict.fromkeys(self.plan.entries, True), **{copy.bit: True for copy in self.plan.copies}}
         gone = [bit for bit in (*before.entries, *(copy.bit for copy in before.copies)) if bit not in now]
         return tuple({"name": _name(bit), "bit": bit, "active": False} for bit in gone)
 
-    def _offered(self, before: Plan) -> tuple[dict[str, Any], ...]:
+    def _offered(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:
         known = {entry.bit: entry.match for entry in before.entries.values()}
         found = [
             _offer(entry.bit, entry.match, copy=False)
@@ -451,7 +464,7 @@ class Control:
         ]
         return tuple(found)
 
-    def _updates(self, before: Plan) -> tuple[TableUpdate, ...]:
+    def _updates(self, before: QueryPlans) -> tuple[TableUpdate, ...]:
         old, new = before.entries, self.plan.entries
         found = [_update("delete", entry) for bit, entry in old.items() if not _is_kept(new.get(bit), entry)]
         for bit, entry in sorted(new.items()):
@@ -464,8 +477,8 @@ class Control:
         return tuple(found)
 
 
-def _is_kept(one: Entry | None, other: Entry) -> bool:
-    """Whether two entries of one bit are the same; a clock is, at whatever pace."""
+def _is_kept(one: StageEntry | None, other: StageEntry) -> bool:
+    """Whether two entries of one bit are the same; clocks are, whatever their period."""
     return one == other or (one is not None and one.role == other.role == "clock")
 
 
@@ -478,21 +491,21 @@ def _offer(bit: int, match: Mapping[str, Any], *, copy: bool) -> dict[str, Any]:
     return {"name": _name(bit), "bit": bit, "conditions": dict(match), "copy": copy, "active": True}
 
 
-def _update(kind: Any, entry: Entry, params: Mapping[str, int] | None = None) -> TableUpdate:
+def _update(kind: Any, entry: StageEntry, params: Mapping[str, int] | None = None) -> TableUpdate:
     map_of_bit = hex(1 << entry.bit)
     return TableUpdate(
         kind=kind,
         table=f"ingress.count_{entry.stage}.queries",
         match={"query_map": [map_of_bit, map_of_bit]},
         action=f"ingress.count_{entry.stage}.{entry.action}",
-        # numbers of more than 64 bits do not travel as such
+        # DUE does not encode integers of more than 64 bits
         params={} if params is None else {name: hex(value) for name, value in params.items()},
         priority=1 + entry.bit,
     )
 
 
 def leftovers(commands: Iterable[Sequence[TableUpdate]]) -> tuple[TableUpdate, ...]:
-    """Deletions of what earlier commands, oldest first, left in a switch: of an adapter that was killed."""
+    """Deletions of the entries that a killed adapter's commands, oldest first, left in a switch."""
     held: dict[tuple[str, str], TableUpdate] = {}
     for updates in commands:
         for update in updates:

@@ -1,9 +1,9 @@
-"""Everything that the Sonata adapter raises.
+"""Every error that the Sonata adapter raises.
 
 SonataError
-├── InvalidQuery        a query is built wrongly (also a ValueError)
-│   └── QueryTextError  ... in its text form: says line and column
-├── InvalidRequest      a key asks for a query or parameter that there is not (also a ValueError)
+├── QueryError          a query is wrong (also a ValueError)
+│   └── QueryTextError  ... in its text form: names line and column
+├── InvalidRequest      a key names an unknown query or parameter (also a ValueError)
 └── NotPlaced           a part of a query cannot be expressed in the switch (the planner's own use)
 """
 
@@ -12,11 +12,11 @@ class SonataError(Exception):
     """Base of all errors of the adapter."""
 
 
-class InvalidQuery(SonataError, ValueError):
+class QueryError(SonataError, ValueError):
     """Operators, fields or types of a query do not fit together."""
 
 
-class QueryTextError(InvalidQuery):
+class QueryTextError(QueryError):
     """The text of a query is wrong.  `line` and `column` count from 1."""
 
     def __init__(self, where: str, line: int, column: int, what: str) -> None:
@@ -26,8 +26,8 @@ class QueryTextError(InvalidQuery):
 
 
 class InvalidRequest(SonataError, ValueError):
-    """A key names no query, an unknown parameter or a value out of bounds; the text says what would do."""
+    """A key names an unknown query or parameter, or a value out of bounds; the text says what is accepted."""
 
 
 class NotPlaced(SonataError):
-    """A part of a query that the switch cannot do; the text says why."""
+    """The switch cannot execute a part of a query; the text says why."""

@@ -1,23 +1,24 @@
-"""DUE keys → queries, and the keys that results are written under.
+"""From DUE keys to queries, and to the keys under which results are written.
 
     network.traffic_query.sonata.<query>:window=3s,threshold=40,dst=10.0.0.0/8     results
     network.traffic_capture.sonata.<protocol>:flag=syn,dst=…,dport=80               packets
     network.handshake.sonata.tcp                                                     completed handshakes
 
-A parameter that is missing means its default.  Items carry all parameters, spelled as the interest
-spelled those that it gave (`window=3000ms` stays that), so that whoever asked receives them.
+A missing parameter has its default.  Items carry all parameters, spelled as in the interest
+(`window=3000ms` stays so), so that the observer receives them.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Final, Literal
 
 import msgspec
 
-from apps.sonata_adapter.catalogue import Template
 from apps.sonata_adapter.errors import InvalidRequest
-from apps.sonata_adapter.expressions import ACK, FIN, RST, SYN_ACK, Flags, Term
-from apps.sonata_adapter.parameters import ANY_PREFIX, Parameter, Value, prefix
-from apps.sonata_adapter.query import Query, field, ip, tcp, udp
+from apps.sonata_adapter.query.catalogue import Template
+from apps.sonata_adapter.query.expressions import ACK, FIN, RST, SYN_ACK, Flags, Term
+from apps.sonata_adapter.query.language import Query, field, ip, tcp, udp
+from apps.sonata_adapter.query.parameters import ANY_PREFIX, Parameter, Value, prefix
 from due import Key
 
 QUERY_PREFIX: Final = "network.traffic_query.sonata"
@@ -38,7 +39,7 @@ _ANY: Final = "any"
 
 
 class Protocol(msgspec.Struct, frozen=True):
-    """What a raw stream's protocol selects."""
+    """The packets that a raw stream's protocol selects."""
 
     meaning: str
     conditions: tuple[Term, ...]
@@ -58,30 +59,30 @@ PROTOCOLS: Final[dict[str, Protocol]] = {
 }
 
 
-class Request(msgspec.Struct, frozen=True):
-    """What a key asks for."""
+class QueryRequest(msgspec.Struct, frozen=True):
+    """The query that a key requests."""
 
     key: str
     """The interest's key, canonical for DUE."""
     kind: Kind
     name: str
     identity: str
-    """Equal for keys that ask for the same: the key with all parameters in one spelling."""
+    """Equal for keys that request the same: the key with all parameters in canonical spelling."""
     output: str
-    """Where results go: all parameters, spelled as the interest spelled them."""
+    """Key of the results: all parameters, spelled as in the interest."""
     query: Query
     values: tuple[tuple[str, Value], ...] = ()
     coarse: int = 0
-    """Count by prefixes instead of addresses: so many bits of IPv4, four times as many of IPv6; 0: addresses."""
+    """Count by prefixes of this many bits for IPv4, four times as many for IPv6; 0: by addresses."""
     within: str = ""
     """A prefix that the query was narrowed down to by refinement; its filters say so, too."""
 
 
-def request_of(key: str, templates: Mapping[str, Template]) -> Request | None:
-    """What an interest asks for; None for a key that asks for nothing of its own.
+def request_of(key: str, templates: Mapping[str, Template]) -> QueryRequest | None:
+    """The query that an interest requests; None for a key that requests none itself.
 
-    A wildcard (`window=*`, `sonata.*`) follows what others ask for.  Raises `InvalidRequest` for an
-    unknown query or parameter and for a value out of bounds: the text says what would do.
+    A wildcard (`window=*`, `sonata.*`) receives what others request.  Raises `InvalidRequest` for an
+    unknown query or parameter and for a value out of bounds; the text says what is accepted.
     """
     parsed = Key.parse(key)
     if not parsed.concrete:
@@ -90,7 +91,7 @@ def request_of(key: str, templates: Mapping[str, Template]) -> Request | None:
     name = parsed.segments[-1]
     given = {name: parsed.spec(name) for name in parsed.specs}
     if parsed.path == HANDSHAKE:
-        return Request(parsed.text, "handshake", "tcp", HANDSHAKE, HANDSHAKE, _HANDSHAKES)
+        return QueryRequest(parsed.text, "handshake", "tcp", HANDSHAKE, HANDSHAKE, _HANDSHAKES)
     if len(parsed.segments) == 4 and path == QUERY_PREFIX:
         return _query_request(parsed, name, given, templates)
     if len(parsed.segments) == 4 and path == CAPTURE_PREFIX:
@@ -109,7 +110,7 @@ def canonical_key(template: Template, values: Mapping[str, Value] | None = None)
 
 def _query_request(
     key: Key, name: str, given: Mapping[str, str], templates: Mapping[str, Template]
-) -> Request:
+) -> QueryRequest:
     template = templates.get(name)
     if template is None:
         raise InvalidRequest(f"{key}: there is no query {name}; there are {', '.join(templates)}")
@@ -118,7 +119,7 @@ def _query_request(
     texts = {each.name: given.get(each.name, each.text(values[each.name])) for each in template.parameters}
     output = Key(f"{QUERY_PREFIX}.{name}").with_specs(**texts).text
     query = msgspec.structs.replace(template.query(values), name=identity)
-    return Request(key.text, "query", name, identity, output, query, tuple(sorted(values.items())))
+    return QueryRequest(key.text, "query", name, identity, output, query, tuple(sorted(values.items())))
 
 
 def _values(key: Key, parameters: Mapping[str, Parameter], given: Mapping[str, str]) -> dict[str, Value]:
@@ -144,7 +145,7 @@ def capture_parameters(protocol: Protocol) -> dict[str, str]:
     return found
 
 
-def _capture_request(key: Key, name: str, given: Mapping[str, str]) -> Request:
+def _capture_request(key: Key, name: str, given: Mapping[str, str]) -> QueryRequest:
     protocol = PROTOCOLS.get(name)
     if protocol is None:
         raise InvalidRequest(f"{key}: there is no raw stream {name}; there are {', '.join(PROTOCOLS)}")
@@ -164,7 +165,7 @@ def _capture_request(key: Key, name: str, given: Mapping[str, str]) -> Request:
     except InvalidRequest as error:
         raise InvalidRequest(f"{key}: {error}") from None
     identity = Key(f"{CAPTURE_PREFIX}.{name}").with_specs(**texts).text
-    return Request(
+    return QueryRequest(
         key.text, "capture", name, identity, key.text, msgspec.structs.replace(query, name=identity)
     )
 
@@ -178,8 +179,8 @@ def _capture_condition(protocol: Protocol, spec: str, text: str) -> tuple[Term |
         return tcp.flags == pattern, text.lower()
     if spec in ("sport", "dport"):
         assert protocol.ports is not None  # noqa: S101 - else the spec is not known
-        if not text.isdecimal() or int(text) > 65_535:
-            raise InvalidRequest(f"{spec}={text} is no port; give 0 to 65535")
+        if not re.fullmatch("[0-9]{1,5}", text) or int(text) > 65_535:
+            raise InvalidRequest(f"{spec}={text} is not a port; give 0 to 65535")
         return protocol.ports[spec == "dport"] == int(text), str(int(text))
     parameter = _PREFIXES[spec == "dst"]
     value = str(parameter.parse(text))

@@ -1,4 +1,4 @@
-"""What queries report."""
+"""Results of queries."""
 
 from typing import Any
 
@@ -7,22 +7,22 @@ import msgspec
 from due import RecordBatch
 
 
-class Result(msgspec.Struct, frozen=True, kw_only=True):
+class QueryResult(msgspec.Struct, frozen=True, kw_only=True):
     """One tuple that a query reports."""
 
     query: str
     """The name under which the query was added."""
     window_us: int
-    """Begin of the window, capture time in us."""
+    """Start of the window, capture time in us."""
     length_us: int
     at_us: int
-    """When the threshold was reached; the window's end for what is known only then."""
+    """When the threshold was reached, us; the window's end if it is only known then."""
     fields: dict[str, int | str]
     exact: bool = True
     partial: bool = False
     """The query came into force within the window and has not seen all of it."""
     error: str = ""
-    """Why it is an estimate, and how good."""
+    """Why it is an estimate, and its error; empty if it is exact."""
 
     def to_value(self) -> dict[str, Any]:
         """The result as a DUE value; times in ns."""
@@ -40,7 +40,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Captured(msgspec.Struct, frozen=True, kw_only=True):
-    """Packets or tuples that a raw stream reports as they come."""
+    """Packets or tuples that a raw stream reports on arrival."""
 
     query: str
     batch: RecordBatch
@@ -48,7 +48,7 @@ class Captured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Handshake(msgspec.Struct, frozen=True, kw_only=True):
-    """A client proved to a service that it can be reached under its address."""
+    """A completed TCP handshake: the client is reachable at its address."""
 
     source: str
     service: str
@@ -56,8 +56,8 @@ class Handshake(msgspec.Struct, frozen=True, kw_only=True):
     at_us: int
 
     def to_value(self) -> dict[str, Any]:
-        """As a DUE value; time in ns."""
+        """The handshake as a DUE value; time in ns."""
         return {"source": self.source, "service": self.service, "port": self.port, "at": self.at_us * 1000}
 
 
-Output = Result | Captured | Handshake
+Output = QueryResult | Captured | Handshake

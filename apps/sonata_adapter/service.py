@@ -1,9 +1,9 @@
-"""The Sonata adapter as a DUE app: keys become queries in the switch, results come back.
+"""The Sonata adapter as a DUE app: turns requested keys into queries in the switch, and writes the results.
 
     network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata.*, network.p4_command.sonata_adapter.*
     network.packets|frames|digests|counts.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
 
-Nothing is observed and nothing is offered while nobody wants a result: with no interest the switch
+While nobody wants a result, nothing is observed and nothing is requested: without an interest the switch
 has no entry and sends nothing.
 """
 
@@ -11,7 +11,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -21,17 +21,18 @@ import msgspec
 import numpy as np
 
 import due.service
-from apps.messages import TableCommand, TableUpdate
-from apps.packets import read_frames
-from apps.sonata_adapter.catalogue import CATALOGUE, Template
-from apps.sonata_adapter.cell_read import CellRead
-from apps.sonata_adapter.control import Changes, Control, Source, Written, leftovers
-from apps.sonata_adapter.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
+from apps.messages import Intake, MessageError, TableCommand, TableUpdate, one_line, youngest
+from apps.packets import SteadyTime
+from apps.sonata_adapter.arrivals import SwitchPrograms, cells_in, command_in, data_in, state_in
+from apps.sonata_adapter.control import Control, ControllerUpdates, Source, Written, leftovers
 from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
-from apps.sonata_adapter.placement import SwitchLimits
+from apps.sonata_adapter.planner.placement import SwitchLimits
+from apps.sonata_adapter.query.catalogue import CATALOGUE, Template
+from apps.sonata_adapter.query.templates import QueryFolder, own_queries
 from apps.sonata_adapter.results import Captured
-from apps.sonata_adapter.templates import QueryFolder, own_queries
+from apps.sonata_adapter.switch.cell_read import CellRead
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
@@ -58,7 +59,7 @@ CAPABILITIES = (
         )
         for template in CATALOGUE.values()
     ),
-    # queries that people add; and wrong parameters, which are answered with what would do
+    # user queries; and wrong parameters, which are answered with what is accepted
     Capability(_offering(f"{QUERY_PREFIX}.*", _OWN_PARAMETERS), delivery="reliable"),
     *(
         Capability(_offering(f"{CAPTURE_PREFIX}.{name}", capture_parameters(protocol)), delivery="reliable")
@@ -72,7 +73,12 @@ CAPABILITIES = (
 )
 
 _LOG = logging.getLogger(__name__)
-_WIDTH: Final = 256
+MOST_SWITCHES: Final = 256
+_STATES_READ: Final = 2_000
+_COMMANDS_READ: Final = 20_000
+"""Most archived items that are read at start, the youngest."""
+_STEP_US: Final = 3_600_000_000
+"""A longer step of a switch's clock is accepted only after several items agree."""
 _LAST_ANSWERS_S: Final = 1.0
 _LOOK_S: Final = 0.01
 _MY_KEYS: Final = (QUERY_PREFIX, CAPTURE_PREFIX, HANDSHAKE)
@@ -82,19 +88,19 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Options of the Sonata adapter."""
 
     limits: SwitchLimits = SwitchLimits()
-    """What queries may take of the switch."""
+    """Resources of the switch that queries may use."""
     keys: int = DEFAULT_LIMIT
-    """Keys that one operator keeps exactly in a window; beyond, results are estimates and say so."""
+    """Keys that one operator keeps exactly in a window; beyond that, results are marked as estimates."""
     lateness_us: int = DEFAULT_LATENESS_US
-    """How long after its end a window waits for late packets, capture time; a quarter of it at most."""
+    """Allowed lateness: how long after its end a window waits for late packets, us; at most a quarter of it."""
     base_us: dict[str, int] = {}
-    """Absolute time of a switch's clock zero, where the controller does not say it: switch to us."""
+    """Switch to absolute time of its clock zero, us, if the controller does not report it."""
     engine: Literal["numpy", "spark"] = "numpy"
-    """What runs the host's operators: numpy in this process, or Spark Structured Streaming (extra `spark`)."""
+    """Engine of the host's operators: numpy in this process, or Spark Structured Streaming (extra `spark`)."""
     spark_master: str = "local[2]"
     """Where Spark runs: `local[N]`, `spark://host:7077`."""
     queries: str = ""
-    """Folder of people's own queries; empty: `$SDNATOR_QUERIES`, or one in the home folder."""
+    """Folder of the user's own queries; empty: `$SDNATOR_QUERIES`, or one in the home folder."""
 
 
 class SonataAdapterService:
@@ -112,6 +118,9 @@ class SonataAdapterService:
             engine=_engine(settings),
         )
         self._lock = threading.RLock()
+        self._intake = Intake(_LOG)
+        self._times: dict[str, SteadyTime] = {}
+        """Clocks of the switches, us."""
         self._observed: dict[Source, Any] = {}
         self._cells: Any = None
         self._switches: dict[str, Any] = {}
@@ -123,21 +132,22 @@ class SonataAdapterService:
         self._written = 0
 
     def start(self) -> None:
-        """Subscribe to what is wanted and to which switches there are."""
-        for item in self._engine.get(SWITCHES):
-            self._on_switch(item)
-        self._engine.observe(SWITCHES).subscribe(self._on_switch)
+        """Subscribe to assignments and to the states of switches."""
+        on_switch = self._intake.reading("switch", state_in, self._on_switch)
+        for item in youngest(self._find, {"dataKey": SWITCHES}, 0, _STATES_READ):
+            on_switch(item)
+        self._engine.observe(SWITCHES).subscribe(on_switch)
         self._engine.on_assignments(self._on_assignments)
 
     def tick(self) -> None:
-        """Packets that waited for other streams go on."""
+        """Process packets that waited for other streams."""
         with self._lock:
             self._write(self._control.tick(time.monotonic()))
             self._read_cells()
             self._refine()
 
     def stop(self) -> None:
-        """Report what is open, and take everything out of the switch."""
+        """Report open results, and remove all entries from the switch."""
         deadline = time.monotonic() + _LAST_ANSWERS_S
         waits = True
         while waits and time.monotonic() < deadline:
@@ -151,9 +161,28 @@ class SonataAdapterService:
             self._control.close()
 
     def health(self) -> dict[str, Any]:
-        """Counters for people."""
+        """Counters for `health`."""
         with self._lock:
-            return {**self._control.health(), "results": self._written, "switches": sorted(self._switches)}
+            return {
+                **self._control.health(),
+                "results": self._written,
+                "switches": sorted(self._switches),
+                "times_doubted": sum(each.doubted for each in self._times.values()),
+                **self._intake.health(),
+            }
+
+    def _find(self, query: Mapping[str, Any], limit: int) -> list[Item]:
+        return self._engine.get(query, limit=limit)
+
+    def _clock(self, item: Item, switch: str) -> SteadyTime | None:
+        """The clock of a switch; None, counted, for a switch beyond the limit."""
+        clock = self._times.get(switch)
+        if clock is None and len(self._times) < MOST_SWITCHES:
+            clock = self._times[switch] = SteadyTime(_STEP_US)
+        if clock is None:
+            text = f"switch {switch}: {MOST_SWITCHES} are known already"
+            self._intake.refuse("switch", MessageError("size", text), item.key)
+        return clock
 
     def _templates(self) -> dict[str, Template]:
         try:
@@ -173,44 +202,41 @@ class SonataAdapterService:
                 self._control.know(self._templates())
                 self._apply(self._control.want(wanted))
             if heard - self._heard:
-                # a controller has come that knows nothing of what was said before
+                # a new controller does not know earlier requests
                 self._apply(self._control.everything())
             self._heard = heard
 
-    def _on_switch(self, item: Item) -> None:
+    def _on_switch(self, item: Item, state: SwitchPrograms) -> None:
         name = item.key.rpartition(".")[2]
-        value = item.value
         with self._lock:
-            base_us = int(value.get("base_us", self._bases.get(name, 0)))
+            clock = self._clock(item, name)
+            if clock is None:
+                return
+            base_us = self._bases.get(name, 0) if state.base_us is None else state.base_us
             fresh = self._control.switch(name, base_us) or name not in self._switches
-            primary = bool(value.get("primary"))
-            again = primary and not self._switches.get(name, False)
-            self._switches[name] = primary
+            again = state.primary and not self._switches.get(name, False)
+            self._switches[name] = state.primary
             self._sweep()
             if fresh or again:
                 self._apply(self._control.everything(), only=name)
-            if value.get("event_time"):
-                self._control.advance(name, int(value["event_time"]) // 1000)
+            if state.event_time and clock.hear(state.event_time // 1000):
+                self._control.advance(name, state.event_time // 1000)
 
     def _sweep(self) -> None:
-        """Once, when this instance is active: take out what one that was killed left in the switches."""
+        """Once active, remove the entries that a killed instance left in the switches."""
         for switch in sorted(self._switches.keys() - self._swept) if self._active else ():
             self._swept.add(switch)
-            past = []
-            for item in self._engine.get(f"{COMMAND}.{switch}"):
-                try:
-                    past.append(TableCommand.from_value(item.value).updates)
-                except msgspec.ValidationError as error:
-                    _LOG.warning("%s: not a command: %s", item.key, error)
-            self._command(switch, leftovers(past))
+            archived = youngest(self._find, {"dataKey": f"{COMMAND}.{switch}"}, 0, _COMMANDS_READ)
+            past = (self._intake.read("command", command_in, item) for item in archived)
+            self._command(switch, leftovers(command.updates for command in past if command is not None))
 
     def _command(self, switch: str, updates: tuple[TableUpdate, ...]) -> None:
         if updates:
             command = TableCommand(id=f"sonata-{time.time_ns()}-{next(self._commands)}", updates=updates)
             self._engine.write(f"{COMMAND}.{switch}", command.to_value(), [NO_WAIT])
 
-    def _apply(self, changes: Changes, only: str = "") -> None:
-        """Tell the controller: what ends first, then counting entries, then classifier bits."""
+    def _apply(self, changes: ControllerUpdates, only: str = "") -> None:
+        """Send changes to the controller: withdrawals first, then counting entries, then classifier bits."""
         for offer in changes.withdraw:
             self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
         for switch in [only] if only else sorted(self._switches):
@@ -218,12 +244,13 @@ class SonataAdapterService:
         for offer in changes.offer:
             self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
         for key, reason in changes.refused:
-            _LOG.warning("%s", reason)
+            _LOG.warning("%s", one_line(reason))
             name = key.split(":")[0].rpartition(".")[2]
             self._engine.write(f"{INCOMPATIBLE}.{name}", {"key": key, "reason": reason}, [NO_WAIT])
         self._observe(self._control.sources)
         if self._control.needs_cells and self._cells is None:
-            self._cells = self._engine.observe(CELLS).subscribe(self._on_cells)
+            on_cells = self._intake.reading("cell", cells_in, self._on_cells)
+            self._cells = self._engine.observe(CELLS).subscribe(on_cells)
         elif not self._control.needs_cells and self._cells is not None:
             self._cells.dispose()
             self._cells = None
@@ -233,12 +260,17 @@ class SonataAdapterService:
             self._observed.pop(source).dispose()
         for source in sorted(sources - self._observed.keys()):
             key = f"network.{source.kind}.p4runtime_ctrl.*.{source.name}"
-            self._observed[source] = self._engine.observe(key).subscribe(self._on_data)
+            on_data = self._intake.reading(source.kind, data_in, self._on_data)
+            self._observed[source] = self._engine.observe(key).subscribe(on_data)
 
-    def _on_data(self, item: Item) -> None:
+    def _on_data(self, item: Item, batch: RecordBatch) -> None:
         _, kind, _, switch, name = item.key.split(".")
-        batch = with_frames(item.value) if kind == "frames" else item.value
         with self._lock:
+            clock = self._clock(item, switch)
+            if clock is None:
+                return
+            rows = clock.believed(batch["time_us"])
+            batch = batch if rows is None else batch.take(rows)
             if kind == "digests":
                 self._write(self._control.digests(switch, name, batch))
                 self._refine()
@@ -249,11 +281,13 @@ class SonataAdapterService:
                 self._control.busy(switch, time.monotonic())
             self._read_cells()
 
-    def _on_cells(self, item: Item) -> None:
+    def _on_cells(self, item: Item, answers: tuple[list[int], list[int]]) -> None:
         """Answers of a switch: `id` and `count` of each question."""
         switch = item.key.rpartition(".")[2]
-        numbers, counts = item.value["id"].tolist(), item.value["count"].tolist()
+        numbers, counts = answers
         with self._lock:
+            if self._clock(item, switch) is None:
+                return
             self._write(self._control.cells(switch, numbers, counts))
             self._read_cells()
 
@@ -280,33 +314,17 @@ class SonataAdapterService:
 
 
 def _engine(settings: Settings) -> Callable[..., WindowEngine]:
-    """Makes engines; raises `SparkMissing` where Spark is asked for and cannot be had."""
+    """A factory for engines; raises `SparkMissing` if Spark is configured but not installed."""
     if settings.engine == "numpy":
         return HostEngine
-    from apps.sonata_adapter.spark import SparkEngine, spark_session
+    from apps.sonata_adapter.host.spark import SparkEngine, spark_session
 
     spark_session(settings.spark_master)
     return partial(SparkEngine, master=settings.spark_master)
 
 
-def with_frames(value: dict[str, Any]) -> RecordBatch:
-    """The controller's frames as a batch: header columns, the bytes, and how many of them there are."""
-    frames = [bytes(frame) for frame in value["frames"]]
-    batch = read_frames(
-        frames,
-        lengths=value["lengths"],
-        times_us=value["times_us"],
-        ports=value["ports"],
-        sequence=value["sequence"],
-        arrival=value["arrival"],
-    )
-    cut = [frame[:_WIDTH] for frame in frames]
-    captured = np.array([len(frame) for frame in cut], dtype=np.uint16)
-    return RecordBatch({**batch, "frame": np.array(cut, dtype=f"V{_WIDTH}"), "captured": captured})
-
-
 def cell_request(reads: Sequence[CellRead]) -> RecordBatch:
-    """Questions about cells as the controller takes them: addresses as two halves."""
+    """Requests for cells in the controller's format: addresses as two halves."""
     low = (1 << 64) - 1
     return RecordBatch(
         {

@@ -13,7 +13,7 @@ from dataplane.compiler.c_machine import CMachine
 from dataplane.compiler.machine import Machine
 from dataplane.compiler.python_machine import PythonMachine
 from dataplane.errors import CompilerError
-from dataplane.tree import Program
+from dataplane.v1model.tree import Program
 
 _log = logging.getLogger(__name__)
 

@@ -3,18 +3,18 @@
 import hashlib
 import os
 import shutil
-import subprocess
+import stat
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import cffi
 
+from dataplane.compiler.confined import compile_confined
 from dataplane.errors import CompilerError
 
 FLAGS = ("-std=gnu11", "-O2", "-fPIC", "-shared", "-fno-strict-aliasing", "-w")
 _COMPILERS = ("cc", "gcc", "clang")
-_TIMEOUT_S = 300
 
 
 def compiler() -> str | None:
@@ -27,16 +27,17 @@ def compiler() -> str | None:
 def cache_directory() -> Path:
     """$XDG_CACHE_HOME/sdnator/dataplane (or under ~/.cache), for its owner only.
 
-    Raises OSError where it cannot be made or belongs to somebody else.
+    Raises OSError where it cannot be made, or others could exchange what is in it.
     """
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     directory = Path(base) / "sdnator" / "dataplane"
     directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    status = directory.stat()
-    if status.st_uid != os.getuid():
-        raise PermissionError(f"{directory} belongs to another user")
-    if status.st_mode & 0o077:
-        directory.chmod(0o700)
+    for place in (directory.parent, directory):
+        status = place.lstat()
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+            raise PermissionError(f"{place} belongs to another user, or is no folder")
+        if status.st_mode & (0o077 if place == directory else 0o022):
+            place.chmod(0o700)
     return directory
 
 
@@ -58,24 +59,40 @@ def compiled_library(text: str, declarations: str) -> tuple[Any, Any]:
     except (OSError, RuntimeError):
         # no home: the library stays mapped after its directory is gone
         with tempfile.TemporaryDirectory(prefix="sdnator-") as temporary:
-            return ffi, ffi.dlopen(str(_compile(cc, text, Path(temporary), digest)))
+            return ffi, _opened(ffi, _compile(cc, text, Path(temporary), digest))
     path = directory / f"{digest}.so"
-    if not path.exists():
+    if not _ours(path):
         path = _compile(cc, text, directory, digest)
-    return ffi, ffi.dlopen(str(path))
+    return ffi, _opened(ffi, path)
+
+
+def _ours(path: Path) -> bool:
+    """Whether it is there, and nobody else can have written it."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return False
+    plain = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+    return plain and status.st_uid == os.geteuid() and not status.st_mode & 0o022
+
+
+def _opened(ffi: cffi.FFI, path: Path) -> Any:
+    if not _ours(path):
+        raise CompilerError(f"{path} is not a file that only we can write: remove it")
+    try:
+        return ffi.dlopen(str(path))
+    except OSError as error:
+        raise CompilerError(f"the compiled program cannot be loaded: {error}; remove {path}") from error
 
 
 def _compile(cc: str, text: str, directory: Path, digest: str) -> Path:
-    with tempfile.TemporaryDirectory(dir=directory) as work:
-        source, built = Path(work) / "switch.c", Path(work) / "switch.so"
-        source.write_text(text)
-        command = [cc, *FLAGS, "-o", str(built), str(source)]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise CompilerError(f"{cc} could not build the switch program: {error}") from error
-        if done.returncode != 0:
-            raise CompilerError(f"{cc} refused the generated C: {done.stderr[:2000]}")
-        path = directory / f"{digest}.so"
-        built.replace(path)
+    path = directory / f"{digest}.so"
+    made = compile_confined(cc, FLAGS, text)
+    try:
+        # written with mode 0600 under another name: nobody sees half a library
+        with tempfile.NamedTemporaryFile(dir=directory, delete=False) as written:
+            written.write(made)
+        Path(written.name).replace(path)
+    except OSError as error:
+        raise CompilerError(f"{path} cannot be written: {error.strerror}") from error
     return path

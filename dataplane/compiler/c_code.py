@@ -10,14 +10,14 @@ engine's registers.  `machine` is the switch: tables, counters, meters, register
 
 from importlib.resources import files
 
-from dataplane import tree
 from dataplane.compiler.c_expressions import CTYPE, convert, kind_of, literal
 from dataplane.compiler.c_statements import ALIGNED, CStatements, key_places, storage, table_words, words
 from dataplane.compiler.control import state_order
-from dataplane.compiler.layout import STANDARD, Layout
+from dataplane.compiler.layout import ENGINE_FIELDS, STANDARD, Layout
 from dataplane.compiler.simplify import simplify
 from dataplane.errors import Unsupported
-from dataplane.tree import Expression, FieldRef, Program
+from dataplane.v1model import tree
+from dataplane.v1model.tree import Expression, FieldRef, Program
 
 _MAX_STATES = 4096
 
@@ -46,7 +46,7 @@ class CGenerator(CStatements):
         code = self.program.errors.get(name, 1)
         self.line(f"if ({condition}) {{ error = {code}; goto done; }}")
 
-    def state(self, state: tree.State) -> None:
+    def state(self, state: tree.ParserState) -> None:
         self.line(f"{self.labels[state.name]}: ;")
         self.fail(f"++turns > {_MAX_STATES}", "ParserTimeout")
         with self.block(""):
@@ -69,7 +69,7 @@ class CGenerator(CStatements):
     def lookahead(self, e: tree.Lookahead) -> None:
         self.fail(f"8ull * (z - o) < {e.offset + e.width}", "PacketTooShort")
 
-    def select(self, state: tree.State) -> None:
+    def select(self, state: tree.ParserState) -> None:
         for n, key in enumerate(state.keys):
             if isinstance(key, tree.Lookahead):
                 self.lookahead(key)
@@ -238,12 +238,15 @@ def _structures(g: CGenerator) -> list[str]:
         "table t[N_TABLES + 1]; u64 *c[N_COUNTERS + 1]; meter *mt[N_METERS + 1];",
         "u64 *reg[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;",
         "u64 stats[6], out_used, out_room, seed; u8 *out; u8 verdict; int budget; job *head, **tail;",
+        "u64 out_of_range[N_COUNTERS + N_METERS + N_REGISTERS + 1];",
         "} machine;",
         "PLAIN void sample(machine *m, u32 id, const u64 *w, const u8 *limbs, u32 members);",
         "#define STD(p, name) (p)->STD_##name",
     ]
-    for f in layout.fields.get(STANDARD, ()):
-        lines += [f"#define HAS_{f.name} 1", f"#define STD_{f.name} {g.names[STANDARD, f.name]}"]
+    for name in ENGINE_FIELDS:
+        ref = layout.standard(name)
+        if ref is not None:
+            lines += [f"#define HAS_{name} 1", f"#define STD_{name} {g.names[STANDARD, name]}"]
     for n in sorted({key_places(s)[0] for s in program.tables.values() if s.keys}):
         lines.append(
             f"PLAIN entry *find{n}(const table *t, const u64 *k) {{ return table_find(t, k, {n}); }}"
@@ -307,8 +310,8 @@ def generate(program: Program, layout: Layout) -> str:
     with g.block("static int parse(machine *m, phv *p)"):
         g.line("(void)m;")
         g.parser()
-    for pipeline in (program.ingress, program.egress):
-        with g.block(f"static void {pipeline.name}(machine *m, phv *p)"):
+    for name, pipeline in (("ingress", program.ingress), ("egress", program.egress)):
+        with g.block(f"static void {name}(machine *m, phv *p)"):
             g.line("i64 a; const u64 *d; int h; u64 i; (void)m; (void)p; (void)a; (void)d; (void)h; (void)i;")
             g.pipeline(pipeline)
     with g.block("static u32 deparse(machine *m, phv *p, u8 *out)"):

@@ -7,10 +7,10 @@ operands are computed at a kind that holds their bounds.
 
 from collections.abc import Callable
 
-from dataplane import tree
 from dataplane.compiler.simplify import Bounds, bounds, simplify, union
 from dataplane.errors import Unsupported
-from dataplane.tree import Binary, Conditional, Const, Expression, FieldRef, Unary
+from dataplane.v1model import tree
+from dataplane.v1model.tree import Binary, Conditional, Const, Expression, FieldRef, Unary
 
 KINDS = (64, 128, 256, 512)
 CTYPE = {64: "u64", 128: "u128", 256: "W4", 512: "W8"}

@@ -11,9 +11,9 @@ from dataplane.compiler import machine as m
 from dataplane.compiler.c_build import compiled_library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
-from dataplane.compiler.machine import Batch, Digest, KeyPlace, Replicas, Rule
+from dataplane.compiler.machine import BatchResult, Digest, KeyPlace, Replicas, Rule
 from dataplane.errors import DataplaneError
-from dataplane.tree import ArraySpec, Node, Program, TableNode, TableSpec
+from dataplane.v1model.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
 _DECLARATIONS = """
 void *dp_new(uint32_t cpu_port);
@@ -22,6 +22,7 @@ uint64_t dp_run(void *h, uint32_t port, uint32_t count, const char *data, const 
                 const uint64_t *times, uint8_t *verdicts);
 const uint8_t *dp_output(void *h);
 void dp_statistics(void *h, uint64_t *to);
+void dp_out_of_range(void *h, uint64_t *to);
 void dp_ports(void *h, const char *exists);
 void dp_session(void *h, uint32_t number, uint32_t count, const uint32_t *pairs, uint32_t length);
 void dp_group(void *h, uint32_t number, uint32_t count, const uint32_t *pairs);
@@ -234,6 +235,7 @@ class CMachine:
             name: CRegisters(native, i, spec) for i, (name, spec) in enumerate(program.registers.items())
         }
         self._digests = {number: spec.name for number, spec in program.digests.items()}
+        self._arrays = m.array_names(program)
 
     def _know_actions(self, program: Program, node: Node) -> None:
         table = self.tables.get(node.name)
@@ -242,7 +244,7 @@ class CMachine:
                 params = program.actions[number].spec.params
                 table.know_action(number, tuple(words(p.width) for p in params))
 
-    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> Batch:
+    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult:
         ffi, lib = self._native.ffi, self._native.lib
         count = len(frames)
         lengths = ffi.new("uint32_t[]", [len(f) for f in frames])
@@ -250,12 +252,12 @@ class CMachine:
         verdicts = ffi.new("uint8_t[]", count)
         data = frames[0] if count == 1 else b"".join(frames)
         used = lib.dp_run(self._native.handle, port, count, data, lengths, times, verdicts)
-        batch = Batch(verdicts=bytes(ffi.buffer(verdicts, count)))
+        batch = BatchResult(verdicts=bytes(ffi.buffer(verdicts, count)))
         if used:
             self._collect(batch, bytes(ffi.buffer(lib.dp_output(self._native.handle), used)))
         return batch
 
-    def _collect(self, batch: Batch, records: bytes) -> None:
+    def _collect(self, batch: BatchResult, records: bytes) -> None:
         at, end = 0, len(records)
         unpack = _RECORD.unpack_from
         while at < end:
@@ -291,6 +293,11 @@ class CMachine:
         counts = self._native.ffi.new("uint64_t[]", len(m.STATISTICS))
         self._native.lib.dp_statistics(self._native.handle, counts)
         return dict(zip(m.STATISTICS, counts, strict=True))
+
+    def out_of_range(self) -> dict[str, int]:
+        counts = self._native.ffi.new("uint64_t[]", len(self._arrays) + 1)
+        self._native.lib.dp_out_of_range(self._native.handle, counts)
+        return {name: count for name, count in zip(self._arrays, counts, strict=False) if count}
 
     def close(self) -> None:
         self._native.close()

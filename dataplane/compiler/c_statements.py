@@ -1,15 +1,16 @@
 """Statements, tables and hash inputs as C; the functions around them are c_code's."""
 
-import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from dataplane import tree
 from dataplane.compiler.c_expressions import CTYPE, CExpressions, convert, kind_of, literal
 from dataplane.compiler.control import Generator
 from dataplane.compiler.layout import Layout
+from dataplane.compiler.machine import array_names
 from dataplane.compiler.simplify import bounds, simplify
 from dataplane.errors import Unsupported
-from dataplane.tree import Const, Expression, FieldRef, MatchKind, Program, Statement
+from dataplane.v1model import tree
+from dataplane.v1model.tree import Const, Expression, FieldRef, MatchKind, Program, Statement
 
 ALIGNED = {8: "be1", 16: "be2", 32: "be4", 48: "be6", 64: "be8", 128: "be16"}
 """Loads of whole bytes, by width in bits."""
@@ -76,8 +77,8 @@ class CStatements(Generator):
         for header, fields in layout.fields.items():
             place = "m." if header in layout.metadata else ""
             for f in fields:
-                plain = re.sub(r"\W", "_", f"{header}_{f.name}")
-                self.names[header, f.name] = f"{place}f{len(self.names)}_{plain}"
+                # the program's own names never get into the source: they may be any text
+                self.names[header, f.name] = f"{place}f{len(self.names)}"
         self.numbers = {h: i for i, h in enumerate(layout.packet_headers)}
         self.index = {
             kind: {name: i for i, name in enumerate(names)}
@@ -89,6 +90,7 @@ class CStatements(Generator):
                 ("s", program.stacks),
             )
         }
+        self.arrays = {name: i for i, name in enumerate(array_names(program))}
         self.e = CExpressions(self.leaf)
         self.places: tuple[tuple[int, int], ...] = ()
         """(word, words) of each parameter of the action in sight."""
@@ -275,16 +277,23 @@ class CStatements(Generator):
             if ref is not None:
                 self.line(f"{self.field(ref)} = {value};")
 
+    @contextmanager
+    def cell(self, array: tree.ArraySpec, index: Expression) -> Iterator[None]:
+        """A block for cell `i` of the array; an index beyond the array is counted instead."""
+        with self.block(f"if ((i = {self.value64(index)}) < {array.size})"):
+            yield
+        self.line(f"else m->out_of_range[{self.arrays[array.name]}]++;")
+
     def do_count(self, s: tree.Count) -> None:
         spec = self.program.counters[s.array]
         cells = f"m->c[{self.index['c'][s.array]}]"
-        with self.block(f"if ((i = {self.value64(s.index)}) < {spec.size})"):
+        with self.cell(spec, s.index):
             self.line(f"{cells}[2 * i]++; {cells}[2 * i + 1] += p->arrived;")
 
     def do_executemeter(self, s: tree.ExecuteMeter) -> None:
         spec = self.program.meters[s.array]
         cost = "p->arrived" if spec.unit == "bytes" else "1"
-        with self.block(f"if ((i = {self.value64(s.index)}) < {spec.size})"):
+        with self.cell(spec, s.index):
             self.assign64(s.target, f"meter_run(&m->mt[{self.index['mt'][s.array]}][i], {cost}, p->now)")
 
     def do_registerread(self, s: tree.RegisterRead) -> None:
@@ -303,14 +312,14 @@ class CStatements(Generator):
             text = self.e.wrapped(text, kind, s.target.field.width)
         elif spec.width > s.target.field.width:
             text = self.e.cut(text, kind, s.target.field.width)
-        with self.block(f"if ((i = {self.value64(s.index)}) < {spec.size})"):
+        with self.cell(spec, s.index):
             self.assign(s.target, text)
 
     def do_registerwrite(self, s: tree.RegisterWrite) -> None:
         spec = self.program.registers[s.array]
         cells, count = f"m->reg[{self.index['reg'][s.array]}]", words(spec.width)
         text, kind = self.e.stored(s.value, tree.FieldType("", spec.width, 0))
-        with self.block(f"if ((i = {self.value64(s.index)}) < {spec.size})"):
+        with self.cell(spec, s.index):
             if kind == 64:
                 self.line(f"{cells}[i] = {text};")
             elif kind == 128:

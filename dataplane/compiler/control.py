@@ -5,13 +5,13 @@ have met is its immediate post-dominator: a branch is written as a block that en
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from dataplane.compiler.layout import Layout, walk
 from dataplane.compiler.simplify import simplify
-from dataplane.errors import ProgramError
-from dataplane.tree import (
+from dataplane.errors import ProgramError, Unsupported
+from dataplane.v1model.tree import (
     ConditionNode,
     Exit,
     Expression,
@@ -24,6 +24,10 @@ from dataplane.tree import (
     TableNode,
 )
 
+MAX_TEXT = 32 << 20
+"""Characters of generated code: where ways part and meet again without order, nodes are written many times."""
+MAX_DEPTH = 90
+"""Nested blocks; Python's own compiler takes 100."""
 NO_ACTION = -1
 """What runs on a miss in a table without default action."""
 
@@ -38,22 +42,44 @@ def successors(node: Node) -> tuple[str | None, ...]:
 
 def order(pipeline: Pipeline) -> list[str]:
     """Nodes reachable from the start, each before its successors.  Raises ProgramError on a cycle."""
-    done: list[str] = []
     state: dict[str, bool] = {}
 
-    def visit(name: str | None) -> None:
-        if name is None or state.get(name):
-            return
-        if name in state:
-            raise ProgramError(f"cycle through {name} in the {pipeline.name} pipeline")
-        state[name] = False
-        for following in successors(pipeline.nodes[name]):
-            visit(following)
-        state[name] = True
-        done.append(name)
+    def following(name: str) -> tuple[str | None, ...]:
+        ahead = successors(pipeline.nodes[name])
+        for each in ahead:
+            if each is not None and state.get(each) is False:
+                raise ProgramError(f"cycle through {each} in the {pipeline.name} pipeline")
+        return ahead
 
-    visit(pipeline.start)
-    return done[::-1]
+    return _depth_first(pipeline.start, following, state)[::-1]
+
+
+def _depth_first(
+    start: str | None, following: Callable[[str], tuple[str | None, ...]], state: dict[str, bool]
+) -> list[str]:
+    """Names reachable from the start, each behind what follows it; `state` is False while that is visited.
+
+    Without recursion: a pipeline may be thousands of tables long.
+    """
+    done: list[str] = []
+    path: list[tuple[str, Iterator[str | None]]] = []
+
+    def enter(name: str) -> None:
+        state[name] = False
+        path.append((name, iter(following(name))))
+
+    if start is not None:
+        enter(start)
+    while path:
+        name, ahead = path[-1]
+        further = next((each for each in ahead if each is not None and each not in state), None)
+        if further is not None:
+            enter(further)
+        else:
+            path.pop()
+            state[name] = True
+            done.append(name)
+    return done
 
 
 def joins(pipeline: Pipeline) -> dict[str, str | None]:
@@ -82,20 +108,12 @@ def joins(pipeline: Pipeline) -> dict[str, str | None]:
 
 def state_order(parser: Parser) -> list[str]:
     """Reachable states, in topological order as far as there is one."""
-    done: list[str] = []
-    seen: set[str] = set()
 
-    def visit(name: str | None) -> None:
-        if name is None or name in seen:
-            return
-        seen.add(name)
+    def following(name: str) -> tuple[str | None, ...]:
         state = parser.states[name]
-        for following in (*(c.next for c in state.cases), state.default):
-            visit(following)
-        done.append(name)
+        return (*(case.next for case in state.cases), state.default)
 
-    visit(parser.start)
-    return done[::-1]
+    return _depth_first(parser.start, following, {})[::-1]
 
 
 def may_exit(body: Sequence[Statement]) -> bool:
@@ -110,8 +128,15 @@ class Generator(ABC):
         self.layout = layout
         self.lines: list[str] = []
         self.depth = 0
+        self.written = 0
 
     def line(self, text: str) -> None:
+        self.written += len(text)
+        if self.written > MAX_TEXT or self.depth > MAX_DEPTH:
+            raise Unsupported(
+                f"a program of more than {MAX_TEXT} characters or {MAX_DEPTH} nested blocks, when it is written out,"
+                " is not supported by the embedded switch"
+            )
         self.lines.append("    " * self.depth + text)
 
     @contextmanager

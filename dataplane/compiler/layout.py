@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataplane import tree
-from dataplane.tree import FieldRef, FieldType, Program
+from dataplane.v1model import tree
+from dataplane.v1model.tree import FieldRef, FieldType, Program
 
-_ENGINE_FIELDS = (
+ENGINE_FIELDS = (
     "ingress_port",
     "egress_spec",
     "egress_port",
@@ -26,6 +26,7 @@ _ENGINE_FIELDS = (
     "checksum_error",
     "parser_error",
 )
+"""Fields of standard_metadata that the engine itself reads or writes."""
 STANDARD = "standard_metadata"
 
 
@@ -114,7 +115,7 @@ def make(program: Program) -> Layout:
         if isinstance(target, FieldRef):
             written[target.header].add(target.field.name)
             used[target.header].add(target.field.name)
-    used.get(STANDARD, set()).update(_ENGINE_FIELDS)
+    used.get(STANDARD, set()).update(ENGINE_FIELDS)
     for group in _linked(program, parts):
         for table in (used, written):
             everything = set().union(*(table[h] for h in group))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from dataplane.compiler import samples
+from dataplane.v1model.tree import Program
 
 Replicas = tuple[tuple[int, int], ...]
 """(port, instance) of each copy."""
@@ -27,7 +28,7 @@ class Digest(NamedTuple):
 
 
 @dataclass(slots=True)
-class Batch:
+class BatchResult:
     """What a batch of frames led to; `verdicts` has a byte per frame."""
 
     outputs: list[tuple[int, bytes]] = field(default_factory=list)
@@ -129,7 +130,7 @@ class Machine(Protocol):
     @property
     def registers(self) -> Mapping[str, RegisterStore]: ...
 
-    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> Batch: ...
+    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult: ...
 
     def set_clone_session(self, session: int, replicas: Replicas | None, packet_length: int) -> None:
         """None removes it."""
@@ -141,7 +142,16 @@ class Machine(Protocol):
 
     def statistics(self) -> dict[str, int]: ...
 
+    def out_of_range(self) -> dict[str, int]:
+        """Accesses beyond an array's last cell, by the array's name; arrays without any are left out."""
+        ...
+
     def close(self) -> None: ...
+
+
+def array_names(program: Program) -> tuple[str, ...]:
+    """Counters, meters and registers in the order in which the back ends number them together."""
+    return (*program.counters, *program.meters, *program.registers)
 
 
 INSTANCE_INGRESS_CLONE, INSTANCE_EGRESS_CLONE = 1, 2

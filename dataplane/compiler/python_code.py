@@ -5,15 +5,17 @@
     deparse(p)    checksums, then the frame's bytes
 
 The list `p` holds every kept field, validity bits, the bytes of extracted headers and the engine's
-registers; `SLOTS` says where.  Names beginning with T, C, M, R are tables, counters, meters, registers.
+registers; `SLOTS` says where.  Names of T, C, M, R and a number are
+tables, counters, meters, registers; D and a number is the name of a digest.  Nothing that a program calls its parts
+gets into the text.
 """
 
-from dataplane import tree
 from dataplane.compiler.control import state_order
 from dataplane.compiler.layout import Layout
 from dataplane.compiler.python_statements import PythonStatements, Slots
 from dataplane.errors import Unsupported
-from dataplane.tree import Expression, FieldRef, Program
+from dataplane.v1model import tree
+from dataplane.v1model.tree import Expression, FieldRef, Program
 
 _MAX_STATES = 4096
 
@@ -27,8 +29,8 @@ class PythonGenerator(PythonStatements):
         """The text of the whole module."""
         with self.block("def parse(p)"):
             self.parser()
-        for pipeline in (self.program.ingress, self.program.egress):
-            with self.block(f"def {pipeline.name}(p)"):
+        for name, pipeline in (("ingress", self.program.ingress), ("egress", self.program.egress)):
+            with self.block(f"def {name}(p)"):
                 self.pipeline(pipeline)
         with self.block("def deparse(p)"):
             self.deparser()
@@ -59,7 +61,7 @@ class PythonGenerator(PythonStatements):
     def fail(self, condition: str, name: str) -> None:
         self.line(f"if {condition}: error = {self.error(name)}; break")
 
-    def state(self, state: tree.State) -> None:
+    def state(self, state: tree.ParserState) -> None:
         self.branch("if", f"s == {self.states[state.name]}")
         for op in state.ops:
             if isinstance(op, tree.Extract):
@@ -74,7 +76,7 @@ class PythonGenerator(PythonStatements):
         self.select(state)
         self.close()
 
-    def select(self, state: tree.State) -> None:
+    def select(self, state: tree.ParserState) -> None:
         for i, key in enumerate(state.keys):
             if isinstance(key, tree.Lookahead):
                 self.fail(f"8 * (z - o) < {key.offset + key.width}", "PacketTooShort")
@@ -214,9 +216,8 @@ class PythonGenerator(PythonStatements):
         for number, spec in self.program.digests.items():
             self.branch(head, f"{self.reg('DIGEST')} == {number}")
             values = [self.key_unsigned(e, w) for e, w in zip(spec.fields, spec.widths, strict=True)]
-            self.line(
-                f"return Digest({spec.name!r}, sample(({', '.join(values)}{',' if len(values) == 1 else ''})))"
-            )
+            members = "".join(f"{value}, " for value in values)
+            self.line(f"return Digest(D{number}, sample(({members})))")
             head = "elif"
         if head == "elif":
             self.close()

@@ -9,11 +9,10 @@ from random import randint
 from types import CodeType
 from typing import Any
 
-from dataplane import externs
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
 from dataplane.compiler import samples
-from dataplane.compiler.machine import Batch, Replicas
+from dataplane.compiler.machine import BatchResult, Replicas
 from dataplane.compiler.python_code import generate
 from dataplane.compiler.python_statements import NO_TRUNCATION, Slots
 from dataplane.compiler.python_tables import (
@@ -22,7 +21,8 @@ from dataplane.compiler.python_tables import (
     PythonRegisters,
     PythonTable,
 )
-from dataplane.tree import Program
+from dataplane.v1model import externs
+from dataplane.v1model.tree import Program
 
 _Packet = list[Any]
 
@@ -73,9 +73,11 @@ class PythonMachine:
         self.counters = {name: PythonCounters(spec.size) for name, spec in program.counters.items()}
         self.meters = {name: PythonMeters(spec) for name, spec in program.meters.items()}
         self.registers = {name: PythonRegisters(spec.size) for name, spec in program.registers.items()}
-        code: CodeType = compile(text, f"<{program.name}>", "exec")
+        self._arrays = m.array_names(program)
+        self._out_of_range = [0] * len(self._arrays)
+        code: CodeType = compile(text, "<switch program>", "exec")
         space = _names() | self._state()
-        exec(code, space)  # noqa: S102 - our own generated text: names and numbers of the program only
+        exec(code, space)  # noqa: S102 - our own generated text: of the program only numbers
         self._parse: Callable[[_Packet], int] = space["parse"]
         self._ingress: Callable[[_Packet], None] = space["ingress"]
         self._egress: Callable[[_Packet], None] = space["egress"]
@@ -86,7 +88,7 @@ class PythonMachine:
         self._groups: dict[int, Replicas] = {}
         self._ports: frozenset[int] | None = None
         self._counts = dict.fromkeys(m.STATISTICS, 0)
-        self._batch = Batch()
+        self._batch = BatchResult()
         self._verdict = 0
         self._budget = 0
         # (to ingress, packet, port): what a pass sends round again waits here, as in BMv2's queues
@@ -98,12 +100,13 @@ class PythonMachine:
         names |= {f"C{i}": c for i, c in enumerate(self.counters.values())}
         names |= {f"M{i}": x.meters for i, x in enumerate(self.meters.values())}
         names |= {f"R{i}": r.values for i, r in enumerate(self.registers.values())}
-        return names
+        names |= {f"D{number}": spec.name for number, spec in self.program.digests.items()}
+        return names | {"OUT_OF_RANGE": self._out_of_range}
 
     # -- packets ------------------------------------------------------------------------------------
 
-    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> Batch:
-        batch = self._batch = Batch()
+    def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult:
+        batch = self._batch = BatchResult()
         verdicts = bytearray()
         for frame, now in zip(frames, times_us, strict=True):
             self._verdict = 0
@@ -282,6 +285,9 @@ class PythonMachine:
 
     def statistics(self) -> dict[str, int]:
         return dict(self._counts)
+
+    def out_of_range(self) -> dict[str, int]:
+        return {name: n for name, n in zip(self._arrays, self._out_of_range, strict=True) if n}
 
     def close(self) -> None:
         """Nothing to free."""

@@ -1,12 +1,14 @@
 """Statements, tables and hash inputs as Python; the functions around them are python_code's."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from dataplane import tree
 from dataplane.compiler.control import Generator
 from dataplane.compiler.layout import Layout
+from dataplane.compiler.machine import array_names
 from dataplane.compiler.simplify import bounds, field_bounds, simplify
-from dataplane.tree import Binary, Const, Expression, FieldRef, Program, Statement
+from dataplane.v1model import tree
+from dataplane.v1model.tree import Binary, Const, Expression, FieldRef, Program, Statement
 
 ENGINE = (
     "PACKET", "OFFSET", "LENGTH", "ARRIVED", "TRUNCATE", "CLONE", "CLONE_LIST", "DIGEST", "RESUBMIT",
@@ -60,6 +62,7 @@ class PythonStatements(Generator):
     def __init__(self, program: Program, layout: Layout) -> None:
         super().__init__(program, layout)
         self.slots = Slots(program, layout)
+        self.arrays = {name: i for i, name in enumerate(array_names(program))}
         self.numbers = {
             kind: {name: i for i, name in enumerate(names)}
             for kind, names in (
@@ -221,35 +224,40 @@ class PythonStatements(Generator):
     def number(self, kind: str, name: str) -> str:
         return f"{kind}{self.numbers[kind][name]}"
 
+    @contextmanager
+    def cell(self, array: tree.ArraySpec, index: Expression) -> Iterator[None]:
+        """A block for cell `i` of the array; an index outside the array is counted instead."""
+        self.line(f"i = {self.value(index)}")
+        self.branch("if", f"0 <= i < {array.size}")
+        yield
+        self.branch("else", "")
+        self.line(f"OUT_OF_RANGE[{self.arrays[array.name]}] += 1")
+        self.close()
+
     def do_count(self, s: tree.Count) -> None:
-        self.line(f"{self.number('C', s.array)}.count({self.value(s.index)}, {self.reg('ARRIVED')})")
+        with self.cell(self.program.counters[s.array], s.index):
+            self.line(f"{self.number('C', s.array)}.count(i, {self.reg('ARRIVED')})")
 
     def do_executemeter(self, s: tree.ExecuteMeter) -> None:
-        self.line(f"i = {self.value(s.index)}")
-        self.branch("if", f"i < {self.program.meters[s.array].size}")
-        meter = f"{self.number('M', s.array)}[i].execute({self.reg('ARRIVED')}, {self.reg('NOW')})"
-        self.line(f"p[{self.slots.field(s.target)}] = {meter}")
-        self.close()
+        with self.cell(self.program.meters[s.array], s.index):
+            meter = f"{self.number('M', s.array)}[i].execute({self.reg('ARRIVED')}, {self.reg('NOW')})"
+            self.line(f"p[{self.slots.field(s.target)}] = {meter}")
 
     def do_registerread(self, s: tree.RegisterRead) -> None:
         spec = self.program.registers[s.array]
-        self.line(f"i = {self.value(s.index)}")
-        self.branch("if", f"i < {spec.size}")
         value = f"{self.number('R', s.array)}[i]"
         if s.target.field.signed:
             value = f"two_comp_mod({value}, {s.target.field.width})"
         elif spec.width > s.target.field.width:
             value += f" & {field_bounds(s.target.field).high}"
-        self.line(f"p[{self.slots.field(s.target)}] = {value}")
-        self.close()
+        with self.cell(spec, s.index):
+            self.line(f"p[{self.slots.field(s.target)}] = {value}")
 
     def do_registerwrite(self, s: tree.RegisterWrite) -> None:
         spec = self.program.registers[s.array]
-        self.line(f"i = {self.value(s.index)}")
-        self.branch("if", f"i < {spec.size}")
         stored = self.fitted(s.value, tree.FieldType("", spec.width, 0))
-        self.line(f"{self.number('R', s.array)}[i] = {stored}")
-        self.close()
+        with self.cell(spec, s.index):
+            self.line(f"{self.number('R', s.array)}[i] = {stored}")
 
     def do_hash(self, s: tree.Hash) -> None:
         self.digest_input(self.program.calculations[s.calculation])

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from operator import attrgetter
 
 from dataplane.compiler.machine import KeyPlace, RangePart, Rule
-from dataplane.externs import Meter
-from dataplane.tree import ArraySpec, TableSpec
+from dataplane.v1model.externs import Meter
+from dataplane.v1model.tree import ArraySpec, TableSpec
 
 _Rates = tuple[int, int, int, int]
 
 
-class Entry:
+class CompiledEntry:
     """One entry as the generated code sees it."""
 
     __slots__ = ("action", "bytes", "hit", "mask", "meter", "order", "packets", "params", "ranges", "value")
@@ -40,7 +40,7 @@ class _Group:
 
     def __init__(self, mask: int) -> None:
         self.mask = mask
-        self.buckets: dict[int, list[Entry]] = {}
+        self.buckets: dict[int, list[CompiledEntry]] = {}
         self.best = (0, 0)
         self.count = 0
 
@@ -59,8 +59,8 @@ class PythonTable:
             shifts.append(total)
             total += key.width
         self.place = KeyPlace(tuple(reversed(shifts)))
-        self.default = Entry(-1, ())
-        self._slots: dict[int, Entry] = {}
+        self.default = CompiledEntry(-1, ())
+        self._slots: dict[int, CompiledEntry] = {}
         self._groups: dict[int, _Group] = {}
         self._ordered: list[_Group] = []
         self._per_byte = False
@@ -68,8 +68,8 @@ class PythonTable:
     def meter_unit(self, unit: str) -> None:
         self._per_byte = unit == "bytes"
 
-    def find(self, key: int) -> Entry | None:
-        found: Entry | None = None
+    def find(self, key: int) -> CompiledEntry | None:
+        found: CompiledEntry | None = None
         for group in self._ordered:
             if found is not None and group.best > found.order:
                 break
@@ -83,7 +83,7 @@ class PythonTable:
 
     def insert(self, slot: int, rule: Rule, action: int, params: Sequence[int], now_us: int) -> None:
         value, mask, ranges, rank = rule
-        entry = Entry(action, tuple(params))
+        entry = CompiledEntry(action, tuple(params))
         entry.meter = Meter(per_byte=self._per_byte)
         entry.hit = now_us
         entry.value, entry.mask, entry.ranges = value & mask, mask, ranges
@@ -117,7 +117,7 @@ class PythonTable:
             self._ordered.remove(group)
 
     def set_default(self, action: int, params: Sequence[int]) -> None:
-        self.default = Entry(action, tuple(params))
+        self.default = CompiledEntry(action, tuple(params))
 
     def counter(self, slot: int) -> tuple[int, int]:
         entry = self._slots[slot]
@@ -149,9 +149,8 @@ class PythonCounters:
         self._bytes = [0] * size
 
     def count(self, index: int, octets: int) -> None:
-        if index < len(self._packets):
-            self._packets[index] += 1
-            self._bytes[index] += octets
+        self._packets[index] += 1
+        self._bytes[index] += octets
 
     def read(self, index: int) -> tuple[int, int]:
         return self._packets[index], self._bytes[index]

@@ -317,6 +317,7 @@ u64 dp_run(void *h, u32 port, u32 count, const u8 *data, const u32 *lengths, con
 
 const u8 *dp_output(void *h) { return ((machine *)h)->out; }
 void dp_statistics(void *h, u64 *to) { memcpy(to, ((machine *)h)->stats, sizeof ((machine *)h)->stats); }
+void dp_out_of_range(void *h, u64 *to) { memcpy(to, ((machine *)h)->out_of_range, sizeof ((machine *)h)->out_of_range); }
 void dp_ports(void *h, const u8 *exists) { memcpy(((machine *)h)->ports, exists, 512); }
 
 static void set_replicas(replicas **place, u32 count, const u32 *pairs, u32 length) {

@@ -7,7 +7,7 @@ operand cannot be that wide.  Bounds tell which, and tell the C back end how wid
 from dataclasses import dataclass
 
 from dataplane.errors import Unsupported
-from dataplane.tree import (
+from dataplane.v1model.tree import (
     Binary,
     Conditional,
     Const,

@@ -17,14 +17,14 @@ from due.messages import Item, PackedFrame
 
 @runtime_checkable
 class ArchiveDriver(Protocol):
-    """Data Archives.  Made by a factory `open_archive(url)`-style constructor taking the URL.
+    """Data Archives.  The constructor takes the URL.
 
     Document fields of queries: dataKey, value (and value.*), timestamp, eventTime, appId, instanceId,
     sequence.  Called from one thread at a time per instance for `insert*`/`prune`, and from any
     thread, at the same time, for `find`.
 
-    Every method raises `ArchiveUnavailable` when trying the same call later may help (server away,
-    file locked, disk full) and `BackendError` when it will not; `find` raises `InvalidQuery`.
+    Every method raises `ArchiveUnavailable` if the same call may succeed later (server away,
+    file locked, disk full), otherwise `BackendError`; `find` also raises `InvalidQuery`.
     """
 
     def insert(self, items: Sequence[Item]) -> None:
@@ -32,13 +32,13 @@ class ArchiveDriver(Protocol):
         ...
 
     def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
-        """Store whole frames; means the same as `insert` of all their items.
+        """Store whole frames; equivalent to `insert` of all their items.
 
-        This is the fast way and what the archiver uses: a frame may be stored as one row with its
+        The archiver uses this because it is faster: a frame may be stored as one row with its
         payload untouched and decoded by `due.codec.unpack` when found.  A frame's items have one key,
         one instance and consecutive sequence numbers from `frame.sequence`; their timestamps lie in
         [first_timestamp, last_timestamp].  Idempotent on (instance_id, key, sequence of each item);
-        a frame is re-sent whole and with the same cut, so (instance_id, key, sequence) of the first
+        a frame is always resent unchanged, so (instance_id, key, sequence) of the first
         item suffices.  `frame.index` asks for item-wise storage with an index on values.
         """
         ...
@@ -46,7 +46,7 @@ class ArchiveDriver(Protocol):
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
         """Items that match a MongoDB-dialect query, oldest first (timestamp, then sequence).
 
-        Of more than `limit` the youngest; what is older is not read then.
+        With a `limit` only the youngest are read and returned.
 
         A plain string under `dataKey` is a DUE key: wildcards allowed, fewer specs match more items
         (`due.keys.Key.matches`).  Times are int ns or datetime (naive = UTC).
@@ -74,7 +74,10 @@ class Spool(Protocol):
     """
 
     def put(self, frames: Sequence[PackedFrame]) -> int:
-        """Append; returns how many *items* did not fit (they are lost and the archiver counts them)."""
+        """Append; returns how many *items* did not fit (they are lost and the archiver counts them).
+
+        Raises `BackendError` where the disk takes nothing; then no frame was appended.
+        """
         ...
 
     def take(self, frames: int) -> list[PackedFrame]:
@@ -86,7 +89,7 @@ class Spool(Protocol):
         ...
 
     def adopt(self) -> None:
-        """Also take over what instances of the app that are gone have left."""
+        """Also take over the spools of instances of the app that have ended."""
         ...
 
     def __len__(self) -> int:
@@ -99,7 +102,7 @@ class Spool(Protocol):
 
 
 class Delivery(msgspec.Struct, frozen=True, gc=False):
-    """A payload that arrived."""
+    """A received payload."""
 
     path: str
     """The key's segments, or the name of a control channel."""
@@ -107,21 +110,21 @@ class Delivery(msgspec.Struct, frozen=True, gc=False):
     token: str = ""
     """Names it for `acknowledge`; empty for best-effort payloads, which need none."""
     tries: int = 1
-    """How often it was handed to a consumer of the group, this time included."""
+    """How often it was delivered to a consumer of the group, including this time."""
 
 
 class Publisher(Protocol):
     """The sending half of a Data Updates connection.  Thread-safe; sends keep their order."""
 
     def publish(self, path: str, *payloads: bytes) -> None:
-        """Send to all who are subscribed now (best effort); does not wait for the server's answer.
+        """Send to all current subscribers (best effort); does not wait for the server's answer.
 
         Raises `UpdatesUnavailable` when there is no connection: the payloads are lost.
         """
         ...
 
     def append(self, path: str, payload: bytes) -> None:
-        """Append to the reliable stream `path`; keeps the payload until its readers acknowledged it.
+        """Append to the reliable stream `path`; keeps the payload until its readers have acknowledged it.
 
         Blocks while the stream's window is full (back-pressure) and while the connection is away.
         """
@@ -136,9 +139,9 @@ class Publisher(Protocol):
         ...
 
     def poll(self) -> float:
-        """Periodic care: read acknowledgements, reconnect when due, re-send what the server lost.
+        """Periodic work: read acknowledgements, reconnect when due, resend what the server lost.
 
-        Returns after how many seconds to come again.
+        Returns the seconds until the next call.
         """
         ...
 
@@ -147,7 +150,7 @@ class Publisher(Protocol):
         ...
 
     def close(self) -> None:
-        """Close the connection; what is not acknowledged is lost."""
+        """Close the connection; unacknowledged payloads are lost."""
         ...
 
 
@@ -165,8 +168,8 @@ class Receiver(Protocol):
     def follow(self, pattern: str, *, start: str = "") -> None:
         """Also read the reliable streams whose path matches, existing and future ones.
 
-        `start`: "" = where the group stopped, or what is written from now on; else a stream id or "0"
-        for all that is kept: the group is set back to it.
+        `start`: "" = where the group stopped, or entries from now on; otherwise a stream id, or "0"
+        for all retained entries: the group's position is set to it.
         """
         ...
 
@@ -175,18 +178,18 @@ class Receiver(Protocol):
         ...
 
     def receive(self, timeout: float) -> list[Delivery]:
-        """What has arrived, in order; [] after `timeout` seconds or `wake`.
+        """Received payloads, in order; [] after `timeout` seconds or `wake`.
 
         Reconnects with back-off by itself.
         """
         ...
 
     def acknowledge(self, delivery: Delivery) -> None:
-        """The group is done with it.  May be sent with the next `receive`."""
+        """Tell the server that the group is done with a delivery; may be sent with the next `receive`."""
         ...
 
     def activate(self, active: bool, *, take_over: bool = False) -> None:
-        """Read streams or rest.  `take_over`: the other members of the group are known to be gone."""
+        """Start or stop reading streams.  `take_over`: the group's other members are known to have ended."""
         ...
 
     def wake(self) -> None:
@@ -194,7 +197,7 @@ class Receiver(Protocol):
         ...
 
     def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
-        """Put a payload that callbacks keep failing on where people can see it."""
+        """Set aside a payload on which callbacks keep failing."""
         ...
 
     def aside(self) -> list[tuple[bytes, str]]:
@@ -204,12 +207,12 @@ class Receiver(Protocol):
     def drain(self) -> bool:
         """Take best-effort payloads off the server while the receiving thread is busy; any thread.
 
-        Whether there were some.  What exceeds the backlog limit is dropped; sequence numbers show it later.
+        Returns whether there were any.  Payloads beyond the backlog limit are dropped; readers see a gap.
         """
         ...
 
     def renew(self) -> None:
-        """Tell producers that this reader lives; called about every second from any thread."""
+        """Renew this reader's leases; called about every second from any thread."""
         ...
 
     def statistics(self) -> dict[str, int]:

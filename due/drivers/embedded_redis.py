@@ -1,7 +1,7 @@
-"""A real Data Updates server out of a wheel, for machines where none is installed.
+"""A real Data Updates server from a Python wheel, for machines where none is installed.
 
-The server runs in the foreground as our child, listens on a Unix socket only, and dies with us: by
-`stop`, or by PR_SET_PDEATHSIG where we are killed.
+The server runs in the foreground as a child process, listens on a Unix socket only, and ends with us: by
+`stop`, or by PR_SET_PDEATHSIG if we are killed.
 """
 
 import ctypes
@@ -32,7 +32,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 _START_TIMEOUT = 30.0
 _LONGEST_SOCKET_PATH = 100
 _SUBSCRIBER_LIMIT = ("128mb", "64mb", "20")
-"""A subscriber that lets more pile up, or so much for so many seconds, is dropped by the server."""
+"""The server drops a subscriber with more output pending, or with this much for this many seconds."""
 
 
 def server_program() -> str:
@@ -90,11 +90,41 @@ class EmbeddedServer:
             raise UpdatesUnavailable("the embedded server is not running: call start()")
         return self._process.pid
 
+    @property
+    def log(self) -> Path:
+        """The server's log file."""
+        return self._directory / "server.log"
+
+    def exit_code(self) -> int | None:
+        """Exit code, negative for a signal; None while it runs."""
+        return 0 if self._process is None else self._process.poll()
+
+    def answers(self) -> bool:
+        """Whether it answers by now; then it counts big payloads as part of a subscriber's output buffer.
+
+        Valkey 9 does not while it sends them by reference, so a stalled subscriber would cost memory
+        without bound; counted, the subscriber is dropped at the limit, comes back, and reports its gap.
+        """
+        try:
+            wire = Wire(self.url)
+            answer = wire.call("PING")
+            wire.call("CONFIG", "SET", "min-string-size-avoid-copy-reply", 1 << 30)
+            wire.close()
+        except UpdatesUnavailable:
+            return False
+        return bool(answer == b"PONG")
+
     def start(self) -> Self:
         """Start and wait until it answers; raises `UpdatesUnavailable` with what the server said."""
+        self.begin()
+        self._wait()
+        return self
+
+    def begin(self) -> None:
+        """Start and return at once; the server is ready when `answers` is True."""
         self._directory.mkdir(parents=True, exist_ok=True)
         self.socket.unlink(missing_ok=True)
-        log = (self._directory / "server.log").open("ab")
+        log = self.log.open("ab")
         with log:
             self._process = subprocess.Popen(
                 _ending_with_us([server_program(), *self._arguments()]),
@@ -103,11 +133,9 @@ class EmbeddedServer:
                 stderr=subprocess.STDOUT,
                 cwd=self._directory,
             )
-        self._wait()
-        return self
 
     def stop(self) -> None:
-        """Stop and leave nothing behind but a directory that was given."""
+        """Stop and remove everything except a directory that was given."""
         if self._process is not None:
             self._process.terminate()
             try:
@@ -121,6 +149,12 @@ class EmbeddedServer:
             shutil.rmtree(self._socket_folder, ignore_errors=True)
         if self._owns_directory:
             shutil.rmtree(self._directory, ignore_errors=True)
+
+    def terminate(self) -> None:
+        """Ask it to end, even if it is suspended; `exit_code` tells when it has."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
         """kill -9, for fault tests; `start` again afterwards."""
@@ -153,26 +187,15 @@ class EmbeddedServer:
         return [part for name, value in arguments.items() for part in (f"--{name}", value)] + limit
 
     def _wait(self) -> None:
-        """Until it answers; then have it count big payloads as part of a subscriber's output buffer.
-
-        Valkey 9 does not while it sends them by reference, so a stalled subscriber would cost memory
-        without bound; counted, the subscriber is dropped at the limit, comes back, and reports its gap.
-        """
+        """Wait until it answers; raises `UpdatesUnavailable` if it ends or does not."""
         deadline = time.monotonic() + _START_TIMEOUT
         while time.monotonic() < deadline:
-            if self._process is None or self._process.poll() is not None:
+            if self.exit_code() is not None:
                 break
-            try:
-                wire = Wire(self.url)
-                answer = wire.call("PING")
-                wire.call("CONFIG", "SET", "min-string-size-avoid-copy-reply", 1 << 30)
-                wire.close()
-            except UpdatesUnavailable:
-                answer = None
-            if answer == b"PONG":
+            if self.answers():
                 return
             time.sleep(0.01)
-        said = (self._directory / "server.log").read_text(errors="replace")[-500:]
+        said = self.log.read_text(errors="replace")[-500:]
         self.stop()
         raise UpdatesUnavailable(f"the embedded server in {self._directory} did not start: {said}")
 
@@ -184,7 +207,7 @@ def _free_port() -> int:
 
 
 def _ending_with_us(command: list[str]) -> list[str]:
-    """The command behind a starter that has the kernel end it when this process does.
+    """The command with a wrapper that lets the kernel end it together with this process.
 
     Not a `preexec_fn`: that forks, and in a process with gRPC in it the child then dies of gRPC's fork
     handlers before it becomes the server, and calls of the parent end with CANCELLED.
@@ -208,7 +231,7 @@ def shared_server(folder: Path) -> tuple[str, EmbeddedServer | None]:
 
 
 def die_with_parent(number: int = signal.SIGKILL) -> None:
-    """Have the kernel send this signal when the thread that started us ends (Linux; elsewhere nothing)."""
+    """Let the kernel send this signal when the thread that started us ends (Linux only)."""
     if _libc is not None:
         _libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
 

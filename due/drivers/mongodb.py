@@ -8,9 +8,11 @@
 A query narrows on the server by index on key and time; `query.matches` decides item by item.
 """
 
+import logging
 import math
 import os
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,23 +23,29 @@ from bson import Int64
 from bson.errors import BSONError
 from pymongo import MongoClient
 from pymongo.collection import Collection
+from pymongo.cursor import Cursor
 from pymongo.errors import BulkWriteError, ConnectionFailure, ExecutionTimeout, PyMongoError
 from pymongo.uri_parser import parse_uri
 
 from due.codec import pack, unpack
-from due.drivers.query import Query, parse
+from due.drivers.latest_items import by_age, latest_items
+from due.drivers.query import ArchiveQuery, parse
+from due.drivers.query_time import in_time, time_left
 from due.drivers.query_tree import Condition
-from due.drivers.youngest import by_age, youngest
-from due.errors import ArchiveUnavailable, BackendError, InvalidOption
+from due.errors import ArchiveUnavailable, BackendError, DecodeError, InvalidOption
 from due.keys import ANY, Key
 from due.messages import Item, PackedFrame
 
 Document: TypeAlias = dict[str, Any]
 
+log = logging.getLogger("due.archive")
+
 _PART_BYTES = 12 << 20
 _DUPLICATE = 11000
 _DOCUMENT_OVERHEAD = 300
 _MAX_NAMED_KEYS = 1000
+_NOTE_SECONDS = 60.0
+_EMPTY_SECONDS = 600.0
 _INT64 = 2**63
 _SERVER_SELECTION_MS = "3000"
 
@@ -62,6 +70,11 @@ class MongoArchive:
         self._pid = 0
         self._closed = False
         self._spans: dict[str, tuple[int, int]] = {}
+        self._noted_at = 0.0
+        self._empty: dict[str, float] = {}
+        """Keys without a document, and since when that is known (s, monotonic)."""
+        self.damaged = 0
+        """Documents that could not be decoded and are missing from results."""
 
     def insert(self, items: Sequence[Item]) -> None:
         """Store items, one document each."""
@@ -69,7 +82,7 @@ class MongoArchive:
             self._insert([_item_document(item) for item in items], [])
 
     def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
-        """Store frames as they are; those that want an index, or are partly here, item by item."""
+        """Store frames unchanged; item by item if an index is wanted or a frame is stored partly."""
         documents = []
         for frame in frames:
             if frame.index:
@@ -85,9 +98,9 @@ class MongoArchive:
         with self._errors():
             criteria = self._criteria(parsed)
             if limit is not None:
-                found = self._table().find(criteria, {"lastTimestamp": 1})
-                heads = [(int(document["lastTimestamp"]), str(document["_id"])) for document in found]
-                return youngest(heads, lambda names: self._read({"_id": {"$in": names}}, parsed), limit)
+                found = in_time(self._find(criteria, {"lastTimestamp": 1}))
+                heads = [(_number(document, "lastTimestamp"), str(document["_id"])) for document in found]
+                return latest_items(heads, lambda names: self._read({"_id": {"$in": names}}, parsed), limit)
             items = list(self._read(criteria, parsed))
         items.sort(key=by_age)
         return items
@@ -98,6 +111,7 @@ class MongoArchive:
             deleted = 0 if before is None else self._prune_older(before)
             if max_bytes is not None:
                 deleted += self._prune_larger(max_bytes)
+            self._prune_keys()
             return deleted
 
     def close(self) -> None:
@@ -134,7 +148,7 @@ class MongoArchive:
             yield
         except (ConnectionFailure, ExecutionTimeout) as error:
             raise ArchiveUnavailable(f"archive {self._shown}: {_short(error)}") from error
-        except (PyMongoError, BSONError) as error:
+        except (PyMongoError, BSONError, OverflowError, UnicodeEncodeError) as error:
             raise BackendError(f"archive {self._shown}: {_short(error)}") from error
 
     # --- writing -------------------------------------------------------------------------------
@@ -161,7 +175,7 @@ class MongoArchive:
     def _stored(
         self, table: Collection[Document], instance: str, key: str, group: Sequence[Document]
     ) -> list[tuple[int, int]]:
-        """Ranges of sequence numbers of this stream that are here and may be concerned."""
+        """Stored ranges of sequence numbers of this stream that may overlap."""
         low = min(document["sequence"] for document in group)
         high = max(document["lastSequence"] for document in group)
         found = table.find(
@@ -185,35 +199,52 @@ class MongoArchive:
                 raise
 
     def _note_keys(self, documents: Iterable[Document]) -> None:
-        """Let readers know the keys, and how far apart the items of one document may lie."""
+        """Record the keys, and the largest span of the items in one document."""
+        if time.monotonic() - self._noted_at > _NOTE_SECONDS:  # a key may have been pruned
+            self._noted_at = time.monotonic()
+            self._spans = {}
         widest: dict[str, tuple[int, int]] = {}
         for document in documents:
-            time, event = widest.get(document["dataKey"], (0, 0))
+            span, event = widest.get(document["dataKey"], (0, 0))
             widest[document["dataKey"]] = (
-                max(time, document["lastTimestamp"] - document["timestamp"]),
+                max(span, document["lastTimestamp"] - document["timestamp"]),
                 max(event, document["lastEventTime"] - document["eventTime"]),
             )
-        for key, (time, event) in widest.items():
+        for key, (span, event) in widest.items():
             known = self._spans.get(key)
-            if known is not None and time <= known[0] and event <= known[1]:
+            if known is not None and span <= known[0] and event <= known[1]:
                 continue
-            spans = (2 * time, 2 * event)
+            spans = (2 * span, 2 * event)
             change = {"$max": {"timeSpan": Int64(spans[0]), "eventSpan": Int64(spans[1])}}
             self._table("_keys").update_one({"_id": {"$eq": key}}, change, upsert=True)
             self._spans[key] = (max(spans[0], known[0]), max(spans[1], known[1])) if known else spans
 
     # --- reading -------------------------------------------------------------------------------
 
-    def _read(self, criteria: Mapping[str, Any], query: Query) -> Iterator[Item]:
-        for document in self._table().find(criteria):
-            yield from _items(self._joined(document), query)
+    def _read(self, criteria: Mapping[str, Any], query: ArchiveQuery) -> Iterator[Item]:
+        for document in in_time(self._find(criteria)):
+            try:
+                yield from _items(self._joined(document), query)
+            except (DecodeError, KeyError, TypeError, ValueError) as error:
+                self.damaged += 1
+                if self.damaged == 1:
+                    log.error(  # noqa: TRY400 - no trace needed
+                        "archive %s: a document is damaged and left out: %r; further ones are only counted",
+                        self._shown,
+                        error,
+                    )
 
-    def _criteria(self, query: Query) -> dict[str, Any]:
+    def _find(self, criteria: Mapping[str, Any], fields: Document | None = None) -> Cursor[Document]:
+        left = time_left()
+        found = self._table().find(criteria, fields)
+        return found if left is None else found.max_time_ms(math.ceil(1000 * left))
+
+    def _criteria(self, query: ArchiveQuery) -> dict[str, Any]:
         named = list(query.conditions("dataKey"))
         keys = list(self._table("_keys").find(_key_range(named)))
 
         def lookup(condition: Condition) -> list[str]:
-            matches = Query(condition).matches
+            matches = ArchiveQuery(condition).matches
             return [d["_id"] for d in keys if matches(Item(d["_id"], None, 0, 0, "", "", 0))]
 
         spans = {
@@ -245,28 +276,52 @@ class MongoArchive:
 
     def _prune_larger(self, max_bytes: int) -> int:
         fields = {"timestamp": 1, "count": 1, "bytes": 1, "parts": 1}
-        documents = sorted(self._table().find({}, fields), key=lambda document: int(document["timestamp"]))
-        excess = sum(int(document["bytes"]) for document in documents) - max_bytes
+        documents = sorted(
+            self._table().find({}, fields), key=lambda document: _number(document, "timestamp")
+        )
+        excess = sum(_number(document, "bytes") for document in documents) - max_bytes
         old = []
         for document in documents:
             if excess <= 0:
                 break
-            excess -= int(document["bytes"])
+            excess -= _number(document, "bytes")
             old.append(document)
         return self._delete(old)
+
+    def _prune_keys(self) -> None:
+        """Remove keys that have had no document for a while; writers record theirs again each minute."""
+        now, keys = time.monotonic(), list(self._table("_keys").find({}))
+        empty = {}
+        for entry in keys:
+            name = {"dataKey": {"$eq": entry["_id"]}}
+            if self._table().find_one(name, {"_id": 1}) is not None:
+                continue
+            since = empty[entry["_id"]] = self._empty.get(entry["_id"], now)
+            if now - since < _EMPTY_SECONDS:
+                continue
+            self._table("_keys").delete_one({"_id": {"$eq": entry["_id"]}})
+            if self._table().find_one(name, {"_id": 1}) is not None:  # written meanwhile
+                self._table("_keys").replace_one({"_id": {"$eq": entry["_id"]}}, entry, upsert=True)
+        self._empty = empty
 
     def _delete(self, documents: Sequence[Document]) -> int:
         for start in range(0, len(documents), 1000):
             names = [document["_id"] for document in documents[start : start + 1000]]
             self._table().delete_many({"_id": {"$in": names}})
-        parts = [f"{d['_id']}#{n}" for d in documents for n in range(d.get("parts", 0))]
+        parts = [f"{d['_id']}#{n}" for d in documents for n in range(_number(d, "parts"))]
         if parts:
             self._table("_parts").delete_many({"_id": {"$in": parts}})
-        return sum(int(document["count"]) for document in documents)
+        return sum(_number(document, "count") for document in documents)
+
+
+def _number(document: Document, name: str) -> int:
+    """A number of a document; 0 if it is damaged."""
+    number = document.get(name)
+    return int(number) if isinstance(number, int) else 0
 
 
 def _check_options(url: str, shown: str) -> None:
-    """pymongo would only warn."""
+    """Refuse unknown options, for which pymongo would only warn."""
     try:
         parse_uri(url, warn=False)
     except (PyMongoError, ValueError, TypeError) as error:
@@ -315,7 +370,7 @@ def _split(document: Document) -> Iterator[Document]:
         yield {"_id": f"{document['_id']}#{number}", "payload": payload[start : start + _PART_BYTES]}
 
 
-def _items(document: Document, query: Query) -> Iterator[Item]:
+def _items(document: Document, query: ArchiveQuery) -> Iterator[Item]:
     if "payload" in document:
         yield from filter(query.matches, unpack(document["payload"]))
         return
@@ -333,7 +388,7 @@ def _items(document: Document, query: Query) -> Iterator[Item]:
 
 
 def _is_exact(value: Any, depth: int = 0) -> bool:
-    """Whether BSON, and every server that speaks it, gives the value back as it is."""
+    """Whether BSON, and every server that supports it, returns the value unchanged."""
     kind = type(value)
     if value is None or kind in (bool, bytes):
         return True
@@ -374,7 +429,7 @@ def _key_range(named: Sequence[Condition]) -> Document:
         return {}
     pattern: Key = first.operand
     prefix = pattern.path.partition(ANY)[0].removesuffix(".")
-    # '~' sorts behind every character that may follow in a key
+    # '~' sorts after every character that a key may contain
     return {"_id": {"$gte": prefix, "$lt": prefix + "~"}} if prefix else {}
 
 

@@ -8,16 +8,19 @@ answer. What a translation cannot express it drops; candidates are therefore nev
 
 Fields: dataKey, value, value.<path>, timestamp, eventTime, appId, instanceId, sequence.
 Operators: $and $or $nor $not $eq $ne $gt $gte $lt $lte $in $nin $exists $regex $options $size.
+Bounds: 30 levels, 20,000 elements, a million characters; `$regex` see `query_regex`.  Beyond: InvalidQuery.
 `dataKey` takes a key as `observe` does, wildcards and fewer specs included; times are datetimes (naive:
 UTC) or int ns.
 """
 
 import re
+import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from due.drivers.query_candidates import Lookup, Spans, mongo, server_can, sql, time_range
-from due.drivers.query_meaning import FIELDS, Record, compiled, kind_of, nanoseconds
+from due.drivers.query_predicate import FIELDS, QueriedItem, compiled, kind_of, nanoseconds
+from due.drivers.query_pushdown import Lookup, Spans, mongo, server_can, sql, time_range
+from due.drivers.query_regex import expression
 from due.drivers.query_tree import EQUAL_OR_ORDER, INT64, And, Condition, Node, Or, weaken
 from due.errors import InvalidQuery
 from due.keys import Key
@@ -26,22 +29,24 @@ _TIMES = ("timestamp", "eventTime")
 _INTEGERS = (*_TIMES, "sequence")
 _OPPOSITE = {"gt": "lte", "gte": "lt", "lt": "gte", "lte": "gt"}
 _KEY_OPERATORS = ("eq", "in", "regex")
-_REGEX_FLAGS = {"i": re.IGNORECASE, "m": re.MULTILINE, "s": re.DOTALL, "x": re.VERBOSE}
+_MOST_LEVELS = 30
+_MOST_ELEMENTS = 20_000
+_MOST_CHARACTERS = 1_000_000
 
 
-class Query:
+class ArchiveQuery:
     """A query, checked once and used many times."""
 
     def __init__(self, node: Node) -> None:
         self.node = node
         self._metadata = weaken(node, lambda condition: condition.field != "value")
-        #: Whether the value of an item has to be looked at.
+        #: Whether the query depends on the values of items.
         self.uses_value = self._metadata != node
-        #: Decides over any `Record`.
-        self.matches: Callable[[Record], bool] = compiled(node)
+        #: Decides over any `QueriedItem`.
+        self.matches: Callable[[QueriedItem], bool] = compiled(node)
         #: The same without its conditions on values: never refuses what `matches` accepts.
-        self.matches_metadata: Callable[[Record], bool] = compiled(self._metadata)
-        #: First and last timestamp, where keys and times are all that is asked for (the usual query).
+        self.matches_metadata: Callable[[QueriedItem], bool] = compiled(self._metadata)
+        #: First and last timestamp, if the query is about keys and times only (the usual case).
         self.time_range = time_range(node)
 
     def to_sql(self, lookup: Lookup[int], spans: Spans) -> tuple[str, list[Any]]:
@@ -64,11 +69,35 @@ class Query:
         return (part for part in parts if isinstance(part, Condition) and part.field == field)
 
 
-def parse(query: Mapping[str, Any]) -> Query:
+def parse(query: Mapping[str, Any]) -> ArchiveQuery:
     """Check a query; raises InvalidQuery, or InvalidKey for a malformed dataKey."""
     if not isinstance(query, Mapping):
         raise InvalidQuery(f"a query is a mapping of fields to conditions, not {type(query).__name__}")
-    return Query(_conjunction(query, negated=False))
+    _check_size(query)
+    return ArchiveQuery(_conjunction(query, negated=False))
+
+
+def _check_size(query: Mapping[str, Any]) -> None:
+    """Bound the size before code that recurses and copies."""
+    waiting: list[tuple[Any, int]] = [(query, 1)]
+    elements = characters = 0
+    while waiting:
+        value, level = waiting.pop()
+        elements += 1
+        if isinstance(value, str | bytes):
+            characters += len(value)
+        elif isinstance(value, Mapping):
+            characters += sum(len(name) for name in value if isinstance(name, str))
+            waiting += [(part, level + 1) for part in value.values()]
+        elif isinstance(value, list | tuple | set | frozenset):
+            waiting += [(part, level + 1) for part in value]
+        for count, most, what in (
+            (level, _MOST_LEVELS, "levels"),
+            (elements + len(waiting), _MOST_ELEMENTS, "elements"),
+            (characters, _MOST_CHARACTERS, "characters"),
+        ):
+            if count > most:
+                raise InvalidQuery(f"a query has at most {most} {what}; split it")
 
 
 def _conjunction(query: Mapping[str, Any], *, negated: bool) -> Node:
@@ -79,7 +108,7 @@ def _join(parts: Sequence[Node], *, either: bool) -> Node:
     if len(parts) == 1:
         return parts[0]
     kind = Or if either else And
-    # an inner one of the same kind is taken apart: what every result has to meet stands at the top
+    # a nested node of the same kind is flattened: conditions on every result stand at the top
     flat = [inner for part in parts for inner in (part.parts if isinstance(part, kind) else (part,))]
     return kind(tuple(flat))
 
@@ -87,23 +116,23 @@ def _join(parts: Sequence[Node], *, either: bool) -> Node:
 def _clause(name: str, operand: Any, *, negated: bool) -> Node:
     if name in ("$and", "$or", "$nor"):
         if not isinstance(operand, list | tuple) or not operand:
-            raise InvalidQuery(f"{name} takes a list of one or more queries, not {operand!r}")
+            raise InvalidQuery(f"{name} takes a list of one or more queries, not {_shown(operand)}")
         inner = negated != (name == "$nor")
         either = (name != "$and") != inner
         for part in operand:
             if not isinstance(part, Mapping):
-                raise InvalidQuery(f"{name} takes a list of queries, and {part!r} is none")
+                raise InvalidQuery(f"{name} takes a list of queries, and {_shown(part)} is not one")
         return _join([_conjunction(part, negated=inner) for part in operand], either=either)
     field, _, rest = name.partition(".") if isinstance(name, str) else (name, "", "")
     if field not in FIELDS or (rest and field != "value"):
         fields = ", ".join(f"{known}[.<path>]" if known == "value" else known for known in FIELDS)
-        raise InvalidQuery(f"unknown field or operator {name!r} in a query; fields are {fields}")
+        raise InvalidQuery(f"unknown field or operator {_shown(name)} in a query; fields are {fields}")
     return _field(field, tuple(rest.split(".")) if rest else (), operand, negated=negated)
 
 
 def _field(field: str, path: tuple[str, ...], operand: Any, *, negated: bool) -> Node:
     if isinstance(operand, re.Pattern):
-        return _condition(field, path, "regex", operand, negated=negated)
+        return _condition(field, path, "regex", expression(field, operand), negated=negated)
     named = (
         [isinstance(key, str) and key.startswith("$") for key in operand]
         if isinstance(operand, Mapping)
@@ -112,15 +141,15 @@ def _field(field: str, path: tuple[str, ...], operand: Any, *, negated: bool) ->
     if not any(named):
         return _condition(field, path, "eq", operand, negated=negated)
     if not all(named):
-        raise InvalidQuery(f"{field}: operators and plain fields do not mix in {operand!r}")
+        raise InvalidQuery(f"{field}: operators and plain fields do not mix in {_shown(operand)}")
     parts = []
     for operator, value in operand.items():
         if operator == "$not":
             if not isinstance(value, Mapping | re.Pattern):
-                raise InvalidQuery(f"{field}: $not takes a mapping of operators, not {value!r}")
+                raise InvalidQuery(f"{field}: $not takes a mapping of operators, not {_shown(value)}")
             parts.append(_field(field, path, value, negated=not negated))
         elif operator == "$regex":
-            pattern = _pattern(field, value, operand.get("$options", ""))
+            pattern = expression(field, value, operand.get("$options", ""))
             parts.append(_condition(field, path, "regex", pattern, negated=negated))
         elif operator != "$options":
             parts.append(_operator(field, path, operator, value, negated=negated))
@@ -133,7 +162,7 @@ def _operator(field: str, path: tuple[str, ...], operator: str, value: Any, *, n
     name = operator[1:]
     if name not in (*EQUAL_OR_ORDER, "in", "exists", "size"):
         raise InvalidQuery(
-            f"{field}: unknown operator {operator!r}; known are $eq $ne $gt $gte $lt $lte $in $nin "
+            f"{field}: unknown operator {_shown(operator)}; known are $eq $ne $gt $gte $lt $lte $in $nin "
             f"$exists $regex $options $size $not"
         )
     return _condition(field, path, name, value, negated=negated)
@@ -142,7 +171,7 @@ def _operator(field: str, path: tuple[str, ...], operator: str, value: Any, *, n
 def _condition(field: str, path: tuple[str, ...], operator: str, value: Any, *, negated: bool) -> Condition:
     if operator == "in":
         if not isinstance(value, list | tuple | set | frozenset):
-            raise InvalidQuery(f"{field}: $in and $nin take a list, not {value!r}")
+            raise InvalidQuery(f"{field}: $in and $nin take a list, not {_shown(value)}")
         operand: Any = tuple(_operand(field, "eq", one) for one in value)
     elif operator == "exists":
         operand, negated = True, negated == bool(value)
@@ -157,34 +186,19 @@ def _condition(field: str, path: tuple[str, ...], operator: str, value: Any, *, 
     return Condition(field, path, operator, operand, negated)
 
 
-def _pattern(field: str, value: Any, options: Any) -> re.Pattern[str]:
-    if isinstance(value, re.Pattern):
-        return value
-    if not isinstance(value, str) or not isinstance(options, str):
-        raise InvalidQuery(f"{field}: $regex and $options take text, not {value!r} and {options!r}")
-    unknown = set(options) - set(_REGEX_FLAGS)
-    if unknown:
-        raise InvalidQuery(f"{field}: unknown $options {''.join(sorted(unknown))!r}; known are i, m, s, x")
-    flags = sum(_REGEX_FLAGS[letter] for letter in set(options))
-    try:
-        return re.compile(value, flags)
-    except re.error as error:
-        raise InvalidQuery(f"{field}: $regex {value!r} is not a regular expression: {error}") from error
-
-
 def _operand(field: str, operator: str, value: Any) -> Any:
     if field == "value":
         return _value_operand(operator, value)
     if operator == "size":
-        raise InvalidQuery(f"{field}: $size counts the elements of a list, and {field} is none")
+        raise InvalidQuery(f"{field}: $size counts the elements of a list, and {field} is not a list")
     if field in _INTEGERS:
         number = nanoseconds(value) if field in _TIMES else value
         if isinstance(number, bool) or not isinstance(number, int) or not -INT64 <= number < INT64:
             kinds = "a datetime or int nanoseconds" if field in _TIMES else "an int of 64 bits"
-            raise InvalidQuery(f"{field}: compare with {kinds}, not {value!r}")
+            raise InvalidQuery(f"{field}: compare with {kinds}, not {_shown(value)}")
         return number
     if not isinstance(value, str):
-        raise InvalidQuery(f"{field}: compare with text, not {value!r}")
+        raise InvalidQuery(f"{field}: compare with text, not {_shown(value)}")
     if field != "dataKey":
         return value
     if operator not in _KEY_OPERATORS:
@@ -195,8 +209,13 @@ def _operand(field: str, operator: str, value: Any) -> Any:
 def _value_operand(operator: str, value: Any) -> Any:
     if operator == "size":
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise InvalidQuery(f"value: $size takes a count from 0, not {value!r}")
+            raise InvalidQuery(f"value: $size takes a count from 0, not {_shown(value)}")
         return value
     if operator in _OPPOSITE and kind_of(value) not in ("bool", "number", "text", "bytes", "time"):
-        raise InvalidQuery(f"value: ${operator} compares numbers, text, bytes or times, not {value!r}")
+        raise InvalidQuery(f"value: ${operator} compares numbers, text, bytes or times, not {_shown(value)}")
     return value
+
+
+def _shown(value: Any) -> str:
+    """A value for messages, shortened."""
+    return reprlib.repr(value)

@@ -35,7 +35,7 @@ EVERYTHING = And(())
 
 
 def weaken(node: Node, keep: Callable[[Condition], bool]) -> Node:
-    """The query with every condition that is not kept taken as met."""
+    """The query with every condition that is not kept replaced by true."""
     if isinstance(node, Condition):
         return node if keep(node) else EVERYTHING
     parts = tuple(weaken(part, keep) for part in node.parts)

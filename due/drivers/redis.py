@@ -1,7 +1,7 @@
 """Data Updates on Redis or Valkey: pub/sub for best-effort keys, streams for reliable ones.
 
 publish ──PUBLISH due:<path>──►                 pipelined: replies are read later
-append  ──XADD due:stream:<path>──►             pipelined, kept until the readers acknowledged
+append  ──XADD due:stream:<path>──►             pipelined, kept until readers have acknowledged
 """
 
 import logging
@@ -18,9 +18,11 @@ from due.backoff import Backoff
 from due.drivers.redis_progress import Question
 from due.drivers.redis_receiver import RedisReceiver, channel_name
 from due.drivers.redis_streams import (
+    CARE_SECONDS,
     LEAST_PAUSE,
+    LIFETIME_S,
     STREAMS,
-    Entry,
+    StreamEntry,
     StreamLedger,
     next_pause,
     parse_id,
@@ -36,17 +38,17 @@ _MOST_OUTSTANDING = 1024
 _ASK_SECONDS = 0.02
 _LONGEST_PAUSE = 5 * _ASK_SECONDS
 _LONG_WAIT_SHARE = 0.25
-"""Of the window may be full when a writer goes on that waits long each time: so it waits less often."""
+"""Share of the window that may be full when a writer that waits long each time continues."""
 _POLL_SECONDS = 0.5
 _CHANNELS = 65536
 _RECONNECT_SECONDS = 0.05
 
 
 _MESSAGE = "message"
-"""Stands for a best-effort message whose reply is awaited: lost if the connection is."""
+"""A best-effort message whose reply is pending; lost with the connection."""
 _COMMAND = "command"
-"""Stands for a command of our own."""
-_Awaited = Entry | Question | str
+"""A command of our own whose reply is pending."""
+_Awaited = StreamEntry | Question | str
 
 
 class RedisUpdates:
@@ -66,7 +68,7 @@ class RedisUpdates:
         self._retain = retain
         self._group_timeout = group_timeout
         self._backlog = backlog
-        client(url).close()  # a wrong URL is reported now
+        client(url).close()  # report a wrong URL now
 
     def publisher(self) -> "RedisPublisher":
         """A new sending half."""
@@ -94,7 +96,8 @@ class RedisPublisher:
         self._run_id = b""
         self._backoff = Backoff()
         self._collect_at = 0
-        """No need to look for replies before so many are outstanding."""
+        """Number of outstanding replies from which to collect them."""
+        self._care_at = 0.0
         self._closed = False
         self._counts = {"refused": 0, "lost_disconnected": 0, "reconnects": 0, "held_back": 0, "resent": 0}
         self._connect()
@@ -121,6 +124,8 @@ class RedisPublisher:
             self._counts["held_back"] += 1
             self._wait_for_readers(ledger)
             self._append(ledger, payload, anyway=True)
+        if not ledger.lasting:
+            self._put_off(ledger)
         if ledger.half_full and ledger.ask_again(time.monotonic(), _ASK_SECONDS):
             self._ask(ledger)
 
@@ -160,6 +165,8 @@ class RedisPublisher:
             for ledger in list(self._ledgers.values()):
                 if ledger.ask_again(now, _POLL_SECONDS / 2):
                     self._ask(ledger)
+            if now >= self._care_at:
+                self._care(now)
         return _POLL_SECONDS
 
     def statistics(self) -> dict[str, int]:
@@ -170,6 +177,7 @@ class RedisPublisher:
                 **self._counts,
                 "connected": connected,
                 "kept_bytes": sum(x.kept_bytes for x in self._ledgers.values()),
+                "streams": len(self._ledgers),
             }
 
     def close(self) -> None:
@@ -204,7 +212,30 @@ class RedisPublisher:
         self._wire.send(b"PUBLISH", STREAMS, ledger.path)
         self._outstanding.extend((_COMMAND, _COMMAND))
 
-    def _send_entry(self, entry: Entry) -> None:
+    def _care(self, now: float) -> None:
+        """Renew the expiry of streams in use; the others are announced again at their next use."""
+        self._care_at = now + CARE_SECONDS
+        for ledger in self._ledgers.values():
+            ledger.lasting = False
+            if ledger.kept or ledger.written:
+                self._put_off(ledger)
+            ledger.written = False
+
+    def _put_off(self, ledger: StreamLedger) -> None:
+        """Announce the stream and renew its expiry; streams of lost producers expire."""
+        with self._lock:
+            if self._wire is None:
+                return
+            try:
+                self._wire.send(b"SADD", STREAMS, ledger.path)
+                self._wire.send(b"EXPIRE", stream_name(ledger.path), LIFETIME_S)
+            except UpdatesUnavailable as error:
+                self._lose(error)
+                return
+            self._outstanding.extend((_COMMAND, _COMMAND))
+            ledger.lasting = True
+
+    def _send_entry(self, entry: StreamEntry) -> None:
         if self._wire is None:
             return
         try:
@@ -224,10 +255,10 @@ class RedisPublisher:
             return True
 
     def _wait_for_readers(self, ledger: StreamLedger) -> None:
-        """Back-pressure: until half of the window is free, and more where readers need long for that.
+        """Back-pressure: wait until half of the window is free, or more if the readers are slow.
 
-        Each question costs wake-ups.  Where the last wait was long we sleep over the answer, for half of that
-        and then for as long as the readers' pace lets expect, and do not wake up for each reply before it.
+        Each question costs wake-ups.  If the last wait was long, sleep for half of that time, and then for as
+        long as the readers' rate suggests, instead of waking up for each reply.
         """
         began = looked = time.monotonic()
         long = ledger.patience > _ASK_SECONDS
@@ -247,7 +278,7 @@ class RedisPublisher:
             ledger.patience = min(_LONGEST_PAUSE, (time.monotonic() - began) / 2)
 
     def _await_answer(self, ledger: StreamLedger, *, asleep: float) -> bool:
-        """Ask how far the readers are and wait a while for the answer, without keeping others out.
+        """Ask for the readers' progress and wait for the answer, without blocking other threads.
 
         Returns whether there is a connection.
         """
@@ -256,7 +287,7 @@ class RedisPublisher:
             if wire is None:
                 self.poll()
                 return False
-            self._guarded_take(wire)  # the answer to an earlier question says less than a new one
+            self._guarded_take(wire)  # a new question is more informative than the answer to an earlier one
             self._ask(ledger)
             if self._wire is None:  # lost while asking
                 return False
@@ -268,7 +299,7 @@ class RedisPublisher:
             poll.register(number, select.POLLIN)
             poll.poll(1000 * _ASK_SECONDS)
         with self._lock:
-            if self._wire is wire:  # nobody reconnected meanwhile
+            if self._wire is wire:  # no other thread reconnected meanwhile
                 self._guarded_take(wire)
         return True
 
@@ -286,7 +317,7 @@ class RedisPublisher:
             self._outstanding.extend([question] * question.size)
 
     def _answered(self, question: Question) -> None:
-        """Forget what the readers are done with, here and on the server."""
+        """Forget what the readers have acknowledged, here and on the server."""
         ledger = question.ledger
         ledger.asked = False
         ledger.acknowledged(question.answer())
@@ -320,20 +351,22 @@ class RedisPublisher:
 
     def _take(self, replies: Iterable[Any]) -> None:
         for reply in replies:
+            if not self._outstanding:
+                raise UpdatesUnavailable("the server sent a reply that nobody asked for")
             awaited = self._outstanding.popleft()
             if isinstance(awaited, Question):
                 if awaited.take(reply):
                     self._answered(awaited)
             elif isinstance(reply, hiredis.ReplyError):
                 self._refused(reply, awaited)
-            elif isinstance(awaited, Entry):
+            elif isinstance(awaited, StreamEntry):
                 awaited.id = parse_id(reply)
 
     def _refused(self, reply: Exception, awaited: _Awaited) -> None:
         self._counts["refused"] += 1
         if self._counts["refused"] == 1:
             log.error("Data Updates refused a message: %s", reply)
-        if isinstance(awaited, Entry):  # kept, and sent again on the next connection
+        if isinstance(awaited, StreamEntry):  # kept, and sent again on the next connection
             raise UpdatesUnavailable(f"the server refused an entry of {awaited.path}: {reply}")
 
     def _lose(self, error: Exception) -> None:
@@ -346,7 +379,7 @@ class RedisPublisher:
         for ledger in self._ledgers.values():
             ledger.asked = False
         delay = self._backoff.failed(time.monotonic())
-        log.warning("lost Data Updates at %s: %s; trying again in %.2f s", self._url, error, delay)
+        log.warning("lost Data Updates at %s: %s; retrying in %.2f s", self._url, error, delay)
 
     def _connect(self) -> None:
         try:
@@ -354,13 +387,13 @@ class RedisPublisher:
             run_id = _run_id(wire)
         except UpdatesUnavailable as error:
             delay = self._backoff.failed(time.monotonic())
-            log.warning("%s; trying again in %.2f s", error, delay)
+            log.warning("%s; retrying in %.2f s", error, delay)
             return
         self._backoff.succeeded()
         self._wire = wire
         if self._run_id:
             self._counts["reconnects"] += 1
-            log.warning("connected to Data Updates at %s again", self._url)
+            log.warning("reconnected to Data Updates at %s", self._url)
         try:
             for ledger in self._ledgers.values():
                 self._restore(wire, ledger, restarted=run_id != self._run_id)
@@ -369,13 +402,16 @@ class RedisPublisher:
             self._lose(error)
 
     def _restore(self, wire: Wire, ledger: StreamLedger, *, restarted: bool) -> None:
-        """Send what the server may not have: readers recognise repeats."""
+        """Resend what the server may not have; readers recognise repeats."""
         self._guarded_settle(wire)
         entries = list(ledger.kept)
+        ledger.lasting = False
         if not restarted:
             entries = [e for e in entries if e.id is None]
-        elif not wire.call("EXISTS", stream_name(ledger.path)):
-            entries = [*ledger.retained, *entries]
+        else:
+            ledger.forget_ids()
+            if not wire.call("EXISTS", stream_name(ledger.path)):
+                entries = [*ledger.retained, *entries]
         self._send_announcement(ledger)
         for entry in entries:
             self._counts["resent"] += 1

@@ -1,4 +1,4 @@
-"""How far the readers of a stream are, asked on the producer's own pipelined connection.
+"""The progress of a stream's readers, requested on the producer's own pipelined connection.
 
     HGETALL leases │ XINFO GROUPS │ XPENDING of each group known     one question, no waiting for the answer
 
@@ -11,11 +11,12 @@ from typing import Any
 
 import hiredis
 
-from due.drivers.redis_streams import StreamLedger, parse_id, readers_name, stream_name
-from due.drivers.redis_wire import pack
+from due.drivers.redis_leases import readers_name
+from due.drivers.redis_streams import StreamLedger, parse_id, stream_name
+from due.drivers.redis_wire import pack, understood
 
 NOBODY = (2**63, 0)
-"""Position where no live group reads: everything may be forgotten."""
+"""Position if no live group reads: everything may be forgotten."""
 
 
 class Question:
@@ -35,22 +36,26 @@ class Question:
         return b"".join((*parts, *(pack((b"XPENDING", name, group)) for group in self._groups)))
 
     def take(self, reply: Any) -> bool:
-        """Take the next reply; whether it was the last."""
+        """Take the next reply; returns whether it was the last."""
         self._replies.append(reply)
         return len(self._replies) == self.size
 
     def answer(self) -> tuple[int, int]:
         """The id up to which every live group has acknowledged; `NOBODY` where there is none.
 
-        Tells the ledger which groups to ask about next time.
+        Tells the ledger which groups to ask about next time.  Raises `UpdatesUnavailable` for a nonsensical answer.
         """
+        with understood("the question how far readers are"):
+            return self._answer()
+
+    def _answer(self) -> tuple[int, int]:
         leases, groups, *pendings = self._replies
         if isinstance(leases, hiredis.ReplyError):
             return (0, 0)
-        stamps = {f.decode(): int(at) / 1000 for f, at in zip(leases[::2], leases[1::2], strict=True)}
-        live = self.ledger.live_groups(stamps, time.time())
+        # asked_at: the answer may have lain in the socket while this process was stopped
+        live = self.ledger.live_groups(_map(leases), self.ledger.asked_at, time.monotonic())
         found = [] if isinstance(groups, hiredis.ReplyError) else [_map(group) for group in groups]
-        self.ledger.groups = tuple(g[b"name"] for g in found if g[b"name"].decode() in live)
+        self.ledger.groups = tuple(g[b"name"] for g in found if g[b"name"] in live)
         if len(self.ledger.groups) < len(live):
             return (0, 0)
         pending = dict(zip(self._groups, pendings, strict=True))

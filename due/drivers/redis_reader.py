@@ -3,6 +3,7 @@
 One request is outstanding at a time; acknowledgements travel with the next request.  Order: before
 reading what is new, a path's pending entries come first: our own after a reconnect, and those of
 members that died.  While another member that still lives has pending entries, a standby member holds.
+A member is dead when this one has watched its lease unchanged for 3 s (see `redis_leases`).
 """
 
 import logging
@@ -17,8 +18,11 @@ import redis
 
 from due.backoff import Backoff
 from due.drivers.base import Delivery
-from due.drivers.redis_streams import STREAMS, readers_name, stream_name
-from due.drivers.redis_wire import Wire, pack
+from due.drivers.redis_aside import Aside
+from due.drivers.redis_leases import LEFT, LeaseValue, LeaseWatch, lease_field, readers_name
+from due.drivers.redis_streams import STREAMS, stream_name
+from due.drivers.redis_upkeep import Upkeep
+from due.drivers.redis_wire import Wire, pack, understood
 from due.errors import UpdatesUnavailable
 
 log = logging.getLogger("due.updates")
@@ -26,23 +30,15 @@ log = logging.getLogger("due.updates")
 _COUNT = 16
 _BLOCK_MS = 1000
 _SILENT_SECONDS = 3.0
-"""A member whose lease is older is taken for dead."""
+"""A member whose lease has not changed for this long counts as dead."""
 _LOOK_SECONDS = 1.0
-"""How often to look after the other members; alone in a group, as often as one could be taken for dead."""
+"""Seconds between two checks of the other members; a single member checks less often."""
 _HOLD_SECONDS = 0.2
-_GONE_SECONDS = 30.0
-"""Whoever has not renewed his lease for so long holds no group."""
-_WITHDRAWN_SECONDS = 10.0
-_FORGET_SECONDS = 3600.0
-_ASIDE_LENGTH = 1000
+_MOST_PATHS = 4096
+"""Most streams that one member reads, because any program may announce paths."""
 _TRIES = 3
-"""How often to try at once to make a group: a connection may just have been cut."""
+"""Immediate attempts to create a group, in case the connection was just lost."""
 _SKIP_REPLY = pack((b"CLIENT", b"REPLY", b"SKIP"))
-
-
-def aside_name(group: str) -> str:
-    """The stream of payloads set aside for a group."""
-    return f"due:poison:{group}"
 
 
 class StreamReader:
@@ -56,7 +52,7 @@ class StreamReader:
         self._shared = shared
         self._lock = threading.Lock()
         self._leases = threading.Lock()
-        """Held while leases are written, or one could be renewed after it was given up."""
+        """Held while leases are written; otherwise one could be renewed after it was given up."""
         self._paths: dict[str, str] = {}
         self._wire: Wire | None = None
         self._wire_id = 0
@@ -66,25 +62,29 @@ class StreamReader:
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
-        self._withdrawn: dict[str, float] = {}
-        self._unmade: dict[str, tuple[str, bool]] = {}
-        """Groups that could not be made, with where they begin: such a stream stays held until it has one."""
+        self._unmade: dict[str, tuple[str, bool, float]] = {}
+        """Groups that could not be created: start, and since when; their streams are not read before that."""
+        self._lease = LeaseValue()
+        self._watches: dict[str, LeaseWatch] = {}
+        self._upkeep = Upkeep(commands, group, consumer)
+        self._aside = Aside(commands, group)
+        self._server_time = ServerTime(commands)
         self._look_at = 0.0
         self._alone = False
         self._quiet = False
-        """Whether the server can keep the reply to an XACK for itself."""
+        """Whether the server can suppress the reply to an XACK."""
         self._claimed: deque[Delivery] = deque()
         self._backoff = Backoff()
         self._active = True
         self._take_over = False
         self._stale = False
         self._connected_before = False
-        self._counts = {"claimed": 0, "set_aside": 0}
+        self._counts = {"claimed": 0, "paths_refused": 0}
 
     def known(self) -> list[str]:
         """Paths of all streams that producers announced."""
         try:
-            return sorted(path.decode() for path in self._commands.smembers(STREAMS))
+            return sorted(path.decode("ascii", "replace") for path in self._commands.smembers(STREAMS))
         except (redis.RedisError, OSError) as error:
             raise UpdatesUnavailable(str(error)) from None
 
@@ -93,28 +93,31 @@ class StreamReader:
         with self._lock:
             if path in self._paths and not reset:
                 return
+            if len(self._paths) >= _MOST_PATHS and path not in self._paths:
+                self._refuse(path)
+                return
             self._paths[path] = start
-            self._withdrawn.pop(path, None)
+            self._upkeep.added(path)
             self._held.add(path)
             self._look_at = 0.0
             self._stale = True
         self._create_group(path, start, reset=reset)
         self.renew()
-        self._tidy(path)
         self._interrupt()
 
     def leave(self, stays: Callable[[str], bool]) -> None:
-        """Stop reading the paths that nobody here wants any more."""
+        """Stop reading paths without an observation."""
         with self._lock:
             gone = [path for path in self._paths if not stays(path)]
             for path in gone:
                 del self._paths[path]
                 self._held.discard(path)
                 self._unmade.pop(path, None)
+                self._watches.pop(path, None)
             self._stale = bool(gone)
-            self._withdrawn.update(dict.fromkeys(gone, time.monotonic()))
+            self._upkeep.withdrawn(gone, time.monotonic())
         with self._leases:
-            self._write_leases(gone, 0)
+            self._write_leases(gone, LEFT)
         self._interrupt()
 
     def activate(self, active: bool, *, take_over: bool) -> None:
@@ -141,7 +144,7 @@ class StreamReader:
         return 0.05 if self._wire is None else _HOLD_SECONDS if self._held else _LOOK_SECONDS
 
     def care(self) -> None:
-        """Look after the dead, connect, and ask for more; before each wait."""
+        """Take over from dead members, reconnect, and request more; called before each wait."""
         if not self._paths or not self._active:
             self._flush_acks()
             return
@@ -159,7 +162,7 @@ class StreamReader:
             self._lose(error)
 
     def read(self, ready: set[int]) -> list[Delivery]:
-        """What has arrived, claimed work first."""
+        """Received entries, claimed ones first."""
         deliveries = list(self._claimed)
         self._claimed.clear()
         if self._wire is None or self._wire.fileno() not in ready:
@@ -178,31 +181,23 @@ class StreamReader:
         self._acks.append((delivery.path, delivery.token))
 
     def set_aside(self, path: str, payload: bytes, reason: str) -> None:
-        """Move a payload out of the way, visibly."""
-        self._counts["set_aside"] += 1
-        try:
-            fields: dict[Any, Any] = {"path": path, "f": payload, "reason": reason}
-            self._commands.xadd(aside_name(self._group), fields, maxlen=_ASIDE_LENGTH, approximate=True)
-        except (redis.RedisError, OSError) as error:
-            log.error("an item of %s could not be set aside: %s", path, error)  # noqa: TRY400 - no trace
+        """Set a payload aside."""
+        self._aside.put(path, payload, reason)
 
     def aside(self) -> list[tuple[bytes, str]]:
         """What was set aside for the group, with reasons; raises `UpdatesUnavailable`."""
-        try:
-            entries = self._commands.xrange(aside_name(self._group))
-        except (redis.RedisError, OSError) as error:
-            raise UpdatesUnavailable(f"what was set aside cannot be listed: {error}") from None
-        return [(fields[b"f"], fields[b"reason"].decode("utf-8", "replace")) for _, fields in entries]
+        return self._aside.all()
 
     def renew(self) -> None:
-        """Renew the leases; a standby instance holds the group's place too."""
+        """Renew the leases; a standby instance keeps the group's position, too."""
         with self._leases:
-            self._write_leases(list(self._paths), int(time.time() * 1000))
-        self._drop_groups()
+            self._write_leases(list(self._paths), self._lease.next())
+        self._upkeep.tick(list(self._paths), time.monotonic())
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
-        return {**self._counts, "held_paths": len(self._held)}
+        sizes = {"held_paths": len(self._held), "read_paths": len(self._paths)}
+        return {**self._counts, **sizes, **self._aside.counts, **self._upkeep.counts}
 
     def close(self) -> None:
         """Acknowledge what is done, give up the leases for good, close."""
@@ -210,34 +205,48 @@ class StreamReader:
         with self._lock:
             paths, self._paths = list(self._paths), {}
         with self._leases:
-            self._write_leases(paths, 0)
+            self._write_leases(paths, LEFT)
         if self._wire is not None:
             self._wire.close()
             self._wire = None
 
-    def _write_leases(self, paths: list[str], stamp: int) -> None:
+    def _refuse(self, path: str) -> None:
+        self._counts["paths_refused"] += 1
+        if self._counts["paths_refused"] == 1:
+            log.error(
+                "%s reads at most %d reliable paths: %s and others are left out; observe a narrower key",
+                self._group,
+                _MOST_PATHS,
+                path,
+            )
+
+    def _write_leases(self, paths: list[str], value: bytes) -> None:
         if not paths:
             return
         try:
             pipe = self._commands.pipeline(transaction=False)
             for path in paths:
-                pipe.hset(readers_name(path), f"{self._group}/{self._consumer}", str(stamp))
+                pipe.hset(readers_name(path), lease_field(self._group, self._consumer), value)
             pipe.execute()
         except (redis.RedisError, OSError) as error:
             log.debug("leases could not be written: %s", error)
 
-    def _create_group(self, path: str, start: str, *, reset: bool = False) -> None:
+    def _create_group(
+        self, path: str, start: str, *, reset: bool = False, since: float | None = None
+    ) -> None:
+        """`since`: when a group was first requested that could not be created then (s, monotonic)."""
         for _ in range(_TRIES):
             try:
-                self._make_group(path, start, reset=reset)
+                begin = self._server_time.start(since) if start == "$" and since is not None else start
+                self._make_group(path, begin, reset=reset)
             except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
                 failed = error
                 continue
             self._unmade.pop(path, None)
             return
-        log.warning("group %s of %s cannot be made now: %s", self._group, path, failed)
-        # what comes from now on is wanted, whenever the group can be made; it begins behind the id it is given
-        self._unmade[path] = (str(int(time.time() * 1000) - 1) if start == "$" else start, reset)
+        log.warning("group %s of %s cannot be created now: %s", self._group, path, failed)
+        # entries from now on are wanted, even if the group is created later
+        self._unmade[path] = (start, reset, time.monotonic() if since is None else since)
 
     def _make_group(self, path: str, start: str, *, reset: bool) -> None:
         try:
@@ -247,39 +256,6 @@ class StreamReader:
                 raise
             if reset:
                 self._commands.xgroup_setid(stream_name(path), self._group, start)
-
-    def _drop_groups(self) -> None:
-        """Of interests withdrawn a while ago: an app that withdraws them because it ends keeps its place."""
-        with self._lock:
-            due = [path for path, at in self._withdrawn.items() if time.monotonic() - at > _WITHDRAWN_SECONDS]
-            for path in due:
-                del self._withdrawn[path]
-        for path in due:
-            self._drop_group(path)
-
-    def _drop_group(self, path: str) -> None:
-        """Without another live member the group goes, and its place with it."""
-        try:
-            leases = self._commands.hgetall(readers_name(path))
-            stamps = [int(at) / 1000 for field, at in leases.items() if self._is_ours(field)]
-            if all(time.time() - at > _GONE_SECONDS for at in stamps):
-                self._commands.xgroup_destroy(stream_name(path), self._group)
-        except (redis.RedisError, OSError) as error:
-            log.debug("group %s of %s could not be dropped: %s", self._group, path, error)
-
-    def _tidy(self, path: str) -> None:
-        """Forget leases of members long gone."""
-        try:
-            leases = self._commands.hgetall(readers_name(path))
-            limit = 1000 * (time.time() - _FORGET_SECONDS)
-            old = [field for field, at in leases.items() if self._is_ours(field) and int(at) < limit]
-            if old:
-                self._commands.hdel(readers_name(path), *old)
-        except (redis.RedisError, OSError) as error:
-            log.debug("leases of %s could not be tidied: %s", path, error)
-
-    def _is_ours(self, field: bytes) -> bool:
-        return field.rpartition(b"/")[0] == self._group.encode()
 
     def _interrupt(self) -> None:
         """Make the server answer the blocked request now, so that a new one goes out."""
@@ -291,7 +267,9 @@ class StreamReader:
 
     def _connect(self) -> None:
         wire = Wire(self._url)
-        self._wire_id = int(wire.call("CLIENT", "ID"))
+        with understood("CLIENT ID and TIME"):
+            self._wire_id = int(wire.call("CLIENT", "ID"))
+            self._server_time.note(_seconds(wire.call("TIME")))
         self._quiet = wire.call("CLIENT", "REPLY", "ON") == b"OK"
         self._backoff.succeeded()
         self._wire = wire
@@ -307,7 +285,7 @@ class StreamReader:
             self._wire.close()
             self._wire = None
         delay = self._backoff.failed(time.monotonic())
-        log.warning("streams at %s: %s; trying again in %.2f s", self._url, error, delay)
+        log.warning("streams at %s: %s; retrying in %.2f s", self._url, error, delay)
 
     def _request(self, wire: Wire) -> None:
         with self._lock:
@@ -315,7 +293,7 @@ class StreamReader:
             self._catch_up &= self._paths.keys()
             history = tuple(self._catch_up)
             paths = history or tuple(p for p in self._paths if p not in self._held)
-            if not self._active:  # put on standby a moment ago
+            if not self._active:  # became a standby a moment ago
                 history = paths = ()
         command = self._packed_acks(quietly=self._quiet and bool(paths))
         if paths:
@@ -328,7 +306,7 @@ class StreamReader:
             wire.send_packed(command)
 
     def _packed_acks(self, *, quietly: bool = False) -> bytes:
-        """`quietly`: a read follows, whose reply stands for theirs; each would wake us up before it."""
+        """`quietly`: a read follows, so replies of their own would only cause wake-ups."""
         command = b""
         while self._acks:
             path = self._acks[0][0]
@@ -360,18 +338,19 @@ class StreamReader:
             self._acks_sent.clear()
         if kind == "ack":
             return []
-        found = [
-            Delivery(name.decode()[len("due:stream:") :], fields[1], token.decode())
-            for name, entries in reply or ()
-            for token, fields in entries
-            if fields
-        ]
+        with understood("a request for entries"):
+            found = [
+                Delivery(name.decode()[len("due:stream:") :], fields[1], token.decode())
+                for name, entries in reply or ()
+                for token, fields in entries
+                if fields
+            ]
         if self._catch_up:
             self._catch_up &= {delivery.path for delivery in found}
         return found
 
     def _repair(self, error: Exception) -> None:
-        """A group or stream is gone, because the server came back empty: begin at its beginning."""
+        """A group or stream is gone because the server restarted empty: begin at its beginning."""
         if "NOGROUP" in str(error) or "UNBLOCKED" in str(error):
             with self._lock:
                 paths = list(self._paths)
@@ -389,11 +368,11 @@ class StreamReader:
         for path in paths:
             unmade = self._unmade.get(path)
             if unmade is not None:
-                self._create_group(path, unmade[0], reset=unmade[1])
+                self._create_group(path, unmade[0], reset=unmade[1], since=unmade[2])
             try:
                 waits = self._claim(path)
             except (redis.RedisError, OSError) as error:
-                log.debug("members of %s could not be looked after: %s", path, error)
+                log.debug("members of %s could not be checked: %s", path, error)
                 self._alone = False
                 continue
             if not waits or self._shared:
@@ -405,19 +384,23 @@ class StreamReader:
         """Take the pending entries of dead members; returns whether a live one has some."""
         name = stream_name(path)
         consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(name, self._group)
-        others = [c for c in consumers if c["name"].decode() != self._consumer]
+        others = [c for c in consumers if c["name"] != self._consumer.encode()]
         self._alone = self._alone and not others
         others = [c for c in others if c["pending"]]
         if not others:
             return False
+        fields = {c["name"]: self._group.encode() + b"/" + c["name"] for c in others}
+        watch = self._watches.setdefault(path, LeaseWatch(_SILENT_SECONDS))
+        asked = time.monotonic()
         leases = self._commands.hgetall(readers_name(path))
+        # a missing lease is treated like an unchanged one
+        watch.look({field: leases.get(field, b"") for field in fields.values()}, asked, time.monotonic())
         waits = False
-        for consumer in others:
-            stamp = int(leases.get(f"{self._group}/{consumer['name'].decode()}".encode(), 0)) / 1000
-            if not self._take_over and time.time() - stamp < _SILENT_SECONDS:
+        for name, field in fields.items():
+            if not self._take_over and watch.silent(field) < _SILENT_SECONDS:
                 waits = True
             else:
-                self._claim_from(path, consumer["name"])
+                self._claim_from(path, name)
         return waits
 
     def _claim_from(self, path: str, consumer: bytes) -> None:
@@ -425,7 +408,7 @@ class StreamReader:
         low = "-"
         while True:
             pending: list[dict[str, Any]] = self._commands.xpending_range(
-                name, self._group, low, "+", 1000, consumername=consumer.decode()
+                name, self._group, low, "+", 1000, consumername=consumer
             )
             if not pending:
                 return
@@ -436,5 +419,34 @@ class StreamReader:
             for token, fields in claimed:
                 if fields:
                     self._counts["claimed"] += 1
-                    self._claimed.append(Delivery(path, fields[b"f"], token.decode(), tries.get(token, 2)))
+                    payload = fields.get(b"f", b"")  # the decoder refuses entries of other programs
+                    self._claimed.append(Delivery(path, payload, token.decode(), tries.get(token, 2)))
             low = "(" + pending[-1]["message_id"].decode()
+
+
+class ServerTime:
+    """Position of a stream at a time when the server could not be asked, by the server's own clock.
+
+    Both ways to compute it agree unless that clock jumped; the earlier result is used, so that a jump causes
+    repeated entries and never missing ones.
+    """
+
+    def __init__(self, commands: Any) -> None:
+        self._commands = commands
+        self._offset: float | None = None
+
+    def note(self, seconds: float) -> None:
+        """The server's clock now, s."""
+        self._offset = seconds - time.monotonic()
+
+    def start(self, since: float) -> str:
+        """The id behind which everything was appended after `since` (s, monotonic)."""
+        seconds, microseconds = self._commands.time()
+        at = seconds + microseconds / 1e6 - (time.monotonic() - since)
+        if self._offset is not None:
+            at = min(at, self._offset + since)
+        return str(max(0, int(at * 1000) - 1))
+
+
+def _seconds(reply: Any) -> float:
+    return int(reply[0]) + int(reply[1]) / 1e6

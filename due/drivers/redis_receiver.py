@@ -17,7 +17,7 @@ from due.drivers.base import Delivery
 from due.drivers.redis_reader import StreamReader
 from due.drivers.redis_streams import STREAMS
 from due.drivers.redis_wire import Wire, client, glob
-from due.errors import UpdatesUnavailable
+from due.errors import InvalidKey, UpdatesUnavailable
 from due.keys import Key
 
 log = logging.getLogger("due.updates")
@@ -130,7 +130,7 @@ class RedisReceiver:
         try:
             os.write(self._wake_write, b"x")
         except (BlockingIOError, OSError):
-            return  # it is awake, or closed
+            return  # it is already awake, or closed
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
@@ -158,13 +158,13 @@ class RedisReceiver:
         key = Key.parse(pattern)
         try:
             for path in self._reader.known():
-                if key.matches_path(path):
+                if key.matches_path(path) and _is_path(path):
                     self._reader.add(path, start, reset=reset)
         except UpdatesUnavailable as error:
             log.warning("streams of %s cannot be listed now: %s", pattern, error)
 
     def _announced(self, path: str) -> None:
-        if any(Key.parse(p).matches_path(path) for p in self._followed):
+        if any(Key.parse(p).matches_path(path) for p in self._followed) and _is_path(path):
             self._reader.add(path, "0")
 
     def _change(self, verb: bytes, pattern: str) -> None:
@@ -210,15 +210,15 @@ class RedisReceiver:
             self._reconnects += 1
         delay = self._backoff.failed(time.monotonic())
         if not self._closed:
-            log.warning("subscriptions at %s: %s; trying again in %.2f s", self._url, error, delay)
+            log.warning("subscriptions at %s: %s; retrying in %.2f s", self._url, error, delay)
 
     def _care(self) -> None:
-        """Reconnect what is lost, and look for streams announced meanwhile."""
+        """Reconnect lost connections, and look for streams announced meanwhile."""
         if self._bus is None and self._patterns and not self._closed:
             with self._lock:
                 opened = self._bus is None and self._open()
             if opened:
-                log.warning("subscribed at %s again", self._url) if self._reconnects else None
+                log.warning("resubscribed at %s", self._url) if self._reconnects else None
                 for pattern in list(self._followed):
                     self._adopt(pattern, "0")
         self._reader.care()
@@ -261,12 +261,14 @@ class RedisReceiver:
         return some
 
     def _sort(self, reply: Any) -> bytes:
-        """Put a message where it belongs; returns the kind of reply."""
+        """Dispatch a message; returns the kind of reply."""
         kind: bytes = reply[0] if isinstance(reply, list) else b""
         if kind not in (b"message", b"pmessage"):
             if isinstance(reply, Exception):
                 log.error("subscription refused: %s", reply)
             return kind
+        if len(reply) < 3 or not (isinstance(reply[-2], bytes) and isinstance(reply[-1], bytes)):
+            raise UpdatesUnavailable("the server sent a message without channel or content")
         channel, payload = reply[-2], reply[-1]
         if channel == _STREAMS:
             self._announced(payload.decode("ascii", "replace"))
@@ -276,3 +278,12 @@ class RedisReceiver:
             self._backlog.append(Delivery(channel[len(_PREFIX) :].decode("ascii", "replace"), payload))
             self._backlog_bytes += len(payload)
         return kind
+
+
+def _is_path(text: str) -> bool:
+    """Whether this is the path of a concrete key; any program may announce anything."""
+    try:
+        key = Key(text)
+    except InvalidKey:
+        return False
+    return key.concrete and key.path == text

@@ -3,19 +3,27 @@
     XADD ──reply──► kept (unacknowledged by readers) ──all live groups acknowledged──► retained (for replay)
 
 A payload stays in `kept` until every live group of readers has acknowledged it; `kept` is bounded by
-the window, and that bound is the back-pressure.  A group lives while one of its instances renewed its
-lease (hash `due:readers:<path>`, field `<group>/<instance>`, value unix ms, 0 = left) within
-`group_timeout`.  If the server comes back empty, retained and kept payloads are sent again; readers
-recognise repeats.  Readers' clocks must agree within a few seconds.
+the window, and that bound is the back-pressure.  A group lives while one of its instances renews its
+lease: until this producer has watched all of them unchanged for `group_timeout` (see `redis_leases`).
+If the server comes back empty, retained and kept payloads are sent again; readers recognise repeats.
+A stream without writer and reader for `LIFETIME_S` expires, with its groups and leases.
 """
 
 from collections import deque
+from collections.abc import Mapping
+
+from due.drivers.redis_leases import LeaseWatch, group_of
+from due.errors import UpdatesUnavailable
 
 STREAMS = "due:streams"
 """Set of the paths that are streams, and the channel on which new ones are announced."""
 _OVERHEAD = 200
+LIFETIME_S = 86_400
+"""Streams and leases expire after this long without a producer and a reader, seconds."""
+CARE_SECONDS = 60.0
+"""Seconds between two renewals of a stream's expiry."""
 LEAST_PAUSE = 0.0025
-"""Seconds between two questions how far the readers are, at least."""
+"""Least seconds between two questions about the readers' progress."""
 
 
 def stream_name(path: str) -> str:
@@ -23,13 +31,8 @@ def stream_name(path: str) -> str:
     return f"due:stream:{path}"
 
 
-def readers_name(path: str) -> str:
-    """The Redis hash of a stream's leases."""
-    return f"due:readers:{path}"
-
-
-class Entry:
-    """A payload on its way: its id is known once the server has answered."""
+class StreamEntry:
+    """A sent payload; its id is known once the server has answered."""
 
     __slots__ = ("id", "path", "payload")
 
@@ -49,14 +52,18 @@ class StreamLedger:
 
     def __init__(self, path: str, window: int, retain: int, group_timeout: float) -> None:
         self.path = path
-        self.kept: deque[Entry] = deque()
+        self.kept: deque[StreamEntry] = deque()
         self.kept_bytes = 0
-        self.retained: deque[Entry] = deque()
+        self.retained: deque[StreamEntry] = deque()
         self._retained_bytes = 0
         self._window = window
         self._retain = retain
         self._group_timeout = group_timeout
-        self._leases: dict[str, float] = {}
+        self._leases = LeaseWatch(group_timeout)
+        self.lasting = False
+        """The stream is announced, and its expiry was renewed within the last `CARE_SECONDS`."""
+        self.written = False
+        """Written to since its expiry was renewed."""
         self.groups: tuple[bytes, ...] = ()
         """Live groups of readers, as of the last answer."""
         self.asked = False
@@ -65,11 +72,11 @@ class StreamLedger:
         self.waiting = False
         """A writer waits for the readers."""
         self.patience = 0.0
-        """How long it is likely to wait the next time, seconds."""
+        """Expected length of its next wait, seconds."""
         self._asked_bytes = 0
 
     def ask_again(self, now: float, seconds: float) -> bool:
-        """Whether to ask how far the readers are: after so long, or when much was added since the last time."""
+        """Whether to ask for the readers' progress: after `seconds`, or after many new bytes."""
         if self.asked or not self.kept:
             return False
         return now - self.asked_at > seconds or (self.kept_bytes - self._asked_bytes) * 4 > self._window
@@ -79,7 +86,7 @@ class StreamLedger:
         self.asked, self.asked_at, self._asked_bytes = True, now, self.kept_bytes
 
     def has_room(self, size: int) -> bool:
-        """Whether a payload of that size fits; a lone big one always does."""
+        """Whether a payload of this size fits into the window; into an empty one any payload does."""
         return not self.kept or self.kept_bytes + size + _OVERHEAD <= self._window
 
     def excess(self, share: float) -> int:
@@ -88,32 +95,40 @@ class StreamLedger:
 
     @property
     def half_full(self) -> bool:
-        """Time to ask how far the readers are."""
+        """Whether it is time to ask for the readers' progress."""
         return self.kept_bytes * 2 > self._window
 
-    def add(self, payload: bytes) -> Entry:
+    def add(self, payload: bytes) -> StreamEntry:
         """Keep a payload that is about to be sent."""
-        entry = Entry(self.path, payload)
+        entry = StreamEntry(self.path, payload)
         self.kept.append(entry)
         self.kept_bytes += entry.size
+        self.written = True
         return entry
 
-    def live_groups(self, leases: dict[str, float], now: float) -> set[str]:
-        """Groups to wait for: seen alive within the time-out, by the server or by us before it lost them."""
-        self._leases.update(leases)
-        self._leases = {f: at for f, at in self._leases.items() if now - at < self._group_timeout}
-        return {field.rpartition("/")[0] for field in self._leases}
+    def live_groups(self, leases: Mapping[bytes, bytes], asked: float, answered: float) -> set[bytes]:
+        """Groups to wait for: seen alive within the timeout, on the server or by us before it lost them."""
+        self._leases.look(leases, asked, answered)
+        return {group_of(field) for field in self._leases.living(self._group_timeout)}
 
     def acknowledged(self, up_to: tuple[int, int]) -> None:
-        """All live groups are done with ids up to this one."""
+        """All live groups have acknowledged the ids up to this one."""
         while self.kept and (at := self.kept[0].id) is not None and at <= up_to:
             entry = self.kept.popleft()
             self.kept_bytes -= entry.size
             self.retained.append(entry)
             self._retained_bytes += entry.size
 
+    def forget_ids(self) -> None:
+        """The server was restarted: earlier ids mean nothing, and its clock may be behind them."""
+        for entry in (*self.retained, *self.kept):
+            entry.id = None
+
     def trim_point(self, streams: int = 1) -> tuple[int, int] | None:
-        """Forget the oldest retained payloads over the share of one of `streams`; the id from which to keep."""
+        """Forget the oldest retained payloads over the share of one of `streams`; the id from which to keep.
+
+        None if nothing was forgotten, or if the id is from before a restart of the server.
+        """
         trimmed = False
         while len(self.retained) > 1 and self._retained_bytes > self._retain // streams:
             self._retained_bytes -= self.retained.popleft().size
@@ -122,12 +137,15 @@ class StreamLedger:
 
 
 def next_pause(waited: float, freed: int, missing: int, longest: float) -> float:
-    """Seconds until asking again is worth it: `freed` bytes in `waited` seconds, `missing` are to come."""
+    """Seconds until the next question: `freed` bytes in `waited` seconds, `missing` bytes still to free."""
     expected = waited * missing / freed if freed > 0 else 2 * waited
     return min(max(expected, LEAST_PAUSE), longest)
 
 
 def parse_id(text: bytes | str) -> tuple[int, int]:
-    """A stream id as a pair that compares."""
-    ms, _, number = (text.decode() if isinstance(text, bytes) else text).partition("-")
-    return int(ms), int(number or 0)
+    """A stream id as a pair that compares; raises `UpdatesUnavailable` for anything else."""
+    try:
+        ms, _, number = (text.decode("ascii") if isinstance(text, bytes) else text).partition("-")
+        return int(ms), int(number or 0)
+    except (ValueError, AttributeError):
+        raise UpdatesUnavailable(f"the server gave {text!r:.60} for a stream's id") from None

@@ -8,6 +8,7 @@ parsing (RESP3, its default, formats each push into a log line).
 import socket
 import ssl
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, cast
 
 import hiredis
@@ -17,12 +18,12 @@ from due.errors import InvalidOption, UpdatesUnavailable
 
 _READ = 1 << 18
 _PARSER_KEEPS = 1 << 20
-"""Spare bytes that the parser does not give back after each message, to ask for them again at the next."""
+"""Spare bytes that the parser keeps between messages instead of allocating them again."""
 _SEND_ROOM = 1 << 20
-"""By itself a Unix socket takes two frames; at every third a writer would have to wait for the server."""
+"""The default buffer of a Unix socket holds two frames, so a writer would wait at every third."""
 _JOIN_BELOW = 1 << 14
 _MOST_PARTS = 512
-"""Linux gathers 1,024 at most."""
+"""Buffers per sendmsg; Linux allows at most 1,024."""
 
 
 def client(url: str) -> redis.Redis:
@@ -42,6 +43,15 @@ def _redis_url(url: str) -> str:
     raise InvalidOption(f"Data Updates URL {url!r}: use redis://host:port/0, rediss://… or unix:///path.sock")
 
 
+@contextmanager
+def understood(what: str) -> Iterator[None]:
+    """Turn every error in an answer into `UpdatesUnavailable`, so that the connection is reopened."""
+    try:
+        yield
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise UpdatesUnavailable(f"the server's answer to {what} is not understood: {error!r}") from None
+
+
 class Wire:
     """A connected socket with a reply parser.  Every failure is an `UpdatesUnavailable`."""
 
@@ -58,13 +68,13 @@ class Wire:
         self._socket: socket.socket = self._connection._sock  # noqa: SLF001
         self._reader = cast("Any", hiredis.Reader())  # its stub knows no buffer but bytes
         self._reader.setmaxbuf(_PARSER_KEEPS)
-        # kept, because the allocator would map and unmap a new one for each read
+        # reused: the allocator would map and unmap a new one for each read
         self._buffer = bytearray(_READ)
 
     def make_room(self) -> None:
-        """Let more wait in the socket; only where something else holds the sender back in time.
+        """Enlarge the socket's send buffer; only for senders that are throttled otherwise.
 
-        Without that a server that takes more than its readers do drops them.
+        An unthrottled sender would fill the server, which drops readers that are too slow.
         """
         if self._socket.family == socket.AF_UNIX:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_ROOM)
@@ -78,7 +88,7 @@ class Wire:
         self.send_all([arguments])
 
     def send_all(self, commands: Sequence[tuple[bytes | str | int, ...]]) -> None:
-        """Send commands with one call of the system where they are few; big last arguments are not copied."""
+        """Send commands with one system call if they are few; big last arguments are not copied."""
         parts = [part for arguments in commands for part in _parts(arguments)]
         if len(parts) == 1:
             self.send_packed(parts[0])
@@ -180,7 +190,7 @@ def _parts(arguments: tuple[bytes | str | int, ...]) -> list[bytes]:
 
 def pack(arguments: tuple[bytes | str | int, ...]) -> bytes:
     """One command as bytes."""
-    return cast("bytes", hiredis.pack_command(cast("Any", arguments)))  # its stub forgets the dots
+    return cast("bytes", hiredis.pack_command(cast("Any", arguments)))  # its stub lacks the dots
 
 
 def glob(pattern: str) -> str | None:

@@ -1,9 +1,12 @@
-"""A bounded queue of frames on disk, for while the archive is away: one SQLite file, first in first out."""
+"""A bounded queue of frames on disk while the archive is away: one SQLite file, first in first out."""
 
 import logging
 import sqlite3
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -17,12 +20,14 @@ PRAGMA journal_mode = WAL;
 CREATE TABLE IF NOT EXISTS frames(id INTEGER PRIMARY KEY AUTOINCREMENT, size INTEGER NOT NULL, data BLOB NOT NULL);
 """
 _RECORD_OVERHEAD = 64
+_DAMAGED_KEPT = 3
 
 
 class DiskSpool:
     """A spool in `folder`/`name`.db, of at most about `limit` bytes; raises BackendError if it cannot be opened.
 
-    Survives kill -9 of its process.  What a full or broken disk does not take counts as not fitting.
+    Survives kill -9 of its process.  A damaged
+    file is set aside under another name (the last three are kept) and an empty one takes its place.
     """
 
     def __init__(self, folder: Path, limit: int, name: str = "spool") -> None:
@@ -31,17 +36,71 @@ class DiskSpool:
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode = msgspec.msgpack.Decoder(PackedFrame).decode
         self._closed = False
+        self._count = self._bytes = 0
+        self.set_aside = 0
+        """Damaged files so far."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
-            self._file.executescript(_SCHEMA)
-            self._file.execute("PRAGMA synchronous = NORMAL")
-            self._count, self._bytes = self._measure()
+            try:
+                self._file = self._opened()
+            except sqlite3.DatabaseError as error:
+                if not _is_damage(error):
+                    raise
+                self._set_aside(error)
         except (OSError, sqlite3.Error) as error:
             raise BackendError(f"spool {self.path} cannot be opened: {error}; name another folder") from error
 
+    def _opened(self) -> sqlite3.Connection:
+        file = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
+        try:
+            file.executescript(_SCHEMA)
+            file.execute("PRAGMA synchronous = NORMAL")
+            count, size = file.execute("SELECT count(*), total(size) FROM frames").fetchone()
+        except UnicodeDecodeError as error:
+            file.close()
+            raise _damaged(error) from error
+        except BaseException:
+            file.close()
+            raise
+        self._count, self._bytes = int(count), int(size)
+        return file
+
+    def _set_aside(self, error: sqlite3.Error) -> None:
+        """Continue with an empty file; raises `sqlite3.Error` or `OSError` if none can be created."""
+        lost = self._count
+        aside = self.path.with_suffix(f".damaged-{time.time_ns()}")
+        self.path.with_suffix(".db-shm").unlink(missing_ok=True)
+        with suppress(FileNotFoundError):
+            self.path.with_suffix(".db-wal").rename(f"{aside}-wal")
+        self.path.rename(aside)
+        former = sorted(self.path.parent.glob(f"{self.path.stem}.damaged-*[0-9]"))
+        for path in former[:-_DAMAGED_KEPT]:
+            path.unlink(missing_ok=True)
+            Path(f"{path}-wal").unlink(missing_ok=True)
+        log.error(
+            "spool %s is damaged (%s): %s frames in it stay in %s for manual repair; an empty spool replaces it",
+            self.path,
+            error,
+            lost or "the",
+            aside,
+        )
+        self._file = self._opened()
+        self.set_aside += 1
+
+    def _failed(self, error: sqlite3.Error) -> bool:
+        """Handle an error; True if a damaged file was replaced by an empty one."""
+        if not _is_damage(error):
+            return False
+        try:
+            self._file.close()
+            self._set_aside(error)
+        except (OSError, sqlite3.Error) as again:
+            log.error("spool %s: %s", self.path, again)  # noqa: TRY400 - no trace needed
+            return False
+        return True
+
     def put(self, frames: Sequence[PackedFrame]) -> int:
-        """Append frames; returns how many items did not fit and are lost."""
+        """Append frames; returns how many items did not fit and are lost.  See `Spool.put`."""
         rows, space = [], self._limit - self._bytes
         for frame in frames:
             data = self._encode(frame)
@@ -53,15 +112,18 @@ class DiskSpool:
         try:
             self._append(rows)
         except sqlite3.Error as error:
-            log.warning("spool %s: %s", self.path, error)
-            rows = []
+            if self._failed(error):
+                return self.put(frames)
+            raise BackendError(f"spool {self.path} takes nothing: {error}; make room on its disk") from error
         return sum(frame.count for frame in frames[len(rows) :])
 
     def take(self, frames: int) -> list[PackedFrame]:
         """Up to `frames` of the oldest frames, which stay until `done`; damaged records are dropped."""
         try:
-            rows = self._file.execute("SELECT id, data FROM frames ORDER BY id LIMIT ?", (frames,)).fetchall()
+            rows = self._rows("SELECT id, data FROM frames ORDER BY id LIMIT ?", frames)
         except sqlite3.Error as error:
+            if self._failed(error):
+                return []
             raise BackendError(f"spool {self.path}: {error}") from error
         return [frame for number, data in rows if (frame := self._read(number, data)) is not None]
 
@@ -81,7 +143,7 @@ class DiskSpool:
     def _read(self, number: int, data: bytes) -> PackedFrame | None:
         try:
             return self._decode(data)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, ValueError, TypeError, RecursionError) as error:
             log.error("spool %s: record %d is damaged and dropped: %s", self.path, number, error)  # noqa: TRY400
             self._remove("id = ?", number)
             return None
@@ -100,15 +162,27 @@ class DiskSpool:
 
     def _remove(self, which: str, number: int) -> None:
         try:
-            removed = self._file.execute(
-                f"DELETE FROM frames WHERE {which} RETURNING size",  # noqa: S608 our own text
-                (number,),
-            ).fetchall()
+            removed = self._rows(f"DELETE FROM frames WHERE {which} RETURNING size", number)  # noqa: S608 our own text
         except sqlite3.Error as error:
+            if self._failed(error):
+                return
             raise BackendError(f"spool {self.path}: {error}") from error
         self._count -= len(removed)
-        self._bytes -= sum(size for (size,) in removed)
+        self._bytes -= sum(size for (size,) in removed if isinstance(size, int))
 
-    def _measure(self) -> tuple[int, int]:
-        count, size = self._file.execute("SELECT count(*), total(size) FROM frames").fetchone()
-        return int(count), int(size)
+    def _rows(self, statement: str, number: int) -> list[Any]:
+        try:
+            return self._file.execute(statement, (number,)).fetchall()
+        except UnicodeDecodeError as error:
+            raise _damaged(error) from error
+
+
+def _damaged(error: UnicodeDecodeError) -> sqlite3.DatabaseError:
+    """What sqlite3 says of a damaged schema may itself be no text, and then that is all that comes out."""
+    made = sqlite3.DatabaseError(f"the file is damaged: {error}")
+    made.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+    return made
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)

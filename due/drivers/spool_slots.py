@@ -1,8 +1,8 @@
-"""Spools of the instances of one app, side by side in one folder: each has its own, none is left undrained.
+"""Spools of the instances of one app in one folder: each instance has its own, and none is left unread.
 
     spool.db  spool.lock      the first instance's      spool-1.db  spool-1.lock   the second's …
 
-An instance owns the spool whose lock it holds; the lock falls with its process.  So a restarted app finds
+An instance owns the spool whose lock it holds; the lock ends with its process.  So a restarted app finds
 its former spool free and goes on with it, and `adopt` takes over what others of the app left behind.
 """
 
@@ -42,14 +42,14 @@ class SlottedSpool:
         return self._taken_from.take(frames)
 
     def done(self, frames: int) -> None:
-        """Remove that many of what `take` gave; an adopted spool that is empty goes."""
+        """Remove that many of the frames that `take` returned; an adopted spool is deleted when empty."""
         (self._taken_from or self._own.spool).done(frames)
         for slot in [slot for slot in self._adopted if not len(slot.spool)]:
             self._adopted.remove(slot)
             slot.remove()
 
     def adopt(self) -> None:
-        """Take over the spools of instances that are gone."""
+        """Take over the spools of instances that have ended."""
         names = {path.stem for path in self._folder.glob("spool*.db")} - {self._own.name}
         for name in sorted(names - {slot.name for slot in self._adopted}):
             slot = self._try(name)
@@ -80,7 +80,7 @@ class SlottedSpool:
         raise BackendError(f"all {_SLOTS} spools in {self._folder} are in use; name another folder")
 
     def _try(self, name: str) -> "_Slot | None":
-        """The spool of this name if nobody has it."""
+        """The spool of this name, unless another instance owns it."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(self._folder / f"{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -98,7 +98,7 @@ class SlottedSpool:
 
 
 class _Slot:
-    """One spool and the lock that makes it ours."""
+    """One spool and its lock."""
 
     def __init__(self, name: str, lock: int, spool: DiskSpool) -> None:
         self.name = name
@@ -107,7 +107,7 @@ class _Slot:
         self.closed = False
 
     def remove(self) -> None:
-        """Empty: take its files away.  The lock's file stays, or two could hold locks of one name."""
+        """Delete an empty spool.  The lock's file stays; otherwise two could hold locks of one name."""
         self.spool.close()
         for suffix in (".db", ".db-wal", ".db-shm"):
             with suppress(OSError):
@@ -115,7 +115,7 @@ class _Slot:
         self.close()
 
     def close(self) -> None:
-        """Let go."""
+        """Close the spool and release the lock."""
         if not self.closed:
             self.closed = True
             self.spool.close()

@@ -1,12 +1,14 @@
 """Data Archives in one file: SQLite in WAL mode, many processes at a time.
 
-A row holds one frame as it travelled, or the value of one item.  Queries narrow rows by index on
+A row holds one encoded frame, or the value of one item.  Queries narrow rows by index on
 key and time, then `query.matches` decides item by item.  URL: `sqlite:///folder/file.db`, with
 `?synchronous=full` to survive a power cut as well as a killed process.
 """
 
+import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from heapq import merge
 from itertools import groupby
 from operator import attrgetter
@@ -15,16 +17,20 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from due.codec import decode_value, encode_value, unpack
-from due.drivers.query import Query, parse
+from due.drivers.latest_items import by_age, latest_items
+from due.drivers.query import ArchiveQuery, parse
+from due.drivers.query_time import in_time, time_left
 from due.drivers.query_tree import Condition
 from due.drivers.sqlite_file import SqliteFile
-from due.drivers.youngest import by_age, youngest
-from due.errors import InvalidOption
+from due.errors import DecodeError, InvalidKey, InvalidOption, Timeout
 from due.messages import Item, PackedFrame
+
+log = logging.getLogger("due.archive")
 
 _VALUE, _FRAME = 0, 1
 _ROW_OVERHEAD = 200
 _PRUNE_ROWS = 5000
+_STEPS = 10_000
 _SYNCHRONOUS = ("normal", "full")
 _INSERT = "INSERT INTO frames VALUES(NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _SELECT = (
@@ -72,6 +78,9 @@ class SqliteArchive:
         if options or synchronous not in _SYNCHRONOUS:
             raise InvalidOption(f"archive URL {url!r}: the only option is synchronous=normal or =full")
         self._file = SqliteFile(path, synchronous)
+        self._url = url
+        self.damaged = 0
+        """Rows that could not be decoded and are missing from results."""
 
     def insert(self, items: Sequence[Item]) -> None:
         """Store items, one row each."""
@@ -79,7 +88,7 @@ class SqliteArchive:
             self._insert_items(connection, items)
 
     def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
-        """Store frames as they are; those that want an index, or are partly here, item by item."""
+        """Store frames unchanged; item by item if an index is wanted or a frame is stored partly."""
         with self._file.writing() as connection:
             for frame in frames:
                 row = self._frame_row(connection, frame)
@@ -95,18 +104,18 @@ class SqliteArchive:
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
         """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
         parsed = parse(query)
-        with self._file.reading() as connection:
+        with self._file.reading() as connection, _interrupted_in_time(connection):
             text, parameters = self._where(connection, parsed)
             if limit is not None:
                 heads = connection.execute(_HEADS + text, parameters).fetchall()
 
                 def read(numbers: Sequence[int]) -> Iterator[Item]:
                     rows = connection.execute(_SELECT + _AMONG, (f"[{','.join(map(str, numbers))}]",))
-                    return (item for row in rows.fetchall() for item in self._items(row, parsed))
+                    return (item for row in in_time(rows.fetchall()) for item in self._items(row, parsed))
 
-                return youngest(heads, read, limit)
+                return latest_items(heads, read, limit)
             rows = connection.execute(_SELECT + text, parameters).fetchall()
-        items = [item for row in rows for item in self._items(row, parsed)]
+        items = [item for row in in_time(rows) for item in self._items(row, parsed)]
         items.sort(key=by_age)
         return items
 
@@ -118,11 +127,14 @@ class SqliteArchive:
         if max_bytes is not None:
             deleted += self._in_steps(lambda connection: _prune_larger(connection, max_bytes))
         if deleted:
+            with self._file.writing() as connection:
+                self._file.keys.prune(connection)
+                self._file.sources.prune(connection)
             self._file.shrink()
         return deleted
 
     def _in_steps(self, step: Callable[[sqlite3.Connection], int]) -> int:
-        """Many short transactions, so that writers in other processes get their turn."""
+        """Use many short transactions, so that writers in other processes are not blocked for long."""
         deleted = 0
         while True:
             with self._file.writing() as connection:
@@ -138,7 +150,7 @@ class SqliteArchive:
     def _insert_items(self, connection: sqlite3.Connection, items: Sequence[Item]) -> None:
         for _, group in groupby(sorted(items, key=_by_identity), _by_stream):
             rows = [self._item_row(connection, item) for item in group]
-            # sequence numbers that occur twice in one call: the first counts
+            # for sequence numbers that occur twice in one call, the first counts
             rows = [
                 row for n, row in enumerate(rows) if not n or row.first_sequence != rows[n - 1].first_sequence
             ]
@@ -169,16 +181,16 @@ class SqliteArchive:
         )
 
     def _widen(self, connection: sqlite3.Connection, row: _Row) -> None:
-        """Let readers know how far apart the items of one row may lie."""
+        """Record the largest span of the items in one row, for readers."""
         time, event = row.last_time - row.first_time, row.last_event - row.first_event
         known_time, known_event = self._file.spans.get(row.key, (0, 0))
         if time > known_time or event > known_event:
-            # twice as much, or a slowly growing span would be written with every frame
+            # twice as much; otherwise a slowly growing span would be written with every frame
             spans = (max(2 * time, known_time), max(2 * event, known_event))
             connection.execute(_WIDEN, (*spans, row.key))
             self._file.spans[row.key] = spans
 
-    def _where(self, connection: sqlite3.Connection, query: Query) -> tuple[str, list[Any]]:
+    def _where(self, connection: sqlite3.Connection, query: ArchiveQuery) -> tuple[str, list[Any]]:
         self._file.keys.refresh(connection)
         self._file.sources.refresh(connection)
         named = list(query.conditions("dataKey"))
@@ -199,13 +211,24 @@ class SqliteArchive:
         table = self._file.keys if condition.field == "dataKey" else self._file.sources
         return table.meeting(condition)
 
-    def _items(self, row: tuple[Any, ...], query: Query) -> Iterator[Item]:
-        key_id, source_id, kind, sequence, time, event, payload = row
-        if kind == _FRAME:
-            yield from _matching(unpack(payload), query)
+    def _items(self, row: tuple[Any, ...], query: ArchiveQuery) -> Iterator[Item]:
+        try:
+            if row[2] == _FRAME:
+                yield from _matching(unpack(row[-1]), query)
+            else:
+                yield from self._single(row, query)
+        except (DecodeError, InvalidKey) as error:
+            self.damaged += 1
+            if self.damaged == 1:
+                text = "%s: a row is damaged and left out: %s; further ones are only counted"
+                log.error(text, self._url, error)  # noqa: TRY400
+
+    def _single(self, row: tuple[Any, ...], query: ArchiveQuery) -> Iterator[Item]:
+        key_id, source_id, _, sequence, time, event, payload = row
+        keys, sources = self._file.keys.entries, self._file.sources.entries
+        if key_id not in keys or source_id not in sources:  # pruned while reading
             return
-        (key,) = self._file.keys.entries[key_id]
-        app, instance = self._file.sources.entries[source_id]
+        (key,), (app, instance) = keys[key_id], sources[source_id]
         item = Item(key, None, time, event, app, instance, sequence)
         if query.matches_metadata(item):
             item = Item(key, decode_value(payload), time, event, app, instance, sequence)
@@ -213,7 +236,31 @@ class SqliteArchive:
                 yield item
 
 
-def _matching(items: list[Item], query: Query) -> Iterator[Item]:
+@contextmanager
+def _interrupted_in_time(connection: sqlite3.Connection) -> Iterator[None]:
+    """Let SQLite check the time limit from time to time."""
+    if time_left() is None:
+        yield
+        return
+    connection.set_progress_handler(_late, _STEPS)
+    try:
+        yield
+    except sqlite3.OperationalError:
+        time_left()
+        raise
+    finally:
+        connection.set_progress_handler(None, 0)
+
+
+def _late() -> bool:
+    try:
+        time_left()
+    except Timeout:
+        return True
+    return False
+
+
+def _matching(items: list[Item], query: ArchiveQuery) -> Iterator[Item]:
     """Of one key that matches already."""
     if query.time_range is None:
         return filter(query.matches, items)

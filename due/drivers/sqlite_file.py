@@ -13,15 +13,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from due.drivers.query import Query
+from due.drivers.query import ArchiveQuery
 from due.drivers.query_tree import Condition
 from due.errors import ArchiveUnavailable, BackendError
 from due.messages import Item
 
 _VERSION = 1
+_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _BUSY_S = 5.0
 _AGAIN_S = 0.01
 _LOOKUPS = 256
+_COMPARE_S = 60.0
+"""Seconds between a reader's checks for pruned keys and sources."""
 _SCHEMA = """
 PRAGMA page_size = 8192;
 PRAGMA auto_vacuum = INCREMENTAL;
@@ -45,21 +48,28 @@ PRAGMA user_version = 1;
 COMMIT;
 """
 
-# a connection that came through a fork is neither used nor closed: its locks are the parent's
+# a connection inherited by fork is neither used nor closed: its locks belong to the parent
 _inherited: list[sqlite3.Connection] = []
 
 
 class Dictionary:
     """The ids of one small table of texts, and which of them meet a condition; read as it grows."""
 
-    def __init__(self, table: str, *columns: str) -> None:
+    def __init__(self, table: str, used_as: str, *columns: str) -> None:
         self._select = f"SELECT id, {', '.join(columns)} FROM {table} WHERE id > ? ORDER BY id"  # noqa: S608 our own names
         self._insert = (
-            f"INSERT INTO {table}({', '.join(columns)}) VALUES({', '.join('?' * len(columns))}) "
-            f"ON CONFLICT DO UPDATE SET id = id RETURNING id"
+            f"INSERT INTO {table}({', '.join(columns)}) VALUES({', '.join('?' * len(columns))}) RETURNING id"
+        )
+        same = " AND ".join(f"{column} = ?" for column in columns)
+        self._known = f"SELECT id FROM {table} WHERE {same}"  # noqa: S608 our own names
+        # the last id stays: reusing it would rename rows of concurrent transactions
+        self._prune = (
+            f"DELETE FROM {table} WHERE id < (SELECT max(id) FROM {table}) "  # noqa: S608 our own names
+            f"AND NOT EXISTS (SELECT 1 FROM frames WHERE {used_as} = {table}.id)"
         )
         self._lock = threading.Lock()
         self._last = 0
+        self._compare_at = 0.0
         self._ids: dict[tuple[str, ...], int] = {}
         self._found: dict[Condition, tuple[int, list[int]]] = {}
         self.entries: dict[int, tuple[str, ...]] = {}
@@ -69,23 +79,41 @@ class Dictionary:
             for number, *texts in connection.execute(self._select, (self._last,)):
                 self.entries[number] = tuple(texts)
                 self._last = number
+            if time.monotonic() >= self._compare_at:
+                self._compare_at = time.monotonic() + _COMPARE_S
+                self._drop_pruned({number for number, *_ in connection.execute(self._select, (0,))})
+
+    def _drop_pruned(self, there: set[int]) -> None:
+        """Forget pruned ids; another reader may see a later state of the file, so newer ids stay."""
+        gone = [number for number in self.entries if number not in there and number < max(there, default=0)]
+        if gone:
+            self.entries = {
+                number: texts for number, texts in self.entries.items() if number not in set(gone)
+            }
+            self._found.clear()
 
     def id_of(self, connection: sqlite3.Connection, *texts: str) -> int:
-        """The id, made if need be within the caller's transaction."""
+        """The id of these texts, added within the caller's transaction if it is new."""
         known = self._ids.get(texts)
         if known is None:
-            known = self._ids[texts] = int(connection.execute(self._insert, texts).fetchone()[0])
+            found = connection.execute(self._known, texts).fetchone()
+            found = found or connection.execute(self._insert, texts).fetchone()
+            known = self._ids[texts] = int(found[0])
         return known
 
     def forget(self) -> None:
-        """Ids made in a transaction that was rolled back are void."""
+        """Forget the ids, which hold for one transaction: others prune, and a rollback makes them void."""
         self._ids.clear()
+
+    def prune(self, connection: sqlite3.Connection) -> int:
+        """Delete texts that no row refers to; returns how many."""
+        return connection.execute(self._prune).rowcount
 
     def meeting(self, condition: Condition) -> list[int]:
         with self._lock:
             seen, ids = self._found.get(condition, (0, []))
             if seen < self._last:
-                matches = Query(condition).matches
+                matches = ArchiveQuery(condition).matches
                 ids = ids + [n for n, texts in self.entries.items() if n > seen and matches(_named(texts))]
                 if len(self._found) >= _LOOKUPS:
                     self._found.clear()
@@ -94,13 +122,13 @@ class Dictionary:
 
 
 def _named(texts: tuple[str, ...]) -> Item:
-    """An item of which only the names count."""
+    """An item with names only."""
     key, app, instance = (texts[0], "", "") if len(texts) == 1 else ("", *texts)
     return Item(key, None, 0, 0, app, instance, 0)
 
 
 class SqliteFile:
-    """Connections to one file: one that writes, and as many that read as there are readers."""
+    """Connections to one file: one for writing, and one for each concurrent reader."""
 
     def __init__(self, path: Path, synchronous: str) -> None:
         self._path = path
@@ -112,8 +140,8 @@ class SqliteFile:
         self._pid = os.getpid()
         self._writer: sqlite3.Connection | None = None
         self._idle: deque[sqlite3.Connection] = deque()
-        self.keys = Dictionary("keys", "key")
-        self.sources = Dictionary("sources", "app", "instance")
+        self.keys = Dictionary("keys", "key_id", "key")
+        self.sources = Dictionary("sources", "source_id", "app", "instance")
         self.spans: dict[int, tuple[int, int]] = {}
 
     def _enter(self) -> None:
@@ -155,12 +183,12 @@ class SqliteFile:
                 self._writer = self._connect()
             connection = self._writer
             connection.execute("BEGIN IMMEDIATE")
+            self.keys.forget()
+            self.sources.forget()
             try:
                 yield connection
                 connection.execute("COMMIT")
             except BaseException:
-                self.keys.forget()
-                self.sources.forget()
                 self.spans.clear()
                 if connection.in_transaction:
                     connection.execute("ROLLBACK")
@@ -168,11 +196,12 @@ class SqliteFile:
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
-        """One view of the file: no row of others comes in whose key or source was not there a moment before."""
+        """One snapshot of the file: no row appears whose key or source was not known before."""
         with self._errors():
             self._enter()
+            idle = self._idle
             try:
-                connection = self._idle.pop()
+                connection = idle.pop()
             except IndexError:
                 connection = self._connect()
             try:
@@ -181,10 +210,10 @@ class SqliteFile:
             finally:
                 if connection.in_transaction:
                     connection.execute("ROLLBACK")
-                if self._closed:
+                if self._closed or idle is not self._idle:
                     connection.close()
                 else:
-                    self._idle.append(connection)
+                    idle.append(connection)
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
@@ -193,16 +222,32 @@ class SqliteFile:
         except sqlite3.OperationalError as error:
             raise ArchiveUnavailable(f"archive {self._path}: {error}") from error
         except sqlite3.Error as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
+                self._let_go()
+                raise ArchiveUnavailable(
+                    f"archive {self._path} is damaged or not an archive ({error}): move it away, or put a copy there; "
+                    f"until then what is to be archived waits in the spool"
+                ) from error
             raise BackendError(f"archive {self._path}: {error}; is it an archive of SDNator?") from error
         except OSError as error:
             raise ArchiveUnavailable(f"archive {self._path}: {error}") from error
+        except (OverflowError, UnicodeEncodeError) as error:
+            raise BackendError(
+                f"archive {self._path}: a number or text that it cannot hold: {error}"
+            ) from error
+
+    def _let_go(self) -> None:
+        """Drop connections to a damaged file; the next call reopens it.  Running reads close their own."""
+        for connection in self._idle:
+            connection.close()
+        self._reset()
 
     def shrink(self) -> None:
-        """Give pages that deletions left free back to the file system."""
+        """Return free pages to the file system."""
         with self._errors():
             self._enter()
             if self._writer is not None:
-                # not `execute`: it would take a single step, which frees a single page
+                # not `execute`: it would free a single page only
                 self._writer.executescript("PRAGMA incremental_vacuum; PRAGMA wal_checkpoint(PASSIVE);")
 
     def close(self) -> None:
@@ -224,7 +269,7 @@ def _make_tables(connection: sqlite3.Connection) -> None:
         except sqlite3.OperationalError as error:
             if connection.in_transaction:
                 connection.execute("ROLLBACK")
-            # two that change a new file's journal mode at once are in each other's way until one lets go
+            # two processes that change a new file's journal mode at once block each other until one gives up
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
                 raise
             time.sleep(_AGAIN_S)

@@ -9,8 +9,12 @@
 //   difference   grows with some frames and falls with others (SYNs - FINs): what it comes to is known when
 //                the window is over.  Keys that reached the threshold meanwhile wait in a ring; the query's
 //                frames of later windows take one of them out each, and report it if it is still over.
+//
+// No index leaves its array, whatever an entry says: a BMv2 built for release does not look, and dies of it.
+// An entry whose cells are not all within a bank has none: all of its keys are overflow.
 
 const bit<32> STAGE_CELLS = 65536;        // of a stage, both banks together
+const bit<32> BANK_CELLS = STAGE_CELLS / 2;
 const bit<32> CELLS = 8 * STAGE_CELLS;
 const bit<32> DIFFERENCE_ZERO = 0x80000000; // in the cell of a difference: it may fall below zero
 
@@ -26,17 +30,21 @@ const bit<32> DIFFERENCE_ZERO = 0x80000000; // in the cell of a difference: it m
 control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) {
     direct_counter(CounterType.packets) stage_counter;
 
-    // Which cell the frame counts in.
+    // Which cell the frame counts in; placed = 0: the entry's cells are not all within a bank.
     action locate(in bit<8> query, in address_t source, in address_t destination, in bit<48> extra,
-                  in bit<64> reciprocal, in bit<32> base, in bit<32> size) {
+                  in bit<64> reciprocal, in bit<32> base, in bit<32> size, out bit<1> placed) {
         bit<112> product = (bit<112>)meta.timestamp * (bit<112>)reciprocal;
         meta.cell_epoch = (bit<32>)(product >> 64) + 1; // a cell of zeros belongs to no window
-        hash(meta.cell_slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
-        meta.cell_slot = meta.cell_slot + first_cell;
-        if (meta.cell_epoch[0:0] == 1) {
-            meta.cell_slot = meta.cell_slot + STAGE_CELLS / 2;
+        placed = 0;
+        if (size != 0 && size <= BANK_CELLS && base <= BANK_CELLS - size) {
+            placed = 1;
+            hash(meta.cell_slot, HashAlgorithm.crc32, base, { query, source, destination, extra }, size);
+            meta.cell_slot = meta.cell_slot + first_cell;
+            if (meta.cell_epoch[0:0] == 1) {
+                meta.cell_slot = meta.cell_slot + BANK_CELLS;
+            }
+            cells.read(meta.cell, meta.cell_slot);
         }
-        cells.read(meta.cell, meta.cell_slot);
     }
 
     // Params: query: number of the query. *_mask: which parts of the frame are its key; extra is the
@@ -52,20 +60,21 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
         address_t destination = meta.destination & destination_mask;
         bit<48> extra = (meta.destination_port & port_mask) ++ ((bit<16>)meta.length & length_mask)
                         ++ (meta.source_port & source_port_mask);
-        locate(query, source, destination, extra, reciprocal, base, size);
-        bit<1> has_cell = 1;
+        bit<1> has_cell;
+        locate(query, source, destination, extra, reciprocal, base, size, has_cell);
         meta.cell_count = 0;
-        if (meta.cell[383:352] == meta.cell_epoch) {
+        if (has_cell == 1 && meta.cell[383:352] == meta.cell_epoch) {
             meta.query_map = meta.query_map & ~repeated;
             if (meta.cell[351:344] == query && meta.cell[343:216] == source
                     && meta.cell[215:88] == destination && meta.cell[87:40] == extra) {
                 meta.cell_count = meta.cell[31:0];
             } else {
                 has_cell = 0;
-                meta.overflow = meta.overflow | bit_of_query;
             }
         }
-        if (has_cell == 1 && meta.reading == 0) {
+        if (has_cell == 0) {
+            meta.overflow = meta.overflow | bit_of_query;
+        } else if (meta.reading == 0) {
             bit<32> step = by_bytes == 1 ? meta.length : 32w1;
             bit<32> after = meta.cell_count |+| step;
             if (meta.cell_count < threshold && after >= threshold) {
@@ -89,11 +98,12 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
         bit<16> port = (answers == 1 ? meta.source_port : meta.destination_port) & port_mask;
         bit<16> source_port = (answers == 1 ? meta.destination_port : meta.source_port) & source_port_mask;
         bit<48> extra = port ++ ((bit<16>)meta.length & length_mask) ++ source_port;
-        locate(count_of, source, destination, extra, reciprocal, base, size);
-        bit<1> has_cell = 1;
+        bit<1> placed;
+        locate(count_of, source, destination, extra, reciprocal, base, size, placed);
+        bit<1> has_cell = placed;
         bit<8> mark = 0;
         meta.cell_count = DIFFERENCE_ZERO;
-        if (meta.cell[383:352] == meta.cell_epoch) {
+        if (has_cell == 1 && meta.cell[383:352] == meta.cell_epoch) {
             if (meta.cell[351:344] == count_of && meta.cell[343:216] == source
                     && meta.cell[215:88] == destination && meta.cell[87:40] == extra) {
                 meta.cell_count = meta.cell[31:0];
@@ -122,7 +132,8 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
             bit<32> after = subtracts == 1 ? meta.cell_count |-| step : meta.cell_count |+| step;
             if (after >= threshold && mark != generation) {
                 bit<32> next = ring[31:0] + 1 == 2 * size ? 32w0 : ring[31:0] + 1;
-                if (next == ring[95:64]) { // no room to wait
+                // no room to wait, or an entry of another size wrote where this one's ring has no place
+                if (next == ring[95:64] || ring[31:0] >= 2 * size) {
                     meta.crossed = meta.crossed | bit_of_query;
                 } else {
                     waiting.write(first_cell + 2 * base + ring[31:0], meta.cell_slot);
@@ -133,7 +144,7 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
             cells.write(meta.cell_slot, meta.cell_epoch ++ count_of ++ source ++ destination ++ extra ++ mark ++ after);
         }
         rings.write((bit<32>)count_of, ring);
-        if (ring[95:64] != ring[63:32]) {
+        if (placed == 1 && ring[95:64] != ring[63:32]) {
             meta.sweep.size = 2 * size;
             meta.sweep.ring = first_cell + 2 * base;
             meta.sweep.query = count_of;
@@ -179,22 +190,26 @@ control Sweep(inout metadata_t meta) {
         bit<136> ring;
         rings.read(ring, (bit<32>)meta.sweep.query);
         bit<32> head = ring[95:64];
-        bit<32> slot;
-        waiting.read(slot, meta.sweep.ring + head);
-        bit<384> cell;
-        cells.read(cell, slot);
-        cells.write(slot, cell[383:40] ++ 8w0 ++ cell[31:0]);
-        head = head + 1 == meta.sweep.size ? 32w0 : head + 1;
-        rings.write((bit<32>)meta.sweep.query, ring[135:96] ++ head ++ ring[63:0]);
-        meta.sweep.left = head == ring[63:32] ? 1w0 : 1w1;
-        if (cell[31:0] >= meta.sweep.threshold) {
-            // a frame makes one digest at most: whoever wanted one of the frame gets a copy of it
-            meta.copies = meta.copies | meta.digests;
-            meta.digests = 0;
-            digest<count_digest_t>(1, {
-                cell[351:344], cell[383:352] - 1, cell[31:0] - DIFFERENCE_ZERO, cell[343:216], cell[215:88],
-                cell[87:72], cell[71:56], cell[55:40], meta.timestamp
-            });
+        // not in the ring: entries of one query do not agree about its size, and nothing can be taken out
+        if (head < meta.sweep.size && ring[63:32] < meta.sweep.size) {
+            bit<32> slot;
+            waiting.read(slot, meta.sweep.ring + head);
+            slot = slot & (CELLS - 1); // P4Runtime may write the register, too
+            bit<384> cell;
+            cells.read(cell, slot);
+            cells.write(slot, cell[383:40] ++ 8w0 ++ cell[31:0]);
+            head = head + 1 == meta.sweep.size ? 32w0 : head + 1;
+            rings.write((bit<32>)meta.sweep.query, ring[135:96] ++ head ++ ring[63:0]);
+            meta.sweep.left = head == ring[63:32] ? 1w0 : 1w1;
+            if (cell[31:0] >= meta.sweep.threshold) {
+                // a frame makes one digest at most: whoever wanted one of the frame gets a copy of it
+                meta.copies = meta.copies | meta.digests;
+                meta.digests = 0;
+                digest<count_digest_t>(1, {
+                    cell[351:344], cell[383:352] - 1, cell[31:0] - DIFFERENCE_ZERO, cell[343:216], cell[215:88],
+                    cell[87:72], cell[71:56], cell[55:40], meta.timestamp
+                });
+            }
         }
     }
 }

@@ -8,7 +8,7 @@ from nicegui import ui
 
 if TYPE_CHECKING:
     from apps.messages import Answer
-    from sdnator.dashboard.service import DashboardService
+    from sdnator.dashboard.page_backend import PageBackend
 
 _ANSWER_SECONDS = 10.0
 _WRONG_SECONDS = 1.0
@@ -17,7 +17,7 @@ _WRONG_SECONDS = 1.0
 class Acting:
     """One browser's right to act."""
 
-    def __init__(self, service: "DashboardService", session: str) -> None:
+    def __init__(self, service: "PageBackend", session: str) -> None:
         self._service = service
         self._session = session
 
@@ -42,9 +42,9 @@ class Acting:
             fault = ui.label("").classes("fault")
 
             async def try_it() -> None:
-                wrong = self._service.sessions.sign_in(
-                    self._session, str(field.value or ""), time.monotonic()
-                )
+                sessions, source = self._service.sessions, ui.context.client.ip
+                await asyncio.sleep(sessions.delay_s(source, time.monotonic()))
+                wrong = sessions.sign_in(self._session, str(field.value or ""), source)
                 if not wrong:
                     ui.navigate.reload()
                     return

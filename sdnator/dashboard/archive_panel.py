@@ -9,12 +9,12 @@ from nicegui import ui
 
 from due.errors import DueError
 from sdnator.dashboard.texts import clock
-from sdnator.due_commands import brief, instant_ns, typed_key
 from sdnator.errors import BadInput
+from sdnator.notation import brief, instant_ns, typed_key
 
 if TYPE_CHECKING:
     from due import Item
-    from sdnator.dashboard.service import DashboardService
+    from sdnator.dashboard.page_backend import PageBackend
 
 _LIMIT = 200
 _TEXT = 400
@@ -23,7 +23,7 @@ _TEXT = 400
 class ArchivePanel:
     """One browser's searches."""
 
-    def __init__(self, service: "DashboardService") -> None:
+    def __init__(self, service: "PageBackend") -> None:
         self._service = service
         with ui.element("div").classes("panel"):
             with ui.element("div").classes("form"):

@@ -81,6 +81,8 @@ class Board:
         """Items written a second by key without specs, by app and instance."""
         self.coordinator = ""
         """What is wrong with the Coordinator; empty: nothing."""
+        self.degraded = ""
+        """Parts that are away or keep dying, as `sdnator up` says; empty: none."""
         self.counts: Counter[str] = Counter()
         self.versions: Counter[str] = Counter()
         self._written: dict[str, tuple[float, int, int]] = {}
@@ -160,6 +162,15 @@ class Board:
             for name in [name for name in self.key_rates if name[1] not in here]:
                 del self.key_rates[name]
             self._changed("apps")
+
+    def supervised(self, health: Mapping[str, Mapping[str, Any]]) -> None:
+        """How `sdnator up` says that its parts are."""
+        away = [(name, one) for name, one in health.items() if one.get("state") in ("restarting", "degraded")]
+        text = "; ".join(
+            f"{name} is {one['state']}: {one.get('cause') or 'starting again'}" for name, one in away
+        )
+        with self.lock:
+            self.degraded = text
 
     def uncoordinated(self, why: str) -> None:
         """The Coordinator does not answer."""

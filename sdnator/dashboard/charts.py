@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from html import escape
 from math import ceil, log10
 from typing import Any
 
@@ -14,6 +15,7 @@ GREY, BLUE, RED, AMBER = "#8a8f98", "#3b82d6", "#d9534f", "#e0a030"
 _LEAST_SCORE = 0.001
 _LEAST_SHOWN = 0.05
 _TOLD = 12
+_NO_MARKUP = str.maketrans("{}", "()")
 _GRID = "rgba(128,128,128,0.18)"
 _PLACES = {
     "p4runtime_ctrl": (12, 52),
@@ -134,8 +136,11 @@ def _node(name: str, rates: Mapping[str, tuple[float, float]], strangers: list[s
         "name": name,
         "value": _PLACES.get(name) or (8 + 14 * (strangers.index(name) % 7), 0),
         "itemStyle": {"color": BLUE if name in _PLACES else AMBER},
-        "label": {"formatter": f"{name}\n▲ {number(written)}/s  ▼ {number(received)}/s"},
-        "tooltip": {"formatter": text},
+        # a label is drawn, not HTML, but {…} is markup there
+        "label": {
+            "formatter": f"{name.translate(_NO_MARKUP)}\n▲ {number(written)}/s  ▼ {number(received)}/s"
+        },
+        "tooltip": {"formatter": as_html(text)},
     }
 
 
@@ -163,8 +168,13 @@ def _edge(
             "color": GREY,
             "fontSize": 10,
         },
-        "tooltip": {"formatter": "<br>".join([f"{producer} → {consumer}", *lines])},
+        "tooltip": {"formatter": "<br>".join(map(as_html, [f"{producer} → {consumer}", *lines]))},
     }
+
+
+def as_html(text: str) -> str:
+    """A text for a tooltip, which ECharts takes as HTML with {…} as its own variables: names come from outside."""
+    return escape(text).replace("{", "&#123;").replace("}", "&#125;")
 
 
 @lru_cache(maxsize=4096)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from nicegui.events import GenericEventArguments
 
     from sdnator.dashboard.acting import Acting
-    from sdnator.dashboard.service import DashboardService
+    from sdnator.dashboard.page_backend import PageBackend
 
 _SHOWN = 50
 _LISTS_SECONDS = 1.0
@@ -43,7 +43,7 @@ def _button(name: str, label: str, icon: str, shown: str = "") -> str:
 class LivePanel:
     """One browser's view of what happens now."""
 
-    def __init__(self, service: "DashboardService", acting: "Acting") -> None:
+    def __init__(self, service: "PageBackend", acting: "Acting") -> None:
         self._board = service.board
         self._acting = acting
         self._seen: dict[str, int] = {}
@@ -52,7 +52,7 @@ class LivePanel:
         with ui.element("div").classes("figures q-mb-sm"):
             for name in (
                 "packets scored/s",
-                "over the line",
+                "above the threshold",
                 "alerts",
                 "blocks and guards",
                 "apps active",
@@ -145,7 +145,7 @@ class LivePanel:
         over = sum(each.over for each in board.scores.bins)
         return {
             "packets scored/s": number(board.scores.rate(now)),
-            "over the line": number(over),
+            "above the threshold": number(over),
             "alerts": number(board.counts["alerts"]),
             "blocks and guards": number(len(board.standing())),
             "apps active": f"{active} of {len(here)}" if here else "-",

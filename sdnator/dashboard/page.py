@@ -12,10 +12,10 @@ from sdnator.dashboard.style import STYLE
 from sdnator.dashboard.switches_panel import SwitchesPanel
 
 if TYPE_CHECKING:
-    from sdnator.dashboard.service import DashboardService
+    from sdnator.dashboard.page_backend import PageBackend
 
 
-def build(service: "DashboardService") -> None:
+def build(service: "PageBackend") -> None:
     """One browser's page."""
     ui.add_css(STYLE)
     ui.colors(primary="#2f6fb3")
@@ -23,6 +23,7 @@ def build(service: "DashboardService") -> None:
     acting = Acting(service, session)
     with ui.header(elevated=False).classes("items-center bar"):
         ui.label("SDNator").classes("text-weight-medium text-subtitle1")
+        degraded = ui.label("").classes("degraded")
         ui.space()
         _dark_button()
         acting.sign_in_button()
@@ -42,6 +43,8 @@ def build(service: "DashboardService") -> None:
 
     def refresh() -> None:
         """Only what is on show costs anything."""
+        if degraded.text != service.board.degraded:
+            degraded.set_text(service.board.degraded)
         if tabs.value == "Live":
             live.refresh()
         elif tabs.value == "Apps":

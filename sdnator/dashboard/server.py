@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
-    from sdnator.dashboard.service import DashboardService
+    from sdnator.dashboard.page_backend import PageBackend
 
 _HISTORY = 100
 """Messages kept for a browser whose connection breaks; the next frame makes up for the others."""
@@ -69,7 +69,7 @@ def _with_headers(send: Any) -> Any:
 
 
 def serve(
-    service: "DashboardService", listener: socket.socket, started: Callable[[Callable[[], None]], None]
+    service: "PageBackend", listener: socket.socket, started: Callable[[Callable[[], None]], None]
 ) -> None:
     """Run until stopped; `started` gets the function that stops it."""
     import uvicorn

@@ -4,6 +4,7 @@ Callbacks run in the engine's thread and only note what came; pages are served i
 and look at the board a few times a second.
 """
 
+import json
 import logging
 import os
 import socket
@@ -102,7 +103,11 @@ class DashboardService:
     def health(self) -> dict[str, Any]:
         """Counters for people."""
         with self.board.lock:
-            return {**self.board.counts, "misunderstood": self._misunderstood}
+            return {
+                **self.board.counts,
+                "misunderstood": self._misunderstood,
+                "degraded": bool(self.board.degraded),
+            }
 
     def _subscribe(self) -> None:
         observe = self._engine.observe
@@ -183,14 +188,15 @@ class DashboardService:
 
     def find(self, key: str, start: int, end: int, limit: int) -> tuple[list[Item], bool]:
         """The youngest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
-        from sdnator.due_commands import youngest
+        from sdnator.northbound import latest
 
-        return youngest(self._engine.get, {"dataKey": key}, start, end, limit)
+        return latest(self._engine.get, {"dataKey": key}, start, end, limit)
 
     def _poll(self) -> None:
-        from sdnator.coordinator_commands import ask
+        from sdnator.northbound import ask
 
         while not self._stopping.wait(_POLL_SECONDS if self.board.versions["apps"] else 0.2):
+            self.board.supervised(_health_of_parts(self.settings.run_file))
             try:
                 url = Path(self.settings.coordinator_file).read_text(encoding="utf-8").strip()
                 apps, instances, flow = (ask(url, path) for path in ("/apps", "/instances", "/flow"))
@@ -213,6 +219,15 @@ class DashboardService:
 
     def _server_started(self, stop: Callable[[], None]) -> None:
         self._stop_server = stop
+
+
+def _health_of_parts(run_file: str) -> dict[str, Any]:
+    """What `sdnator up` has written of its parts; empty where there is nothing to read."""
+    try:
+        found = json.loads(Path(run_file).read_bytes())["health"] if run_file else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def listening(host: str, port: int) -> socket.socket:

@@ -4,23 +4,23 @@ import msgspec
 
 
 class DashboardOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The page that `sdnator up` serves."""
+    """The dashboard of `sdnator up`."""
 
     enabled: bool = True
-    """Serve the page with `sdnator up`."""
+    """Serve the dashboard with `sdnator up`."""
     host: str = "127.0.0.1"
-    """Address to listen on.  There is no TLS: put a proxy before it where others shall come."""
+    """Address to listen on.  There is no TLS: for access from other machines put a TLS proxy in front."""
     port: int = 8470
-    """Port; where it is taken, or 0: a free one, which `sdnator status` names."""
+    """TCP port; if it is taken, or 0: a free one, which `sdnator status` shows."""
     names: tuple[str, ...] = ()
-    """Host names under which browsers may ask for the page, besides localhost and addresses."""
+    """Host names that browsers may use for the dashboard, besides localhost and IP addresses."""
     token_file: str = ""
-    """File with the token that signs in; empty: `dashboard.token` in the state folder, made at the first
-    start.  $SDNATOR_DASHBOARD_TOKEN goes before both."""
+    """File with the sign-in token; empty: `dashboard.token` in the state folder, made at the first start.
+    $SDNATOR_DASHBOARD_TOKEN overrides both."""
     frames: float = 4.0
-    """Most updates of a page in a second."""
+    """Most updates of the page per second."""
     history_s: float = 120.0
-    """Seconds that the plot of scores shows."""
+    """Length of the score plot in seconds."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.port < 65_536:
@@ -32,7 +32,7 @@ class DashboardOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class SwitchPlace(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a switch is read."""
+    """A switch that the dashboard reads."""
 
     name: str
     address: str
@@ -40,8 +40,10 @@ class SwitchPlace(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Settings(DashboardOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options, and the places that the pipeline knows."""
+    """Options, and addresses that `sdnator up` fills in."""
 
     coordinator_file: str = ""
     """File that holds the URL of the Coordinator's HTTP API."""
     switches: tuple[SwitchPlace, ...] = ()
+    run_file: str = ""
+    """File to which `sdnator up` writes the state of its parts; empty: none."""

@@ -1,13 +1,16 @@
 """Who may change something: the token, compared in constant time, and the browsers that gave it.  Pure."""
 
 import hmac
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Mapping
 from pathlib import Path
 
 VARIABLE = "SDNATOR_DASHBOARD_TOKEN"
 _SESSIONS = 64
-_TRIES, _TRIES_SECONDS = 5, 60.0
+_REMEMBERED_SECONDS = 60.0
+_FREE_TRIES = 2
+_DELAY_SECONDS, _LONGEST_DELAY_SECONDS = 0.5, 4.0
+_SOURCES = 256
 LEAST = 16
 
 
@@ -29,29 +32,54 @@ def token_from(file: str, environment: Mapping[str, str]) -> str:
     return token
 
 
+class Throttle:
+    """Makes guessing slow for the address it comes from, and bars nobody: the owner may sit behind the same one."""
+
+    def __init__(self) -> None:
+        self._tries: OrderedDict[str, deque[float]] = OrderedDict()
+
+    def delay_s(self, source: str, now: float) -> float:
+        """Seconds for which this attempt has to wait; tries count from their beginning, so that many at once
+        gain nothing.  `now` in seconds."""
+        tries = self._tries.setdefault(source, deque(maxlen=_FREE_TRIES + 16))
+        self._tries.move_to_end(source)
+        while len(self._tries) > _SOURCES:
+            self._tries.popitem(last=False)
+        while tries and now - tries[0] >= _REMEMBERED_SECONDS:
+            tries.popleft()
+        tries.append(now)
+        over = len(tries) - _FREE_TRIES
+        return min(_LONGEST_DELAY_SECONDS, _DELAY_SECONDS * 2.0 ** (over - 1)) if over > 0 else 0.0
+
+    def forget(self, source: str) -> None:
+        """Somebody there had the token."""
+        self._tries.pop(source, None)
+
+
 class Sessions:
     """Browsers that have signed in; the oldest is signed out when there are too many."""
 
     def __init__(self, token: str) -> None:
         self._token = token.encode()
         self._signed_in: OrderedDict[str, None] = OrderedDict()
-        self._failed: list[float] = []
+        self._throttle = Throttle()
 
     @property
     def possible(self) -> bool:
         """Whether there is a token at all."""
         return bool(self._token)
 
-    def sign_in(self, session: str, token: str, now: float) -> str:
-        """Empty where the browser is signed in, else why not; `now` in seconds."""
+    def delay_s(self, source: str, now: float) -> float:
+        """Seconds to wait before `sign_in` for a browser at this address; `now` in seconds."""
+        return self._throttle.delay_s(source, now)
+
+    def sign_in(self, session: str, token: str, source: str) -> str:
+        """Empty where the browser is signed in, else why not; the right token always does."""
         if not self._token:
             return "there is no token: nobody can sign in"
-        self._failed = [each for each in self._failed if now - each < _TRIES_SECONDS]
-        if len(self._failed) >= _TRIES:
-            return "too many wrong tokens: wait a minute"
-        if not hmac.compare_digest(token.strip().encode(), self._token):
-            self._failed.append(now)
+        if not hmac.compare_digest(token.strip().encode("utf-8", "replace"), self._token):
             return "this is not the token"
+        self._throttle.forget(source)
         self._signed_in[session] = None
         while len(self._signed_in) > _SESSIONS:
             self._signed_in.popitem(last=False)

@@ -4,6 +4,7 @@ STYLE = """
 body { font-variant-numeric: tabular-nums; }
 .w-full { width: 100%; }
 .bar { padding: 2px 16px; display: flex; align-items: center; }
+.degraded:not(:empty) { background: #b71c1c; border-radius: 4px; padding: 1px 8px; margin-left: 12px; font-size: .85rem; }
 .q-tab-panels { background: transparent !important; overflow: visible; }
 .nicegui-content { padding: 12px; gap: 12px; max-width: 1500px; margin: 0 auto; width: 100%; }
 .board { display: grid; gap: 12px; width: 100%; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); }

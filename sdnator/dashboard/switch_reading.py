@@ -13,7 +13,7 @@ def read_switch(place: SwitchPlace) -> tuple[list[dict[str, Any]], list[dict[str
     """Tables by name, and entries with what they have counted.  Raises OSError where the switch does not answer."""
     import grpc
 
-    from apps.p4runtime_ctrl.p4info import Program
+    from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
     from p4rt import P4RuntimeStub, p4runtime
 
     with grpc.insecure_channel(place.address, options=[("grpc.max_receive_message_length", -1)]) as channel:
@@ -21,7 +21,7 @@ def read_switch(place: SwitchPlace) -> tuple[list[dict[str, Any]], list[dict[str
         wanted = p4runtime.GetForwardingPipelineConfigRequest(device_id=place.device_id)
         wanted.response_type = p4runtime.GetForwardingPipelineConfigRequest.P4INFO_AND_COOKIE
         try:
-            program = Program(stub.GetForwardingPipelineConfig(wanted, timeout=_SECONDS).config.p4info)
+            program = ProgramInfo(stub.GetForwardingPipelineConfig(wanted, timeout=_SECONDS).config.p4info)
             entries = _entries(stub, place.device_id, program)
         except grpc.RpcError as error:
             raise OSError(

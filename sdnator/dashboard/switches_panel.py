@@ -9,7 +9,7 @@ from sdnator.dashboard.switch_reading import read_switch
 from sdnator.dashboard.texts import number
 
 if TYPE_CHECKING:
-    from sdnator.dashboard.service import DashboardService
+    from sdnator.dashboard.page_backend import PageBackend
 
 
 def _columns(*named: tuple[str, str]) -> list[dict[str, Any]]:
@@ -22,7 +22,7 @@ def _columns(*named: tuple[str, str]) -> list[dict[str, Any]]:
 class SwitchesPanel:
     """One browser's view of the switches."""
 
-    def __init__(self, service: "DashboardService") -> None:
+    def __init__(self, service: "PageBackend") -> None:
         self._board = service.board
         self._places = {place.name: place for place in service.settings.switches}
         first = next(iter(self._places), None)

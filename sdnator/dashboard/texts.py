@@ -54,6 +54,6 @@ def alert_row(one: Alert, number: int) -> dict[str, Any]:
         "target": who,
         "address": sender.ip or sender.mac,
         "where": f"{clock(one.event_time)} · {sender.switch} port {sender.port} · score {one.peak_score:.1f} "
-        f"· {one.over} of {one.packets} packets over the line",
+        f"· {one.over} of {one.packets} packets above the threshold",
         "reason": one.reason,
     }

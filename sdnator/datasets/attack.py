@@ -18,14 +18,14 @@ from typing import Final
 
 from sdnator.datasets import frames
 from sdnator.datasets import hosts as h
-from sdnator.datasets.traffic import ARP, SECOND, TCP, UDP, Chance, Sent
+from sdnator.datasets.traffic import ARP, SECOND, TCP, UDP, Chance, SentPacket
 
 TELNET, TELNET_ALTERNATIVE, COMMAND_PORT = 23, 2_323, 48_101
 FLOODS: Final = ("udp", "syn", "ack")
 
 
 @dataclass(frozen=True)
-class Plan:
+class AttackPlan:
     """What the intruder wants."""
 
     floods: tuple[str, ...] = FLOODS
@@ -39,7 +39,7 @@ class Plan:
     """The victim of a SYN flood answers every SYN with a SYN-ACK, and that of an ACK flood with RSTs."""
 
 
-def traffic(seed: int, start: int, end: int, plan: Plan) -> list[Sent]:
+def traffic(seed: int, start: int, end: int, plan: AttackPlan) -> list[SentPacket]:
     """All attack packets from `start` to `end` (µs), in order of time."""
     parts = [_break_in(Chance(seed, 2, 0), start), _commands(Chance(seed, 2, 1), start + 6 * SECOND, end)]
     if plan.scan:
@@ -52,16 +52,16 @@ def traffic(seed: int, start: int, end: int, plan: Plan) -> list[Sent]:
     return sent
 
 
-def _from(src: h.Host, packet: Sent) -> Sent:
+def _from(src: h.LanHost, packet: SentPacket) -> SentPacket:
     return packet._replace(attacker=src.mac_text)
 
 
 def _segment(
-    time: int, src: h.Host, dst: h.Host, ports: tuple[int, int], flags: int, *, size: int = 0
-) -> Sent:
+    time: int, src: h.LanHost, dst: h.LanHost, ports: tuple[int, int], flags: int, *, size: int = 0
+) -> SentPacket:
     """A segment of a session between the intruder and the camera, with `size` bytes of payload."""
     length = max(54 + size, frames.MIN_FRAME) if not flags & frames.SYN else 74
-    return Sent(
+    return SentPacket(
         time,
         TCP,
         src,
@@ -78,13 +78,13 @@ def _segment(
 def _session(
     chance: Chance,
     time: int,
-    client: h.Host,
-    server: h.Host,
+    client: h.LanHost,
+    server: h.LanHost,
     *,
     port: int,
     talk: tuple[tuple[bool, int], ...],
     pace: tuple[float, float] = (0.02, 0.25),
-) -> Iterator[Sent]:
+) -> Iterator[SentPacket]:
     """A TCP session; `talk` = (from the client?, bytes) in turn, each acknowledged."""
     sport = chance.port()
     out, back = (sport, port), (port, sport)
@@ -104,11 +104,11 @@ def _session(
     yield _segment(time + 2_500, server, client, back, frames.FIN | ack)
 
 
-def _break_in(chance: Chance, start: int) -> Iterator[Sent]:
+def _break_in(chance: Chance, start: int) -> Iterator[SentPacket]:
     """Logs in over telnet after a few guesses, has the camera fetch its new program from the intruder."""
     for packet in (
-        Sent(start, ARP, h.INTRUDER, h.INFECTED.ip, frames.MIN_FRAME),
-        Sent(start + 3 * SECOND, ARP, h.INFECTED, h.INTRUDER.ip, frames.MIN_FRAME),
+        SentPacket(start, ARP, h.INTRUDER, h.INFECTED.ip, frames.MIN_FRAME),
+        SentPacket(start + 3 * SECOND, ARP, h.INFECTED, h.INTRUDER.ip, frames.MIN_FRAME),
     ):
         yield _from(packet.src, packet)
     login = tuple((bool(turn % 2), chance.number(6, 40)) for turn in range(16))
@@ -116,13 +116,13 @@ def _break_in(chance: Chance, start: int) -> Iterator[Sent]:
     yield from _download(chance, start + 4 * SECOND, chance.number(30, 45), (0.0009, 0.0025))
 
 
-def _download(chance: Chance, start: int, segments: int, pace: tuple[float, float]) -> Iterator[Sent]:
+def _download(chance: Chance, start: int, segments: int, pace: tuple[float, float]) -> Iterator[SentPacket]:
     """The camera asks the intruder for a program and gets it in `segments` full segments."""
     talk = ((True, 120), *((False, 1_448) for _ in range(segments)))
     yield from _session(chance, start, h.INFECTED, h.INTRUDER, port=80, talk=talk, pace=pace)
 
 
-def _commands(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def _commands(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Registers with the intruder, two bytes there and back about once a minute, now and then a new program."""
     sport = chance.port()
     out, back = (sport, COMMAND_PORT), (COMMAND_PORT, sport)
@@ -136,16 +136,18 @@ def _commands(chance: Chance, start: int, end: int) -> Iterator[Sent]:
         yield from _download(chance, at, chance.number(140, 190), (0.015, 0.03))
 
 
-def _arp_sweep(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def _arp_sweep(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Who has each address of the LAN, again and again."""
     for sweep in (start, *chance.every(75, 10, start + 60 * SECOND, end)):
         at = sweep
         for number in chance.pick(1, 254, 254):
-            yield _from(h.INFECTED, Sent(at, ARP, h.INFECTED, bytes((192, 168, 2, number)), frames.MIN_FRAME))
+            yield _from(
+                h.INFECTED, SentPacket(at, ARP, h.INFECTED, bytes((192, 168, 2, number)), frames.MIN_FRAME)
+            )
             at += chance.number(20_000, 180_000)
 
 
-def _telnet_scan(chance: Chance, start: int, end: int, plan: Plan) -> Iterator[Sent]:
+def _telnet_scan(chance: Chance, start: int, end: int, plan: AttackPlan) -> Iterator[SentPacket]:
     """SYNs to random addresses, one in five of them on the LAN, from one source port."""
     rate = chance.between(*plan.scan_rate) / SECOND
     at, sport = float(start), chance.port()
@@ -164,12 +166,12 @@ def _wait(chance: Chance) -> float:
     return min(-math.log(chance.number(1, 1 << 30) / (1 << 30)), 4.0)
 
 
-def _tcp(time: int, dst: bytes, ports: tuple[int, int], flags: int, number: int) -> Sent:
+def _tcp(time: int, dst: bytes, ports: tuple[int, int], flags: int, number: int) -> SentPacket:
     length = 74 if flags & frames.SYN else frames.MIN_FRAME
-    return Sent(time, TCP, h.INFECTED, dst, length, *ports, flags, number)
+    return SentPacket(time, TCP, h.INFECTED, dst, length, *ports, flags, number)
 
 
-def _floods(chance: Chance, start: int, end: int, plan: Plan) -> Iterator[Sent]:
+def _floods(chance: Chance, start: int, end: int, plan: AttackPlan) -> Iterator[SentPacket]:
     """The floods of the plan in turn, with pauses, again and again."""
     at, turn = start, 0
     while at < end:
@@ -178,14 +180,14 @@ def _floods(chance: Chance, start: int, end: int, plan: Plan) -> Iterator[Sent]:
         at, turn = until + chance.between(25, 60), turn + 1
 
 
-def _flood(chance: Chance, start: int, end: int, kind: str, plan: Plan) -> Iterator[Sent]:
+def _flood(chance: Chance, start: int, end: int, kind: str, plan: AttackPlan) -> Iterator[SentPacket]:
     gap = SECOND / (chance.between(*plan.flood_rate) / SECOND)
     ack_victim = h.PC.ip if plan.answer_all else h.CLOUD[0]
     at = float(start)
     while at < end:
         number, sport = chance.number(0, 0xFFFF_FFFF), chance.number(1_024, 65_535)
         if kind == "udp":
-            packet = Sent(int(at), UDP, h.INFECTED, h.DOORBELL.ip, 554, sport, chance.number(1, 65_535))
+            packet = SentPacket(int(at), UDP, h.INFECTED, h.DOORBELL.ip, 554, sport, chance.number(1, 65_535))
         else:
             flags, dst = (frames.SYN, h.PC.ip) if kind == "syn" else (frames.ACK, ack_victim)
             packet = _tcp(int(at), dst, (sport, 80), flags, number)

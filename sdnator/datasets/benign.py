@@ -10,12 +10,12 @@ from typing import Final
 
 from sdnator.datasets import frames
 from sdnator.datasets import hosts as h
-from sdnator.datasets.traffic import ARP, ECHO, RAW, SECOND, TCP, UDP, Chance, Sent, burst, query
+from sdnator.datasets.traffic import ARP, ECHO, RAW, SECOND, TCP, UDP, Chance, SentPacket, burst, query
 
-Device = Callable[[Chance, int, int], Iterator[Sent]]
+Device = Callable[[Chance, int, int], Iterator[SentPacket]]
 
 
-def traffic(seed: int, start: int, end: int, news: int) -> list[Sent]:
+def traffic(seed: int, start: int, end: int, news: int) -> list[SentPacket]:
     """All harmless packets from `start` to `end` (µs), in order of time; from `news` on there is a new habit."""
     sent = [
         packet
@@ -27,24 +27,28 @@ def traffic(seed: int, start: int, end: int, news: int) -> list[Sent]:
     return sent
 
 
-def _udp(time: int, src: h.Host, dst: bytes, length: int, ports: tuple[int, int]) -> Sent:
-    return Sent(time, UDP, src, dst, length, *ports)
+def _udp(time: int, src: h.LanHost, dst: bytes, length: int, ports: tuple[int, int]) -> SentPacket:
+    return SentPacket(time, UDP, src, dst, length, *ports)
 
 
-def _ask(time: int, src: h.Host, server: bytes, name: str, sport: int, *, answered: bool = False) -> Sent:
+def _ask(
+    time: int, src: h.LanHost, server: bytes, name: str, sport: int, *, answered: bool = False
+) -> SentPacket:
     question = query(name, sport)
-    return Sent(time, UDP, src, server, 42 + len(question), sport, 53, payload=question, answered=answered)
+    return SentPacket(
+        time, UDP, src, server, 42 + len(question), sport, 53, payload=question, answered=answered
+    )
 
 
-def _syn(time: int, src: h.Host, dst: bytes, sport: int, dport: int, *, length: int = 74) -> Sent:
-    return Sent(
+def _syn(time: int, src: h.LanHost, dst: bytes, sport: int, dport: int, *, length: int = 74) -> SentPacket:
+    return SentPacket(
         time, TCP, src, dst, length, sport, dport, frames.SYN, number=(time * 2_654_435_761) & 0xFFFF_FFFF
     )
 
 
 def _keep_alive(
-    chance: Chance, src: h.Host, clouds: tuple[bytes, ...], times: Iterator[int], port: int
-) -> Iterator[Sent]:
+    chance: Chance, src: h.LanHost, clouds: tuple[bytes, ...], times: Iterator[int], port: int
+) -> Iterator[SentPacket]:
     """A round of 40-byte datagrams to every cloud host, back to back."""
     for time in times:
         at = time
@@ -53,7 +57,7 @@ def _keep_alive(
             at += chance.number(1, 3) if chance.happens(0.7) else chance.number(100, 700)
 
 
-def camera_wired(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def camera_wired(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Keep-alives every half second in rounds of ten, and two TCP connections that never succeed."""
     for cycle in chance.every(9.05, 0.02, start, end):
         times = (cycle + number * SECOND // 2 + chance.number(0, 4_000) for number in range(10))
@@ -66,7 +70,7 @@ def camera_wired(chance: Chance, start: int, end: int) -> Iterator[Sent]:
             yield _syn(at + chance.number(2, 240), h.CAMERA_WIRED, h.CLOUD[14], ports[1], 80, length=60)
 
 
-def camera_cloud(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def camera_cloud(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Five seconds of keep-alives to eight cloud hosts, then TCP to eleven with retries; pings now and then."""
     services = (80, 443, 8_000, 8_080, 21_047)
     clouds = h.CLOUD[:8] + h.CLOUD[9:13]
@@ -81,10 +85,10 @@ def camera_cloud(chance: Chance, start: int, end: int) -> Iterator[Sent]:
     for cycle in chance.every(178, 0.5, start, end):
         for number in range(10):
             at = cycle + number * SECOND + chance.number(0, 1_500)
-            yield Sent(at, ECHO, h.CAMERA_CLOUD, h.GATEWAY.ip, 98, number=number)
+            yield SentPacket(at, ECHO, h.CAMERA_CLOUD, h.GATEWAY.ip, 98, number=number)
 
 
-def doorbell(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def doorbell(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Nine connections every 12.7 s, a name asked every 5 s, a ping every 30 s."""
     targets = ((4, 8_000), (3, 443), (2, 80), (1, 8_080), (0, 21_047), (0, 443), (2, 80), (4, 8_000), (8, 80))
     for cycle in chance.every(12.7, 0.15, start, end):
@@ -99,10 +103,10 @@ def doorbell(chance: Chance, start: int, end: int) -> Iterator[Sent]:
         name = ("time.doorbell.example", "cloud.doorbell.example", "p.doorbell.example")[chance.number(0, 2)]
         yield _ask(at, h.DOORBELL, h.GATEWAY.ip, name, chance.port())
     for number, at in enumerate(chance.every(30.1, 0.02, start, end)):
-        yield Sent(at, ECHO, h.DOORBELL, h.GATEWAY.ip, 98, number=number)
+        yield SentPacket(at, ECHO, h.DOORBELL, h.GATEWAY.ip, 98, number=number)
 
 
-def monitor(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def monitor(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Asks for a long name every two seconds (answered) and for short ones; announces itself by SSDP."""
     port = 2_440
     for at in chance.every(2.0, 0.03, start, end):
@@ -123,15 +127,15 @@ def monitor(chance: Chance, start: int, end: int) -> Iterator[Sent]:
             when += chance.number(2, 1_500)
 
 
-def pinged_dome(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def pinged_dome(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """A PC pings the dome camera every second."""
     for number, at in enumerate(chance.every(1.013, 0.007, start, end)):
-        yield Sent(at, ECHO, h.PC, h.DOME.ip, 74, number=number)
+        yield SentPacket(at, ECHO, h.PC, h.DOME.ip, 74, number=number)
 
 
 def _resolver(
-    chance: Chance, src: h.Host, names: tuple[str, ...], *, period: float, start: int, end: int
-) -> Iterator[Sent]:
+    chance: Chance, src: h.LanHost, names: tuple[str, ...], *, period: float, start: int, end: int
+) -> Iterator[SentPacket]:
     """Asks three servers in turn, two of them outside, and gets no answer."""
     servers = (h.GATEWAY.ip, *h.DNS_PUBLIC)
     for cycle in chance.every(period, period / 12, start, end):
@@ -141,7 +145,7 @@ def _resolver(
             at += chance.around(period / 4, period / 60)
 
 
-def _web_retries(chance: Chance, src: h.Host, period: float, start: int, end: int) -> Iterator[Sent]:
+def _web_retries(chance: Chance, src: h.LanHost, period: float, start: int, end: int) -> Iterator[SentPacket]:
     """Seven connections to a dead web server, 0.11 s apart, each tried again after three seconds."""
     for cycle in chance.every(period, period / 20, start, end):
         for number in range(7):
@@ -150,23 +154,23 @@ def _web_retries(chance: Chance, src: h.Host, period: float, start: int, end: in
             yield _syn(at + 3_003_000 + chance.number(0, 900), src, h.CLOUD[13], port, 80)
 
 
-def _seek_absent(chance: Chance, src: h.Host, start: int, end: int) -> Iterator[Sent]:
+def _seek_absent(chance: Chance, src: h.LanHost, start: int, end: int) -> Iterator[SentPacket]:
     """Asks once a second, for minutes at a time, who has the address of a device that is gone."""
     for cycle in chance.every(240, 30, start, end):
         times = (
             cycle + number * SECOND + chance.number(0, 12_000) for number in range(chance.number(50, 75))
         )
         for at in burst(times, end):
-            yield Sent(at, ARP, src, h.address(h.ABSENT), frames.MIN_FRAME)
+            yield SentPacket(at, ARP, src, h.address(h.ABSENT), frames.MIN_FRAME)
 
 
-def _search(chance: Chance, src: h.Host, period: float, start: int, end: int) -> Iterator[Sent]:
+def _search(chance: Chance, src: h.LanHost, period: float, start: int, end: int) -> Iterator[SentPacket]:
     """SSDP searches that nobody answers."""
     for at in chance.every(period, period / 5, start, end):
         yield _udp(at, src, h.SSDP_GROUP, 179, (chance.port(), 1_900))
 
 
-def dome(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def dome(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     names = ("www.dome-camera.example.net", "time.dome.example", "log.dome.example")
     yield from _resolver(chance, h.DOME, names, period=3.9, start=start, end=end)
     yield from _web_retries(chance, h.DOME, 85, start, end)
@@ -174,7 +178,7 @@ def dome(chance: Chance, start: int, end: int) -> Iterator[Sent]:
     yield from _search(chance, h.DOME, 38, start, end)
 
 
-def recorder(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def recorder(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     names = ("sync.recorder.example.net", "time.recorder.example", "registration.recorder.example")
     yield from _resolver(chance, h.RECORDER, names, period=4.5, start=start, end=end)
     yield from _web_retries(chance, h.RECORDER, 100, start, end)
@@ -185,15 +189,15 @@ def recorder(chance: Chance, start: int, end: int) -> Iterator[Sent]:
         yield _igmp(at + chance.around(2, 0.5), h.RECORDER)
 
 
-def _igmp(time: int, src: h.Host) -> Sent:
+def _igmp(time: int, src: h.LanHost) -> SentPacket:
     """A report of group membership, with the router alert option left out."""
     body = frames.icmp(0x22, 0, bytes.fromhex("00000001"), bytes.fromhex("04000000efffFFfa"))  # same layout
     packet = frames.ipv4(src.ip, h.IGMP_GROUP, frames.IGMP, body, ttl=1)
     data = frames.ethernet(h.mac_towards(h.IGMP_GROUP), src.mac, frames.TYPE_IPV4, packet)
-    return Sent(time, RAW, src, h.IGMP_GROUP, frames.MIN_FRAME, payload=data)
+    return SentPacket(time, RAW, src, h.IGMP_GROUP, frames.MIN_FRAME, payload=data)
 
 
-def plugs(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def plugs(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Three smart plugs: two ask for their cloud and the time every ten seconds, one in groups of five."""
     for plug in (h.PLUG_A, h.PLUG_B):
         for at in chance.every(10.01, 0.01, start, end):
@@ -208,7 +212,7 @@ def plugs(chance: Chance, start: int, end: int) -> Iterator[Sent]:
             yield _ask(cycle + chance.around(delay, 0.01), h.PLUG_OLD, h.GATEWAY.ip, name, port)
 
 
-def camera_p2p(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def camera_p2p(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Looks for its three rendezvous servers every 40 s, asks two name servers in turn."""
     port = chance.port()
     for number, at in enumerate(chance.every(40.4, 0.02, start, end)):
@@ -219,7 +223,7 @@ def camera_p2p(chance: Chance, start: int, end: int) -> Iterator[Sent]:
         yield _ask(at, h.CAMERA_P2P, (h.GATEWAY.ip, h.DNS_PUBLIC[0])[number % 2], "p2p.camera.example", 3_126)
 
 
-def small_devices(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def small_devices(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """A webcam, a thermostat and a single-board computer that ask for names; a clock that asks for the time."""
     for at in chance.every(20, 8, start, end):
         yield _ask(at, h.WEBCAM, h.GATEWAY.ip, "api.webcam.example.net", chance.port())
@@ -258,7 +262,7 @@ def small_devices(chance: Chance, start: int, end: int) -> Iterator[Sent]:
             )
 
 
-def infrastructure(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def infrastructure(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Spanning tree every 2 s, loop tests every 10 s, discovery every minute; router advertisements."""
     tree = frames.llc(bytes.fromhex("0180c2000000"), h.SWITCH.mac, b"\x42\x42\x03" + bytes(35))
     loop = frames.ethernet(h.SWITCH.mac, h.SWITCH.mac, frames.TYPE_LOOPBACK, b"\0\0\1\0")
@@ -267,14 +271,14 @@ def infrastructure(chance: Chance, start: int, end: int) -> Iterator[Sent]:
     )
     for data, period, spread in ((tree, 2.0, 0.001), (loop, 10.0, 0.001), (found, 60.0, 0.1)):
         for at in chance.every(period, spread, start, end):
-            yield Sent(at, RAW, h.SWITCH, h.SSDP_GROUP, max(len(data), frames.MIN_FRAME), payload=data)
+            yield SentPacket(at, RAW, h.SWITCH, h.SSDP_GROUP, max(len(data), frames.MIN_FRAME), payload=data)
     for at in chance.every(8.0, 0.02, start, end):
         yield _neighbour(at, 136, 86)
     for at in chance.every(42, 6, start, end):
         yield _neighbour(at, 134, 110)
 
 
-def _neighbour(time: int, kind: int, length: int) -> Sent:
+def _neighbour(time: int, kind: int, length: int) -> SentPacket:
     """The gateway says over IPv6 that it is there."""
     src, dst = h.address("fe80::1"), h.address("ff02::1")
     link = h.GATEWAY.mac
@@ -292,13 +296,13 @@ def _neighbour(time: int, kind: int, length: int) -> Sent:
     message = frames.icmp6(src, dst, kind, 0, body)
     packet = frames.ipv6(src, dst, frames.ICMP6, message, hops=255)
     data = frames.ethernet(bytes.fromhex("333300000001"), h.GATEWAY.mac, frames.TYPE_IPV6, packet)
-    return Sent(time, RAW, h.GATEWAY, dst, length, payload=data)
+    return SentPacket(time, RAW, h.GATEWAY, dst, length, payload=data)
 
 
 SSDP_SIZES: Final = (360, 374, 356, 380, 382, 380, 372, 368, 388, 333, 340)
 
 
-def ssdp_bursts(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def ssdp_bursts(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """The gateway announces its eleven services twice, a second apart, about every five minutes."""
     for cycle in chance.every(323, 1.5, start, end):
         for repeat in range(2):
@@ -308,7 +312,7 @@ def ssdp_bursts(chance: Chance, start: int, end: int) -> Iterator[Sent]:
                 at += chance.number(300, 640)
 
 
-def media_player(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def media_player(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """The PC looks for media servers every few minutes; the gateway answers with all its services."""
     for cycle in chance.every(170, 40, start, end):
         port, at = chance.port(), cycle
@@ -320,17 +324,17 @@ def media_player(chance: Chance, start: int, end: int) -> Iterator[Sent]:
             at += chance.number(2_000, 9_000)
 
 
-def neighbours(chance: Chance, start: int, end: int) -> Iterator[Sent]:
+def neighbours(chance: Chance, start: int, end: int) -> Iterator[SentPacket]:
     """Every device renews the gateway's hardware address twice a minute, and the gateway theirs."""
     for host in h.LAN_HOSTS[1:-1]:
         slow = 4 if host in {h.SINGLE_BOARD, h.CLOCK, h.WEBCAM} else 1
         for at in chance.every(34 * slow, 7, start, end):
-            yield Sent(at, ARP, host, h.GATEWAY.ip, frames.MIN_FRAME, flags=1)
+            yield SentPacket(at, ARP, host, h.GATEWAY.ip, frames.MIN_FRAME, flags=1)
         for at in chance.every(42 * slow, 6, start, end):
-            yield Sent(at, ARP, h.GATEWAY, host.ip, frames.MIN_FRAME, flags=1)
+            yield SentPacket(at, ARP, h.GATEWAY, host.ip, frames.MIN_FRAME, flags=1)
     for one, other in ((h.DOME, h.PC), (h.PC, h.DOME)):
         for at in chance.every(31, 4, start, end):
-            yield Sent(at, ARP, one, other.ip, frames.MIN_FRAME, flags=1)
+            yield SentPacket(at, ARP, one, other.ip, frames.MIN_FRAME, flags=1)
 
 
 DEVICES: Final[tuple[Device, ...]] = (

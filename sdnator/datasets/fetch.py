@@ -4,14 +4,19 @@ URL ──► .NAME.part (+ .NAME.part.json: which URL, which version) ──►
 
 FetchError (BadInput)
 ├── BadSource           not an http(s) URL, or the server refuses
+│   └── NotThere        the server says 404 or 410
+├── WrongContent        a web page came instead of the file
+├── DiskFull            no room for the file; what is there is kept
 ├── Interrupted         the connection broke more often than is tried again; what is there is kept
 └── ChecksumMismatch    what came is not what was expected; it is thrown away
 """
 
+import errno
 import hashlib
 import http.client
 import json
 import os
+import shutil
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -25,6 +30,10 @@ from sdnator.errors import BadInput
 _CHUNK: Final = 1 << 18
 _TIMEOUT_S: Final = 30
 _HTTP_PARTIAL, _HTTP_RANGE_WRONG = 206, 416
+_GONE: Final = (404, 410)
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_RESERVE_BYTES: Final = 16 << 20
+"""Room that a download leaves on the disk."""
 
 Progress = Callable[[int, int | None], None]
 
@@ -35,6 +44,18 @@ class FetchError(BadInput):
 
 class BadSource(FetchError):
     """Not an http(s) URL, or the server refuses."""
+
+
+class NotThere(BadSource):
+    """The server has nothing at this address."""
+
+
+class WrongContent(FetchError):
+    """A web page came instead of the file, or something else that it cannot be."""
+
+
+class DiskFull(FetchError):
+    """No room for the file; what has come is kept for the next try."""
 
 
 class Interrupted(FetchError):
@@ -68,11 +89,18 @@ class _Part:
         self.note = self.target.with_name(f".{self.target.name}.part.json")
         self.version = ""
         if self.path.exists() and self.note.exists():
-            known = json.loads(self.note.read_text(encoding="utf-8"))
-            if known.get("url") == self.url:
-                self.version = str(known.get("version", ""))
+            self.version = self._noted_version()
         if not self.version:  # nothing says what the bytes at hand belong to
             self.path.unlink(missing_ok=True)
+
+    def _noted_version(self) -> str:
+        try:
+            known = json.loads(self.note.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # a note cut off by a crash: start again
+            return ""
+        if not isinstance(known, dict) or known.get("url") != self.url:
+            return ""
+        return str(known.get("version", ""))
 
     @property
     def size(self) -> int:
@@ -105,7 +133,7 @@ def fetch(
         progress: called with bytes so far and, where the server tells it, bytes in all.
 
     Raises:
-        BadSource, Interrupted, ChecksumMismatch
+        BadSource, WrongContent, DiskFull, Interrupted, ChecksumMismatch
         OSError: `target` cannot be written.
     """
     if urllib.parse.urlsplit(url).scheme not in {"http", "https"}:
@@ -119,7 +147,8 @@ def fetch(
             if _continue(part, progress):
                 return _finish(part, sha256.lower(), resumed_at)
         except urllib.error.HTTPError as error:
-            raise BadSource(f"{url}: the server answers {error.code} {error.reason}; check the URL") from None
+            kind = NotThere if error.code in _GONE else BadSource
+            raise kind(f"{url}: the server answers {error.code} {error.reason}; check the URL") from None
         except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
             if attempt == tries - 1:
                 raise _interrupted(part, error) from None
@@ -128,6 +157,10 @@ def fetch(
 
 def _interrupted(part: _Part, error: Exception | None) -> Interrupted:
     reason = getattr(error, "reason", error) or "the server closes the connection too early"
+    if not part.size:
+        return Interrupted(
+            f"{part.url}: nothing came ({reason}); check the connection, or fetch it from another server"
+        )
     return Interrupted(
         f"{part.url}: download broken off after {part.size:,} bytes ({reason}); "
         "run the command again to continue where it ended"
@@ -150,18 +183,56 @@ def _continue(part: _Part, progress: Progress) -> bool:
         return False
     with response:
         fresh = response.status != _HTTP_PARTIAL
-        version = response.headers.get("ETag") or response.headers.get("Last-Modified") or ""
+        if not fresh and not response.headers.get("Content-Range", "").startswith(f"bytes {part.size}-"):
+            part.drop()  # another part than was asked for: start again
+            return False
+        _refuse_page(part.url, response.headers.get_content_type())
         if fresh:
-            part.belongs_to(version)
+            part.belongs_to(response.headers.get("ETag") or response.headers.get("Last-Modified") or "")
         done = 0 if fresh else part.size
-        length = response.headers.get("Content-Length")
-        total = done + int(length) if length is not None else None
-        with part.path.open("wb" if fresh else "ab") as file:
+        length = response.headers.get("Content-Length", "")
+        total = done + int(length) if length.isdecimal() else None
+        _refuse_overflow(part, (total or 0) - done)
+        _store(part, response, done, total, progress)
+        return total is None or part.size >= total
+
+
+def _store(
+    part: _Part, response: http.client.HTTPResponse, done: int, total: int | None, progress: Progress
+) -> None:
+    try:
+        with part.path.open("ab" if done else "wb") as file:
             while chunk := response.read1(_CHUNK):
                 file.write(chunk)
                 done += len(chunk)
                 progress(done, total)
-        return total is None or done >= total
+    except OSError as error:
+        if error.errno in _FULL:
+            raise _disk_full(part, 0) from None
+        raise
+
+
+def _refuse_page(url: str, kind: str) -> None:
+    """A portal that wants a registration, or an error page with status 200."""
+    if kind in {"text/html", "application/xhtml+xml"}:
+        raise WrongContent(
+            f"{url}: a web page came instead of the file (the publisher may ask for a registration, or has moved "
+            "it); fetch it with a browser and give it with --from FILE, or give another place with --mirror URL"
+        )
+
+
+def _refuse_overflow(part: _Part, missing: int) -> None:
+    if missing and missing + _RESERVE_BYTES > shutil.disk_usage(part.path.parent).free:
+        raise _disk_full(part, missing)
+
+
+def _disk_full(part: _Part, missing: int) -> DiskFull:
+    needed = f"{missing:,} bytes are missing" if missing else "the disk is full"
+    free = shutil.disk_usage(part.path.parent).free
+    return DiskFull(
+        f"{part.target}: no room for it: {needed}, {free:,} bytes are free in {part.path.parent}; make room and "
+        "run the command again to continue, or choose another folder"
+    )
 
 
 def _finish(part: _Part, expected: str, resumed_at: int) -> Fetched:

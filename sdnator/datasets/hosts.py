@@ -9,7 +9,7 @@ from typing import Final
 
 
 @dataclass(frozen=True)
-class Host:
+class LanHost:
     """A device on the LAN."""
 
     mac_text: str
@@ -27,8 +27,8 @@ def address(text: str) -> bytes:
     return ipaddress.ip_address(text).packed
 
 
-def _lan(mac: str, number: int) -> Host:
-    return Host(mac, f"192.168.2.{number}")
+def _lan(mac: str, number: int) -> LanHost:
+    return LanHost(mac, f"192.168.2.{number}")
 
 
 GATEWAY: Final = _lan("4c:09:d4:c6:12:7b", 1)
@@ -47,7 +47,7 @@ PLUG_B: Final = _lan("50:c7:bf:1c:9c:c6", 119)
 SINGLE_BOARD: Final = _lan("b8:27:eb:e1:a9:f6", 118)
 CAMERA_P2P: Final = _lan("00:ec:04:56:93:03", 126)
 CLOCK: Final = _lan("d4:6e:0e:2c:15:d4", 196)
-SWITCH: Final = Host("00:14:1c:28:d6:06", "192.168.2.250")
+SWITCH: Final = LanHost("00:14:1c:28:d6:06", "192.168.2.250")
 ABSENT: Final = "192.168.2.106"
 """A device that was taken away; others still look for it."""
 

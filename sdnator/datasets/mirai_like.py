@@ -1,11 +1,11 @@
-"""A capture in the likeness of the public Mirai set: an hour of harmless traffic, then an infection.
+"""A capture like the public Mirai set: 50 minutes of benign traffic, then an infection.
 
     benign.traffic ┐
                    ├─ in order of time ─► Network.carry ─► OUT.pcap + OUT.labels.csv
     attack.traffic ┘
 
-Label 1 marks what an infected device or its master sends for the attack, with the sender's MAC.
-Label 0 is everything else: the house, the infected camera's own business, and what victims answer.
+Label 1 marks packets that an infected device or the intruder sends for the attack, with the sender's MAC.
+Label 0 is everything else: benign devices, the infected camera's normal traffic, and answers of victims.
 """
 
 import heapq
@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sdnator.captures import CaptureWriter
+from sdnator.capture.captures import CaptureWriter
+from sdnator.capture.labels import Labels, labels_path, write_labels
 from sdnator.datasets import attack, benign
 from sdnator.datasets.network import Network
-from sdnator.datasets.traffic import SECOND, Chance, Frame, Sent
+from sdnator.datasets.traffic import SECOND, Chance, SentPacket, WireFrame
 from sdnator.errors import BadInput
-from sdnator.labels import Labels, labels_path, write_labels
 
 START_S: Final = 1_709_625_600
 """Capture time of the first second: 2024-03-05 08:00 UTC."""
@@ -33,7 +33,7 @@ SNAP: Final = 200
 
 
 @dataclass(frozen=True)
-class Options:
+class MiraiLikeOptions:
     """What to generate."""
 
     seed: int = 1
@@ -43,7 +43,7 @@ class Options:
     """From the infection to the end; harmless traffic goes on. 0 = no attack."""
     background: bool = True
     """False = the attack and its answers only, to be spliced behind a real capture."""
-    plan: attack.Plan = field(default_factory=attack.Plan)
+    plan: attack.AttackPlan = field(default_factory=attack.AttackPlan)
     max_packets: int = MAX_PACKETS
 
 
@@ -60,7 +60,7 @@ class Made:
 
 
 def make(
-    options: Options, out: str | os.PathLike[str], progress: Callable[[int], None] = lambda _: None
+    options: MiraiLikeOptions, out: str | os.PathLike[str], progress: Callable[[int], None] = lambda _: None
 ) -> Made:
     """Write the capture and its labels beside it; the same options give the same bytes.
 
@@ -97,14 +97,14 @@ def make(
 
 def make_mirai_like(out: str | os.PathLike[str], *, seed: int = 1) -> Made:
     """The default data set: about 160,000 packets, half of them before the infection."""
-    return make(Options(seed=seed), out)
+    return make(MiraiLikeOptions(seed=seed), out)
 
 
-def generate(options: Options) -> Iterator[Frame]:
+def generate(options: MiraiLikeOptions) -> Iterator[WireFrame]:
     """The frames of a capture, in order of time."""
     onset = int(options.benign_seconds * SECOND) if options.background else 0
     end = onset + int(options.attack_seconds * SECOND)
     harmless = benign.traffic(options.seed, 0, end, int(onset * _NEWS_AT)) if options.background else []
     hostile = attack.traffic(options.seed, onset, end, options.plan)
-    sent: Iterator[Sent] = heapq.merge(harmless, hostile, key=lambda packet: packet.time)
+    sent: Iterator[SentPacket] = heapq.merge(harmless, hostile, key=lambda packet: packet.time)
     return Network(Chance(options.seed, 3), SNAP, cookies=options.plan.answer_all).carry(sent)

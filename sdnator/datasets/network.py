@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from sdnator.datasets import frames
-from sdnator.datasets.hosts import BY_IP, GATEWAY, PC, Host, is_local
-from sdnator.datasets.traffic import ARP, ECHO, RAW, SECOND, TCP, UDP, Chance, Frame, Sent, as_frame
+from sdnator.datasets.hosts import BY_IP, GATEWAY, PC, LanHost, is_local
+from sdnator.datasets.traffic import ARP, ECHO, RAW, SECOND, TCP, UDP, Chance, SentPacket, WireFrame, as_frame
 
 OPEN_PORTS: Final = {PC.ip: {80, 445}, GATEWAY.ip: {53, 80}}
 _BACKLOG: Final = 256
@@ -56,9 +56,9 @@ class Network:
         self._limit = _Limit()
         self._half_open: dict[bytes, deque[int]] = {}
 
-    def carry(self, packets: Iterable[Sent]) -> Iterator[Frame]:
+    def carry(self, packets: Iterable[SentPacket]) -> Iterator[WireFrame]:
         """Frames in order of time; `packets` come in order of time."""
-        pending: list[tuple[int, int, Frame]] = []
+        pending: list[tuple[int, int, WireFrame]] = []
         for number, sent in enumerate(packets):
             while pending and pending[0][0] <= sent.time:
                 yield heapq.heappop(pending)[2]
@@ -69,7 +69,7 @@ class Network:
         while pending:
             yield heapq.heappop(pending)[2]
 
-    def _answers(self, sent: Sent, frame: Frame) -> Iterator[Frame]:
+    def _answers(self, sent: SentPacket, frame: WireFrame) -> Iterator[WireFrame]:
         if sent.kind == RAW or sent.dst[0] >> 4 == 0xE:
             return
         if sent.kind == ARP:
@@ -84,17 +84,19 @@ class Network:
         elif sent.kind == TCP and sent.dst in BY_IP:
             yield from self._tcp_reply(sent)
 
-    def _later(self, answer: Sent, delay: float) -> Frame:
+    def _later(self, answer: SentPacket, delay: float) -> WireFrame:
         return as_frame(answer._replace(time=answer.time + self._chance.around(delay, delay / 6)), self._snap)
 
-    def _arp_reply(self, sent: Sent) -> Iterator[Frame]:
+    def _arp_reply(self, sent: SentPacket) -> Iterator[WireFrame]:
         owner = BY_IP.get(sent.dst)
         if owner is not None and owner is not sent.src:
             data = frames.arp(2, owner.mac, owner.ip, sent.src.mac, sent.src.ip)
             time = sent.time + self._chance.around(0.0003, 0.00003)
-            yield Frame(time, frames.MIN_FRAME, frames.pad(data), "")
+            yield WireFrame(time, frames.MIN_FRAME, frames.pad(data), "")
 
-    def _unreachable(self, sent: Sent, frame: Frame, by: Host, delay: float) -> Iterator[Frame]:
+    def _unreachable(
+        self, sent: SentPacket, frame: WireFrame, by: LanHost, delay: float
+    ) -> Iterator[WireFrame]:
         """An ICMP error that quotes the packet: port unreachable from its target, else network."""
         if not self._limit.allows(by.ip, sent.src.ip, sent.time):
             return
@@ -107,9 +109,9 @@ class Network:
         packet = frames.ipv4(by.ip, sent.src.ip, frames.ICMP, body, more=more)
         data = frames.ethernet(sent.src.mac, by.mac, frames.TYPE_IPV4, packet)
         time = sent.time + self._chance.around(delay, delay / 8)
-        yield Frame(time, max(len(data) + more, frames.MIN_FRAME), frames.pad(data), "")
+        yield WireFrame(time, max(len(data) + more, frames.MIN_FRAME), frames.pad(data), "")
 
-    def _udp_reply(self, sent: Sent, frame: Frame) -> Iterator[Frame]:
+    def _udp_reply(self, sent: SentPacket, frame: WireFrame) -> Iterator[WireFrame]:
         if sent.dst == GATEWAY.ip and sent.dport == 53:
             if sent.answered:
                 back = sent._replace(src=GATEWAY, dst=sent.src.ip, sport=53, dport=sent.sport, attacker="")
@@ -117,7 +119,7 @@ class Network:
         elif sent.dst in BY_IP and sent.sport != 1_900:  # nobody asked for it, unless it is an SSDP answer
             yield from self._unreachable(sent, frame, BY_IP[sent.dst], 0.0006)
 
-    def _tcp_reply(self, sent: Sent) -> Iterator[Frame]:
+    def _tcp_reply(self, sent: SentPacket) -> Iterator[WireFrame]:
         """SYN-ACK from an open port, RST from a closed one; the attack's own sessions answer themselves."""
         if sent.answered or sent.flags & (frames.RST | frames.FIN):
             return
@@ -125,7 +127,7 @@ class Network:
         is_open = sent.dport in OPEN_PORTS.get(victim.ip, ())
         syn = sent.flags & (frames.SYN | frames.ACK) == frames.SYN
         flags = frames.SYN | frames.ACK if syn and is_open else frames.RST | (frames.ACK if syn else 0)
-        back = Sent(
+        back = SentPacket(
             *(sent.time, TCP, victim, sent.src.ip, frames.MIN_FRAME, sent.dport, sent.sport, flags),
             number=sent.number,
         )
@@ -135,7 +137,7 @@ class Network:
             for delay in (0, *_RETRIES):
                 yield self._later(back._replace(time=sent.time + delay * SECOND), 0.0004)
 
-    def _has_room(self, victim: Host, time: int) -> bool:
+    def _has_room(self, victim: LanHost, time: int) -> bool:
         half_open = self._half_open.setdefault(victim.ip, deque())
         while half_open and half_open[0] <= time:
             half_open.popleft()

@@ -12,9 +12,9 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sdnator.captures import CaptureWriter
+from sdnator.capture.captures import CaptureWriter
+from sdnator.capture.tshark_tsv import TYPE_LOOPBACK, TsharkRow, TsvError, read_rows
 from sdnator.datasets import frames
-from sdnator.tshark_tsv import TYPE_LOOPBACK, TsharkRow, TsvError, read_rows
 
 _STP_GROUP = 0x0180C2000000
 _STP, _CDP = b"\x42\x42\x03", b"\xaa\xaa\x03\x00\x00\x0c\x20\x00"

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sdnator.captures import Capture, CapturedFrame, CaptureWriter, CutCapture
-from sdnator.labels import Labels, labels_path, read_labels, write_labels
+from sdnator.capture.captures import Capture, CapturedFrame, CaptureWriter, CutCapture
+from sdnator.capture.labels import Labels, labels_path, read_labels, write_labels
 
 
 @dataclass(frozen=True)

@@ -10,18 +10,18 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from sdnator.datasets import frames
-from sdnator.datasets.hosts import Host, mac_towards
+from sdnator.datasets.hosts import LanHost, mac_towards
 
 SECOND: Final = 1_000_000
 UDP, TCP, ECHO, ARP, RAW = "udp", "tcp", "echo", "arp", "raw"
 
 
-class Sent(NamedTuple):
+class SentPacket(NamedTuple):
     """One packet that a device sends by itself; what others answer is made by `network`."""
 
     time: int
     kind: str
-    src: Host
+    src: LanHost
     dst: bytes
     """Address the packet goes to; for ARP the address asked for."""
     length: int
@@ -39,7 +39,7 @@ class Sent(NamedTuple):
     """A name server answers this query."""
 
 
-class Frame(NamedTuple):
+class WireFrame(NamedTuple):
     """A frame on the wire."""
 
     time: int
@@ -97,13 +97,13 @@ def query(name: str, ident: int = 1) -> bytes:
     return ident.to_bytes(2, "big") + bytes.fromhex("01000001000000000000") + labels + b"\0\0\1\0\1"
 
 
-def as_frame(sent: Sent, snap: int) -> Frame:
+def as_frame(sent: SentPacket, snap: int) -> WireFrame:
     """The frame of a packet, its payload cut so that about `snap` bytes are left."""
     data = sent.payload if sent.kind == RAW else _BUILDERS[sent.kind](sent, snap)
-    return Frame(sent.time, sent.length, frames.pad(data, min(sent.length, snap))[:snap], sent.attacker)
+    return WireFrame(sent.time, sent.length, frames.pad(data, min(sent.length, snap))[:snap], sent.attacker)
 
 
-def _udp(sent: Sent, snap: int) -> bytes:
+def _udp(sent: SentPacket, snap: int) -> bytes:
     size = sent.length - 42
     payload = sent.payload[:size].ljust(min(size, max(snap - 42, 0)), b"\0")
     more = size - len(payload)
@@ -111,7 +111,7 @@ def _udp(sent: Sent, snap: int) -> bytes:
     return _ipv4(sent, frames.UDP, datagram, more)
 
 
-def _tcp(sent: Sent, snap: int) -> bytes:
+def _tcp(sent: SentPacket, snap: int) -> bytes:
     room = sent.length - 34
     syn = bool(sent.flags & frames.SYN)
     options = frames.syn_options(min((room - 20) & ~3, 40)) if syn and room >= 24 else b""
@@ -129,19 +129,19 @@ def _tcp(sent: Sent, snap: int) -> bytes:
     return _ipv4(sent, frames.TCP, segment, more)
 
 
-def _echo(sent: Sent, _: int) -> bytes:
+def _echo(sent: SentPacket, _: int) -> bytes:
     kind = 8 if sent.flags == 0 else 0
     rest = (1).to_bytes(2, "big") + (sent.number & 0xFFFF).to_bytes(2, "big")
     return _ipv4(sent, frames.ICMP, frames.icmp(kind, 0, rest, bytes(sent.length - 42)))
 
 
-def _arp(sent: Sent, _: int) -> bytes:
+def _arp(sent: SentPacket, _: int) -> bytes:
     """`flags` 1 = asked of the known owner instead of everybody."""
     to = mac_towards(sent.dst) if sent.flags else frames.BROADCAST
     return frames.arp(1, sent.src.mac, sent.src.ip, bytes(6), sent.dst, to=to)
 
 
-def _ipv4(sent: Sent, proto: int, payload: bytes, more: int = 0) -> bytes:
+def _ipv4(sent: SentPacket, proto: int, payload: bytes, more: int = 0) -> bytes:
     packet = frames.ipv4(sent.src.ip, sent.dst, proto, payload, more=more, ident=sent.time & 0xFFFF)
     return frames.ethernet(mac_towards(sent.dst), sent.src.mac, frames.TYPE_IPV4, packet)
 

@@ -1,9 +1,8 @@
 """Messages survive the wire and refuse what is not theirs."""
 
-import msgspec
 import pytest
 
-from apps.messages import Alert, Decision, Target
+from apps.messages import Alert, Decision, MessageError, Target
 from tests.apps.firewall.alerts import alert
 
 
@@ -15,8 +14,8 @@ def test_message_survives_the_wire():
 
 def test_wrong_field_is_named():
     """A value of another shape is refused, and the text names the field."""
-    value = alert().to_value() | {"hot_seconds": "many"}
-    with pytest.raises(msgspec.ValidationError, match="hot_seconds"):
+    value = alert().to_value() | {"anomalous_seconds": "many"}
+    with pytest.raises(MessageError, match="anomalous_seconds"):
         Alert.from_value(value)
 
 
@@ -26,5 +25,5 @@ def test_unknown_action_is_refused():
         id="x", action="block", switch="s1", target=Target(kind="ip", address="10.0.0.1"),
         reason="r", event_time=1, expires=2,
     )  # fmt: skip
-    with pytest.raises(msgspec.ValidationError, match="action"):
+    with pytest.raises(MessageError, match="action"):
         Decision.from_value(decision.to_value() | {"action": "explode"})

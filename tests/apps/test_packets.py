@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apps.packets import PACKET_COLUMNS, read_frames
-from tests.apps.kitsune.traffic import FIELDS as TSHARK_FIELDS
+from sdnator.testing.packet_rows import FIELDS as TSHARK_FIELDS
 from tests.naive.frames import read_frame
-from tests.requirements import optional_program, shared_data
+from tests.requirements import require_program, shared_data
 
 MACS = bytes.fromhex("0200000000020200000000 01".replace(" ", ""))
 CAPTURES = ("synflood_one_source", "ssh_guessing", "ftp_bruteforce", "synflood_spoofed")
@@ -141,7 +141,7 @@ def test_equals_tshark_on_the_real_capture(pad):
 
 @pytest.mark.parametrize("name", CAPTURES)
 def test_equals_an_installed_tshark(name):
-    tshark = optional_program("tshark")
+    tshark = require_program("tshark")
     path = shared_data(f"captures/{name}.pcap")
     fields = [part for field in TSHARK_FIELDS for part in ("-e", field)]
     options = ["-T", "fields", "-E", "header=n", "-E", "occurrence=f", *fields]

@@ -5,7 +5,7 @@ import struct
 import grpc
 import pytest
 
-from tests.dataplane.controller import insert, update_errors
+from sdnator.testing.p4runtime_client import insert, update_errors
 
 
 def frame(what=0, *, a=0, b=0, c=0, d=0, e=0):

@@ -10,8 +10,8 @@ import pytest
 
 from dataplane.bmv2 import PROGRAM
 from p4rt import p4runtime
+from sdnator.testing.p4runtime_client import EntryBuilder, P4RuntimeClient, program_config
 from tests.contract.targets import Bmv2Target, EmbeddedTarget, Target
-from tests.dataplane.controller import Controller, Names, program_config
 from tests.requirements import optional_program
 
 PROGRAMS = Path(__file__).resolve().parents[1] / "dataplane" / "programs"
@@ -39,7 +39,7 @@ def config():
 
 @pytest.fixture(scope="session")
 def names(config):
-    return Names(config.p4info)
+    return EntryBuilder(config.p4info)
 
 
 @pytest.fixture
@@ -47,9 +47,9 @@ def connect(target):
     """Opens controllers with ever higher election ids; all are closed afterwards."""
     opened = []
 
-    def open_one(**options) -> Controller:
+    def open_one(**options) -> P4RuntimeClient:
         options.setdefault("election_id", next(_ids))
-        opened.append(Controller(target.address, **options))
+        opened.append(P4RuntimeClient(target.address, **options))
         return opened[-1]
 
     yield open_one
@@ -58,7 +58,7 @@ def connect(target):
 
 
 @pytest.fixture
-def bare(connect) -> Controller:
+def bare(connect) -> P4RuntimeClient:
     """A primary on a switch whose pipeline may be any or none."""
     controller = connect()
     assert controller.arbitrate().status.code == 0
@@ -66,7 +66,7 @@ def bare(connect) -> Controller:
 
 
 @pytest.fixture
-def controller(target, bare, config) -> Controller:
+def controller(target, bare, config) -> P4RuntimeClient:
     """A primary on a switch with the feature program, freshly set and empty."""
     target.drain()
     for entity in _replications(bare):
@@ -75,7 +75,7 @@ def controller(target, bare, config) -> Controller:
     return bare
 
 
-def _replications(controller: Controller) -> list:
+def _replications(controller: P4RuntimeClient) -> list:
     """BMv2 keeps clone sessions and groups when a pipeline is set: delete what other tests left."""
     sessions, groups = p4runtime.Entity(), p4runtime.Entity()
     sessions.packet_replication_engine_entry.clone_session_entry.SetInParent()

@@ -10,8 +10,9 @@ import grpc
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from dataplane.bmv2 import Bmv2
-from dataplane.switch import Backend
-from tests.dataplane.embedded import Embedded
+from dataplane.p4runtime.trust import AnyProgram
+from dataplane.v1model.switch import Backend
+from sdnator.testing.switch_double import SwitchDouble
 
 _WAIT_S = 60.0
 _QUIET_S = 0.15
@@ -35,7 +36,7 @@ class EmbeddedTarget:
 
     def __init__(self, backend: Backend) -> None:
         self.name = f"embedded-{backend}"
-        self._switch = Embedded(backend=backend)
+        self._switch = SwitchDouble(programs=AnyProgram(), backend=backend)
         self.address = self._switch.address
 
     def inject(self, port: int, *frames: bytes) -> None:

@@ -3,8 +3,8 @@
 import pytest
 
 from p4rt import p4runtime
-from tests.apps.p4runtime_ctrl.programs import PROGRAM
-from tests.dataplane.controller import TIMEOUT_S, Names, insert, modify, program_config, text
+from sdnator.testing.p4runtime_client import TIMEOUT_S, EntryBuilder, insert, modify, program_config, text
+from sdnator.testing.product_program import PROGRAM
 
 _HOUR_US = 3_600_000_000
 _ZERO = 1 << 31
@@ -20,7 +20,7 @@ def counting(target, bare):
     target.drain()
     config = program_config(PROGRAM.with_suffix(""))
     bare.set_pipeline(config)
-    names = Names(config.p4info)
+    names = EntryBuilder(config.p4info)
     given = {"bit_of_query": 1, "source_mask": _ADDRESS, "threshold": _ZERO + 2, "size": 64, "generation": 1}
     given |= {"count_of": 9, "reciprocal": -(-(1 << 64) // _HOUR_US)}
     action = names.actions["ingress.count_3.difference"]

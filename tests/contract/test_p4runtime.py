@@ -10,9 +10,7 @@ import grpc
 import pytest
 
 from p4rt import p4runtime
-from tests.contract.asking import codes, entries, flow, forward, frame, ip_frame, route, status_of
-from tests.contract.differences import differs
-from tests.dataplane.controller import (
+from sdnator.testing.p4runtime_client import (
     TIMEOUT_S,
     clone_session,
     delete,
@@ -21,6 +19,8 @@ from tests.dataplane.controller import (
     program_config,
     text,
 )
+from tests.contract.asking import codes, entries, flow, forward, frame, ip_frame, route, status_of
+from tests.contract.differences import differs
 from tests.requirements import shared_data
 
 UNKNOWN, INVALID, NOT_FOUND, EXISTS, DENIED, EXHAUSTED = 2, 3, 5, 6, 7, 8

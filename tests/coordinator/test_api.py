@@ -5,6 +5,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -70,6 +71,10 @@ def north(engine: Engine, registry: Registry) -> Northbound:
             "assignments_sent",
             "failovers",
             "retention_deleted",
+            "refused",
+            "apps",
+            "declared_keys",
+            "epochs",
         )
         return {"leading": True, **dict.fromkeys(counts, 3)}
 
@@ -146,12 +151,69 @@ def test_get_reads_the_archive(client: httpx.Client, engine: Engine) -> None:
 
 @pytest.mark.parametrize(
     "query",
-    ["", "key=a..b", "key=a&since=soon", "query=[1]", "query={", 'query={"colour":1}', "key=a&limit=many"],
+    [
+        "",
+        "key=a..b",
+        "key=a&since=soon",
+        "query=[1]",
+        "query={",
+        'query={"colour":1}',
+        "key=a&limit=many",
+        "query=" + "[" * 9000,
+        "query=" + '{"$nor":[' * 900 + "1" + "]}" * 900,
+        "key=a&since=" + "9" * 5000,
+        'query={"value":{"$regex":"(a)%5C%5C1"}}',
+        "query=" + "x" * 40_000,
+    ],
 )
 def test_wrong_questions_are_explained(client: httpx.Client, query: str) -> None:
     answer = client.get(f"/get?{query}")
     assert answer.status_code == 400
     assert answer.json()["detail"]
+
+
+def test_an_answer_is_bounded_and_brings_the_youngest(
+    client: httpx.Client, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for n in range(5):
+        engine.write("get.large", [n, "x" * 1000])
+    monkeypatch.setattr(api, "_MAX_ANSWER_BYTES", 2500)
+    answer = client.get("/get", params={"key": "get.large", "since": 1}).json()
+    assert [one["value"][0] for one in answer["items"]] == [3, 4]
+    assert answer["more"] is True
+
+
+def test_a_question_that_takes_too_long_is_given_up(
+    client: httpx.Client, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine.write("get.long", 1)
+    monkeypatch.setattr(api, "_QUERY_S", 0.0)
+    answer = client.get("/get?key=get.long")
+    assert (answer.status_code, answer.json()["error"]) == (503, "Timeout")
+
+
+def test_slow_questions_hold_nobody_else_up(
+    client: httpx.Client, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(api, "_WAIT_S", 0.05)
+    asked, answer_now = threading.Semaphore(0), threading.Event()
+
+    def slow(*_query: Any, **_limit: Any) -> list[Item]:
+        asked.release()
+        answer_now.wait(WATCHDOG_S)
+        return []
+
+    monkeypatch.setattr(engine, "get", slow)
+    with ThreadPoolExecutor(api._QUERIES) as pool:
+        waiting = [
+            pool.submit(httpx.get, f"{client.base_url}/get?key=a", trust_env=False, timeout=WATCHDOG_S)
+            for _ in range(api._QUERIES)
+        ]
+        assert all(asked.acquire(timeout=WATCHDOG_S) for _ in waiting)
+        assert client.get("/get?key=a").status_code == 503
+        assert client.get("/instances").status_code == 200
+        answer_now.set()
+        assert [one.result().status_code for one in waiting] == [200] * api._QUERIES
 
 
 def test_observe_sends_items_as_they_come(client: httpx.Client, engine: Engine) -> None:

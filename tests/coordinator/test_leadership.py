@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -141,3 +142,16 @@ def test_whatever_happens_in_the_end_one_leads(happenings: list[tuple[str, int]]
     room.stopped = set()
     room.run(3.0)
     assert len(room.leaders()) == 1
+
+
+def test_a_claim_from_far_ahead_is_not_believed() -> None:
+    """Or whoever says the highest number would keep every Coordinator from leading."""
+    one = Leadership("a", started=1, now=0.0)
+    for _ in range(20):
+        one.tick(one._ticked + STEP)
+    assert one.leading
+    one.heard(Claim(instance_id="b", started=0, term=2**53, leading=True), one._ticked)
+    assert one.leading
+    for term in (2**64, -1):
+        with pytest.raises(msgspec.ValidationError):
+            msgspec.convert({"instance_id": "b", "started": 0, "term": term}, Claim)

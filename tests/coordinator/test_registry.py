@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.registry import Registry, State
+from coordinator.registry import InstanceState, Registry
 from coordinator.selection import STRATEGIES, Candidate
 from due.membership import Assignments, Heartbeat, Registration
 from due.messages import Capability, Interest
@@ -293,7 +293,7 @@ def test_every_strategy_picks_one_of_the_candidates(name: str) -> None:
 
 
 def test_states_are_the_four_of_the_design() -> None:
-    assert [state.value for state in State] == ["active", "idle", "unresponsive", "offline"]
+    assert [state.value for state in InstanceState] == ["active", "idle", "unresponsive", "offline"]
 
 
 def _left_by_a_former_coordinator() -> World:

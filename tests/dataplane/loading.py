@@ -3,9 +3,9 @@
 from functools import cache
 from pathlib import Path
 
-from dataplane.program import load
-from dataplane.switch import Backend
-from dataplane.tree import Program
+from dataplane.v1model.program import load
+from dataplane.v1model.switch import Backend
+from dataplane.v1model.tree import Program
 from tests.requirements import shared_data
 
 _HERE = Path(__file__).resolve().parent
@@ -27,18 +27,6 @@ def sdnator() -> Program:
 def shared(name: str) -> Program:
     """One of the shared programs: small, sketch."""
     return load(shared_data(f"p4/{name}.json").read_text())
-
-
-def ethernet(etype: int, payload: bytes) -> bytes:
-    return bytes.fromhex("020000000002 020000000001") + etype.to_bytes(2, "big") + payload
-
-
-def frame(
-    what: int, a: int = 0, b: int = 0, c: int = 0, d: int = 0, e: int = 0, *, rest: bytes = b""
-) -> bytes:
-    """A frame of features.p4's own type; the header is 20 bytes behind Ethernet."""
-    parts = [(what, 1), (a, 1), (b, 1), (c, 2), (d, 4), (e, 8), (0, 2)]
-    return ethernet(0x88B5, b"".join(v.to_bytes(n, "big") for v, n in parts) + rest)
 
 
 def fields(data: bytes) -> dict[str, int]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dataplane.bmv2 import PROGRAM, Bmv2, Bmv2Error
-from tests.dataplane.controller import Controller
+from sdnator.testing.p4runtime_client import P4RuntimeClient
 from tests.requirements import optional_program
 
 
@@ -40,7 +40,7 @@ def test_it_serves_on_loopback_and_ends():
     optional_program(PROGRAM)
     with Bmv2({}, device_id=3) as switch:
         assert switch.address.startswith("127.0.0.1:")
-        with Controller(switch.address, device_id=3) as controller:
+        with P4RuntimeClient(switch.address, device_id=3) as controller:
             assert controller.arbitrate().status.code == 0
         pid = switch.pid
     assert not Path(f"/proc/{pid}").exists()

@@ -6,12 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from dataplane.device import Device
+from dataplane.p4runtime.device import Device
+from dataplane.p4runtime.trust import AnyProgram
 from dataplane.packet_loop import PacketClock, PacketLoop
-from dataplane.ports import MemoryPort
-from tests.dataplane.controller import TIMEOUT_S, Controller, Names, insert, modify, program_config
-from tests.dataplane.embedded import Embedded
-from tests.dataplane.test_device import until
+from dataplane.ports.port import MemoryPort
+from sdnator.testing.p4runtime_client import (
+    TIMEOUT_S,
+    EntryBuilder,
+    P4RuntimeClient,
+    insert,
+    modify,
+    program_config,
+)
+from sdnator.testing.switch_double import SwitchDouble
+from tests.dataplane.p4runtime.test_device import until
 
 PROGRAM = Path(__file__).parent / "programs" / "features"
 
@@ -43,11 +51,11 @@ def test_stopping_is_no_fault():
 
 
 def test_frames_for_ports_that_do_not_exist_are_counted():
-    with Embedded() as switch, Controller(switch.address) as controller:
+    with SwitchDouble(programs=AnyProgram()) as switch, P4RuntimeClient(switch.address) as controller:
         config = program_config(PROGRAM)
         controller.arbitrate()
         controller.set_pipeline(config)
-        names = Names(config.p4info)
+        names = EntryBuilder(config.p4info)
         controller.write(insert(names.entry("I.ports", {"sm.ingress_port": 1}, "I.forward", [99])))
         controller.write(insert(names.entry("I.ports", {"sm.ingress_port": 2}, "I.forward", [3])))
         switch.memory[1].inject(bytes(60))
@@ -59,11 +67,11 @@ def test_frames_for_ports_that_do_not_exist_are_counted():
 
 def test_no_frame_sees_half_of_an_atomic_batch():
     """One of two tables drops every frame, in turns; only a half batch would let a frame through."""
-    with Embedded() as switch, Controller(switch.address) as controller:
+    with SwitchDouble(programs=AnyProgram()) as switch, P4RuntimeClient(switch.address) as controller:
         config = program_config(PROGRAM)
         controller.arbitrate()
         controller.set_pipeline(config)
-        names = Names(config.p4info)
+        names = EntryBuilder(config.p4info)
 
         def port(action, params=()):
             return names.entry("I.ports", {"sm.ingress_port": 1}, action, params)

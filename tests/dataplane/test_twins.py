@@ -5,13 +5,13 @@ from random import Random
 
 import pytest
 
-from dataplane.externs import MeterConfig
-from dataplane.switch import Replica, Switch
-from dataplane.tables import TableError
-from dataplane.tree import Program
-from tests.dataplane import counting_traffic
+from dataplane.v1model.externs import MeterConfig
+from dataplane.v1model.switch import Replica, Switch
+from dataplane.v1model.tables import TableError
+from dataplane.v1model.tree import Program
+from sdnator.testing import counting_traffic
+from sdnator.testing.switch_traffic import Chooser, Maker, feature_frame, network_frame
 from tests.dataplane.loading import BACKENDS, features, sdnator, shared
-from tests.dataplane.traffic import Chooser, Maker, feature_frame, network_frame
 
 _FRAMES = 600
 _COUNTING_FRAMES = 1500
@@ -67,6 +67,9 @@ def fill(chooser: Chooser, switches: list[Switch]) -> None:
 
 def compare_state(one: Switch, two: Switch, now_us: int) -> None:
     assert one.statistics() == two.statistics()
+    assert one.out_of_range() == two.out_of_range()
+    if one.program is sdnator():
+        assert one.out_of_range() == {}
     for name, table in one.tables.items():
         twin = two.tables[name]
         for entry in table.entries():
@@ -168,4 +171,6 @@ def test_bad_frames_are_survived_and_counted(case, backend):
         assert len(result.verdicts) == len(frames)
     assert switch.statistics()["frames"] == 2 * len(frames)
     assert switch.statistics()["parser_errors"] > 0
+    if case != "features":
+        assert switch.out_of_range() == {}
     switch.close()

@@ -26,4 +26,4 @@ def test_a_coroutine_receives_items_in_order(make_engine):
         return [number for number in got if number >= 0]
 
     assert asyncio.run(main()) == list(range(100))
-    wait_for(lambda: not engine._session.dispatcher._observations)
+    wait_for(lambda: not engine._session.dispatcher._routes.observations)

@@ -8,7 +8,8 @@ import pytest
 from due.archiver import Archiver
 from due.codec import pack, unpack
 from due.drivers.spool import DiskSpool
-from due.errors import ArchiveUnavailable, BackendError
+from due.drivers.sqlite import SqliteArchive
+from due.errors import ArchiveUnavailable, BackendError, Timeout
 from due.messages import Item
 from tests.due.conftest import wait_for
 
@@ -52,6 +53,21 @@ def _frame(first: int, count: int = 10):
 @pytest.fixture
 def shelf():
     return Shelf()
+
+
+def test_a_frame_that_no_archive_can_hold_is_counted_and_costs_no_other(tmp_path):
+    archive = SqliteArchive(f"sqlite://{tmp_path / 'archive.db'}")
+    archiver = Archiver(archive)
+    late = msgspec.structs.replace(_frame(20), first_event_time=2**63, last_event_time=2**63)
+    for frame in (_frame(0), late, _frame(40)):
+        archiver.put(frame)
+    archiver.flush(60)
+    assert (archiver.statistics()["archived"], archiver.statistics()["refused"]) == (20, 10)
+    archiver.put(_frame(60))
+    archiver.flush(60)
+    assert len(archive.find({})) == 30
+    archiver.close()
+    archive.close()
 
 
 def test_flush_means_archived(shelf):
@@ -156,6 +172,45 @@ def test_one_bad_frame_does_not_cost_the_others_of_its_batch(shelf):
     archiver.put(_frame(30))
     archiver.flush(20)
     assert max(shelf.items) == 39
+    archiver.close()
+
+
+def _fill(spool):
+    """No page more: what SQLite says then is what it says on a full disk."""
+    (pages,) = spool._file.execute("PRAGMA page_count").fetchone()
+    spool._file.execute(f"PRAGMA max_page_count = {pages}")
+
+
+def test_frames_wait_while_a_full_disk_takes_neither_archive_nor_spool(shelf, tmp_path):
+    """Archive and spool often stand on one disk; `flush` does not say that all is well meanwhile."""
+    spool = Bare(tmp_path, 1 << 20)
+    _fill(spool)
+    shelf.problem = ArchiveUnavailable("database or disk is full")
+    archiver = Archiver(shelf, spool)
+    for first in range(0, 1000, 10):
+        archiver.put(_frame(first))
+    with pytest.raises(Timeout):
+        archiver.flush(0.5)
+    shelf.problem = None
+    archiver.flush(60)
+    assert sorted(shelf.items) == list(range(1000))
+    assert archiver.statistics()["lost"] == 0
+    archiver.close()
+
+
+def test_on_a_full_disk_writers_do_not_wait_for_ever(shelf, tmp_path):
+    """What the queue cannot hold is lost and counted; what it holds is archived later."""
+    spool = Bare(tmp_path, 1 << 20)
+    _fill(spool)
+    shelf.problem = ArchiveUnavailable("database or disk is full")
+    archiver = Archiver(shelf, spool, queue_bytes=20_000)
+    for first in range(0, 1000, 10):
+        archiver.put(_frame(first))
+    shelf.problem = None
+    archiver.flush(60)
+    counts = archiver.statistics()
+    assert counts["lost"] > 0
+    assert counts["lost"] + len(shelf.items) == 1000
     archiver.close()
 
 

@@ -324,3 +324,9 @@ def test_idle_outlets_are_put_away_and_their_numbers_go_on(make_engine, monkeypa
     assert health["outlets"] <= 60
     assert health["written"] == 600
     assert health["receiving"]["gaps"] == health["receiving"]["repeats"] == 0
+
+
+@pytest.mark.parametrize("app_id", ["", "<b>", "a.b", "*", "a\n", "a" * 65])
+def test_app_ids_that_no_key_could_hold(app_id):
+    with pytest.raises(InvalidOption, match="app id"):
+        Engine().init(app_id)

@@ -30,6 +30,10 @@ def test_a_foreign_detector_is_wrapped_in_fewer_than_ten_lines():
     assert len(_lines("foreign_detector.py", "wrapper")) < 10
 
 
+def test_a_detector_of_a_library_is_wrapped_in_at_most_ten_lines():
+    assert len(_lines("river_detector.py", "wrapper")) <= 10
+
+
 def test_the_node_client_has_at_most_150_lines():
     assert len((EXAMPLES / "client.mjs").read_text().splitlines()) <= 150
 
@@ -79,6 +83,25 @@ def test_the_foreign_detector_scores(server, make_engine, tmp_path):
         wait_for(lambda: scores)
         process.communicate("\n", timeout=30)
     assert scores == [[0.0, 0.0, 960.0]]
+
+
+def test_half_space_trees_score_what_is_unlike_what_they_learnt(server, make_engine, tmp_path):
+    controller = make_engine("p4runtime_ctrl")
+    scores = []
+    controller.observe("network.anomaly.half_space_trees.score").subscribe(
+        lambda item: scores.extend(item.value)
+    )
+    usual = RecordBatch({"length": np.tile([60, 80], 600), "tcp_dport": np.full(1200, 443)})
+    odd = RecordBatch({"length": np.array([1500]), "tcp_dport": np.array([23])})
+    with _start("river_detector.py", server, tmp_path) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("Enter")
+        for batch in (usual, odd):
+            controller.write("network.packets.p4runtime_ctrl.s1.all", batch, [PUB_ONLY])
+            controller.flush()
+        wait_for(lambda: len(scores) == 1201)
+        process.communicate("\n", timeout=30)
+    assert scores[-1] > 1.1 * max(scores[600:1200])
 
 
 NODE = """

@@ -1,6 +1,11 @@
 """A member buffers, then works alone or as assigned; it never speaks under an older epoch or while in doubt."""
 
+from contextlib import suppress
+
+import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from due.keys import Key
 from due.membership import (
@@ -166,3 +171,64 @@ def test_messages_survive_the_wire(message):
     from due.codec import decode_value, encode_value
 
     assert type(message).from_value(decode_value(encode_value(message.to_value()))) == message
+
+
+VALUES = {
+    Registration: _member().registration.to_value(),
+    Heartbeat: _member().beat().to_value(),
+    Assignments: _assignments(assignments=(_wants("n.**", 2.5),)).to_value(),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "value"),
+    [
+        (Registration, "app_id", "<img src=x>"),
+        (Registration, "app_id", "kitsune\n"),
+        (Registration, "app_id", ""),
+        (Registration, "app_id", "a" * 65),
+        (Registration, "instance_id", "i'"),
+        (Registration, "heartbeat", float("nan")),
+        (Registration, "heartbeat", 0.0),
+        (Registration, "heartbeat", 1e9),
+        (Registration, "started", 2**63),
+        (Registration, "revision", -1),
+        (Registration, "host", "h" * 256),
+        (Registration, "capabilities", [{"key": "a.b"}] * 16_385),
+        (Registration, "capabilities", [{"key": "a.b", "frequency": -1.0}]),
+        (Registration, "capabilities", [{"key": "a.b", "frequency": 1e-320}]),
+        (Registration, "capabilities", [{"key": "a." * 1000}]),
+        (Registration, "interests", [{"key": "a.b", "frequency": [1.0, float("inf")]}]),
+        (Heartbeat, "epoch", 2**64 - 1),
+        (Heartbeat, "epoch", 2**32 - 1),
+        (Heartbeat, "epoch", -1),
+        (Heartbeat, "received", 2**64 - 1),
+        (Heartbeat, "app_id", "x y"),
+        (Assignments, "epoch", 2**62),
+        (Assignments, "active", "<b>"),
+        (Assignments, "revisions", {"<b>": 1}),
+        (Assignments, "assignments", [{"key": "n.**", "frequency": float("nan")}]),
+        (Assignments, "assignments", [{"key": "not a key"}]),
+    ],
+)
+def test_messages_out_of_range_are_refused_with_one_error(kind, field, value):
+    kind.from_value(VALUES[kind])
+    with pytest.raises(msgspec.ValidationError):
+        kind.from_value({**VALUES[kind], field: value})
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(st.sampled_from(list(VALUES)), st.data())
+def test_whatever_stands_in_a_message_there_is_one_error(kind, data):
+    value = dict(VALUES[kind])
+    for field in data.draw(st.lists(st.sampled_from(sorted(value)), max_size=3)):
+        value[field] = data.draw(anything)
+    for wrong in (value, data.draw(anything)):
+        with suppress(msgspec.ValidationError):
+            kind.from_value(wrong)

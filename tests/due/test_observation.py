@@ -1,13 +1,16 @@
 """A tracker drops what came already, counts what is missing, and hears no replaced instance."""
 
+import pytest
 import reactivex.operators as ops
 from hypothesis import given
 from hypothesis import strategies as st
 
-from due.codec import Frame
+from due.codec import MAX_EPOCH, Frame
+from due.errors import RefusedFrame
 from due.keys import Key
 from due.messages import Item
-from due.observation import Observation, Tracker, deliver
+from due.observation import Observation, deliver
+from due.tracker import CONFIRMED, FAR, KEPT, Tracker
 
 
 def _frame(before, count=2, *, instance="i", epoch=0, key="a.b"):
@@ -26,11 +29,17 @@ def test_lost_items_are_counted_exactly(arrives, count):
     assert tracker.gaps == count * arrives[first:last].count(False)
 
 
-@given(st.lists(st.integers(0, 9), max_size=40))
-def test_repeats_are_dropped_and_order_never_goes_back(order):
+@given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 5)), min_size=1, max_size=30))
+def test_what_a_producer_sends_again_is_dropped_and_order_never_goes_back(steps):
     tracker = Tracker(shared=False)
-    admitted = [n for n in order if tracker.admit(_frame(2 * n), reliable=True)]
-    assert admitted == sorted(set(admitted))
+    written, admitted, number = [], [], 0
+    for step, again in steps:
+        number += step
+        written.append(number)
+        came = written[-1 - again :]
+        admitted += [n for n in came if tracker.admit(_frame(2 * n), reliable=True)]
+    assert admitted == written
+    assert tracker.refuted == 0
 
 
 @given(st.lists(st.integers(0, 9), max_size=40))
@@ -55,6 +64,59 @@ def test_an_older_epoch_under_the_same_path_is_fenced_off():
     assert not tracker.admit(_frame(2, instance="old", epoch=1), reliable=True)
     assert tracker.admit(_frame(0, instance="old", epoch=1, key="a.other"), reliable=True)
     assert tracker.fenced == 2
+
+
+@pytest.mark.parametrize("jump", [1, 1000, 2**30, FAR - 200])
+def test_a_false_jump_costs_none_of_the_genuine_frames(jump):
+    tracker = Tracker(shared=False)
+    assert tracker.admit(_frame(0), reliable=True)
+    tracker.admit(_frame(2 + jump), reliable=True)
+    tracker.admit(_frame(104 + jump), reliable=True)
+    assert all(tracker.admit(_frame(n), reliable=True) for n in range(2, 50, 2))
+    assert (tracker.refuted, tracker.repeats) == (1, 0)
+
+
+def test_a_jump_that_no_outage_explains_is_refused_and_changes_nothing():
+    tracker = Tracker(shared=False)
+    assert tracker.admit(_frame(0), reliable=True)
+    for before in (2**40, 2**61):
+        with pytest.raises(RefusedFrame) as refused:
+            tracker.admit(_frame(before), reliable=True)
+        assert refused.value.cause == "out_of_range"
+    assert tracker.admit(_frame(2), reliable=True)
+    assert (tracker.gaps, tracker.repeats) == (0, 0)
+
+
+def test_a_false_first_frame_is_seen_by_frames_from_before_all_that_could_be_kept():
+    tracker = Tracker(shared=False)
+    assert tracker.admit(_frame(2**61), reliable=True)
+    assert all(tracker.admit(_frame(n), reliable=True) for n in range(KEPT - 10, KEPT, 2))
+    assert tracker.refuted == 1
+
+
+def test_a_jump_counts_once_the_numbers_behind_it_have_gone_on():
+    tracker = Tracker(shared=False)
+    tracker.admit(_frame(0), reliable=True)
+    assert all(tracker.admit(_frame(10 + 2 * n), reliable=True) for n in range(CONFIRMED + 1))
+    assert not tracker.admit(_frame(2), reliable=True)
+    assert (tracker.gaps, tracker.repeats) == (8, 2)
+
+
+def test_what_another_instance_read_while_this_one_rested_is_not_read_again():
+    tracker = Tracker(shared=False)
+    tracker.admit(_frame(0), reliable=True)
+    tracker.rested()
+    assert tracker.admit(_frame(10), reliable=True)
+    assert not tracker.admit(_frame(2), reliable=True)
+
+
+def test_an_epoch_that_its_own_writer_denies_fences_nobody():
+    tracker = Tracker(shared=False)
+    assert tracker.admit(_frame(0, epoch=3), reliable=True)
+    tracker.admit(_frame(2, epoch=MAX_EPOCH), reliable=True)
+    assert all(tracker.admit(_frame(n, epoch=3), reliable=True) for n in (4, 6))
+    assert not tracker.admit(_frame(0, epoch=2, instance="older"), reliable=True)
+    assert (tracker.fenced, tracker.refuted) == (2, 1)
 
 
 def _observation(**options):

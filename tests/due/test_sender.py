@@ -5,15 +5,15 @@ import threading
 
 import pytest
 
+from due.key_writer import PUBLISH, KeyWriter
 from due.keys import Key
-from due.outlet import PUBLISH, Outlet
-from due.sender import Agenda, Pressure, Sender
+from due.sender import Agenda, BatchSender, Pressure
 
 PATIENCE = 30.0
 
 
-def _outlet(sink=lambda *_: None, dirty=lambda _: None) -> Outlet:
-    return Outlet(Key("a.b"), "app", "inst", frame_bytes=1000, single_bytes=300, sink=sink, dirty=dirty)
+def _outlet(sink=lambda *_: None, dirty=lambda _: None) -> KeyWriter:
+    return KeyWriter(Key("a.b"), "app", "inst", frame_bytes=1000, single_bytes=300, sink=sink, dirty=dirty)
 
 
 def test_handing_over_the_interpreter_is_no_pressure():
@@ -74,7 +74,7 @@ def visits():
     def service(outlet, _now):
         outlet.cut()
 
-    sender = Sender(0.001, service, lambda _outlet: False)
+    sender = BatchSender(0.001, service, lambda _outlet: False)
     sender.start()
     outlet = _outlet(sink, sender.dirty)
     outlet.fast = True
@@ -104,7 +104,7 @@ def test_what_follows_full_frames_is_sent_too(visits):
 
 
 def test_a_paced_outlet_is_not_postponed_by_its_writer():
-    sender = Sender(1000.0, lambda *_: None, lambda _: False)
+    sender = BatchSender(1000.0, lambda *_: None, lambda _: False)
     outlet = _outlet()
     sender.dirty(outlet)
     due, outlet.stay = outlet.due, 1e6

@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 import urllib.request
 from pathlib import Path
 
 import pytest
 
+from due import NO_WAIT
 from tests.due.conftest import gone, wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -48,14 +50,11 @@ def start(tmp_path, server):
     program.write_text(textwrap.dedent(APP))
     started = []
 
-    def run(*arguments):
+    def run(*arguments, **options):
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "DUE_DIRECTORY": str(tmp_path)}
         command = [sys.executable, str(program), "--updates", server.url, *arguments]
-        started.append(
-            subprocess.Popen(
-                command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-            )
-        )
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        started.append(subprocess.Popen(command, env=environment, text=True, **pipes, **options))
         return started[-1]
 
     yield run
@@ -131,6 +130,9 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
         (["--metrics", "203.0.113.1:80"], "203.0.113.1:80"),
         (["--settings", "/nowhere.json"], "/nowhere.json"),
         (["--settings", "{folder}/wrong.json"], "factr"),
+        (["--settings", "{folder}/deep.json"], "deep.json"),
+        (["--settings", "{folder}/bytes.json"], "bytes.json"),
+        (["--settings", "/dev/zero"], "/dev/zero"),
         (["--archive", "ftp://x"], "ftp://x"),
         (["--updates", "http://x"], "http://x"),
         (["--updates", "redis://127.0.0.1:1/0"], "127.0.0.1:1"),
@@ -138,6 +140,8 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
 )
 def test_a_wrong_option_is_one_clear_line(start, tmp_path, arguments, text):
     (tmp_path / "wrong.json").write_text('{"factr": 3}')
+    (tmp_path / "deep.json").write_text('{"factor": ' + "[" * 100_000)
+    (tmp_path / "bytes.json").write_bytes(b'{"factor": "\xff"}')
     process = start(*(a.format(folder=tmp_path) for a in arguments))
     _, stderr = process.communicate(timeout=60)
     assert process.returncode in (1, 2)
@@ -172,3 +176,97 @@ def test_a_service_ends_with_its_parent(tmp_path, server):
         child = int(parent.stdout.readline())
         parent.kill()
     wait_for(lambda: gone(child))
+
+
+BREAKABLE = (
+    APP.replace('lambda i: self.engine.write("svc.out", i.value * self.settings.factor)', "self.handle")
+    .replace(
+        "    def tick(self):\n",
+        """    def handle(self, item):
+        if item.value == "die":
+            raise SystemExit
+        if item.value == "hang":
+            time.sleep(3600)
+        if item.value == "hang main":
+            self.hang = True
+    hang = False
+    def tick(self):
+        while self.hang:
+            time.sleep(3600)
+""",
+    )
+    .replace("import sys\n", "import sys, time\n", 1)
+)
+
+
+@pytest.fixture
+def breakable(start, tmp_path, make_engine):
+    """Starts the app with a pipe for its heartbeats: the process, its ready line, the pipe and a way to break it."""
+    (tmp_path / "app.py").write_text(textwrap.dedent(BREAKABLE))
+    reading, writing = os.pipe()
+    os.set_inheritable(writing, True)
+
+    def run(*arguments):
+        process = start("--heartbeat-fd", str(writing), *arguments, close_fds=False)
+        ready = json.loads(process.stdout.readline())
+        engine = make_engine("outside")
+        return process, ready, lambda what: engine.write("svc.in", what, [NO_WAIT])
+
+    yield run, reading
+    os.close(reading)
+    os.close(writing)
+
+
+def _beats(reading, seconds):
+    """The bytes of so many seconds."""
+    os.set_blocking(reading, False)
+    came, end = b"", time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(0.05)
+        try:
+            came += os.read(reading, 100)
+        except BlockingIOError:
+            continue
+    return came
+
+
+def test_a_byte_about_every_second_says_that_all_threads_answer(breakable):
+    run, reading = breakable
+    run()
+    wait_for(lambda: len(_beats(reading, 3.0)) >= 2)
+
+
+@pytest.mark.parametrize("what", ["hang", "hang main"])
+def test_a_service_that_hangs_writes_no_more_heartbeats(breakable, what):
+    run, reading = breakable
+    process, _, break_it = run()
+    wait_for(lambda: _beats(reading, 0.1))
+    break_it(what)
+    wait_for(lambda: not _beats(reading, 3.0))
+    assert process.poll() is None
+
+
+def test_healthz_says_that_a_callback_takes_long(breakable):
+    run, _ = breakable
+    _, ready, break_it = run("--metrics", "127.0.0.1:0")
+    break_it("hang")
+    wait_for(lambda: json.loads(_fetch(ready["metrics"], "/healthz")[1])["status"] == "busy")
+    status, text = _fetch(ready["metrics"], "/healthz")
+    assert (status, json.loads(text)["dispatcher_s"] > 0) == (200, True)
+
+
+def test_a_service_whose_dispatcher_dies_ends_with_a_word(breakable):
+    run, _ = breakable
+    process, _, break_it = run()
+    break_it("die")
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "the thread due-dispatcher died" in stderr
+    assert "SystemExit" in stderr
+
+
+def test_a_heartbeat_descriptor_that_is_not_open_is_refused(start):
+    process = start("--heartbeat-fd", "999")
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "--heartbeat-fd 999" in stderr

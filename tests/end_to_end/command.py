@@ -1,18 +1,29 @@
 """The `sdnator` command as a user runs it."""
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 SECONDS = 170
 
 
-def sdnator(*arguments: str | Path, seconds: float = SECONDS) -> subprocess.CompletedProcess[str]:
+def sdnator(
+    *arguments: str | Path, seconds: float = SECONDS, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run the command to its end, standard output and error as text."""
-    command = [sys.executable, "-m", "sdnator.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+    command = [sys.executable, "-m", "sdnator.cli.main", *map(str, arguments)]
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=seconds,
+        check=False,
+        env=os.environ | dict(environment or {}),
+    )
 
 
 def figures(*arguments: str | Path) -> dict[str, Any]:

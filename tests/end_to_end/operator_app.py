@@ -1,7 +1,14 @@
 """The operator's commands as a program: `python -m tests.end_to_end.operator_app up`, errors as the product tells them."""
 
-from sdnator import coordinator_commands, doctor, due_commands, status_command, switch_commands, up_command
-from sdnator.cli import app, main
+from sdnator.cli import (
+    coordinator_commands,
+    doctor,
+    due_commands,
+    status_command,
+    switch_commands,
+    up_command,
+)
+from sdnator.cli.main import app, main
 
 COMMANDS = (
     up_command.up,

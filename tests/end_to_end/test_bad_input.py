@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sdnator.datasets.mirai_like import Options, make
+from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from tests.end_to_end.command import figures, sdnator
 
 MARK = "SDNATOR_TEST_RUN"
@@ -22,7 +22,7 @@ SECONDS = 120
 def capture(tmp_path_factory):
     """A short generated capture: a few thousand packets, no attack."""
     path = tmp_path_factory.mktemp("capture") / "home.pcap"
-    make(Options(seed=9, benign_seconds=200, attack_seconds=0), path)
+    make(MiraiLikeOptions(seed=9, benign_seconds=200, attack_seconds=0), path)
     return path
 
 
@@ -71,7 +71,7 @@ def test_capture_shorter_than_training_names_the_options(capture):
     ],
 )
 def test_wrong_option_is_named(capture, options, word):
-    """Before anything is started; tests/sdnator/test_replay_command.py has the other options."""
+    """Before anything is started; tests/sdnator/cli/test_replay_command.py has the other options."""
     done = sdnator("replay", capture, "--train", "1000", *options)
     assert done.returncode == 2
     assert word in told(done)
@@ -126,7 +126,7 @@ def running(capture, tmp_path):
     keep = tmp_path / "keep"
     report = tmp_path / "report"
     command = [
-        sys.executable, "-m", "sdnator.cli", "replay", str(capture),
+        sys.executable, "-m", "sdnator.cli.main", "replay", str(capture),
         "--train", "1000", "--pace", "1x", "--report", str(report), "--keep", str(keep), "--json",
     ]  # fmt: skip
     run = uuid.uuid4().hex
@@ -152,7 +152,7 @@ def test_ctrl_c_leaves_nothing_behind(running):
     out, error = process.communicate(timeout=SECONDS)
     assert process.returncode == 130
     assert "Traceback" not in error
-    assert error.rstrip().endswith("sdnator: interrupted; nothing was left running")
+    assert error.rstrip().endswith("sdnator: interrupted; all processes are stopped")
     assert out == ""
     assert not report.exists()
     assert processes_of(run) == []

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from due.drivers.sqlite import SqliteArchive
-from sdnator.datasets.mirai_like import Options, make
+from sdnator.capture.interfaces import VethPair
+from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from sdnator.datasets.rebuild import rebuild
-from sdnator.wire import VethPair
 from tests.end_to_end.command import figures, sdnator
 from tests.requirements import optional_program, require_netns, shared_data
 
@@ -47,7 +47,7 @@ def attacked_capture(real_capture):
 def short_capture(tmp_path_factory):
     """Four minutes of harmless traffic, half a one of an attack."""
     path = tmp_path_factory.mktemp("short") / "short.pcap"
-    make(Options(seed=4, benign_seconds=240, attack_seconds=30), path)
+    make(MiraiLikeOptions(seed=4, benign_seconds=240, attack_seconds=30), path)
     return path
 
 
@@ -74,7 +74,7 @@ def test_scores_of_the_real_packets_are_the_published_detectors(real_capture, tm
 
 
 def test_nobody_is_blocked_in_the_real_harmless_traffic(real_capture):
-    """33 packets of the gateway score over the line; they raise alerts, and nobody is cut off."""
+    """33 packets of the gateway score above the threshold; they raise alerts, and nobody is cut off."""
     found = figures("replay", real_capture, "--fm-grace", "2000", "--ad-grace", "10000")
     assert (found["blocks"], found["packets_dropped"], found["packets_lost"]) == ([], 0, 0)
     assert found["alerts"] == 3
@@ -118,13 +118,14 @@ def test_flood_answered_by_its_victim_blocks_the_flooder_only(tmp_path):
     assert found["packets_lost"] == 0
 
 
-def test_everything_decided_is_in_the_archive(tmp_path):
-    """Alerts, score summaries, decisions and confirmations are found again after the run."""
+def test_everything_decided_is_in_the_archive(tmp_path, monkeypatch):
+    """Alerts, scores, decisions and confirmations are found again, in a folder given relative to the current one."""
+    monkeypatch.chdir(tmp_path)
     capture = tmp_path / "short.pcap"
-    make(Options(seed=4, benign_seconds=600, attack_seconds=120), capture)
+    make(MiraiLikeOptions(seed=4, benign_seconds=600, attack_seconds=120), capture)
     keep = tmp_path / "keep"
     labels = tmp_path / "short.labels.csv"
-    found = figures("replay", capture, "--labels", labels, "--train", "9000", "--keep", keep)
+    found = figures("replay", capture, "--labels", labels, "--train", "9000", "--keep", "keep")
     archive = SqliteArchive(f"sqlite:///{keep / 'with-blocking' / 'archive.db'}")
     try:
         assert len(archive.find({"dataKey": "network.anomaly.kitsune.alert"})) == found["alerts"]

@@ -4,7 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
-from tests.apps.p4runtime_ctrl.stage import Stage
+from sdnator.testing.controller_run import ControllerRun
 from tests.end_to_end.command import sdnator
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "sonata.md").read_text(encoding="utf-8")
@@ -21,7 +21,7 @@ def test_commands_for_a_running_pipeline(tmp_path, monkeypatch):
     (query,) = re.findall(r"```text\n(.*?)```", TEXT, re.DOTALL)
     file = tmp_path / "my_scan.sonata"
     file.write_text(query)
-    with Stage(tmp_path) as stage:
+    with ControllerRun(tmp_path) as stage:
         stage.run("apps.sonata_adapter.service", {})
         stage.controller()
         where = {"observe": ["--updates", stage.server.url], "get": ["--archive", stage.archive]}

@@ -6,9 +6,10 @@ import sys
 
 import pytest
 
-from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, end, wait_for
-from tests.apps.sonata_adapter.traffic import BASE_US as TRAFFIC_US
-from tests.apps.sonata_adapter.traffic import mixed
+from sdnator.testing.controller_run import BASE_US, ControllerRun, Heard
+from sdnator.testing.query_traffic import BASE_US as TRAFFIC_US
+from sdnator.testing.query_traffic import mixed
+from sdnator.testing.waiting import wait_for
 from tests.end_to_end.command import sdnator
 
 PREFIX = "network.traffic_query.sonata"
@@ -17,7 +18,7 @@ KEY = f"{PREFIX}.new_tcp:threshold=10,window=2s"
 
 @pytest.fixture
 def stage(tmp_path):
-    with Stage(tmp_path) as stage:
+    with ControllerRun(tmp_path) as stage:
         stage.run("apps.sonata_adapter.service", {})
         yield stage
 
@@ -28,7 +29,16 @@ def telemetry(states):
 
 
 def observer(stage, *options):
-    command = [sys.executable, "-m", "sdnator.cli", "observe", KEY, "--updates", stage.server.url, *options]
+    command = [
+        sys.executable,
+        "-m",
+        "sdnator.cli.main",
+        "observe",
+        KEY,
+        "--updates",
+        stage.server.url,
+        *options,
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -63,14 +73,16 @@ def test_the_last_consumers_death_takes_the_query_out_of_the_switch(stage):
         # both are known by now, or the second is the one that keeps the entry
         line = leaving.stdout.readline()
         assert json.loads(line)["records"] >= 0
-        stage.kill(killed)
+        killed.kill()
         leaving.terminate()
         _, told = finished(leaving)
         assert "0 items" in told
         wait_for(lambda: telemetry(states) == [], 60, stage.log)
     finally:
         for process in (killed, leaving):
-            end(process)
+            process.kill()
+            process.wait(60)
+            process.stdout.close()
             process.stderr.close()
 
 

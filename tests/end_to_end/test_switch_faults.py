@@ -1,10 +1,11 @@
 """Whatever is killed, real processes end up with a switch that holds what it should, and nothing else."""
 
-from apps.p4runtime_ctrl.session import Address, Pipeline, Session
+from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram, P4RuntimeSession
 from due import Capability
 from p4rt import P4RuntimeStub
-from tests.apps.p4runtime_ctrl.programs import program
-from tests.apps.p4runtime_ctrl.stage import Heard, Stage, block, wait_for
+from sdnator.testing.controller_run import ControllerRun, Heard, block
+from sdnator.testing.product_program import program
+from sdnator.testing.waiting import wait_for
 from tests.requirements import optional_program
 
 DECISIONS = Capability("network.block.firewall.*", delivery="reliable", archive="always")
@@ -15,7 +16,9 @@ def entries_of(address):
     """What a switch holds in the tables of blocks and wires; reading needs no rights over it."""
     where = Address(address, 1, 0)
     with where.channel() as channel:
-        session = Session(P4RuntimeStub(channel), where, Pipeline(b"", program().message), None)
+        session = P4RuntimeSession(
+            P4RuntimeStub(channel), where, CompiledProgram(b"", program().message), None
+        )
         try:
             found = [program().describe(entry) for entry in session.read_entries() if not entry.is_const]
         except Exception as error:  # noqa: BLE001 - the switch may be starting; the wait goes on
@@ -66,7 +69,7 @@ def holds(stage, firewall, *blocked, wire=True):
 def test_bmv2_and_controller_are_killed_while_decisions_go_on(tmp_path):
     """What tests/apps/p4runtime_ctrl/faults shows with the embedded switch."""
     optional_program("simple_switch_grpc")
-    with Stage(tmp_path, kind="bmv2") as stage:
+    with ControllerRun(tmp_path, kind="bmv2") as stage:
         controller = stage.controller()
         firewall = Firewall(stage)
         for source in (1, 2, 3):
@@ -89,21 +92,21 @@ def test_bmv2_and_controller_are_killed_while_decisions_go_on(tmp_path):
 
 def test_a_killed_controller_leaves_its_switch_closed_where_that_is_configured(tmp_path):
     """That it stays open otherwise is shown in tests/apps/p4runtime_ctrl/faults."""
-    with Stage(tmp_path, fail="closed") as stage:
+    with ControllerRun(tmp_path, fail="closed") as stage:
         controller = stage.controller()
         firewall = Firewall(stage)
         firewall.decide(1)
         holds(stage, firewall, 1)
         stage.kill(controller)
         holds(stage, firewall, 1, wire=False)
-        wait_for(lambda: "fail closed, the wires are out" in stage.log(), SECONDS, why=stage.log)
+        wait_for(lambda: "fail closed, port forwarding is removed" in stage.log(), SECONDS, why=stage.log)
         stage.controller()
         holds(stage, firewall, 1)
         wait_for(lambda: firewall.state().get("primary") and firewall.state()["fail"] == "closed", SECONDS)
 
 
 def test_an_earlier_run_in_the_same_archive_can_be_left_behind(tmp_path):
-    with Stage(tmp_path) as stage:
+    with ControllerRun(tmp_path) as stage:
         first = stage.controller()
         firewall = Firewall(stage)
         firewall.decide(1)

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from sdnator.syn_flood import VOID_FROM, guard, named, start_product
-from sdnator.syn_flood_lab import PLANS, Lab
-from sdnator.syn_flood_records import success
-from sdnator.syn_flood_stage import Stage
-from sdnator.syn_flood_trial import Field, Outcome, Trial
+from sdnator.demos.syn_flood.demo import VOID_FROM, guard, named, start_product
+from sdnator.demos.syn_flood.lab import PLANS, Lab
+from sdnator.demos.syn_flood.records import success
+from sdnator.demos.syn_flood.stage import FloodStage
+from sdnator.demos.syn_flood.trial import Trial, TrialHosts, TrialOutcome
 from tests.requirements import require_netns, shared_data
 
 pytestmark = pytest.mark.slow
@@ -35,10 +35,10 @@ def namespaces() -> str:
 class Ground:
     """A running stage, and what happened on it before the product was there."""
 
-    field: Field
-    unprotected: Outcome
+    field: TrialHosts
+    unprotected: TrialOutcome
 
-    def flood(self, sources, service: int, *, seconds: float = 4.2, **changes) -> Outcome:
+    def flood(self, sources, service: int, *, seconds: float = 4.2, **changes) -> TrialOutcome:
         return self.field.run(Trial(sources=sources, service=service, seconds=seconds, **changes))
 
 
@@ -47,8 +47,8 @@ def ground(tmp_path_factory) -> Iterator[Ground]:
     """One stage for all floods, each against a service of its own; nothing is left of it."""
     require_netns()
     folder = tmp_path_factory.mktemp("syn-flood")
-    with Lab() as lab, Stage(lab, folder, switch="embedded", guard=guard(5000)) as stage:
-        field = Field(stage, [plan.service(each) for plan in PLANS.values() for each in range(1, 50)])
+    with Lab() as lab, FloodStage(lab, folder, switch="embedded", guard=guard(5000)) as stage:
+        field = TrialHosts(stage, [plan.service(each) for plan in PLANS.values() for each in range(1, 50)])
         trial = Trial(sources="spoofed", service=UNPROTECTED, seconds=4.7, protection="none")
         outcome = field.run(trial)
         lab.flush_metrics()
@@ -134,7 +134,7 @@ def test_interrupted_run_leaves_nothing_behind(number, phase, tmp_path):
     require_netns()
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from sdnator.syn_flood import SynFloodOptions, Told, run_syn_flood\n"
+        "from sdnator.demos.syn_flood.demo import SynFloodOptions, Told, run_syn_flood\n"
         "options = SynFloodOptions(unprotected_seconds=4.5, seconds=60)\n"
         "run_syn_flood(options, Told(second=lambda line: print(line.phase, flush=True)))\n"
     )

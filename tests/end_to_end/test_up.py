@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from due.drivers.embedded_redis import EmbeddedServer
-from sdnator.wire import VethPair
+from due.drivers.embedded_redis import EmbeddedServer, server_program
+from sdnator.capture.interfaces import VethPair
 from tests.end_to_end.test_bad_input import MARK, processes_of
 from tests.requirements import optional_program, require_netns
 
@@ -188,6 +188,24 @@ def test_a_part_that_dies_is_started_again(standing, part):
     until(lambda: (now := operator.well()) and now["parts"][part]["pid"] != before)
 
 
+def test_parts_that_hang_are_started_again(standing):
+    """Each in its own way: an app, the server, the switch; stopped processes never end by themselves."""
+    operator, _ = standing
+    before = until(operator.well)["parts"]
+    hung = ("firewall", "updates", "switch")
+    for part in hung:
+        os.kill(before[part]["pid"], signal.SIGSTOP)
+    after = until(
+        lambda: (
+            (now := operator.well())
+            and all(now["parts"][part]["pid"] != before[part]["pid"] for part in hung)
+            and now
+        )
+    )
+    assert "no heartbeat" in after["parts"]["firewall"]["cause"]
+    assert "firewall was restarted" in operator.run("status").stdout
+
+
 def test_down_ends_everything_and_keeps_the_archive(operator):
     with operator.up() as (process, said):
         until(operator.well)
@@ -195,7 +213,7 @@ def test_down_ends_everything_and_keeps_the_archive(operator):
         assert (done.returncode, done.stdout) == (0, f"stopped (process {said['pid']})\n")
         _, error = process.communicate(timeout=SECONDS)
         assert process.returncode == 0
-        assert error.endswith("stopped; nothing was left running\n")
+        assert error.endswith("stopped; all processes have ended\n")
     assert processes_of(operator.mark) == []
     assert operator.run("status").returncode == 1
     assert operator.run("get", "due.event.coordinator", "--json").stdout.count("activated") >= len(APPS) - 1
@@ -231,7 +249,7 @@ format = "json"
 [metrics]
 targets = "TARGETS"
 [firewall]
-rules.hot_seconds = HOT
+rules.anomalous_seconds = HOT
 [kitsune]
 threshold = THRESHOLD
 [[switches]]
@@ -255,7 +273,9 @@ def test_a_configuration_holds_and_hangup_takes_up_what_it_can(operator, tmp_pat
         assert [one["name"] for one in said["switches"]] == ["left", "right"]
         assert said["parts"].keys() >= {"switch-left", "switch-right"}
         parts = {group["labels"]["part"]: group["targets"] for group in json.loads(targets.read_text())}
-        assert parts.keys() == APPS
+        assert parts.keys() == {*APPS, "supervisor"}
+        metrics = urllib.request.urlopen(f"http://{parts['supervisor'][0]}/metrics").read().decode()
+        assert 'sdnator_part_state{part="switch-left",state="running"} 1' in metrics
         assert b"kitsune_" in urllib.request.urlopen(f"http://{parts['kitsune'][0]}/metrics").read()
         state = tmp_path / "state" / "sdnator"
         assert json.loads((state / "kitsune.settings.json").read_text())["threshold"] == 1.5
@@ -268,14 +288,14 @@ def test_a_configuration_holds_and_hangup_takes_up_what_it_can(operator, tmp_pat
             return json.loads(operator.run("status", "--json").stdout)["parts"]["firewall"]["pid"]
 
         until(lambda: firewall_now() != said["parts"]["firewall"])
-        assert json.loads((state / "firewall.settings.json").read_text())["rules"]["hot_seconds"] == 8
+        assert json.loads((state / "firewall.settings.json").read_text())["rules"]["anomalous_seconds"] == 8
         file.write_text("[kitsune]\nthresold = 1")
         process.send_signal(signal.SIGHUP)
         assert process.stderr is not None
         heard = ""
-        while "not taken up" not in heard:
+        while "not applied" not in heard:
             heard += process.stderr.readline()
-        assert "kitsune: it would train anew" in heard
+        assert "kitsune: a restart would train it again" in heard
         assert "did you mean threshold?" in heard
         assert process.poll() is None
     assert processes_of(operator.mark) == []
@@ -292,13 +312,80 @@ def test_killed_it_takes_all_along(operator):
         pass
 
 
-def test_death_of_the_switch_ends_it_with_a_reason(operator):
+def test_the_switch_comes_back_at_its_address_and_nothing_else_is_touched(operator):
+    """The controller finds it again, and puts back what was in it."""
     with operator.up() as (process, said):
+        before = until(operator.well)
+        assert operator.run("blocks", "add", "203.0.113.9", "--reason", "a test").returncode == 0
+        until(lambda: "203.0.113.9" in operator.run("tables", "s1", "--table", "block_src").stdout)
         os.kill(said["parts"]["switch"], signal.SIGKILL)
-        _, error = process.communicate(timeout=SECONDS)
-        assert process.returncode == 1
-        assert "sdnator: switch was killed by SIGKILL" in error
-    assert processes_of(operator.mark) == []
+        after = until(lambda: (now := operator.well()) and now["parts"]["switch"]["restarts"] and now)
+        assert after["switch"]["address"] == before["switch"]["address"]
+        for part in PARTS - {"switch", "p4runtime_ctrl"}:
+            assert after["parts"][part]["pid"] == before["parts"][part]["pid"]
+        until(lambda: "203.0.113.9" in operator.run("tables", "s1", "--table", "block_src").stdout)
+        assert process.poll() is None
+
+
+def test_an_app_that_keeps_dying_is_degraded_and_guards_nobody_less(operator):
+    """Switch, controller and firewall run on; status says what is wrong and exits with 1."""
+    with operator.up() as (process, _):
+        before = until(operator.well)["parts"]
+
+        def degraded():
+            now = json.loads(operator.run("status", "--json").stdout)["parts"]
+            if now["kitsune"]["alive"] and now["kitsune"]["state"] != "degraded":
+                os.kill(now["kitsune"]["pid"], signal.SIGKILL)
+            return now["kitsune"]["state"] == "degraded" and now
+
+        after = until(degraded)
+        for part in PARTS - {"kitsune"}:
+            assert (after[part]["pid"], after[part]["state"]) == (before[part]["pid"], "running")
+        done = operator.run("status")
+        assert (done.returncode, "DEGRADED" in done.stdout) == (1, True)
+        assert "the last death: kitsune was killed by SIGKILL" in done.stdout
+        assert process.poll() is None
+
+
+PASSWORD = "correct-horse-battery"  # noqa: S105 - of a server of this test
+
+
+@contextmanager
+def guarded_server(folder):
+    """A server that asks for a password."""
+    folder.mkdir()
+    file = folder / "valkey.conf"
+    file.write_text(f'port 0\nunixsocket {folder}/v.sock\nrequirepass {PASSWORD}\nsave ""\n')
+    with subprocess.Popen([server_program(), str(file)], cwd=folder, stdout=subprocess.DEVNULL) as server:
+        try:
+            until((folder / "v.sock").exists)
+            yield f"unix://:{PASSWORD}@{folder}/v.sock"
+        finally:
+            server.terminate()
+
+
+def test_a_password_is_seen_nowhere_but_in_files_of_its_user(operator, tmp_path):
+    """Not in what is printed, in arguments, in environments of the parts, in logs; files with it have mode 0600."""
+    with guarded_server(tmp_path / "server") as url:
+        operator.environment["SDNATOR_UP_UPDATES"] = url
+        with operator.up() as (process, said):
+            until(operator.well)
+            os.kill(said["parts"]["kitsune"], signal.SIGKILL)
+            until(lambda: (now := operator.well()) and now["parts"]["kitsune"]["restarts"])
+            looks = (("status",), ("status", "--json"), ("config", "show"), ("doctor", "--updates", url))
+            shown = [json.dumps(said), *(operator.run(*words).stdout for words in looks)]
+            for pid in set(processes_of(operator.mark)) - {process.pid}:
+                shown += [Path(f"/proc/{pid}/{file}").read_text() for file in ("cmdline", "environ")]
+            process.terminate()
+            shown += process.communicate(timeout=SECONDS)
+        state = tmp_path / "state" / "sdnator"
+        files = [path for path in state.rglob("*") if path.is_file()]
+        shown += [path.read_text() for path in files if ".log" in path.name]
+        assert not [text for text in shown if PASSWORD in text]
+        holding = [path for path in files if PASSWORD.encode() in path.read_bytes()]
+        assert {path.name for path in holding} >= {"kitsune.engine.json"}
+        assert {path.stat().st_mode & 0o777 for path in holding} == {0o600}
+        assert state.stat().st_mode & 0o777 == 0o700
 
 
 def test_given_backends_are_used(operator, tmp_path):

@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Callable, Mapping
 
-from dataplane.tree import Binary, Conditional, Const, Expression, FieldRef, FieldType, Unary
+from dataplane.v1model.tree import Binary, Conditional, Const, Expression, FieldRef, FieldType, Unary
 
 Values = Mapping[str, int]
 """Field name -> value."""

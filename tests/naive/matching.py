@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from dataplane.tables import Exact, Lpm, Match, MatchValue, Optional, Range, TableEntry, Ternary
+from dataplane.v1model.tables import Exact, Lpm, Match, MatchValue, Optional, Range, TableEntry, Ternary
 
 
 def matches(value: int, m: MatchValue, width: int = 32) -> bool:

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from dataplane.externs import CounterValue
-from dataplane.switch import Switch
+from dataplane.v1model.externs import CounterValue
+from dataplane.v1model.switch import Switch
 from tests.dataplane.loading import BACKENDS, sdnator
 from tests.p4.sdnator_switch import made
 
@@ -18,8 +18,11 @@ def standing_switch(request) -> Iterator[Switch]:
 
 
 @pytest.fixture
-def switch(standing_switch) -> Switch:
-    """Without entries, with the program's default actions; registers keep what is in them."""
+def switch(standing_switch) -> Iterator[Switch]:
+    """Without entries, with the program's default actions; registers keep what is in them.
+
+    The test made no access out of range.
+    """
     for table in standing_switch.tables.values():
         table.clear()
         if not table.spec.default_is_const:
@@ -27,4 +30,6 @@ def switch(standing_switch) -> Switch:
     unparsed = standing_switch.counters["ingress.unparsed_frames"]
     for cause in range(unparsed.spec.size):
         unparsed.write(cause, CounterValue())
-    return standing_switch
+    before = standing_switch.out_of_range()
+    yield standing_switch
+    assert standing_switch.out_of_range() == before

@@ -1,8 +1,8 @@
 """p4/sdnator.p4 on the embedded switch, and frames for it."""
 
-from dataplane.switch import Backend, Replica, Switch
-from dataplane.tables import TableEntry
-from dataplane.tree import Program
+from dataplane.v1model.switch import Backend, Replica, Switch
+from dataplane.v1model.tables import TableEntry
+from dataplane.v1model.tree import Program
 
 CPU = 510
 FLOOD, FLOOD_10 = 1, 2

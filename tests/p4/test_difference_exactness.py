@@ -44,6 +44,7 @@ def twin(request):
     switch = made(sdnator(), request.param)
     want_by_port(switch)
     yield switch
+    assert switch.out_of_range() == {}
     switch.close()
 
 

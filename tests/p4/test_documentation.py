@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from sdnator import p4_program
+from sdnator.testing.p4runtime_client import program_config
 from tests.contract.differences import markdown
-from tests.dataplane.controller import program_config
 
 _DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "dataplane.md"
 _STAGES = 8

@@ -1,6 +1,6 @@
 """Layer 2: flooding, learning by digest, stations that move, VLANs; wires come first."""
 
-from dataplane.tables import Exact
+from dataplane.v1model.tables import Exact
 from tests.p4.sdnator_switch import CPU, FLOOD, FLOOD_10, entry, ethernet, mac, udp, want_all
 
 A, B = mac(1), mac(2)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dataplane.tables import Exact, Ternary
+from dataplane.v1model.tables import Exact, Ternary
 from tests.p4.sdnator_switch import PACKET_IN_BYTES, entry, ethernet, mac, udp, want_all
 
 CUT, MALFORMED, EXTENSIONS, PROTOCOL, ETHERTYPE = range(1, 6)

@@ -6,13 +6,13 @@ import tomllib
 import pytest
 from typer.testing import CliRunner
 
-from sdnator import config_file
-from sdnator.cli import app
-from sdnator.config_commands import example_lines
-from sdnator.config_file import WrongConfiguration, load, option_paths, variable
-from sdnator.config_lines import line_at, lines_of
-from sdnator.config_model import SECTIONS, fields
-from sdnator.config_texts import texts
+from sdnator.cli.config_commands import example_lines
+from sdnator.cli.main import app
+from sdnator.config import config_file
+from sdnator.config.config_file import WrongConfiguration, load, option_paths, variable
+from sdnator.config.config_lines import line_at, lines_of
+from sdnator.config.config_model import fields, sections
+from sdnator.config.config_texts import texts
 
 
 def run(*words, **environment):
@@ -39,9 +39,9 @@ def faults(tmp_path, text, environment=None):
         ("[firewall.rules]\ndry_rum = true", "FILE:2: firewall.rules.dry_rum: there is no such option; did you mean dry_run?"),
         ("[up]\nquota = 0", "FILE:2: up.quota: quota=0.0: at least 0.01 GiB"),
         ("[up]\nretain_every_s = 5", "FILE:2: up.retain_every_s: there is no such option; it belongs to coordinator.retain_every_s"),
-        ("schema = 2", "FILE:1: schema: 2 is not what this version reads; it reads 1: see CHANGELOG for what changed"),
+        ("schema = 2", "FILE:1: schema: 2 is not supported; this version reads 1: see CHANGELOG for what changed"),
         ('[[switches]]\n[[switches]]\nname = "s1"', "FILE:3: switches[1].name: there are two switches named s1"),
-        ('[[switches]]\nkind = "there"', "FILE:1: switches[0]: --switch there: give embedded, bmv2 or HOST:PORT"),
+        ('[[switches]]\nkind = "there"', "FILE:1: switches[0]: --switch there: give embedded, bmv2 or HOST:PORT, or unix:/PATH"),
         ("[p4runtime_ctrl]\nswitches = []", "FILE:2: p4runtime_ctrl.switches: there is no such option; see `sdnator config example`"),
     ],
 )  # fmt: skip
@@ -61,7 +61,7 @@ def test_what_a_part_says_of_its_values_is_said_before_it_starts(tmp_path):
 
 def test_broken_toml_is_told_with_its_line(tmp_path):
     (fault,) = faults(tmp_path, "[kitsune]\nthreshold = = 1")
-    assert fault.startswith("FILE:2: this is no TOML")
+    assert fault.startswith("FILE:2: this is not TOML")
 
 
 def test_variables_go_before_the_file(tmp_path):
@@ -101,7 +101,7 @@ def test_nothing_given_costs_nothing_and_means_the_defaults():
 
 def test_every_option_has_a_text():
     """Where it is declared, and nowhere else."""
-    bare = [f"{name}.{option}" for name, one in SECTIONS.items() for option in fields(name)
+    bare = [f"{name}.{option}" for name, one in sections().items() for option in fields(name)
             if not texts(one.kind()).get(option) and not hasattr(fields(name)[option].type, "__struct_fields__")]  # fmt: skip
     assert [path for path in bare if not path.startswith("p4runtime_ctrl.")] == []
 
@@ -124,7 +124,7 @@ def test_the_example_says_nothing_but_the_defaults(tmp_path):
     path.write_text("\n".join(options).replace("# [[switches]]", "[[switches]]"))
     given = load(path, {})
     assert len(given.given["firewall"]) > 5
-    for name in SECTIONS:
+    for name in sections():
         if name != "switches":
             assert given.struct(name) == load(None, {}).struct(name)
 

@@ -18,7 +18,7 @@ def alert(at_s: int = 100, sender: Sender = CAMERA, **changes: Any) -> Alert:
         "packets": 50,
         "over": 45,
         "peak_score": 12.5,
-        "hot_seconds": 5,
+        "anomalous_seconds": 5,
         "rate": 50.0,
         "training_rate": 20.0,
         "mac_addresses": 1,

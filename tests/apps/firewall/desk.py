@@ -10,7 +10,7 @@ from reactivex import Subject
 from apps.firewall.service import FirewallService
 from apps.firewall.settings import Settings
 from apps.messages import Confirmation, Decision
-from due import Item
+from due import Item, Key
 from due.errors import ArchiveUnavailable
 
 NOW = 1_700_000_000_000_000_000
@@ -39,14 +39,20 @@ class FakeEngine:
         self.written.append((key, value))
         return True
 
-    def get(self, query: object) -> list[Item]:
+    def get(self, query: object, *, limit: int | None = None) -> list[Item]:
         if self.archive_hangs is not None:
             self.archive_hangs.wait(60)
         if self.archive_away:
             raise ArchiveUnavailable("the archive is away")
         wanted = query["dataKey"] if isinstance(query, dict) else query
-        after = query.get("timestamp", {}).get("$gt", 0) if isinstance(query, dict) else 0
-        return [item for item in self.archived if item.key == wanted and item.timestamp > after]
+        tests = query.get("timestamp", {}) if isinstance(query, dict) else {}
+        after, before = tests.get("$gt", 0), tests.get("$lt", 1 << 63)
+        found = [
+            item
+            for item in self.archived
+            if Key.parse(wanted).matches(Key.parse(item.key)) and after < item.timestamp < before
+        ]
+        return found if limit is None else found[max(0, len(found) - limit) :]
 
 
 class Desk:
@@ -62,7 +68,8 @@ class Desk:
             self.switch(switch)
 
     def hand(self, key: str, value: Any, *, pattern: str = "", at: int = NOW, instance: str = "i1") -> None:
-        item = Item(key, value, at, at, "somebody", instance, 1)
+        named = key.partition(":")[0].split(".")[2]
+        item = Item(key, value, at, at, "sonata_adapter" if named == "sonata" else named, instance, 1)
         self.engine.subjects[pattern or key].on_next(item)
 
     def switch(self, name: str = "s1", *, primary: bool = True, instance: str = "i1", at: int = NOW) -> None:

@@ -3,36 +3,36 @@
 import numpy as np
 import pytest
 
-from apps.firewall.bindings import Bindings
-from apps.firewall.known_sources import KnownSources
-from apps.firewall.ledger import SECOND, Ledger
-from apps.firewall.policy import AllowList, Rules
-from apps.firewall.recent_syns import HOSTS, Surges
-from apps.firewall.services import Service
-from apps.firewall.syn_defence import SOURCES_SAMPLED, Suspicion, SynDefence
-from apps.firewall.syn_policy import SynRules
+from apps.firewall.arp.arp_bindings import ArpBindings
+from apps.firewall.evidence.known_sources import KnownSources
+from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
+from apps.firewall.policy.rules import AllowList, Rules
+from apps.firewall.syn.recent_syns import HOSTS, Surges
+from apps.firewall.syn.services import TcpService
+from apps.firewall.syn.syn_defence import SOURCES_SAMPLED, Suspicion, SynDefence
+from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Decision, Evidence
 from apps.packets import read_frames
-from apps.sonata_adapter.handshake import Handshakes
+from apps.sonata_adapter.host.handshake import Handshakes
 from due import RecordBatch
-from sdnator.captures import Capture
-from sdnator.datasets.mirai_like import Options, make
-from sdnator.tshark_tsv import read_batches
+from sdnator.capture.captures import Capture
+from sdnator.capture.tshark_tsv import read_batches
+from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from tests.apps.firewall.alerts import alert
 from tests.apps.firewall.desk import ALERT, ARP, HANDSHAKE, NOW, SYNS, Desk
 from tests.apps.firewall.rows import arp, records, spoofed_syns
-from tests.apps.firewall.test_recent_syns import batch
+from tests.apps.firewall.syn.test_recent_syns import batch
 from tests.requirements import shared_data
 
-WEB = Service("10.0.0.1", 80)
+WEB = TcpService("10.0.0.1", 80)
 GATEWAY, RESOLVER, KNOWN, NEIGHBOUR = "10.0.0.254", "10.0.0.253", "10.3.0.7", "10.3.0.8"
-WEB6, KNOWN6 = Service("fd00::1", 80), "fd03::7"
+WEB6, KNOWN6 = TcpService("fd00::1", 80), "fd03::7"
 ATTACKER, HOST = 0x02_00_00_00_00_66, 0x02_00_00_00_00_07
 ANY = Evidence(key="k", timestamp=1, summary="a surge")
 
 
 def defence(allow: tuple[str, ...] = (), known: int = 4000) -> SynDefence:
-    return SynDefence(SynRules(), (), Ledger(Rules()), AllowList.parse(allow), KnownSources(known))
+    return SynDefence(SynRules(), (), BlockLifecycle(Rules()), AllowList.parse(allow), KnownSources(known))
 
 
 @pytest.mark.parametrize("forged", [GATEWAY, RESOLVER, KNOWN, "10.9.9.9", "fd00::254", KNOWN6, "fd09::9"])
@@ -83,7 +83,7 @@ def test_client_that_retries_is_not_blocked_with_the_flooders():
 
 def host_alert(port: int, mac: str, address: str, addresses: int = 5) -> dict[str, object]:
     sender = {"switch": "s1", "port": port, "mac": mac, "ip": address}
-    return alert(hot_seconds=5, mac_addresses=addresses).to_value() | {"sender": sender}
+    return alert(anomalous_seconds=5, mac_addresses=addresses).to_value() | {"sender": sender}
 
 
 def test_anomalies_in_somebodys_name():
@@ -192,13 +192,13 @@ class Watchman:
         self.defence = defence()
         self.handshakes = Handshakes()
         self.surges = Surges(SynRules().threshold, SynRules().window_ms)
-        self.bindings = Bindings(training_s=600, settle_s=3600, contest_s=60)
+        self.bindings = ArpBindings(training_s=600, settle_s=3600, contest_s=60)
         self.decisions: list[Decision] = []
         self.syns = 0
 
     def see(self, packets: RecordBatch, syns: RecordBatch) -> None:
         for done in self.handshakes.process(packets):
-            self.defence.handshake(done.source, Service(done.service, done.port), done.at_us * 1000)
+            self.defence.handshake(done.source, TcpService(done.service, done.port), done.at_us * 1000)
         assert not any(theft.certain for theft in self.bindings.add(packets.take(packets["arp_op"] > 0)))
         self.syns += len(syns)
         self.defence.recent.add(syns)
@@ -221,7 +221,7 @@ def test_real_packets():
 def test_generated_benign_hour(seed, tmp_path):
     """With flags and handshakes."""
     path = tmp_path / "benign.pcap"
-    make(Options(seed=seed, benign_seconds=900, attack_seconds=0), path)
+    make(MiraiLikeOptions(seed=seed, benign_seconds=900, attack_seconds=0), path)
     watchman = Watchman()
     with Capture(path) as capture:
         frames = list(capture)

@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 from apps.messages import Instruction
 from due import Capability
 from due.errors import UpdatesUnavailable
-from sdnator.blocks_commands import blocks
+from sdnator.cli.blocks_commands import blocks
+from sdnator.cli.switch_commands import tables
 from sdnator.errors import PipelineError
-from sdnator.switch_commands import tables
-from tests.apps.p4runtime_ctrl.stage import Stage, wait_for
+from sdnator.testing.controller_run import ControllerRun
+from sdnator.testing.waiting import wait_for
 
 SECONDS = 120.0
 INSTRUCTION = "network.instruction.operator.firewall"
@@ -26,7 +27,7 @@ LEFT = {"allow": 1, "known_sources": 1, "protect": 1}
 
 @pytest.fixture
 def stage(tmp_path):
-    with Stage(tmp_path) as made:
+    with ControllerRun(tmp_path) as made:
         yield made
 
 
@@ -51,13 +52,18 @@ def reaches(stage, wanted: dict[str, int]) -> None:
 
 
 def decide(engine) -> None:
-    """A block of each kind by hand, and a client that becomes known."""
+    """A block of each kind by hand."""
     for subject in ("192.0.2.66", "198.51.100.0/24", "02:00:00:00:00:66@1"):
         said = Instruction(id=subject, verb="block", subject=subject, seconds=36_000)
         engine.write(INSTRUCTION, said.to_value())
-    handshake = {"source": "10.3.0.1", "service": "10.0.0.1", "port": 80, "at": 1}
-    engine.write("network.handshake.sonata.tcp", handshake)
     engine.flush(SECONDS)
+
+
+def shake_hands(adapter) -> None:
+    """A client becomes known."""
+    handshake = {"source": "10.3.0.1", "service": "10.0.0.1", "port": 80, "at": 1}
+    adapter.write("network.handshake.sonata.tcp", handshake)
+    adapter.flush(SECONDS)
 
 
 def panic_without_redis(stage) -> None:
@@ -103,8 +109,9 @@ def test_decisions_survive_and_panic_ends_them_without_redis(stage):
     firewall = stage.run("apps.firewall.service", SETTINGS)
     told = Capability(INSTRUCTION, delivery="reliable", archive="always")
     shook = Capability("network.handshake.sonata.tcp", delivery="reliable", archive="always")
-    engine = stage.engine("operator", capabilities=[told, shook])
+    engine = stage.engine("operator", capabilities=[told])
     decide(engine)
+    shake_hands(stage.engine("sonata_adapter", capabilities=[shook]))
     reaches(stage, EVERYTHING)
 
     stage.kill(firewall)

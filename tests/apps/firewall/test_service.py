@@ -6,14 +6,14 @@ import time
 
 import pytest
 
-from apps.firewall.policy import Rules
-from apps.firewall.syn_policy import SynRules
+from apps.firewall.policy.rules import Rules
+from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Instruction, TableCommand
 from due import Item
 from tests.apps.firewall.alerts import alert
 from tests.apps.firewall.desk import ALERT, NOW, SYN_ACKS, SYNS, Desk, FakeEngine
 from tests.apps.firewall.rows import records, syn_ack
-from tests.apps.firewall.test_recent_syns import batch
+from tests.apps.firewall.syn.test_recent_syns import batch
 
 VICTIM = "10.0.0.1"
 QUICK = SynRules(grace_ms=0, patience_ms=0, reset_after_ms=0)
@@ -114,7 +114,7 @@ def test_archive_that_hangs_holds_no_decision_up():
     desk = Desk(engine=engine, archive_patience_s=0.05, detect=False)
     engine.archive_hangs = threading.Event()
     try:
-        desk.hand(ALERT, alert(hot_seconds=5).to_value())
+        desk.hand(ALERT, alert(anomalous_seconds=5).to_value())
         assert len(desk.blocked) == 1
         assert "history unknown" in desk.decisions[0].reason
         assert desk.service.health()["archive_away"] == 1
@@ -165,17 +165,18 @@ def test_prefix_block_by_hand_lives_and_dies_as_a_command():
     assert commands(desk, "ingress.block") == ["insert", "delete"]
 
 
-def test_panic_in_the_archive_is_carried_out(monkeypatch):
-    """Once: said while Data Updates were away."""
+@pytest.mark.parametrize("clock_s", [1, -3600])
+def test_panic_in_the_archive_is_carried_out(monkeypatch, clock_s):
+    """Once: said while Data Updates were away, be it after the wall clock was set back by an hour."""
     monkeypatch.setattr("apps.firewall.service.ARCHIVED_WORD_S", 0.0)
     desk = Desk()
     desk.hand(
         INSTRUCTION, Instruction(id="a", verb="block", subject="192.0.2.1").to_value(), pattern=INSTRUCTIONS
     )
     desk.service.tick()
-    later = time.time_ns() + 10**9
+    later = time.time_ns() + clock_s * 10**9
     panic = Instruction(id="p", verb="panic").to_value()
-    desk.engine.archived.append(Item(INSTRUCTIONS, panic, later, later, "operator", "o1", 1))
+    desk.engine.archived.append(Item(INSTRUCTION, panic, later, later, "operator", "o1", 1))
     desk.tick_until(lambda: len(desk.decisions) > 1)
     assert [each.action for each in desk.decisions] == ["block", "unblock"]
     desk.service.tick()
@@ -185,7 +186,7 @@ def test_panic_in_the_archive_is_carried_out(monkeypatch):
 def test_instruction_that_is_sent_again_is_not_carried_out_again():
     """Data Updates send again what nobody has acknowledged; the archive has the answers of an earlier run."""
     engine = FakeEngine()
-    engine.archived.append(Item("network.answer.firewall.*", {"id": "a"}, 1, 1, "firewall", "f1", 1))
+    engine.archived.append(Item("network.answer.firewall.operator", {"id": "a"}, 1, 1, "firewall", "f1", 1))
     desk = Desk(engine=engine)
     for name, address in (("a", "192.0.2.1"), ("b", "192.0.2.2"), ("b", "192.0.2.3")):
         said = Instruction(id=name, verb="block", subject=address).to_value()
@@ -200,7 +201,7 @@ def test_refused_allow_entry_in_the_archive_does_not_stop_the_start():
     wrong = Instruction(id="a", verb="allow", subject="10.0.0.300").to_value()
     right = Instruction(id="b", verb="allow", subject="10.0.0.3").to_value()
     engine.archived += [
-        Item(INSTRUCTIONS, value, n, n, "operator", "o1", n)
+        Item(INSTRUCTION, value, n, n, "operator", "o1", n)
         for n, value in enumerate((wrong, {"x": 1}, right))
     ]
     assert Desk(engine=engine).service.health()["allowed"] == 1
@@ -211,7 +212,7 @@ def test_caps_stop_and_shout():
     desk = Desk(rules=Rules(max_blocks=1), detect=False)
     for number in range(5):
         sender = {"switch": "s1", "port": 1, "mac": f"02:00:00:00:00:0{number}", "ip": f"10.0.0.{number}"}
-        value = alert(hot_seconds=5).to_value() | {"sender": sender}
+        value = alert(anomalous_seconds=5).to_value() | {"sender": sender}
         desk.hand(ALERT, value)
     assert len(desk.blocked) == 1
     (shout,) = [text for text in desk.events if "STOPPED" in text]
@@ -228,7 +229,7 @@ def test_known_hosts_are_not_blocked_in_numbers():
         desk.hand("network.handshake.sonata.tcp", value)
     for number in range(8):
         sender = {"switch": "s1", "port": 1, "mac": f"02:00:00:00:00:0{number}", "ip": f"10.0.0.{number}"}
-        desk.hand(ALERT, alert(hot_seconds=5).to_value() | {"sender": sender})
+        desk.hand(ALERT, alert(anomalous_seconds=5).to_value() | {"sender": sender})
     assert len(desk.blocked) == 2
     assert any("max_known_share" in text for text in desk.events)
 
@@ -246,7 +247,7 @@ def test_events_go_to_the_file_and_health_is_numbers(tmp_path):
     """Alerts, decisions, notices; the file is whole when the service has stopped."""
     eve = tmp_path / "eve.json"
     desk = Desk(eve_file=str(eve), detect=False)
-    desk.hand(ALERT, alert(hot_seconds=5).to_value())
+    desk.hand(ALERT, alert(anomalous_seconds=5).to_value())
     desk.service.stop()
     events = [json.loads(line) for line in eve.read_text().splitlines()]
     assert [event["alert"]["category"] for event in events] == ["anomaly", "block"]

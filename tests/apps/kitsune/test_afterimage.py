@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from apps.kitsune.afterimage import WIDTH, AfterImage, seconds
 from apps.kitsune.kernel import load_kernel
 from due import RecordBatch
-from tests.apps.kitsune.traffic import batch_of, blank, part, real, tshark_fields, tsv_rows
-from tests.naive.afterimage import AfterImage as Naive
+from sdnator.testing.oracles.afterimage import NaiveAfterImage as Naive
+from sdnator.testing.packet_rows import batch_of, blank, part, tshark_fields
+from tests.apps.kitsune.real_packets import real, tsv_rows
 from tests.requirements import missing, shared_data
 
 ENGINES = ["kernel", "twin"]

@@ -12,7 +12,7 @@ def say(talk, time, source, destination, ports, flags=0, *, tcp=True):
     number = {CLIENT: 1, SERVER: 2}[source]
     key = (tcp, source, ports[0], ports[1])
     reverse = (tcp, destination, ports[1], ports[0])
-    return talk.payer(number, time, key, reverse, flags)
+    return talk.responsible(number, time, key, reverse, flags)
 
 
 @pytest.mark.parametrize("flags", [SYN_ACK, RST, RST | ACK])

@@ -9,8 +9,9 @@ from apps.kitsune.kernel import load_kernel
 from apps.kitsune.model_file import NotAModelError, load_model, save_model
 from apps.messages import Alert
 from due import RecordBatch
+from sdnator.testing.packet_rows import blank, part
+from tests.apps.kitsune.real_packets import real
 from tests.apps.kitsune.test_afterimage import require_reference_arithmetic
-from tests.apps.kitsune.traffic import blank, part, real
 from tests.requirements import shared_data
 
 SETTINGS = DetectorSettings(fm_grace=2_000, ad_grace=10_000, mode="reference")
@@ -51,7 +52,7 @@ def test_all_scores_equal_the_published_ones(outcome):
 def test_three_bursts_of_the_gateway_alert_and_do_not_block(outcome):
     _, scores, alerts = outcome
     assert np.count_nonzero(scores >= 1) == 33
-    assert [(alert.packets, alert.over, alert.hot_seconds) for alert in alerts] == [
+    assert [(alert.packets, alert.over, alert.anomalous_seconds) for alert in alerts] == [
         (11, 11, n) for n in (1, 2, 3)
     ]
     assert {alert.role for alert in alerts} == {"gateway"}

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.cluster.hierarchy import linkage, to_tree
 
 from apps.kitsune.feature_map import FeatureMapper, single_linkage, split_tree
-from tests.naive.kitnet import FeatureMap as Naive
-from tests.naive.kitnet import split
+from sdnator.testing.oracles.kitnet import NaiveFeatureMap as Naive
+from sdnator.testing.oracles.kitnet import split
 from tests.requirements import shared_data
 
 

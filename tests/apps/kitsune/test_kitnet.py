@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from apps.kitsune.kernel import load_kernel
 from apps.kitsune.kitnet import KitNet
+from sdnator.testing.oracles.kitnet import NaiveKitNet as Naive
 from tests.apps.kitsune.test_afterimage import ENGINES, engine
-from tests.naive.kitnet import KitNet as Naive
 from tests.requirements import shared_data
 
 FM, AD = 500, 1500

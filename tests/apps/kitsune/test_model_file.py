@@ -124,3 +124,14 @@ def test_an_untrained_model_and_an_unwritable_place_are_refused(tmp_path, networ
         save_model(tmp_path / "m.npz", KitNet(), {})
     with pytest.raises(ModelFileError, match="cannot be written"):
         save_model(tmp_path / "no" / "m.npz", network, {})
+
+
+@pytest.mark.parametrize(("place", "byte"), [(4, 255), (6, 1)])
+def test_a_zip_file_of_another_version_or_encrypted_is_refused(path, place, byte):
+    """Python's reader has errors of its own for these."""
+    whole = bytearray(path.read_bytes())
+    directory = whole.index(b"PK\x01\x02")
+    whole[directory + place + 2] = whole[whole.index(b"PK\x03\x04") + place] = byte
+    path.write_bytes(bytes(whole))
+    with pytest.raises(NotAModelError, match="not a whole Kitsune model"):
+        load_model(path)

@@ -9,7 +9,8 @@ import apps.kitsune.online
 from apps.kitsune.model_file import ModelFileError
 from apps.kitsune.online import Kitsune
 from apps.packets import PACKET_COLUMNS
-from tests.apps.kitsune.traffic import part, real
+from sdnator.testing.packet_rows import part
+from tests.apps.kitsune.real_packets import real
 
 
 def rows(batch):

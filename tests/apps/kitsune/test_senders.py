@@ -1,10 +1,10 @@
-"""A second is hot when at least three and at least half of a sender's packets are over the line; hot seconds add up."""
+"""A second is hot when at least three and at least half of a sender's packets are above the threshold; anomalous seconds add up."""
 
 import numpy as np
 
 from apps.kitsune.senders import Senders
 from due import RecordBatch
-from tests.apps.kitsune.traffic import blank
+from sdnator.testing.packet_rows import blank
 
 HOST, OTHER = 0xC0A80205, 0xC0A80206
 BASE_S = 1_600_000_000
@@ -43,7 +43,7 @@ def test_a_second_becomes_hot_when_it_is_over():
     assert hot.second == BASE_S + 5
     assert (hot.tally.packets, hot.tally.over, hot.tally.peak, hot.tally.first_over) == (3, 3, 2.0, 0)
     assert hot.record.identity == ("s1", 3, HOST & 0xFF, (4, 0, HOST))
-    assert (hot.hot_seconds, hot.record.training_rate) == (1, 4)
+    assert (hot.anomalous_seconds, hot.record.training_rate) == (1, 4)
 
 
 def test_two_packets_or_less_than_half_are_not_hot():
@@ -57,7 +57,7 @@ def test_two_packets_or_less_than_half_are_not_hot():
 def test_hot_seconds_of_the_last_ten_add_up():
     senders = trained_senders()
     rows = [(second, HOST, 5) for second in (10, 11, 15, 20, 21) for _ in range(3)]
-    counts = [hot.hot_seconds for hot in feed(senders, rows) + senders.finish()]
+    counts = [hot.anomalous_seconds for hot in feed(senders, rows) + senders.finish()]
     assert counts == [1, 2, 3, 3, 3]
 
 

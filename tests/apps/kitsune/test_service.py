@@ -13,8 +13,9 @@ import pytest
 from apps.kitsune.service import ALERT, CAPABILITIES, INTERESTS, PACKETS, SCORE
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest
 from due.drivers.embedded_redis import EmbeddedServer
+from sdnator.testing.packet_rows import blank, part
+from tests.apps.kitsune.real_packets import real
 from tests.apps.kitsune.test_afterimage import require_reference_arithmetic
-from tests.apps.kitsune.traffic import blank, part, real
 from tests.requirements import shared_data
 
 KEY = "network.packets.p4runtime_ctrl.s1.all"

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from apps.kitsune.senders import Record
+from apps.kitsune.senders import SenderRecord
 from apps.kitsune.training_check import TrainingCheck
-from tests.apps.kitsune.traffic import blank
+from sdnator.testing.packet_rows import blank
 
 
 def record(number, rate, hosts=1):
     identity = ("s1", 1, number, (4, 0, 0xC0A80200 + number))
-    return Record(identity, training_rate=rate, training_destinations=hosts)
+    return SenderRecord(identity, training_rate=rate, training_destinations=hosts)
 
 
 def syns(count, seconds):

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import grpc
 from google.rpc import code_pb2
 
-from apps.p4runtime_ctrl.desired_state import entry_key
+from apps.p4runtime_ctrl.state.desired_state import entry_key
 from p4rt import add_p4runtime_servicer, p4runtime, status
 
 _DETAILS = "grpc-status-details-bin"

@@ -1,11 +1,11 @@
 """When the counters of blocks are read."""
 
-from apps.p4runtime_ctrl import agent
+from apps.p4runtime_ctrl import worker
 from apps.p4runtime_ctrl.settings import Settings
-from tests.apps.p4runtime_ctrl.programs import program
-from tests.apps.p4runtime_ctrl.stage import wait_for
-from tests.apps.p4runtime_ctrl.test_agent import MINE, Connected, Written
-from tests.apps.p4runtime_ctrl.test_switch import Held, decision
+from sdnator.testing.product_program import program
+from sdnator.testing.waiting import wait_for
+from tests.apps.p4runtime_ctrl.state.test_desired_switch import Held, decision
+from tests.apps.p4runtime_ctrl.test_worker import MINE, Connected, Written
 
 
 class Read(Held):
@@ -23,12 +23,12 @@ class Read(Held):
 
 
 def test_decisions_that_follow_each_other_are_counted_together(monkeypatch):
-    monkeypatch.setattr(agent, "_CALM_S", 3600.0)
+    monkeypatch.setattr(worker, "_CALM_S", 3600.0)
     engine, switch = Written(), Read()
     settings = Settings(switches=(MINE,), program="", p4info="", restore=False)
-    one = agent.Agent(engine, settings, MINE, program(), Connected)
+    one = worker.SwitchWorker(engine, settings, MINE, program(), Connected)
     one._counted_at = float("-inf")  # as long after boot
-    one.start(chief=True)
+    one.start(active=True)
     one.became_primary(switch)
     one.decide(decision(1))
     wait_for(lambda: set(engine.counted()) == {"d1"}, 60)
@@ -36,7 +36,7 @@ def test_decisions_that_follow_each_other_are_counted_together(monkeypatch):
         one.decide(decision(number, address=f"10.0.0.{number}"))
     wait_for(lambda: ("d5", "installed") in engine.confirmed(), 60)
     assert switch.readings == 1
-    monkeypatch.setattr(agent, "_CALM_S", 0.0)
+    monkeypatch.setattr(worker, "_CALM_S", 0.0)
     everything = {f"d{number}" for number in range(1, 6)}
     wait_for(lambda: one.tick() or set(engine.counted()) == everything, 60)
     one.stop()

@@ -5,8 +5,8 @@ import pytest
 from apps.p4runtime_ctrl.service import CAPABILITIES, P4RuntimeCtrlService
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from due import Assignment, Key
-from tests.apps.p4runtime_ctrl.programs import P4INFO, PROGRAM
-from tests.apps.p4runtime_ctrl.stage import PACKETS
+from sdnator.testing.controller_run import PACKETS
+from sdnator.testing.product_program import P4INFO, PROGRAM
 
 SETTINGS = Settings(
     switches=(SwitchSettings(name="s1", address="127.0.0.1:1"),), program=str(PROGRAM), p4info=str(P4INFO)

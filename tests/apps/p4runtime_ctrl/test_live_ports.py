@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from apps.packets import PACKET_COLUMNS, read_frames
-from sdnator.wire import VethPair
-from tests.apps.p4runtime_ctrl.stage import PACKETS, Heard, Stage, frame, wait_for
-from tests.apps.p4runtime_ctrl.targets import KINDS
+from sdnator.capture.interfaces import VethPair
+from sdnator.testing.controller_run import PACKETS, ControllerRun, Heard, frame
+from sdnator.testing.switch_target import KINDS
+from sdnator.testing.waiting import wait_for
 from tests.requirements import optional_program, require_netns
 
 COUNT = 500
@@ -32,7 +33,7 @@ def test_frames_of_an_interface(kind, telemetry, veth, tmp_path):
     if kind == "bmv2":
         optional_program("simple_switch_grpc")
     near, far = veth
-    with Stage(tmp_path, kind=kind, veth=far, forward={}) as stage:
+    with ControllerRun(tmp_path, kind=kind, veth=far, forward={}) as stage:
         stage.controller(telemetry=telemetry)
         heard = Heard(stage.engine("listener"), PACKETS, "network.switch.p4runtime_ctrl.s1")
         wait_for(lambda: any(v["telemetry"] == ["packets"] for v in heard.values("switch")), why=stage.log)

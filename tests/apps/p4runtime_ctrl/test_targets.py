@@ -6,13 +6,14 @@ import pytest
 
 from apps.messages import Decision, TableCommand, TableUpdate
 from apps.messages import Target as Sender
-from apps.p4runtime_ctrl.connection import Connection
-from apps.p4runtime_ctrl.desired_state import INSERT, Change
-from apps.p4runtime_ctrl.session import Address, Pipeline
-from apps.p4runtime_ctrl.switch import Switch
-from apps.p4runtime_ctrl.telemetry import Request
-from tests.apps.p4runtime_ctrl.programs import PROGRAM, program
-from tests.apps.p4runtime_ctrl.targets import KINDS, Target
+from apps.p4runtime_ctrl.southbound.connection import Connection
+from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram
+from apps.p4runtime_ctrl.state.desired_state import INSERT, Change
+from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
+from apps.p4runtime_ctrl.telemetry.classifier import TelemetryRequest
+from sdnator.testing.product_program import PROGRAM, program
+from sdnator.testing.switch_target import KINDS, SwitchTarget
+from tests.requirements import optional_program
 
 
 class Attached:
@@ -22,7 +23,7 @@ class Attached:
         self.switch = switch
         self.changed = threading.Condition()
         self.reports, self.session, self.error = [], None, None
-        pipeline = Pipeline(PROGRAM.read_bytes(), program().message)
+        pipeline = CompiledProgram(PROGRAM.read_bytes(), program().message)
         self.connection = Connection(Address(address, 1, rank), pipeline, self)
         self.connection.open()
 
@@ -61,7 +62,9 @@ class Attached:
 
 @pytest.fixture(params=KINDS)
 def target(request, tmp_path):
-    made = Target(request.param, tmp_path)
+    if request.param == "bmv2":
+        optional_program("simple_switch_grpc")
+    made = SwitchTarget(request.param, tmp_path)
     made.start()
     yield made
     made.stop()
@@ -81,7 +84,7 @@ def attach(target):
 
 
 def make(**options):
-    return Switch("s1", program(), lambda: (0, 0), **options)
+    return DesiredSwitch("s1", program(), lambda: (0, 0), **options)
 
 
 def decision(number, action, sender):
@@ -97,10 +100,10 @@ SENDERS = (
     Sender(kind="mac", address="02:00:00:00:00:02"),
 )
 REQUESTS = (
-    Request(name="packets", bit=255),
-    Request(name="web", bit=0, conditions={"dst": "10.0.0.0/8", "dport": [80, 90], "protocol": 6}),
-    Request(name="scan", bit=1, conditions={"tcp_flags": [2, 0x17], "dport": [85, 1023], "vid": 7}),
-    Request(name="six", bit=2, conditions={"src": "2001:db8::/32", "ingress_port": 1}, copy=False),
+    TelemetryRequest(name="packets", bit=255),
+    TelemetryRequest(name="web", bit=0, conditions={"dst": "10.0.0.0/8", "dport": [80, 90], "protocol": 6}),
+    TelemetryRequest(name="scan", bit=1, conditions={"tcp_flags": [2, 0x17], "dport": [85, 1023], "vid": 7}),
+    TelemetryRequest(name="six", bit=2, conditions={"src": "2001:db8::/32", "ingress_port": 1}, copy=False),
 )
 
 
@@ -176,9 +179,9 @@ def test_telemetry_comes_and_goes(target, attach):
 
 
 def test_a_backup_takes_over(target, attach):
-    chief = attach(make(forward={1: 2}), rank=2)
-    chief.until_up()
-    deputy = attach(make(forward={1: 2}), rank=1)
-    assert not deputy.reports
-    chief.connection.close()
-    assert str(deputy.until_up()) == "nothing to change"
+    active = attach(make(forward={1: 2}), rank=2)
+    active.until_up()
+    standby = attach(make(forward={1: 2}), rank=1)
+    assert not standby.reports
+    active.connection.close()
+    assert str(standby.until_up()) == "nothing to change"

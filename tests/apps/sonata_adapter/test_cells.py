@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.control import Control
-from apps.sonata_adapter.results import Result
-from dataplane.tables import TableEntry, Ternary
+from apps.sonata_adapter.query.catalogue import CATALOGUE
+from apps.sonata_adapter.results import QueryResult
+from dataplane.v1model.tables import TableEntry, Ternary
 from due import RecordBatch
+from sdnator.testing.query_traffic import BASE_US, TimedFrame, batch_of, tcp
+from tests.apps.sonata_adapter.switch.test_register_reads import HALF_OPEN, OWN
 from tests.apps.sonata_adapter.switch_model import counts_of, matches
-from tests.apps.sonata_adapter.test_tallies import HALF_OPEN, OWN
-from tests.apps.sonata_adapter.traffic import BASE_US, Frame, batch_of, tcp
 from tests.dataplane.loading import sdnator
 from tests.p4.counting_switch import ask
 from tests.p4.sdnator_switch import made
@@ -90,7 +90,8 @@ def network(request):
 def segments(second, number, flags, *, back=False):
     ends = ("192.0.2.1", "10.0.0.9") if back else ("10.0.0.9", "192.0.2.1")
     return [
-        Frame(BASE_US + round(second * 1e6) + n, 60, tcp(*ends, 1000 + n, 80, flags)) for n in range(number)
+        TimedFrame(BASE_US + round(second * 1e6) + n, 60, tcp(*ends, 1000 + n, 80, flags))
+        for n in range(number)
     ]
 
 
@@ -102,5 +103,5 @@ def test_counts_of_a_window_are_known_when_it_is_over(network):
         network.play(frame, number / 10)
     network.written += network.control.tick(len(frames))
     results = [one.output for one in network.written]
-    assert all(isinstance(each, Result) for each in results)
+    assert all(isinstance(each, QueryResult) for each in results)
     assert [(each.fields["count"], each.exact) for each in results] == [(11, True), (4, True)]

@@ -4,14 +4,14 @@ from typing import Any
 
 import pytest
 
-from apps.sonata_adapter.catalogue import CATALOGUE
-from apps.sonata_adapter.control import Changes, Control, leftovers
-from apps.sonata_adapter.placement import reciprocal
-from apps.sonata_adapter.results import Captured, Result
+from apps.sonata_adapter.control import Control, ControllerUpdates, leftovers
+from apps.sonata_adapter.planner.placement import reciprocal
+from apps.sonata_adapter.query.catalogue import CATALOGUE
+from apps.sonata_adapter.results import Captured, QueryResult
+from sdnator.testing.oracles import sonata
+from sdnator.testing.query_traffic import TimedFrame, batch_of, batches, mixed, office, tcp
+from tests.apps.sonata_adapter.query.test_catalogue import expect, same
 from tests.apps.sonata_adapter.switch_model import SwitchModel, counts_of
-from tests.apps.sonata_adapter.test_catalogue import expect, same
-from tests.apps.sonata_adapter.traffic import Frame, batch_of, batches, mixed, office, tcp
-from tests.naive import sonata
 
 PREFIX = "network.traffic_query.sonata"
 
@@ -68,7 +68,7 @@ def answered(control, switch, asked, now, written):
 def ending(frames):
     """A last SYN, some windows later: the switch's clock goes on, and results of the end come."""
     last = frames[-1].time_us + 120_000_000
-    return [*frames, *(Frame(last + n, 60, tcp("10.0.0.1", "10.0.0.2", 1, 2, 2)) for n in range(5))]
+    return [*frames, *(TimedFrame(last + n, 60, tcp("10.0.0.1", "10.0.0.2", 1, 2, 2)) for n in range(5))]
 
 
 def rows(results):
@@ -215,7 +215,7 @@ def test_windows_follow_the_clock_of_the_switch():
         written += control.finish()
         assert written
         for one in written:
-            assert isinstance(one.output, Result)
+            assert isinstance(one.output, QueryResult)
             assert (one.output.window_us - frames[0].time_us + 700_000) % 2_000_000 == 0
 
 
@@ -249,5 +249,5 @@ def test_what_a_killed_adapter_left_is_taken_out():
         switch.change(changes)
     sweep = leftovers(changes.updates for changes in said)
     assert sweep
-    switch.change(Changes(updates=sweep))
+    switch.change(ControllerUpdates(updates=sweep))
     assert not any(switch.stages)

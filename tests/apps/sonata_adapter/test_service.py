@@ -4,14 +4,15 @@ from functools import partial
 
 import pytest
 
-from apps.sonata_adapter.catalogue import CATALOGUE
 from apps.sonata_adapter.control import Control
-from apps.sonata_adapter.placement import SwitchLimits
-from dataplane.capture_port import COPIED
-from tests.apps.p4runtime_ctrl.stage import BASE_US, Heard, Stage, end, wait_for
-from tests.apps.sonata_adapter.test_catalogue import expect
-from tests.apps.sonata_adapter.traffic import BASE_US as TRAFFIC_US
-from tests.apps.sonata_adapter.traffic import Frame, mixed
+from apps.sonata_adapter.planner.placement import SwitchLimits
+from apps.sonata_adapter.query.catalogue import CATALOGUE
+from dataplane.ports.capture_port import COPIED
+from sdnator.testing.controller_run import BASE_US, ControllerRun, Heard, end
+from sdnator.testing.query_traffic import BASE_US as TRAFFIC_US
+from sdnator.testing.query_traffic import TimedFrame, mixed
+from sdnator.testing.waiting import wait_for
+from tests.apps.sonata_adapter.query.test_catalogue import expect
 
 PREFIX = "network.traffic_query.sonata"
 ENTERED = ("installed", "exists")
@@ -19,7 +20,7 @@ ENTERED = ("installed", "exists")
 
 @pytest.fixture
 def stage(tmp_path):
-    with Stage(tmp_path) as stage:
+    with ControllerRun(tmp_path) as stage:
         yield stage
 
 
@@ -67,7 +68,7 @@ def test_keys_become_queries_and_leave_with_them(stage):
     health = Heard(engine, "due.health.sonata_adapter")
     wait_for(lambda: quiet(health))
     end(adapter)
-    shifted = [Frame(f.time_us - TRAFFIC_US + BASE_US, f.length, f.data) for f in frames]
+    shifted = [TimedFrame(f.time_us - TRAFFIC_US + BASE_US, f.length, f.data) for f in frames]
     for name in CATALOGUE:
         truth = {(f.window, f.fields) for f in expect(name, shifted, {"window": 2000})}
         wait_for(partial(at_least, results, name, truth), why=partial(found, results, name))

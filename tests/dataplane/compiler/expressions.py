@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from random import Random
 
-from dataplane import tree
-from dataplane.tree import Binary, Conditional, Const, Expression, FieldRef, FieldType, Unary
+from dataplane.v1model import tree
+from dataplane.v1model.tree import Binary, Conditional, Const, Expression, FieldRef, FieldType, Unary
 
 WIDTHS = (1, 3, 8, 9, 16, 31, 32, 48, 63, 64, 65, 100, 127, 128, 129, 200, 256, 300, 448, 512)
 SIGNED = (8, 16, 33, 64, 100, 128)
@@ -110,7 +110,7 @@ def program(targets: Sequence[tuple[FieldType, Expression | None]]) -> tree.Prog
     body: list[tree.Statement] = [tree.Assign(egress_spec, Const(1)), tree.AddHeader("result")]
     body += [tree.Assign(FieldRef("result", f), e) for f, e in targets if e is not None]
     node = tree.TableNode("tbl_run", (), (), (0,), {0: None}, False, None, None, hidden_action=0)
-    parse = tree.State("start", (tree.Extract("given"),), (), (), (), None)
+    parse = tree.ParserState("start", (tree.Extract("given"),), (), (), (), None)
     return tree.Program(
         name="expressions",
         headers=headers,

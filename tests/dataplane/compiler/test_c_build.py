@@ -1,11 +1,17 @@
 """Compiling: once for each text, in a private place, and what happens where it cannot be done."""
 
+import os
+import re
+import tempfile
+from pathlib import Path
+
 import pytest
 
-from dataplane.compiler import c_build
+from dataplane.compiler import c_build, confined
 from dataplane.errors import CompilerError, DataplaneError
-from dataplane.switch import Switch
-from tests.dataplane.loading import features, frame
+from dataplane.v1model.switch import Switch
+from sdnator.testing.switch_traffic import frame
+from tests.dataplane.loading import features
 
 _TEXT = "int answer(void) { return 42; }\n"
 
@@ -44,6 +50,85 @@ def test_without_a_place_to_keep_it_the_library_still_runs(monkeypatch):
 def test_refused_text_is_reported():
     with pytest.raises(CompilerError, match="refused the generated C"):
         c_build.compiled_library("no C at all", "int answer(void);")
+
+
+def recorded(tmp_path, monkeypatch, script):
+    """A compiler that says what it is and may do, and then compiles, or does `script` instead."""
+    said, real = tmp_path / "said", c_build.compiler()
+    said.touch()
+    tmp_path.chmod(0o711)
+    said.chmod(0o666)
+    made = tmp_path / "cc"
+    report = f'(id -u; pwd; stat -c %a .; env; ulimit -a; cat /proc/net/route; echo "$@") > {said}'
+    script = script or f'exec {real} "$@"'
+    made.write_text(f"#!/bin/sh\n{report}\n{script}\n")
+    made.chmod(0o755)
+    monkeypatch.setenv("CC", str(made))
+    return said
+
+
+@pytest.fixture
+def reachable():
+    """A folder that other users get to: pytest's own are closed."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def test_the_compiler_has_no_rights_or_secrets_of_ours(cache, reachable, monkeypatch):
+    monkeypatch.setenv("A_SECRET", "of ours")
+    said = recorded(reachable, monkeypatch, "")
+    _, made = c_build.compiled_library(_TEXT, "int answer(void);")
+    assert made.answer() == 42
+    text = said.read_text()
+    user, folder, mode = text.splitlines()[:3]
+    assert ("of ours" in text, mode, Path(folder).exists()) == (False, "700", False)
+    assert int(user) != 0
+    assert (int(user) == os.getuid()) == (os.getuid() != 0)
+    for name, most in (("time", confined.CPU_S), ("memory", confined.MEMORY_BYTES >> 10)):
+        assert re.search(rf"{name}\b.*\b{most}\n", text), text
+    assert [f.stat().st_mode & 0o777 for f in cache.iterdir()] == [0o600]
+
+
+@pytest.mark.usefixtures("cache")
+@pytest.mark.parametrize(
+    ("script", "text"),
+    [
+        ("ln -s /etc/passwd switch.so", "no switch.so"),
+        ("mkfifo switch.so", "no plain file|not a plain file"),
+        ("echo nonsense > switch.so", "is no library"),
+        ("true", "no switch.so"),
+    ],
+)
+def test_what_is_no_library_is_not_loaded(reachable, monkeypatch, script, text):
+    recorded(reachable, monkeypatch, script)
+    with pytest.raises(CompilerError, match=text):
+        c_build.compiled_library(_TEXT, "int answer(void);")
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_compiler_that_does_not_end_is_ended(reachable, monkeypatch):
+    recorded(reachable, monkeypatch, "sleep 1000")
+    monkeypatch.setattr(confined, "TIMEOUT_S", 0.5)
+    with pytest.raises(CompilerError, match="not done within"):
+        c_build.compiled_library(_TEXT, "int answer(void);")
+
+
+def test_a_library_that_others_could_have_written_is_made_again(cache):
+    c_build.compiled_library(_TEXT, "int answer(void);")
+    (file,) = cache.iterdir()
+    file.chmod(0o666)
+    before = file.stat().st_mtime_ns
+    c_build.compiled_library(_TEXT, "int answer(void);")
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert file.stat().st_mtime_ns > before
+
+
+def test_a_link_in_place_of_the_cache_is_not_followed(tmp_path, cache):
+    cache.parent.mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    cache.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="no folder"):
+        c_build.cache_directory()
 
 
 def test_without_a_compiler_auto_takes_python(monkeypatch):

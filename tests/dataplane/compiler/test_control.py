@@ -4,7 +4,7 @@ import pytest
 
 from dataplane.compiler.control import joins, order
 from dataplane.errors import ProgramError
-from dataplane.tree import ConditionNode, Const, Node, Pipeline
+from dataplane.v1model.tree import ConditionNode, Const, Node, Pipeline
 
 
 def pipeline(**edges: tuple[str | None, str | None]) -> Pipeline:

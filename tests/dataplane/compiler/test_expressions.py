@@ -8,8 +8,8 @@ from dataplane.compiler.c_code import generate
 from dataplane.compiler.layout import make
 from dataplane.compiler.simplify import bounds, simplify
 from dataplane.errors import Unsupported
-from dataplane.switch import Switch
-from dataplane.tree import Binary, Const, Expression, FieldRef, Unary
+from dataplane.v1model.switch import Switch
+from dataplane.v1model.tree import Binary, Const, Expression, FieldRef, Unary
 from tests.dataplane.compiler.expressions import (
     INPUTS,
     SIGNED,

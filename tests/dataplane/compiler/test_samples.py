@@ -3,8 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataplane.bytestrings import encode as canonical
 from dataplane.compiler.samples import decode, encode, varint
+from dataplane.p4runtime.bytestrings import encode as canonical
 from p4rt import p4runtime
 
 

@@ -4,6 +4,7 @@ import datetime as dt
 import math
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,17 +12,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from due.backends import open_archive as archive_of
 from due.codec import pack
 from due.drivers.base import ArchiveDriver
-from due.drivers.mongodb import MongoArchive
-from due.drivers.sqlite import SqliteArchive
 from due.errors import BackendError, InvalidKey, InvalidQuery
 from due.messages import Item, RecordBatch
 from tests.due.drivers.mongo_server import PATIENT, mongo_server
 from tests.naive.archive_query import naive_find
 
 T0 = 1_700_000_000_123_456_789
-DRIVERS = ("sqlite", "mongodb")
+DRIVERS = ("sqlite", "mongodb", "memory")
 Open = Callable[[], ArchiveDriver]
 
 
@@ -31,19 +31,23 @@ def mongo_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield url
 
 
+def _url(request: pytest.FixtureRequest, folder: Path) -> str:
+    unique = abs(hash(request.node.nodeid))
+    if request.param == "sqlite":
+        return f"sqlite://{folder}/archive.db"
+    if request.param == "memory":
+        return f"memory://t{unique}"
+    return request.getfixturevalue("mongo_url") + f"?{PATIENT}&collection=t{unique}"
+
+
 @pytest.fixture(params=DRIVERS)
 def open_archive(request: pytest.FixtureRequest, tmp_path) -> Iterator[Open]:
     """Opens the same empty archive as often as it is called."""
     opened: list[ArchiveDriver] = []
-    if request.param == "sqlite":
-        url = f"sqlite://{tmp_path}/archive.db"
-    else:
-        url = (
-            request.getfixturevalue("mongo_url") + f"?{PATIENT}&collection=t{abs(hash(request.node.nodeid))}"
-        )
+    url = _url(request, tmp_path)
 
     def make() -> ArchiveDriver:
-        opened.append(SqliteArchive(url) if request.param == "sqlite" else MongoArchive(url))
+        opened.append(archive_of(url))
         return opened[-1]
 
     yield make

@@ -138,3 +138,29 @@ def test_names_that_bson_does_not_take_are_still_found(archive: MongoArchive) ->
     (found,) = archive.find({"value.$c": 2})
     assert found.value == value
     assert len(archive.find({"value.big": {"$gt": 2**62}})) == 1
+
+
+def test_a_damaged_document_costs_that_document_only(archive: MongoArchive) -> None:
+    archive.insert([Item("a.b", n, n, n, "app", "i", n) for n in range(1, 6)])
+    table = archive._table()
+    table.update_one({"sequence": {"$eq": 2}}, {"$set": {"payload": b"no frame"}})
+    table.update_one({"sequence": {"$eq": 3}}, {"$unset": {"instanceId": ""}})
+    table.update_one({"sequence": {"$eq": 4}}, {"$set": {"parts": "many"}})
+    assert [item.value for item in archive.find({"dataKey": "a.b"})] == [1, 5]
+    assert [item.value for item in archive.find({"dataKey": "a.b"}, limit=1)] == [5]
+
+
+def test_keys_go_a_while_after_their_last_document_and_come_back(
+    archive: MongoArchive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.insert(items(3, key="gone"))
+    archive.insert([Item("stays", 1, 2 * T0, 2 * T0, "app", "i", 1)])
+    keys = archive._table("_keys")
+    assert archive.prune(before=T0 + 100) == 3
+    assert {key["_id"] for key in keys.find({})} == {"gone", "stays"}, "not at once"
+    monkeypatch.setattr(mongodb, "_EMPTY_SECONDS", 0.0)
+    monkeypatch.setattr(mongodb, "_NOTE_SECONDS", 0.0)
+    archive.prune(before=T0 + 100)
+    assert {key["_id"] for key in keys.find({})} == {"stays"}
+    archive.insert(items(3, key="gone", start=10))
+    assert len(archive.find({"dataKey": "gone"})) == 3

@@ -121,7 +121,7 @@ def test_what_a_query_means_on_metadata(query: dict[str, Any], matches: bool) ->
         ({5: 1}, "5"),
         ({"$where": "x"}, r"\$where"),
         ({"$or": []}, r"\$or takes a list"),
-        ({"$and": [1]}, "1 is none"),
+        ({"$and": [1]}, "1 is not one"),
         ({"value": {"$near": 1}}, r"\$near"),
         ({"value": {"$gt": 1, "b": 2}}, "do not mix"),
         ({"value": {"$in": 5}}, "take a list"),
@@ -146,6 +146,91 @@ def test_what_a_query_means_on_metadata(query: dict[str, Any], matches: bool) ->
 def test_wrong_queries_are_explained(query: Any, complaint: str) -> None:
     with pytest.raises(InvalidQuery, match=complaint):
         parse(query)
+
+
+def _nested(operator: str, depth: int) -> dict[str, Any]:
+    query: dict[str, Any] = {"$eq": 1} if operator == "$not" else {"value": 1}
+    for _ in range(depth):
+        query = {operator: query} if operator == "$not" else {operator: [query]}
+    return {"value": query} if operator == "$not" else query
+
+
+@pytest.mark.parametrize(
+    ("query", "complaint"),
+    [
+        (_nested("$not", 5000), "levels"),
+        (_nested("$and", 5000), "levels"),
+        (_nested("$nor", 5000), "levels"),
+        ({"value": {"$in": list(range(30_000))}}, "elements"),
+        ({"$or": [{"value": 1}] * 30_000}, "elements"),
+        ({"value": "x" * 2_000_000}, "characters"),
+        ({"value": {"$regex": "a" * 1001}}, "characters"),
+        ({"value": {"$regex": r"(a)\1"}}, "linear time"),
+        ({"value": {"$regex": "(?=a)"}}, "linear time"),
+        ({"value": {"$regex": "(((a{99}){99}){99})"}}, "linear time"),
+        ({"value": re.compile("a b", re.VERBOSE)}, "only I, M and S"),
+        ({"value": re.compile(b"a")}, "take text"),
+    ],
+)
+def test_queries_have_bounds(query: Any, complaint: str) -> None:
+    with pytest.raises(InvalidQuery, match=complaint):
+        parse(query)
+
+
+@pytest.mark.timeout(20)
+def test_a_regular_expression_takes_time_by_the_length_of_the_text_only() -> None:
+    """A backtracking matcher would be at it until the end of days."""
+    assert not parse({"value": {"$regex": r"^((\w|\.)+)+!$"}}).matches(item("a." * 100_000))
+    assert parse({"dataKey": {"$regex": r"^((\w|\.)+)+$"}}).matches(item(key="a." * 100 + "b"))
+
+
+_SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9) | st.binary(max_size=4)
+)
+_WORDS = ["$and", "$or", "$nor", "$not", "$eq", "$gt", "$in", "$regex", "$options", "$size", "$exists"]
+_FIELDS = [
+    "value",
+    "value.1",
+    "value.²",
+    "value.a." + "9" * 5000,
+    "dataKey",
+    "timestamp",
+    "appId",
+    "sequence",
+]
+_VALUES = st.recursive(
+    _SCALARS,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=2), inner, max_size=3),
+)
+_QUERIES = st.dictionaries(
+    st.sampled_from(_FIELDS + _WORDS),
+    st.recursive(
+        _SCALARS,
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(st.sampled_from(_WORDS + _FIELDS), inner, max_size=3)
+        ),
+    ),
+    max_size=3,
+)
+
+
+@given(_QUERIES, _VALUES)
+def test_whatever_is_asked_is_answered_or_refused(query: dict[str, Any], value: Any) -> None:
+    try:
+        parsed = parse(query)
+    except (InvalidQuery, InvalidKey):
+        return
+    assert parsed.matches(item(value)) in (True, False)
+
+
+@given(_VALUES, _VALUES, st.sampled_from(["$eq", "$gt", "$lte", "$in"]))
+def test_any_value_compares_with_any_operand(value: Any, operand: Any, operator: str) -> None:
+    try:
+        parsed = parse({"value": {operator: operand}})
+    except InvalidQuery:
+        return
+    assert parsed.matches(item(value)) in (True, False)
 
 
 def test_a_malformed_key_is_named() -> None:

@@ -65,7 +65,7 @@ def test_foreign_and_newer_payloads_are_counted_and_skipped(make_engine, server,
     wait_for(lambda: got == ["fine"])
     counts = engine.health()["receiving"]
     assert (counts["undecodable"], counts["newer_version"]) == (3, 2)
-    assert caplog.text.count("skipped what arrived") == 2
+    assert caplog.text.count("refused a frame") == 2
 
 
 def test_instances_of_a_shared_app_divide_a_stream(make_engine, monkeypatch):
@@ -88,7 +88,7 @@ def test_instances_of_a_shared_app_divide_a_stream(make_engine, monkeypatch):
 
 
 def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path, monkeypatch):
-    monkeypatch.setattr("due.drivers.redis_reader._WITHDRAWN_SECONDS", 0.1)
+    monkeypatch.setattr("due.drivers.redis_upkeep._WITHDRAWN_SECONDS", 0.1)
     with EmbeddedServer(tmp_path / "u") as server:
         init = {"capabilities": [Capability("r.gone", delivery="reliable")]}
         producer = make_engine("producer", url=server.url, init=init)

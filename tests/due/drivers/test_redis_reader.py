@@ -7,8 +7,9 @@ import pytest
 import redis
 
 from due.drivers.base import Delivery
+from due.drivers.redis_leases import readers_name
 from due.drivers.redis_reader import StreamReader
-from due.drivers.redis_streams import readers_name, stream_name
+from due.drivers.redis_streams import stream_name
 from due.drivers.redis_wire import client
 from tests.due.conftest import wait_for
 

@@ -1,8 +1,12 @@
 """The ledger keeps what readers still need, within the window, and knows who is alive."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from due.drivers.redis_progress import Question
 from due.drivers.redis_streams import LEAST_PAUSE, StreamLedger, next_pause, parse_id
+from due.errors import UpdatesUnavailable
 
 
 def _ledger(**changes):
@@ -47,11 +51,30 @@ def test_what_the_server_has_not_answered_is_never_forgotten():
 
 
 def test_groups_live_by_their_leases_even_after_the_server_lost_them():
+    ledger, seconds = _ledger(group_timeout=3.0), iter(range(100, 200))
+
+    def look(**leases):
+        now = float(next(seconds))
+        return ledger.live_groups({f.replace("_", "/").encode(): v for f, v in leases.items()}, now, now)
+
+    assert look(kitsune_1=b"7", gone_1=b"5", left_1=b"0") == {b"kitsune", b"gone"}
+    for number in range(3):
+        assert look(kitsune_1=b"%d" % number, gone_1=b"5", left_1=b"0")
+    assert look(kitsune_1=b"4", gone_1=b"5") == {b"kitsune"}
+    assert look() == {b"kitsune"}
+    assert look(kitsune_1=b"0", kitsune_2=b"1") == {b"kitsune"}
+    assert look(kitsune_2=b"0") == set()
+
+
+def test_ids_of_an_earlier_life_of_the_server_trim_nothing():
+    """Its clock may be behind them: what is new would be deleted."""
     ledger = _ledger()
-    assert ledger.live_groups({"kitsune/1": 100.0, "gone/1": 60.0, "left/1": 0.0}, 101.0) == {"kitsune"}
-    assert ledger.live_groups({}, 110.0) == {"kitsune"}
-    assert ledger.live_groups({"kitsune/1": 0.0, "kitsune/2": 110.0}, 111.0) == {"kitsune"}
-    assert ledger.live_groups({"kitsune/2": 0.0}, 112.0) == set()
+    _add(ledger, 8)
+    ledger.acknowledged((8, 0))
+    ledger.forget_ids()
+    assert ledger.trim_point() is None
+    ledger.acknowledged((2**63, 0))
+    assert not ledger.kept
 
 
 def test_ids_compare_as_numbers():
@@ -78,3 +101,38 @@ def test_excess_is_what_is_kept_beyond_a_share_of_the_window():
 )
 def test_a_writer_asks_again_when_the_readers_pace_lets_expect_room(waited, freed, missing, seconds):
     assert next_pause(waited, freed, missing, 0.1) == pytest.approx(seconds)
+
+
+_REPLIES = st.recursive(
+    st.none()
+    | st.integers(-5, 2**64)
+    | st.sampled_from([b"name", b"pending", b"last-delivered-id", b"5-1", b"x", b"group", b"group/one"])
+    | st.binary(max_size=3),
+    lambda inner: st.lists(inner, max_size=6),
+    max_leaves=20,
+)
+
+
+@given(st.lists(_REPLIES, min_size=3, max_size=3))
+def test_whatever_the_server_answers_nothing_is_forgotten_by_mistake(replies):
+    ledger = _ledger()
+    ledger.groups = (b"group",)
+    _add(ledger, 3)
+    question = Question(ledger)
+    ledger.asking(0.0)
+    for reply in replies:
+        question.take(reply)
+    try:
+        position = question.answer()
+    except UpdatesUnavailable:
+        return
+    ledger.acknowledged(position)
+    assert len(ledger.kept) + len(ledger.retained) == 3
+
+
+@given(_REPLIES)
+def test_an_id_is_read_or_refused(reply):
+    try:
+        assert len(parse_id(reply)) == 2
+    except UpdatesUnavailable:
+        return

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -67,10 +68,46 @@ os.kill(os.getpid(), signal.SIGKILL)
     spool.close()
 
 
-def test_a_file_that_is_no_spool_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "spool.db").write_bytes(b"something else" * 100)
+def test_a_damaged_file_is_set_aside_and_the_queue_goes_on(tmp_path: Path, caplog) -> None:
+    for _ in range(5):
+        (tmp_path / "spool.db").write_bytes(b"something else" * 100)
+        spool = DiskSpool(tmp_path, 1 << 20)
+        assert spool.set_aside == 1
+        spool.put([frame(1)])
+        assert spool.take(5) == [frame(1)]
+        spool.close()
+    kept = list(tmp_path.glob("spool.damaged-*"))
+    assert len(kept) == 3
+    assert all(path.read_bytes() == b"something else" * 100 for path in kept)
+    assert "is damaged" in caplog.text
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
     with pytest.raises(BackendError, match=r"spool\.db"):
-        DiskSpool(tmp_path, 1 << 20)
+        DiskSpool(tmp_path / "file", 1 << 20)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(st.tuples(st.integers(0, 2**16), st.binary(min_size=1, max_size=64)), min_size=1, max_size=5))
+def test_whatever_is_in_the_file_it_works_or_says_why(
+    tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, bytes]]
+) -> None:
+    folder = tmp_path_factory.mktemp("spool")
+    spool = DiskSpool(folder, 1 << 20)
+    spool.put([frame(n) for n in range(50)])
+    spool.close()
+    content = bytearray((folder / "spool.db").read_bytes())
+    for place, change in changes:
+        position = place % len(content)
+        content[position : position + len(change)] = change
+    (folder / "spool.db").write_bytes(content)
+    with suppress(BackendError):
+        spool = DiskSpool(folder, 1 << 20)
+        while taken := spool.take(7):
+            spool.done(len(taken))
+        spool.put([frame(100)])
+        spool.close()
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -96,4 +133,34 @@ def test_it_behaves_like_a_list(
             spool.close()
             spool = DiskSpool(folder, 1 << 20)
         assert len(spool) == len(model)
+    spool.close()
+
+
+@pytest.mark.parametrize("data", [b"\xa5\xff", bytes.fromhex("9ba1ffa3617070"), None, 7, "text"])
+def test_a_record_that_is_none_is_dropped_and_the_others_stay(tmp_path: Path, data: object) -> None:
+    """Texts that are no UTF-8, a record without size, values of other types."""
+    spool = DiskSpool(tmp_path, 1 << 20)
+    spool.put([frame(1)])
+    for statement in (
+        "ALTER TABLE frames RENAME TO old",
+        "CREATE TABLE frames(id INTEGER PRIMARY KEY, size, data)",
+    ):
+        spool._file.execute(statement)
+    spool._file.execute("INSERT INTO frames SELECT * FROM old")
+    spool._file.execute("INSERT INTO frames VALUES(0, NULL, ?)", (data,))
+    assert spool.take(5) == [frame(1)]
+    spool.done(1)
+    assert spool.take(5) == []
+    spool.close()
+
+
+def test_a_schema_that_is_no_text_is_damage(tmp_path: Path) -> None:
+    """What SQLite says of it cannot be decoded: an empty file takes its place."""
+    DiskSpool(tmp_path, 1 << 20).close()
+    file = tmp_path / "spool.db"
+    file.write_bytes(file.read_bytes().replace(b"CREATE TABLE frames(", b"CREATE T\x80BLE fr\xffm\xff(", 1))
+    spool = DiskSpool(tmp_path, 1 << 20)
+    assert spool.set_aside == 1
+    spool.put([frame(1)])
+    assert spool.take(1) == [frame(1)]
     spool.close()

@@ -10,12 +10,15 @@ from types import SimpleNamespace
 
 import pytest
 
+from due.archiver import Archiver
 from due.codec import pack
 from due.drivers import sqlite_file
 from due.drivers.query import parse
+from due.drivers.spool_slots import SlottedSpool
 from due.drivers.sqlite import SqliteArchive
 from due.errors import ArchiveUnavailable, BackendError, InvalidOption
 from due.messages import Item
+from tests.due.conftest import wait_for
 
 T0 = 1_700_000_000_000_000_000
 ROOT = Path(__file__).parents[3]
@@ -210,11 +213,83 @@ def test_a_folder_that_cannot_be_made_is_unavailable(tmp_path: Path) -> None:
         opened(tmp_path / "file").find({})
 
 
-def test_another_kind_of_file_is_an_error_for_good(tmp_path: Path) -> None:
+def test_a_damaged_file_is_unavailable_until_it_is_moved_away(tmp_path: Path) -> None:
     (tmp_path / "archive.db").write_bytes(b"no database at all" * 1000)
-    with pytest.raises(BackendError, match="is it an archive") as raised:
-        opened(tmp_path).insert(items(1))
-    assert not isinstance(raised.value, ArchiveUnavailable)
+    archive = opened(tmp_path)
+    for call in (lambda: archive.insert(items(1)), lambda: archive.find({})):
+        with pytest.raises(ArchiveUnavailable, match=r"damaged.*move it away"):
+            call()
+    (tmp_path / "archive.db").rename(tmp_path / "damaged.db")
+    archive.insert(items(1))
+    assert len(archive.find({})) == 1
+    archive.close()
+
+
+def test_a_damaged_row_costs_that_row_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    archive = opened(tmp_path)
+    archive.insert_frames([pack(items(10, start=start)) for start in (1, 11, 21)])
+    archive.insert(items(3, key="single"))
+    file = sqlite3.connect(tmp_path / "archive.db", isolation_level=None)
+    file.execute("UPDATE frames SET payload = x'c1c1c1' WHERE id IN (2, 4)")
+    file.close()
+    assert len(archive.find({})) == 22
+    assert archive.damaged == 2
+    assert caplog.text.count("left out") == 1
+    archive.close()
+
+
+def test_a_full_disk_sends_items_to_the_spool_and_loses_none(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    archive.insert(items(1))
+    archive._file._writer.execute("PRAGMA max_page_count = 20")  # as a disk without room
+    archiver = Archiver(archive, SlottedSpool(tmp_path, 1 << 24), batch=1)
+    for start in range(2, 202):
+        archiver.put(pack([Item("a.b", bytes(2000), start, start, "app", "i", start)]))
+    archiver.flush(60)
+    assert archiver.statistics()["spooled"] > 0
+    archive._file._writer.execute("PRAGMA max_page_count = 100000")
+    wait_for(lambda: not archiver.backlog())
+    assert archiver.statistics()["lost"] == archiver.statistics()["refused"] == 0
+    assert [i.sequence for i in archive.find({"dataKey": "a.b"}) if isinstance(i.value, bytes)] == list(
+        range(2, 202)
+    )
+    archiver.close()
+    archive.close()
+
+
+def test_what_no_file_can_hold_is_refused_for_good(tmp_path: Path) -> None:
+    archive = opened(tmp_path)
+    for number in (2**63, 2**64 - 1, -(2**63) - 1):
+        with pytest.raises(BackendError) as raised:
+            archive.insert([Item("a.b", 1, 5, number, "app", "i", 1)])
+        assert not isinstance(raised.value, ArchiveUnavailable)
+    archive.insert(items(1))
+    archive.close()
+
+
+def test_keys_and_sources_go_with_their_last_row_and_writers_and_readers_notice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_file, "_COMPARE_S", 0.0)
+    writer, other, reader = opened(tmp_path), opened(tmp_path), opened(tmp_path)
+    for n in range(50):
+        writer.insert([Item(f"gone.k{n}", n, n + 1, n + 1, "app", f"i{n}", 1)])
+    writer.insert([Item("stays", 1, 10**6, 10**6, "app", "last", 1)])
+    assert len(reader.find({})) == 51
+    assert other.prune(before=1000) == 50
+    file = sqlite3.connect(tmp_path / "archive.db")
+    counts = [file.execute(f"SELECT count(*) FROM {table}").fetchone()[0] for table in ("keys", "sources")]  # noqa: S608
+    file.close()
+    assert counts == [1, 1]
+    # the writer knew the ids of what was pruned
+    writer.insert([Item("gone.k7", 7, 10**6, 10**6, "app", "i7", 2)])
+    writer.insert_frames([pack([Item("gone.k8", 8, 10**6, 10**6, "app", "i8", 2)])])
+    found = {(item.key, item.instance_id) for item in reader.find({})}
+    assert found == {("stays", "last"), ("gone.k7", "i7"), ("gone.k8", "i8")}
+    assert [item.value for item in reader.find({"dataKey": "gone.*"})] == [7, 8]
+    assert len(reader._file.keys.entries) == 3
+    for archive in (writer, other, reader):
+        archive.close()
 
 
 def test_a_file_of_a_newer_version_is_refused(tmp_path: Path) -> None:
@@ -246,3 +321,16 @@ def test_deleted_space_is_used_again_or_given_back(tmp_path: Path) -> None:
     assert archive.prune(before=400) == 399
     archive.close()
     assert (tmp_path / "archive.db").stat().st_size < 2_500_000
+
+
+def test_a_frame_whose_own_key_is_none_costs_that_row_only(tmp_path: Path) -> None:
+    """The row's key was looked up, the frame says another, which is no key."""
+    archive = opened(tmp_path)
+    archive.insert_frames([pack(items(10, start=start)) for start in (1, 11)])
+    file = sqlite3.connect(tmp_path / "archive.db", isolation_level=None)
+    payload = pack([Item("a..\0", 1, 1, 1, "app", "i", 1)]).payload
+    file.execute("UPDATE frames SET payload = ? WHERE id = 1", (payload,))
+    file.close()
+    assert len(archive.find({"dataKey": "a.*", "value": {"$exists": True}})) == 10
+    assert archive.damaged == 1
+    archive.close()

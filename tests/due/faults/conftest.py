@@ -1,9 +1,10 @@
 """Programs as processes with their output in files, killed at the end whatever happens."""
 
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -16,11 +17,23 @@ ROOT = Path(__file__).parents[3]
 class Program:
     """A started process with its output in a file."""
 
-    def __init__(self, folder: Path, *arguments: object, module: str = "tests.due.faults.programs") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *arguments: object,
+        module: str = "tests.due.faults.programs",
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self.output = folder / f"output-{time.monotonic_ns()}.txt"
         command = [sys.executable, "-m", module, *map(str, arguments)]
         with self.output.open("wb") as out:
-            self.process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=out)
+            self.process = subprocess.Popen(
+                command,
+                cwd=ROOT,
+                stdin=subprocess.PIPE,
+                stdout=out,
+                env={**os.environ, **(environment or {})},
+            )
 
     def lines(self) -> list[str]:
         """What was said so far, whole lines."""

@@ -1,8 +1,12 @@
 """Small apps that fault tests start as processes and kill: `python -m tests.due.faults.programs NAME URL ...`."""
 
+import os
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
 
 from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Options
 
@@ -11,18 +15,23 @@ SPEECH = "fault.speech.speaker"
 OPTIONS = Options(coordinated=False, window_bytes=4 << 20, backlog_bytes=4 << 20)
 
 
-def _engine(url: str, app: str, role=PRODUCER | CONSUMER, **init) -> Engine:
-    engine = Engine(OPTIONS)
+def _engine(url: str, app: str, role=PRODUCER | CONSUMER, options=OPTIONS, **init) -> Engine:
+    engine = Engine(options)
     engine.set_pubsub(url)
     engine.init(app, role, **init)
     return engine
 
 
-def produce(url: str, delivery: str, count: str, size: str) -> None:
+def produce(
+    url: str, delivery: str, count: str, size: str, window: str = str(4 << 20), patience: str = "30"
+) -> None:
     """Write numbered payloads and say where we are, then that all is flushed; one more for each line we get."""
     engine = _engine(
         url,
         "maker",
+        options=msgspec.structs.replace(
+            OPTIONS, window_bytes=int(window), retain_bytes=4 * int(window), group_timeout=float(patience)
+        ),
         capabilities=[Capability(KEY, delivery="reliable" if delivery == "reliable" else "best_effort")],
     )
     padding = b"." * int(size)
@@ -95,7 +104,16 @@ def listen(url: str) -> None:
     sys.stdin.readline()
 
 
+def shift_clock(file: Path) -> None:
+    """From now on this process' wall clock is off by as many seconds as the file says at the moment."""
+    real = time.time_ns
+    time.time_ns = lambda: real() + 10**9 * int(file.read_text() or 0)
+    time.time = lambda: time.time_ns() / 1e9
+
+
 if __name__ == "__main__":
+    if "FAULT_CLOCK" in os.environ:
+        shift_clock(Path(os.environ["FAULT_CLOCK"]))
     programs: dict[str, Callable[..., None]] = {
         "produce": produce,
         "consume": consume,

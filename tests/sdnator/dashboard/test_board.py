@@ -30,7 +30,7 @@ def on(switch, one):
 def alert(number):
     return Alert(
         id=str(number), sender=Sender(switch="s1", port=1, mac="02:00:00:00:00:01"), event_time=number,
-        first_packet=0, packets=1, over=1, peak_score=2.0, hot_seconds=1, rate=1.0, training_rate=1.0,
+        first_packet=0, packets=1, over=1, peak_score=2.0, anomalous_seconds=1, rate=1.0, training_rate=1.0,
         mac_addresses=1, reason="",
     )  # fmt: skip
 
@@ -149,3 +149,12 @@ def test_a_topic_that_changes_gets_another_number():
     board.alert(alert(1))
     assert board.versions["alerts"] != before
     assert board.versions["scores"] == 0
+
+
+def test_parts_that_keep_dying_are_told_and_those_that_run_are_not():
+    board = Board()
+    health = {"state": "degraded", "cause": "kitsune was killed by SIGKILL", "restarts": 4}
+    board.supervised({"kitsune": health, "firewall": {"state": "running", "cause": ""}})
+    assert board.degraded == "kitsune is degraded: kitsune was killed by SIGKILL"
+    board.supervised({})
+    assert board.degraded == ""

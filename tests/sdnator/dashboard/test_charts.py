@@ -58,6 +58,22 @@ def test_an_arrow_has_the_rates_of_the_keys_that_go_along_it():
     ]
 
 
+HOSTILE = "<img src=x onerror=alert(1)>{b|x}"
+
+
+def test_names_from_outside_are_no_markup():
+    """ECharts takes a tooltip's text as HTML, and {…} in it and in labels as its own."""
+    flow = [{"producer": HOSTILE, "consumer": "firewall", "interest": f"x.{HOSTILE}"}]
+    series = flow_chart([{"app_id": HOSTILE}], flow, {}, {})["series"][0]
+    tips = [one["tooltip"]["formatter"] for one in (*series["data"], *series["links"])]
+    for tip in tips:
+        bare = tip.replace("<br>", "")
+        assert not {"<", ">", "{", "}", '"'} & set(bare)
+    assert "&lt;img src=x onerror=alert(1)&gt;" in "".join(tips)
+    for one in series["data"]:
+        assert "{" not in one["label"]["formatter"]
+
+
 def test_numbers_are_short():
     shown = [number(value) for value in (0, 0.25, 3, 3.5, 17.2, 9_999, 12_345, 2_300_000)]
     assert shown == ["0", "0.2", "3", "3.5", "17", "9,999", "12.3 k", "2.3 M"]

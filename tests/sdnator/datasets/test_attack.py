@@ -3,14 +3,14 @@
 import pytest
 
 from sdnator.datasets import frames, hosts
-from sdnator.datasets.attack import Plan, traffic
-from sdnator.datasets.traffic import ARP, SECOND, TCP, UDP, Sent
+from sdnator.datasets.attack import AttackPlan, traffic
+from sdnator.datasets.traffic import ARP, SECOND, TCP, UDP, SentPacket
 
 LENGTH = 400 * SECOND
 
 
-def _attack(**options) -> list[Sent]:
-    return traffic(1, SECOND, SECOND + LENGTH, Plan(**options))
+def _attack(**options) -> list[SentPacket]:
+    return traffic(1, SECOND, SECOND + LENGTH, AttackPlan(**options))
 
 
 def test_every_packet_names_its_sender():

@@ -1,13 +1,24 @@
 """A download resumes where it broke off, and a wrong file never gets the right name."""
 
 import hashlib
+import resource
+import shutil
+import signal
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from sdnator.datasets.fetch import BadSource, ChecksumMismatch, Interrupted, fetch
+from sdnator.datasets.fetch import (
+    BadSource,
+    ChecksumMismatch,
+    DiskFull,
+    Interrupted,
+    NotThere,
+    WrongContent,
+    fetch,
+)
 
 CONTENT = bytes(range(256)) * 4_000
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -22,6 +33,8 @@ class Source:
         self.break_after: list[int] = []
         self.ranges = True
         self.tells_length = True
+        self.content_type = ""
+        self.wrong_by = 0
         self.asked: list[str | None] = []
         source = self
 
@@ -49,6 +62,12 @@ class Source:
                 return
         body = self.content[start:]
         request.send_response(206 if start else 200)
+        if start:
+            request.send_header(
+                "Content-Range", f"bytes {start + self.wrong_by}-{len(self.content) - 1}/{len(self.content)}"
+            )
+        if self.content_type:
+            request.send_header("Content-Type", self.content_type)
         if self.etag:
             request.send_header("ETag", self.etag)
         if self.tells_length:
@@ -141,7 +160,53 @@ def test_a_wrong_checksum_leaves_nothing(tmp_path, source):
 def test_bad_sources(tmp_path, source):
     with pytest.raises(BadSource, match="not an http"):
         fetch("file:///etc/passwd", tmp_path / "f")
-    with pytest.raises(BadSource, match="404"):
+    with pytest.raises(NotThere, match="404"):
         fetch(source.url.replace("/mirai", "/missing"), tmp_path / "f")
     with pytest.raises(Interrupted, match="refused"):
         fetch("http://127.0.0.1:1/x", tmp_path / "f", tries=1)
+
+
+def test_a_web_page_instead_of_the_file(tmp_path, source):
+    """A portal's page is refused before anything is stored."""
+    source.content, source.content_type = b"<!DOCTYPE html>please register", "text/html; charset=utf-8"
+    with pytest.raises(WrongContent, match="a web page came"):
+        fetch(source.url, tmp_path / "f")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_too_small_is_told_before_the_download(tmp_path, source, monkeypatch):
+    """What is missing and what is free; nothing was downloaded."""
+    monkeypatch.setattr("shutil.disk_usage", lambda _path: shutil._ntuple_diskusage(10, 5, 5))
+    with pytest.raises(DiskFull, match=r"1,024,000 bytes are missing, 5 bytes are free"):
+        fetch(source.url, tmp_path / "f")
+    assert not (tmp_path / "f").exists()
+
+
+def test_a_disk_that_fills_up_keeps_what_has_come(tmp_path, source):
+    """A limit on the size of files stands for the full disk; the next try goes on from there."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
+    try:
+        with pytest.raises(DiskFull, match="the disk is full"):
+            fetch(source.url, tmp_path / "f")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert fetch(source.url, tmp_path / "f", sha256=SHA256).resumed_at == 300_000
+
+
+def test_a_note_that_was_cut_off_starts_again(tmp_path, source):
+    """A crash may leave half a note: nothing says what the bytes at hand belong to."""
+    source.break_after = [1_000]
+    with pytest.raises(Interrupted):
+        fetch(source.url, tmp_path / "f", tries=1)
+    (tmp_path / ".f.part.json").write_text('{"url": "ht')
+    assert fetch(source.url, tmp_path / "f", sha256=SHA256).resumed_at == 0
+
+
+def test_another_part_than_was_asked_for_is_not_appended(tmp_path, source):
+    """A server that sends some other range: the file is fetched from its start."""
+    source.break_after, source.wrong_by = [1_000], 7
+    assert fetch(source.url, tmp_path / "f", sha256=SHA256).path.read_bytes() == CONTENT
+    assert source.asked == [None, "bytes=1000-", None]

@@ -8,19 +8,19 @@ from apps.kitsune.kernel import load_kernel
 from apps.kitsune.kitnet import KitNet
 from apps.packets import read_frames
 from due import RecordBatch
-from sdnator.captures import Capture
+from sdnator.capture.captures import Capture
+from sdnator.capture.labels import read_labels
 from sdnator.datasets import hosts, mirai_like
-from sdnator.datasets.attack import Plan
-from sdnator.datasets.mirai_like import Options, generate, make
-from sdnator.datasets.traffic import Frame
+from sdnator.datasets.attack import AttackPlan
+from sdnator.datasets.mirai_like import MiraiLikeOptions, generate, make
+from sdnator.datasets.traffic import WireFrame
 from sdnator.errors import BadInput
-from sdnator.labels import read_labels
-from sdnator.summary import roc_auc
+from sdnator.replay.summary import roc_auc
 
-SHORT = Options(benign_seconds=40, attack_seconds=30)
+SHORT = MiraiLikeOptions(benign_seconds=40, attack_seconds=30)
 
 
-def _batch(frames: list[Frame]) -> RecordBatch:
+def _batch(frames: list[WireFrame]) -> RecordBatch:
     number = len(frames)
     return read_frames(
         [frame.data for frame in frames],
@@ -59,18 +59,18 @@ def test_what_is_written(tmp_path):
 
 def test_limits(tmp_path):
     """A capture ends at its most packets; without an attack nothing is labelled; nothing at all is refused."""
-    made = make(Options(benign_seconds=40, attack_seconds=0, max_packets=500), tmp_path / "a.pcap")
+    made = make(MiraiLikeOptions(benign_seconds=40, attack_seconds=0, max_packets=500), tmp_path / "a.pcap")
     assert (made.packets, made.attack_packets, made.first_attack) == (500, 0, None)
-    alone = make(Options(background=False, attack_seconds=20), tmp_path / "b.pcap")
+    alone = make(MiraiLikeOptions(background=False, attack_seconds=20), tmp_path / "b.pcap")
     assert alone.first_attack == 0
     with pytest.raises(BadInput, match="no packet to write"):
-        make(Options(benign_seconds=0, attack_seconds=0), tmp_path / "c.pcap")
+        make(MiraiLikeOptions(benign_seconds=0, attack_seconds=0), tmp_path / "c.pcap")
     assert not (tmp_path / "c.pcap").exists()
 
 
 def test_a_broken_run_leaves_no_capture(tmp_path, monkeypatch):
     def interrupted(_options):
-        yield Frame(0, 60, bytes(60), "")
+        yield WireFrame(0, 60, bytes(60), "")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(mirai_like, "generate", interrupted)
@@ -86,7 +86,7 @@ def _share(chosen) -> float:
 @pytest.mark.parametrize("seed", [1, 77])
 def test_the_house_resembles_the_public_capture(seed):
     """The figures of the first 38,363 packets of the public set, within a fifth or so."""
-    frames = list(generate(Options(seed=seed, benign_seconds=1_400, attack_seconds=0)))
+    frames = list(generate(MiraiLikeOptions(seed=seed, benign_seconds=1_400, attack_seconds=0)))
     batch = _batch(frames)
     gaps = np.diff(batch["time_us"]) / 1e3
     quoted = batch["quoted"] == 1
@@ -103,7 +103,7 @@ def test_the_house_resembles_the_public_capture(seed):
     assert len(np.unique(batch["eth_src"])) == 17  # the 18th is the intruder
 
 
-def _scores(frames: list[Frame]) -> tuple[np.ndarray, int]:
+def _scores(frames: list[WireFrame]) -> tuple[np.ndarray, int]:
     kernel = load_kernel()
     if kernel is None:
         pytest.skip("needs the C kernel: the Python twin takes minutes here")
@@ -118,11 +118,16 @@ def _scores(frames: list[Frame]) -> tuple[np.ndarray, int]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "plan"),
-    [(1, Plan()), (2, Plan()), (10, Plan()), (4, Plan(scan=False, floods=("syn",), answer_all=True))],
+    [
+        (1, AttackPlan()),
+        (2, AttackPlan()),
+        (10, AttackPlan()),
+        (4, AttackPlan(scan=False, floods=("syn",), answer_all=True)),
+    ],
 )
 def test_kitsune_finds_it_hard_but_not_too_hard(seed, plan):
     """Default training: benign median near 0.01, attack median between 2 and 50, AUC from 0.90 to 0.99."""
-    frames = list(generate(Options(seed=seed, plan=plan)))
+    frames = list(generate(MiraiLikeOptions(seed=seed, plan=plan)))
     assert len(frames) <= mirai_like.MAX_PACKETS
     score, trained = _scores(frames)
     attack = np.array([bool(frame.attacker) for frame in frames])
@@ -130,7 +135,7 @@ def test_kitsune_finds_it_hard_but_not_too_hard(seed, plan):
     assert onset >= 70_000
     assert float(np.median(score[trained:onset])) == pytest.approx(0.01, rel=0.5)
     assert 2 <= float(np.median(score[attack])) <= 50
-    if plan == Plan():
+    if plan == AttackPlan():
         assert float(np.median(score[trained:][~attack[trained:]])) == pytest.approx(0.01, rel=0.5)
         area = roc_auc(attack[trained:], score[trained:])
         assert area is not None

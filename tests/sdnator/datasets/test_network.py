@@ -6,14 +6,14 @@ from scapy.layers.l2 import Ether
 
 from sdnator.datasets import frames, hosts
 from sdnator.datasets.network import Network
-from sdnator.datasets.traffic import ARP, ECHO, SECOND, Chance, Frame, Sent
+from sdnator.datasets.traffic import ARP, ECHO, SECOND, Chance, SentPacket, WireFrame
 from sdnator.datasets.traffic import TCP as TCP_KIND
 from sdnator.datasets.traffic import UDP as UDP_KIND
 
 CLOUD = hosts.CLOUD[0]
 
 
-def _carry(*sent: Sent, cookies: bool = False) -> list[Frame]:
+def _carry(*sent: SentPacket, cookies: bool = False) -> list[WireFrame]:
     found = list(Network(Chance(1), 200, cookies=cookies).carry(sent))
     assert [frame.time for frame in found] == sorted(frame.time for frame in found)
     return found
@@ -22,7 +22,7 @@ def _carry(*sent: Sent, cookies: bool = False) -> list[Frame]:
 def test_unreachable_quotes_the_packet():
     """What goes out comes back as an ICMP error of the gateway that quotes ports and addresses."""
     sent, error = (
-        Ether(frame.data) for frame in _carry(Sent(0, UDP_KIND, hosts.DOME, CLOUD, 82, 40_000, 10_240))
+        Ether(frame.data) for frame in _carry(SentPacket(0, UDP_KIND, hosts.DOME, CLOUD, 82, 40_000, 10_240))
     )
     assert (error[ICMP].type, error[ICMP].code, error[IP].src, error[IP].dst) == (
         3,
@@ -36,36 +36,36 @@ def test_unreachable_quotes_the_packet():
 
 def test_unreachables_are_limited():
     """Six in a burst, then one a second for each asker."""
-    burst = [Sent(n * 1000, UDP_KIND, hosts.DOME, CLOUD, 82, 1, 2) for n in range(100)]
+    burst = [SentPacket(n * 1000, UDP_KIND, hosts.DOME, CLOUD, 82, 1, 2) for n in range(100)]
     assert len(_carry(*burst)) == 106
-    steady = [Sent(n * SECOND // 2, UDP_KIND, hosts.DOME, CLOUD, 82, 1, 2) for n in range(100)]
+    steady = [SentPacket(n * SECOND // 2, UDP_KIND, hosts.DOME, CLOUD, 82, 1, 2) for n in range(100)]
     assert 150 <= len(_carry(*steady)) <= 158
 
 
 def test_arp_and_ping_and_names():
-    reply = Ether(_carry(Sent(0, ARP, hosts.DOME, hosts.PC.ip, 60))[1].data)
+    reply = Ether(_carry(SentPacket(0, ARP, hosts.DOME, hosts.PC.ip, 60))[1].data)
     assert (reply[ARP_LAYER].op, reply[ARP_LAYER].hwsrc, reply.dst) == (
         2,
         hosts.PC.mac_text,
         hosts.DOME.mac_text,
     )
-    assert len(_carry(Sent(0, ARP, hosts.DOME, hosts.address(hosts.ABSENT), 60))) == 1
-    assert len(_carry(Sent(0, ARP, hosts.DOME, hosts.DOME.ip, 60))) == 1
-    pong = Ether(_carry(Sent(0, ECHO, hosts.PC, hosts.DOME.ip, 74, number=9))[1].data)
+    assert len(_carry(SentPacket(0, ARP, hosts.DOME, hosts.address(hosts.ABSENT), 60))) == 1
+    assert len(_carry(SentPacket(0, ARP, hosts.DOME, hosts.DOME.ip, 60))) == 1
+    pong = Ether(_carry(SentPacket(0, ECHO, hosts.PC, hosts.DOME.ip, 74, number=9))[1].data)
     assert (pong[ICMP].type, pong[ICMP].seq, pong.src) == (0, 9, hosts.DOME.mac_text)
-    asked = Sent(0, UDP_KIND, hosts.DOME, hosts.GATEWAY.ip, 80, 5_000, 53)
+    asked = SentPacket(0, UDP_KIND, hosts.DOME, hosts.GATEWAY.ip, 80, 5_000, 53)
     assert len(_carry(asked)) == 1
     answer = Ether(_carry(asked._replace(answered=True))[1].data)
     assert (answer[UDP].sport, answer[UDP].dport, answer[IP].dst) == (53, 5_000, "192.168.2.110")
 
 
 def test_groups_get_no_answer():
-    assert len(_carry(Sent(0, UDP_KIND, hosts.DOME, hosts.SSDP_GROUP, 179, 1, 1900))) == 1
+    assert len(_carry(SentPacket(0, UDP_KIND, hosts.DOME, hosts.SSDP_GROUP, 179, 1, 1900))) == 1
 
 
-def _syn(time: int, port: int, dport: int = 80) -> Sent:
+def _syn(time: int, port: int, dport: int = 80) -> SentPacket:
     bot = hosts.INFECTED
-    return Sent(time, TCP_KIND, bot, hosts.PC.ip, 74, port, dport, frames.SYN, attacker=bot.mac_text)
+    return SentPacket(time, TCP_KIND, bot, hosts.PC.ip, 74, port, dport, frames.SYN, attacker=bot.mac_text)
 
 
 def test_a_victim_answers_and_its_answers_are_harmless():
@@ -93,7 +93,7 @@ def test_backlog_and_cookies():
 def test_a_flooded_port_answers_with_unreachables():
     bot = hosts.INFECTED
     flood = [
-        Sent(n * 1000, UDP_KIND, bot, hosts.DOORBELL.ip, 554, 1, n + 1, attacker=bot.mac_text)
+        SentPacket(n * 1000, UDP_KIND, bot, hosts.DOORBELL.ip, 554, 1, n + 1, attacker=bot.mac_text)
         for n in range(100)
     ]
     found = _carry(*flood)

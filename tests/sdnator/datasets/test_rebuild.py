@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from apps.packets import PACKET_COLUMNS, read_frames
-from sdnator.captures import Capture
+from sdnator.capture.captures import Capture
+from sdnator.capture.tshark_tsv import COLUMNS, TsharkRow, as_columns, read_rows
 from sdnator.datasets.rebuild import RebuildError, frame, rebuild
-from sdnator.tshark_tsv import COLUMNS, TsharkRow, as_columns, read_rows
-from tests.requirements import optional_program, shared_data
+from sdnator.testing.table_samples import TSHARK_HEADER, TSHARK_UDP
+from tests.requirements import require_program, shared_data
 
 GUESSED = {"tcp_flags", "tcp_seq", "tcp_ack", "icmp6_type", "icmp6_code"}
 """Columns of the packet record that the table does not have."""
@@ -119,15 +120,13 @@ def test_rows_that_no_frame_can_stand_for(fields, words):
 
 def test_nanoseconds_are_kept(tmp_path):
     """A table with ns times gives a ns capture; a bad row leaves no file."""
-    from tests.sdnator.test_tshark_tsv import HEADER, UDP
-
     table, out = tmp_path / "t.tsv", tmp_path / "out.pcap"
-    table.write_text(f"{HEADER}\n{UDP.replace('391651000', '391651007')}\n")
+    table.write_text(f"{TSHARK_HEADER}\n{TSHARK_UDP.replace('391651000', '391651007')}\n")
     assert rebuild(table, out).nanoseconds
     with Capture(out) as capture:
         assert capture.first_time_ns == 1_540_446_383_391_651_007
     out.unlink()
-    table.write_text(f"{HEADER}\n{UDP}\n{UDP.replace('117', '20', 1)}\n")
+    table.write_text(f"{TSHARK_HEADER}\n{TSHARK_UDP}\n{TSHARK_UDP.replace('117', '20', 1)}\n")
     with pytest.raises(RebuildError, match="line 3"):
         rebuild(table, out)
     assert [path.name for path in tmp_path.iterdir()] == ["t.tsv"]
@@ -135,7 +134,7 @@ def test_nanoseconds_are_kept(tmp_path):
 
 def test_tshark_writes_the_same_table_again(tmp_path):
     """The real tshark finds in the rebuilt frames, byte for byte, the table that they were rebuilt from."""
-    tshark = optional_program("tshark")
+    tshark = require_program("tshark")
     table, out = shared_data("kitsune/mirai_38k.tsv.gz"), tmp_path / "out.pcap"
     rebuild(table, out)
     fields = [word for name in COLUMNS for word in ("-e", name)]

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sdnator.captures import Capture, CapturedFrame, CaptureError, CaptureWriter
+from sdnator.capture.captures import Capture, CapturedFrame, CaptureError, CaptureWriter
+from sdnator.capture.labels import Labels, LengthMismatch, labels_path, read_labels, write_labels
 from sdnator.datasets.splice import splice
-from sdnator.labels import Labels, LengthMismatch, labels_path, read_labels, write_labels
 
 MAC = b"\x02\x00\x00\x00\x00\x09"
 T0 = 1_540_446_382_000_000_000

@@ -11,7 +11,7 @@ from sdnator.datasets.traffic import (
     RAW,
     SECOND,
     Chance,
-    Sent,
+    SentPacket,
     as_frame,
     query,
 )
@@ -26,7 +26,7 @@ from sdnator.datasets.traffic import (
 @pytest.mark.parametrize("length", [60, 74, 200, 201, 554, 1514])
 def test_lengths_and_cuts(length):
     """The IP header tells the whole length, the bytes end at the snap length."""
-    sent = Sent(5, UDP_KIND, hosts.DOME, hosts.PC.ip, length, 1, 2)
+    sent = SentPacket(5, UDP_KIND, hosts.DOME, hosts.PC.ip, length, 1, 2)
     frame = as_frame(sent, 200)
     assert (frame.time, frame.length, len(frame.data), frame.attacker) == (5, length, min(length, 200), "")
     assert Ether(frame.data)[IP].len == length - 14
@@ -35,18 +35,20 @@ def test_lengths_and_cuts(length):
 
 def test_tcp_sizes():
     """A SYN of 74 bytes has 20 of options; an ACK of 60 has no payload, one of 1,502 has 1,448."""
-    syn = Ether(as_frame(Sent(0, TCP_KIND, hosts.DOME, hosts.PC.ip, 74, 1, 2, frames.SYN), 200).data)
+    syn = Ether(as_frame(SentPacket(0, TCP_KIND, hosts.DOME, hosts.PC.ip, 74, 1, 2, frames.SYN), 200).data)
     assert (syn[TCP].dataofs, syn[IP].len) == (10, 60)
-    ack = Ether(as_frame(Sent(0, TCP_KIND, hosts.DOME, hosts.PC.ip, 60, 1, 2, frames.ACK), 200).data)
+    ack = Ether(as_frame(SentPacket(0, TCP_KIND, hosts.DOME, hosts.PC.ip, 60, 1, 2, frames.ACK), 200).data)
     assert ack[IP].len == 40
-    data = Ether(as_frame(Sent(0, TCP_KIND, hosts.DOME, hosts.PC.ip, 1502, 1, 2, frames.ACK), 200).data)
+    data = Ether(as_frame(SentPacket(0, TCP_KIND, hosts.DOME, hosts.PC.ip, 1502, 1, 2, frames.ACK), 200).data)
     assert data[IP].len - 40 == 1448
 
 
 def test_echo_and_raw():
-    echo = Ether(as_frame(Sent(0, ECHO, hosts.DOME, hosts.PC.ip, 98, number=70_000), 200).data)
+    echo = Ether(as_frame(SentPacket(0, ECHO, hosts.DOME, hosts.PC.ip, 98, number=70_000), 200).data)
     assert (echo[ICMP].type, echo[ICMP].seq, echo[IP].len) == (8, 70_000 & 0xFFFF, 84)
-    assert as_frame(Sent(0, RAW, hosts.DOME, b"\xe0", 60, payload=b"abc"), 200).data == b"abc" + bytes(57)
+    assert as_frame(SentPacket(0, RAW, hosts.DOME, b"\xe0", 60, payload=b"abc"), 200).data == b"abc" + bytes(
+        57
+    )
 
 
 def test_query_is_a_dns_question():

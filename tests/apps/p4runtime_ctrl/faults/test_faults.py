@@ -5,8 +5,9 @@ import threading
 import pytest
 
 from due import Capability
-from tests.apps.p4runtime_ctrl.cable import Cable
-from tests.apps.p4runtime_ctrl.stage import PACKETS, Bystander, Heard, Stage, block, frame, wait_for
+from sdnator.testing.cable import Cable
+from sdnator.testing.controller_run import PACKETS, Bystander, ControllerRun, Heard, block, end, frame
+from sdnator.testing.waiting import wait_for
 
 DECISIONS = Capability("network.block.firewall.*", delivery="reliable", archive="always")
 CONFIRMATIONS = "network.confirmation.p4runtime_ctrl.*"
@@ -62,7 +63,7 @@ def entries(stage):
 
 @pytest.fixture
 def stage(tmp_path):
-    with Stage(tmp_path) as made:
+    with ControllerRun(tmp_path) as made:
         yield made
 
 
@@ -172,12 +173,11 @@ def test_a_standby_controller_takes_over(stage):
 
 @pytest.mark.parametrize(("fail", "without_controller"), [("open", FORWARDED), ("closed", 0)])
 def test_what_happens_to_traffic_without_a_controller_is_configured(tmp_path, fail, without_controller):
-    with Stage(tmp_path, fail=fail) as stage:
+    with ControllerRun(tmp_path, fail=fail) as stage:
         controller = stage.controller()
         feed = stage.feed()
         assert verdicts(feed, [4]) == [FORWARDED]
-        controller.terminate()
-        controller.wait(60)
+        end(controller)
         with Bystander(stage.target.address):
             assert verdicts(feed, [4]) == [without_controller]
         stage.controller()

@@ -1,0 +1,1 @@
+"""Address owners, learnt from ARP."""

@@ -1,0 +1,163 @@
+"""Owners of IPv4 addresses (MAC and port), learnt from ARP, and claims of others' addresses.  Pure.
+
+A claim of an address that belongs to another host proves nothing by itself: hosts get new addresses, and
+a standby takes over from a dead router.  It is an attack if the owner, from its own port and MAC, uses
+the address after the claim.  Then the claimant's port + MAC is blocked, never the address.
+
+Two cases are only reported and lead to no block: the owner was not present in training, so it may be the
+attacker itself; and the claimant shares its port with other hosts, one of which may have forged its MAC.
+"""
+
+import ipaddress
+from collections import OrderedDict, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+from due import RecordBatch
+
+ADDRESSES: Final = 16_384
+CLAIMS: Final = 1024
+PORTS: Final = 1024
+STATIONS: Final = 256
+"""MAC addresses remembered per port."""
+_GROUP: Final = 1 << 40
+
+
+class BoundHost(NamedTuple):
+    """A MAC address behind a port of a switch."""
+
+    port: int
+    mac: int
+
+    @classmethod
+    def of(cls, port: int, mac: str) -> Self:
+        """From a MAC address with colons."""
+        return cls(port, int(mac.replace(":", ""), 16))
+
+    @property
+    def text(self) -> str:
+        """The MAC address with colons."""
+        return ":".join(f"{byte:02x}" for byte in self.mac.to_bytes(6, "big"))
+
+
+@dataclass
+class _Binding:
+    station: BoundHost
+    since: int
+    seen: int
+    trained: bool
+    """It was present in training, and nobody else claimed its address."""
+
+
+@dataclass(frozen=True)
+class BindingConflict:
+    """A host claims an address whose owner is present; times are capture time in ns."""
+
+    address: str
+    owner: BoundHost
+    thief: BoundHost
+    at: int
+    certain: bool
+    """Whether a block of the claimant harms nobody else."""
+
+
+class ArpBindings:
+    """At most `ADDRESSES` addresses; the least recently used one is evicted first.
+
+    Training lasts `training_s` from the first packet on; later bindings are settled after `settle_s` without
+    another claim.  A claim waits `contest_s` for the owner.
+    """
+
+    def __init__(self, *, training_s: float, settle_s: float, contest_s: float) -> None:
+        self._training = int(training_s * 1e9)
+        self._trained_at = 0
+        self._settle = int(settle_s * 1e9)
+        self._contest = int(contest_s * 1e9)
+        self._bound: OrderedDict[int, _Binding] = OrderedDict()
+        self._claims: OrderedDict[tuple[int, BoundHost], int] = OrderedDict()
+        self._behind: defaultdict[int, set[int]] = defaultdict(set)
+
+    def __len__(self) -> int:
+        return len(self._bound)
+
+    @property
+    def claims(self) -> int:
+        """Claims that wait for the owner to speak."""
+        return len(self._claims)
+
+    def add(self, batch: RecordBatch) -> list[BindingConflict]:
+        """ARP packets in order; columns time_us, port, arp_op, arp_src_mac, arp_src_ip and eth_src are used."""
+        names = ("time_us", "port", "arp_op", "eth_src", "arp_src_mac", "arp_src_ip")
+        found: list[BindingConflict] = []
+        for at, port, operation, sender, mac, address in zip(
+            *(batch[name].tolist() for name in names), strict=True
+        ):
+            if operation not in (1, 2) or not address or mac & _GROUP or sender & _GROUP:
+                continue
+            self._trained_at = self._trained_at or at * 1000 + self._training
+            # where ARP and Ethernet differ, the Ethernet source counts: a block would match it
+            found += self._heard(address, BoundHost(port, sender), at * 1000, honest=sender == mac)
+        return found
+
+    def _heard(
+        self, address: int, station: BoundHost, now: int, *, honest: bool
+    ) -> Iterator[BindingConflict]:
+        if station.port in self._behind or len(self._behind) < PORTS:
+            neighbours = self._behind[station.port]
+            if len(neighbours) < STATIONS:
+                neighbours.add(station.mac)
+        bound = self._bound.get(address)
+        if bound is None:
+            if honest:
+                self._bind(address, station, now)
+        elif bound.station == station and honest:
+            bound.seen = now
+            self._bound.move_to_end(address)
+            yield from self._contested(address, bound, now)
+        elif not self._settled(bound, now) or bound.station.mac == station.mac:
+            # too new to have an owner, or the owner moved to another port
+            self._bind(address, station, now)
+        else:
+            self._claims[address, station] = now
+            if len(self._claims) > CLAIMS:
+                self._claims.popitem(last=False)
+            if now - bound.seen > self._settle:  # the owner is gone
+                self._bind(address, station, now)
+
+    def _settled(self, bound: _Binding, now: int) -> bool:
+        return (bound.trained and now >= self._trained_at) or now - bound.since >= self._settle
+
+    def forged(self, address: str, station: BoundHost) -> bool:
+        """Whether an address certainly belongs to another host than the one that uses it."""
+        if ":" in address or not address:
+            return False
+        bound = self._bound.get(int(ipaddress.IPv4Address(address)))
+        return bound is not None and bound.trained and bound.station != station
+
+    def addresses_of(self, station: BoundHost) -> list[str]:
+        """Addresses that belong to a host."""
+        found = (address for address, bound in self._bound.items() if bound.station == station)
+        return [str(ipaddress.IPv4Address(address)) for address in found]
+
+    def _bind(self, address: int, station: BoundHost, now: int) -> None:
+        trained = now < self._trained_at and address not in self._bound
+        self._bound[address] = _Binding(station, now, now, trained)
+        self._bound.move_to_end(address)
+        self._claims.pop((address, station), None)
+        if len(self._bound) > ADDRESSES:
+            self._bound.popitem(last=False)
+
+    def _contested(self, address: int, bound: _Binding, now: int) -> Iterator[BindingConflict]:
+        for key in [key for key in self._claims if key[0] == address]:
+            if now - self._claims.pop(key) <= self._contest:
+                thief = key[1]
+                text = str(ipaddress.IPv4Address(address))
+                certain = bound.trained and self.is_alone(thief)
+                yield BindingConflict(text, bound.station, thief, now, certain)
+
+    def is_alone(self, station: BoundHost) -> bool:
+        """Whether it is the only host behind its port."""
+        others = self._behind.get(station.port, {station.mac, 0}) - {station.mac}
+        lives_here = any(each.station == station for each in self._bound.values())
+        return not (others and lives_here)

@@ -1,0 +1,1 @@
+"""Output of decisions: table entries, EVE, webhooks."""

@@ -1,0 +1,1 @@
+"""Evidence about a sender: archived history and recent traffic."""

@@ -1,0 +1,93 @@
+"""Queries to Data Archives with a time limit, so that no decision waits for an unreachable archive.  I/O."""
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+from apps.messages import youngest
+from due import Engine, Item
+from due.errors import DueError
+
+ASK_AGAIN_S: Final = 10.0
+"""Pause after a query without an answer, in seconds."""
+
+log = logging.getLogger(__name__)
+
+
+MOST: Final = 100_000
+"""Most items of one query, the newest."""
+
+
+class _Question(threading.Thread):
+    def __init__(self, engine: Engine, query: Mapping[str, Any], since: int, most: int) -> None:
+        super().__init__(name="archive query", daemon=True)
+        self._engine = engine
+        self._asked = (query, since, most)
+        self.items: list[Item] | None = None
+        self.problem = "no answer in time"
+        self.start()
+
+    def run(self) -> None:
+        try:
+            self.items = youngest(self._find, *self._asked)
+        except DueError as error:
+            self.problem = str(error)
+
+    def _find(self, query: Mapping[str, Any], limit: int) -> list[Item]:
+        return self._engine.get(query, limit=limit)
+
+
+class Archive:
+    """Queries with a time limit of `patience_s`; while the archive is unreachable they return None."""
+
+    def __init__(self, engine: Engine, patience_s: float) -> None:
+        self._engine = engine
+        self._patience_s = patience_s
+        self._asked: _Question | None = None
+        self._looking: _Question | None = None
+        self._look_after = time.monotonic()
+        self._quiet_until = float("-inf")
+        self.unanswered = 0
+        self.items_read = 0
+
+    @property
+    def away(self) -> bool:
+        """Whether the last query got no answer."""
+        return self._quiet_until > time.monotonic()
+
+    def find(
+        self,
+        query: str | Mapping[str, Any],
+        patience_s: float | None = None,
+        *,
+        since: int = 0,
+        most: int = MOST,
+    ) -> list[Item] | None:
+        """The newest `most` items written after `since` (ns), oldest first; None if no answer comes in time."""
+        asked = {"dataKey": query} if isinstance(query, str) else query
+        if self.away or (self._asked is not None and self._asked.is_alive()):
+            self.unanswered += 1
+            return None
+        question = self._asked = _Question(self._engine, asked, since, most)
+        question.join(self._patience_s if patience_s is None else patience_s)
+        found = question.items
+        if found is None:
+            self.unanswered += 1
+            self._quiet_until = time.monotonic() + ASK_AGAIN_S
+            log.warning("Data Archives do not answer, deciding without history: %s", question.problem)
+        self.items_read += len(found or ())
+        return found
+
+    def look(self, query: Mapping[str, Any], since: int, every_s: float) -> list[Item]:
+        """Results of the background query so far; starts a new query at intervals.  Never waits."""
+        if self._looking is not None:
+            if self._looking.is_alive():
+                return []
+            found, self._looking = self._looking.items or [], None
+            return found
+        if time.monotonic() >= self._look_after:
+            self._look_after = time.monotonic() + every_s
+            self._looking = _Question(self._engine, query, since, MOST)
+        return []

@@ -1,0 +1,102 @@
+"""A sender's history from archived items.  Pure."""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import Any, Final
+
+from apps.messages import Decision, Instruction, MessageError, Target
+from due import Item
+
+
+def offences_query(target: Target) -> dict[str, Any]:
+    """The archive query for earlier blocks of a target."""
+    return {
+        "dataKey": "network.block_prefix.firewall.*" if "/" in target.address else "network.block.firewall.*",
+        "value.action": "block",
+        "value.target.address": target.address,
+    }
+
+
+def offences_of_many(addresses: Sequence[str]) -> dict[str, Any]:
+    """The archive query for earlier blocks of any of the addresses."""
+    return {
+        "dataKey": "network.block.firewall.*",
+        "value.action": "block",
+        "value.target.address": {"$in": list(addresses)},
+    }
+
+
+def count_offences(items: Iterable[Item], target: Target, before: int) -> int:
+    """Earlier blocks of the target, counted by decision; an extension is not a new offence."""
+    ids = set()
+    for decision in _readable(items):
+        if decision.target == target and decision.event_time < before and not decision.dry_run:
+            ids.add(decision.id)
+    return len(ids)
+
+
+DECISIONS: Final = (
+    "network.block.firewall.*",
+    "network.block_prefix.firewall.*",
+    "network.protect.firewall.*",
+)
+ANSWERS: Final = "network.answer.firewall"
+"""`<ANSWERS>.<who asked>`"""
+INSTRUCTIONS: Final = "network.instruction.*.firewall"
+
+
+def instructions_in(items: Iterable[Item]) -> list[Instruction]:
+    """Archived instructions in order, without malformed ones."""
+    found = []
+    for item in items:
+        try:
+            found.append(Instruction.from_value(item.value))
+        except MessageError:
+            continue
+    return found
+
+
+def carried_out(instructions: Iterable[Instruction], answered: Collection[str]) -> list[Instruction]:
+    """Without instructions with a deadline that no firewall answered: their sender was told that nothing was done."""
+    return [each for each in instructions if not each.expires or each.id in answered]
+
+
+def decisions_in(items: Iterable[Item]) -> list[Decision]:
+    """Archived decisions in the order they were written.
+
+    Dry runs and malformed items are left out.
+    """
+    ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
+    return [decision for decision in _readable(ordered) if not decision.dry_run]
+
+
+def _readable(items: Iterable[Item]) -> Iterator[Decision]:
+    for item in items:
+        try:
+            yield Decision.from_value(item.value)
+        except MessageError:
+            continue
+
+
+def in_force(decisions: Iterable[Decision]) -> list[Decision]:
+    """Decisions in force: the latest for each target on each switch, unless it lifts.
+
+    Expired ones are included: the firewall decides whether to extend or lift them.
+    """
+    latest: dict[tuple[str, Target], Decision] = {}
+    for decision in decisions:
+        key = (decision.switch, decision.target)
+        latest.pop(key, None)
+        if decision.action in ("block", "protect"):
+            latest[key] = decision
+    return list(latest.values())
+
+
+def allowed_by(instructions: Iterable[Instruction], beforehand: Iterable[str] = ()) -> tuple[str, ...]:
+    """The allow-list from the settings and from instructions since."""
+    entries = dict.fromkeys(beforehand)
+    for instruction in instructions:
+        if instruction.verb == "allow":
+            entries[instruction.subject] = None
+        elif instruction.verb == "disallow":
+            entries.pop(instruction.subject, None)
+    return tuple(entries)

@@ -1,0 +1,93 @@
+"""State that the firewall restores from Data Archives at its start.  I/O."""
+
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from typing import Any, Final, TypeVar
+
+from apps.firewall.arrivals import answer_in, command_in, decision_in, handshake_in, instruction_in
+from apps.firewall.enforcement.switch_entries import KEPT, leftovers
+from apps.firewall.evidence.archive import MOST, Archive
+from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, in_force
+from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
+from apps.firewall.settings import Settings
+from apps.messages import LONGEST_BLOCK_S, Decision, Instruction, Intake, MessageError, TableUpdate
+from due import Item
+
+_PATIENCE_S: Final = 30.0
+_DAY_NS: Final = 86_400_000_000_000
+_LONGEST_NS: Final = LONGEST_BLOCK_S * 1_000_000_000 + _DAY_NS
+"""Longest block plus a day for clock changes: older decisions are no longer in force."""
+_INSTRUCTIONS: Final = 20_000
+_ANSWERS: Final = 1_000
+_SOURCE_SHARE: Final = 10
+"""Archived handshakes read per known source."""
+
+_T = TypeVar("_T")
+log = logging.getLogger(__name__)
+
+
+class ArchivedPast:
+    """Reads each kind of message with limits; `intake` counts malformed ones."""
+
+    def __init__(self, archive: Archive, intake: Intake, settings: Settings) -> None:
+        self._archive = archive
+        self._intake = intake
+        self._settings = settings
+
+    def instructions(self) -> list[Instruction]:
+        """Instructions that change the allow-list, oldest first."""
+        query = {"dataKey": INSTRUCTIONS, "value.verb": {"$in": ["allow", "disallow"]}}
+        return self._read(query, "instruction", instruction_in, most=_INSTRUCTIONS)
+
+    def answered(self) -> list[str]:
+        """Ids of the instructions carried out most recently."""
+        return self._read(f"{ANSWERS}.*", "answer", answer_in, most=_ANSWERS)
+
+    def panics(self) -> list[str]:
+        """Ids of the panics in the archive, which were carried out already."""
+        query = {"dataKey": INSTRUCTIONS, "value.verb": "panic"}
+        return [each.id for each in self._read(query, "instruction", instruction_in, most=_ANSWERS)]
+
+    def standing(self) -> list[Decision]:
+        """The newest decision for each target, if it is in force."""
+        since = time.time_ns() - _LONGEST_NS
+        found = [each for key in DECISIONS for each in self._read(key, "decision", decision_in, since=since)]
+        return in_force(each for each in found if not each.dry_run)
+
+    def teach(self, known: KnownSources) -> None:
+        """Known sources, from the handshakes of the last `known_days`."""
+        days, most = self._settings.known_days, _SOURCE_SHARE * self._settings.known_limit
+        since = time.time_ns() - (days + 1) * _DAY_NS
+        shakes = self._read(HANDSHAKES, "handshake", _archived_handshake, since=since, most=most)
+        learn_archived(known, shakes, days)
+        log.info("%d known sources in the archive", len(known))
+
+    def leftovers(self, wanted: Iterable[TableUpdate]) -> dict[str, list[TableUpdate]]:
+        """By switch: deletions of entries of an earlier run that are no longer wanted."""
+        past: defaultdict[str, list[Item]] = defaultdict(list)
+        for item in self._archive.find(f"{KEPT}.*", _PATIENCE_S) or ():
+            if self._intake.read("command", command_in, item) is not None:
+                past[item.key.rpartition(".")[2]].append(item)
+        return {switch: leftovers(items, wanted) for switch, items in past.items()}
+
+    def _read(
+        self,
+        query: str | dict[str, Any],
+        kind: str,
+        decode: Callable[[Item], _T],
+        *,
+        since: int = 0,
+        most: int = MOST,
+    ) -> list[_T]:
+        items = self._archive.find(query, _PATIENCE_S, since=since, most=most) or ()
+        found = (self._intake.read(kind, decode, item) for item in items)
+        return [each for each in found if each is not None]
+
+
+def _archived_handshake(item: Item) -> tuple[str, int]:
+    source, _, at = handshake_in(item)
+    if at > item.timestamp + _DAY_NS:
+        raise MessageError("time", f"{item.key}: {at} is later than the time it was written")
+    return source, at

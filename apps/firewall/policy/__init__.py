@@ -1,0 +1,1 @@
+"""Rules for blocking, and the life cycle of a block."""

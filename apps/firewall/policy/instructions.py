@@ -1,0 +1,125 @@
+"""Instructions of operators: block, unblock, allow, disallow, panic.  Pure."""
+
+import ipaddress
+from collections.abc import Iterable
+
+from apps.firewall.evidence.history import allowed_by
+from apps.firewall.policy.block_lifecycle import BlockLifecycle
+from apps.firewall.policy.rules import AllowList, is_mac
+from apps.firewall.syn.syn_defence import EVERY_SWITCH, SynDefence
+from apps.messages import Answer, Decision, Evidence, Instruction, Target
+
+_MOST_ENTRIES = 10_000
+Outcome = tuple[list[Decision], Answer]
+
+
+class Desk:
+    """Applies instructions to blocks, guards and the allow-list; time is capture time in ns."""
+
+    def __init__(self, ledger: BlockLifecycle, syn: SynDefence, entries: Iterable[str]) -> None:
+        self._ledger = ledger
+        self._syn = syn
+        self.entries = tuple(entries)
+        self.allow = AllowList.parse(self.entries)
+
+    def take_up(self, instructions: Iterable[Instruction]) -> None:
+        """Restore the allow-list from before a restart; refused instructions are in the archive, too."""
+        self._set_entries(tuple(filter(_is_entry, allowed_by(instructions, self.entries))))
+
+    def carry_out(self, instruction: Instruction, evidence: Evidence, now: int) -> Outcome:
+        """Decisions to publish, and the answer; a refused instruction changes nothing."""
+        try:
+            decisions, text = getattr(self, f"_{instruction.verb}")(instruction, evidence, now)
+        except ValueError as error:
+            return [], Answer(id=instruction.id, done=False, text=str(error))
+        return decisions, Answer(id=instruction.id, done=True, text=text)
+
+    def _block(self, instruction: Instruction, evidence: Evidence, now: int) -> tuple[list[Decision], str]:
+        target = target_in(instruction.subject)
+        if self.allow.covers_target(target):
+            raise ValueError(
+                f"{target.address} is on the allow-list, which always wins; `sdnator allow remove` it first"
+            )
+        if len(self._ledger.blocks) >= self._ledger.rules.max_blocks:
+            raise ValueError(f"{len(self._ledger.blocks)} blocks are in force (max_blocks); lift some first")
+        if self._ledger.matching(target.address):
+            raise ValueError(f"{target.address} is blocked already")
+        reason = f"by hand: {instruction.reason or 'no reason given'}"
+        decision = self._ledger.open(
+            EVERY_SWITCH, target, reason, (evidence,), now, seconds=instruction.seconds
+        )
+        return [decision], f"block {decision.id} of {target.address} for {instruction.seconds} s"
+
+    def _unblock(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
+        found = self._ledger.matching(instruction.subject)
+        guards = self._syn.release(instruction.subject, now, "by hand")
+        if not found and not guards:
+            raise ValueError(
+                f"no block or guard has the id or address {instruction.subject}; see `sdnator blocks list`; "
+                "guards that the settings name stay"
+            )
+        return self._lift(found, now, "by hand") + guards, f"{len(found) + len(guards)} lifted"
+
+    def _panic(self, _: Instruction, __: Evidence, now: int) -> tuple[list[Decision], str]:
+        blocks = [block.decision for block in self._ledger.blocks.values()]
+        decisions = self._lift(blocks, now, "panic: everything is lifted")
+        decisions += self._syn.release_all(now, "panic: everything is lifted")
+        return decisions, f"{len(decisions)} lifted; guards that the settings name stay"
+
+    def _allow(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
+        if len(self.entries) >= _MOST_ENTRIES:
+            raise ValueError(f"the allow-list has {_MOST_ENTRIES} entries; remove some, or name prefixes")
+        self._set_entries((*self.entries, instruction.subject))
+        blocks = [block.decision for block in self._ledger.blocks.values()]
+        touched = [each for each in blocks if self.allow.covers_target(each.target)]
+        lifted = self._lift(touched, now, f"{instruction.subject} is on the allow-list now")
+        blocks_lifted = "1 block" if len(lifted) == 1 else f"{len(lifted)} blocks"
+        return lifted, f"{instruction.subject} is allowed; {blocks_lifted} lifted"
+
+    def _disallow(self, instruction: Instruction, _: Evidence, __: int) -> tuple[list[Decision], str]:
+        if instruction.subject not in self.entries:
+            raise ValueError(
+                f"{instruction.subject} is not on the allow-list: {', '.join(self.entries) or 'empty'}"
+            )
+        self._set_entries(tuple(each for each in self.entries if each != instruction.subject))
+        return [], f"{instruction.subject} is no longer allowed"
+
+    def _lift(self, decisions: Iterable[Decision], now: int, reason: str) -> list[Decision]:
+        lifted = (self._ledger.lift(each.id, now, reason) for each in decisions)
+        return [each for each in lifted if each is not None]
+
+    def _set_entries(self, entries: tuple[str, ...]) -> None:
+        self.allow = self._syn.allow = AllowList.parse(entries)
+        self.entries = tuple(dict.fromkeys(entries))
+
+
+def refused_as_late(instruction: Instruction, wall_ns: int) -> Answer | None:
+    """The answer to an instruction that is too old; None if it may be carried out."""
+    if not 0 < instruction.expires < wall_ns:
+        return None
+    late = (wall_ns - instruction.expires) / 1e9
+    text = f"came {late:.0f} s after its end and was not carried out; ask again (are both clocks right?)"
+    return Answer(id=instruction.id, done=False, text=text)
+
+
+def _is_entry(text: str) -> bool:
+    try:
+        AllowList.parse((text,))
+    except ValueError:
+        return False
+    return True
+
+
+def target_in(text: str) -> Target:
+    """An address, prefix, MAC or MAC@PORT as a target; raises ValueError that names the valid forms."""
+    mac, _, port = text.partition("@")
+    if is_mac(mac) and (port.isdecimal() or text == mac):
+        return Target(kind="mac", address=mac.lower(), port=int(port) if port else None)
+    try:
+        if "/" not in text:
+            return Target(kind="ip", address=str(ipaddress.ip_address(text)))
+        network = ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        raise ValueError(f"{text!r} is no IP address, no prefix and no MAC address") from None
+    alone = network.num_addresses == 1
+    return Target(kind="ip", address=str(network.network_address if alone else network))

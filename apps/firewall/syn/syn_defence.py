@@ -1,0 +1,293 @@
+"""Defence against SYN floods: which services are guarded, and which sources are blocked.
+
+    switch seen ──► guard of the services that the settings name, and known sources
+    syn_flood result or surge ──► the SYNs that came towards that host ──► policy ──► guard, soon
+                                                             ... once more, later ──► block, surely
+    handshake ──► known source
+
+Pure: decisions are returned and the caller publishes them; times are capture time in ns.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+from apps.firewall.evidence.known_sources import KnownSources
+from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle, decision_id
+from apps.firewall.policy.prefix_aggregation import Network, any_within, crowded_prefixes
+from apps.firewall.policy.rules import AllowList
+from apps.firewall.syn.recent_syns import RecentSyns
+from apps.firewall.syn.services import TcpService
+from apps.firewall.syn.syn_policy import Sample, SynRules, SynVerdict, judge_syns
+from apps.messages import Decision, Evidence, Target
+
+EVERY_SWITCH = "*"
+UNKNOWN_HISTORY = "history unknown: Data Archives do not answer"
+COLD_HISTORY = "nobody is known from handshakes yet, so everybody is challenged once"
+SERVICES_LEARNT = 4096
+SOURCES_SAMPLED = 4096
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """A flood towards a host; times are capture time in ns."""
+
+    host: str
+    evidence: Evidence
+    now: int
+    since: int
+
+
+class Watch:
+    """The SYNs towards one host, under examination."""
+
+    def __init__(self, host: str, evidence: Evidence, now: int) -> None:
+        self.host = host
+        self.evidence = evidence
+        self.now = now
+        self.unsure = False
+        """Sources would be blocked if they had had more time to finish their handshakes."""
+        self.syns: Counter[tuple[int, str]] = Counter()
+        """By port and source."""
+        self.total = 0
+
+    def add(self, port: int, source: str) -> None:
+        self.total += 1
+        if len(self.syns) < SOURCES_SAMPLED or (port, source) in self.syns:
+            self.syns[port, source] += 1
+
+    def finished(self, port: int, source: str) -> None:
+        """A handshake removes its SYN from the sample, and one repetition of it."""
+        if self.syns[port, source] > 2:
+            self.syns[port, source] -= 2
+        else:
+            del self.syns[port, source]  # a Counter accepts this for missing keys, too
+
+    def often(self, rules: SynRules) -> list[str]:
+        """Sources that may be blocked."""
+        found = (source for (_, source), count in self.syns.items() if count >= rules.repeats)
+        return list(islice(found, rules.sources))
+
+
+class SynDefence:
+    """Guards services and examines suspected floods; blocks are opened in the `BlockLifecycle`."""
+
+    def __init__(
+        self,
+        rules: SynRules,
+        services: Iterable[TcpService],
+        ledger: BlockLifecycle,
+        allow: AllowList,
+        known: KnownSources,
+        is_silent: Callable[[TcpService], bool] = lambda _: False,
+    ) -> None:
+        """`is_silent`: whether no answer of a service has been seen."""
+        self.rules = rules
+        self._is_silent = is_silent
+        self.known = known
+        self._always = frozenset(services)
+        self._ledger = ledger
+        self.allow = allow
+        self._guarded: dict[TcpService, Decision] = {}
+        self.services: dict[TcpService, None] = {}
+        """Known from handshakes; the most recent last."""
+        self.recent = RecentSyns(rules.sample)
+        self._finished: deque[tuple[int, str, TcpService]] = deque(maxlen=rules.sample)
+
+    @property
+    def guarded(self) -> list[TcpService]:
+        """All services under guard."""
+        return sorted(self._always | self._guarded.keys())
+
+    def arm(self, switch: str, now: int) -> list[Decision]:
+        """The guards for a switch that has connected."""
+        beforehand = [
+            self._protect(
+                service, switch, "the settings name it as a service that matters", (), now, expires=0
+            )
+            for service in sorted(self._always)
+        ]
+        return beforehand + [_on(switch, decision) for decision in self._guarded.values()]
+
+    def suspect(self, suspicion: Suspicion) -> Watch:
+        """Collect the SYNs of a suspected flood."""
+        host, now, since = suspicion.host, suspicion.now, suspicion.since
+        for service, decision in self._guarded.items():
+            if service.address == host:
+                expires = now + self.rules.protect_s * SECOND
+                self._guarded[service] = _changed(decision, expires=expires)
+        watch = Watch(host, suspicion.evidence, now)
+        for port, source in self.recent.towards(host, since):
+            watch.add(port, source)
+        for at, source, service in self._finished:
+            if at >= since and service.address == host:
+                watch.finished(service.port, source)
+        return watch
+
+    def _guard_known_services(self, watch: Watch) -> list[Decision]:
+        reason = f"{watch.evidence.summary}, whose SYNs were not seen here: its known service is guarded"
+        services = [service for service in self.services if service.address == watch.host]
+        return [guard for service in services for guard in self._guard(service, reason, watch)]
+
+    def handshake(self, source: str, service: TcpService, at: int) -> None:
+        """A source has completed a handshake with a service."""
+        self.known.learn(source, at)
+        self.services.pop(service, None)
+        self.services[service] = None
+        if len(self.services) > SERVICES_LEARNT:
+            del self.services[next(iter(self.services))]
+        self._finished.append((at, source, service))
+
+    def conclude(
+        self, watch: Watch, offences: Mapping[str, int] | None, *, sure: bool = True
+    ) -> list[Decision]:
+        """Decisions for a watch; `offences` are earlier blocks by address, None if unknown.
+
+        Unless handshakes had time to complete (`sure`) nobody is blocked: the service is guarded, and
+        the watch is marked as unsure.
+        """
+        if not len(self.recent):  # the stream of SYNs does not reach us
+            return self._guard_known_services(watch)
+        by_port: dict[int, dict[str, int]] = {}
+        for (port, source), count in watch.syns.items():
+            by_port.setdefault(port, {})[source] = count
+        decisions: list[Decision] = []
+        for port, syns in sorted(by_port.items()):
+            sample = Sample(TcpService(watch.host, port), syns)
+            verdict = judge_syns(sample, self.rules, self.allow, self.known, self.gather)
+            if verdict.block and sure and self._is_dead(sample.service):
+                # a device may send SYNs to a server that is gone: nothing is half-open there.  Where
+                # only one direction passes the switch the guard has to do, since nobody can tell the two apart
+                decisions += self._guard(sample.service, f"{verdict.reason} once it answers anybody", watch)
+            elif verdict.block and not sure:
+                watch.unsure = True
+                reason = f"{verdict.reason} unless they finish their handshakes soon; guarded meanwhile"
+                decisions += self._guard(sample.service, reason, watch)
+            else:
+                decisions += self._carry_out(sample.service, verdict, watch, offences)
+        return decisions
+
+    def _is_dead(self, service: TcpService) -> bool:
+        return service not in self.services and self._is_silent(service)
+
+    def gather(self, addresses: Iterable[str]) -> dict[str, list[str]]:
+        """Prefixes that may be blocked in place of the addresses."""
+        rules = self._ledger.rules
+        found = crowded_prefixes(
+            addresses, rules.prefix_neighbours, rules.prefix_v4, rules.prefix_v6, self.is_inhabited
+        )
+        return {str(network): members for network, members in found.items()}
+
+    def is_inhabited(self, prefix: Network) -> bool:
+        """Whether the prefix contains a known, allowed or guarded address."""
+        if self.allow.touches(prefix) or any_within(prefix, self.known):
+            return True
+        services = {each.address for each in (*self.services, *self._always, *self._guarded)}
+        return any_within(prefix, services)
+
+    def spared(self) -> Callable[[str], bool]:
+        """Clients whose half-open connections are not reset: known, allowed, or with a finished handshake."""
+        finished = {source for _, source, _ in self._finished}
+        return lambda each: each in finished or each in self.known or self.allow.covers_address(each)
+
+    def restore(self, decisions: Iterable[Decision]) -> None:
+        """Restore guards that a flood led to before a restart; those of the settings are always set."""
+        for decision in decisions:
+            port = decision.target.port
+            if decision.action == "protect" and decision.expires and port is not None:
+                self._guarded[TcpService(decision.target.address, port)] = decision
+
+    def release(self, which: str, now: int, reason: str) -> list[Decision]:
+        """Lift guards set because of floods, by id or address; a flood that continues sets them again."""
+        found = [service for service, each in self._guarded.items() if which in (each.id, service.address)]
+        return [
+            _changed(self._guarded.pop(service), action="unprotect", reason=reason, event_time=now)
+            for service in found
+        ]
+
+    def release_all(self, now: int, reason: str) -> list[Decision]:
+        """Lift all guards set because of floods."""
+        lifted = [
+            _changed(each, action="unprotect", reason=reason, event_time=now)
+            for each in self._guarded.values()
+        ]
+        self._guarded.clear()
+        return lifted
+
+    def due(self, now: int) -> list[Decision]:
+        """Lift guards that have expired."""
+        over = [service for service, decision in self._guarded.items() if 0 < decision.expires <= now]
+        reason = "no flood was seen for the time of a guard"
+        return [
+            _changed(self._guarded.pop(service), action="unprotect", reason=reason, event_time=now)
+            for service in over
+        ]
+
+    def _carry_out(
+        self, service: TcpService, verdict: SynVerdict, watch: Watch, offences: Mapping[str, int] | None
+    ) -> list[Decision]:
+        decisions: list[Decision] = []
+        if verdict.protects:
+            decisions += self._guard(service, verdict.reason, watch)
+        blocked = {block.decision.target.address for block in self._ledger.blocks.values()}
+        for source in verdict.block:
+            if source in blocked or self._ledger.in_blocked_prefix(source):
+                continue
+            cap = self._ledger.cap_reached(watch.now)
+            if cap is not None:
+                self._ledger.refuse(cap, source, watch.now)
+                continue
+            target = Target(kind="ip", address=source)
+            note = "" if offences is not None else f" ({UNKNOWN_HISTORY})"
+            decisions.append(
+                self._ledger.open(
+                    EVERY_SWITCH,
+                    target,
+                    verdict.reason + note,
+                    (watch.evidence,),
+                    watch.now,
+                    offences=(offences or {}).get(source, 0),
+                )
+            )
+        return decisions
+
+    def _guard(self, service: TcpService, reason: str, watch: Watch) -> list[Decision]:
+        if service in self._always or service in self._guarded:
+            return []
+        expires = watch.now + self.rules.protect_s * SECOND
+        reason = reason if len(self.known) else f"{reason} ({COLD_HISTORY})"
+        made = self._protect(service, EVERY_SWITCH, reason, (watch.evidence,), watch.now, expires=expires)
+        self._guarded[service] = made
+        return [made]
+
+    def _protect(
+        self,
+        service: TcpService,
+        switch: str,
+        reason: str,
+        evidence: tuple[Evidence, ...],
+        now: int,
+        *,
+        expires: int,
+    ) -> Decision:
+        return Decision(
+            id=decision_id(switch, service.target, now),
+            action="protect",
+            switch=switch,
+            target=service.target,
+            reason=reason,
+            evidence=evidence,
+            event_time=now,
+            expires=expires,
+            dry_run=self._ledger.rules.dry_run,
+        )
+
+
+def _on(switch: str, decision: Decision) -> Decision:
+    return _changed(decision, switch=switch)
+
+
+def _changed(old: Decision, **changes: Any) -> Decision:
+    return Decision(**({name: getattr(old, name) for name in old.__struct_fields__} | changes))

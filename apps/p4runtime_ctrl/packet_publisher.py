@@ -1,0 +1,141 @@
+"""Messages of a switch → DUE items: the hot path.
+
+One item for each wanted key, from one batch of the stream, in its order.  `write` blocks while consumers of
+reliable keys are behind; then the stream is not read, and gRPC's flow control stops the switch.
+"""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+from apps.p4runtime_ctrl.southbound.counts_in import CountReader
+from apps.p4runtime_ctrl.southbound.digest_in import DigestReader
+from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker, Source
+from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.southbound.packet_in import PacketInBatch, PacketReader
+from apps.p4runtime_ctrl.southbound.sequence_merge import PacketRows, SequenceMerger
+from apps.p4runtime_ctrl.telemetry.demand import APP, Demand, Kind, key_of
+from apps.packets import read_frames
+
+Write = Callable[[str, Any, int], object]
+"""Key, value and event time (ns) of an item to be published at once."""
+
+_SECOND_US: Final = 1_000_000
+
+
+class PacketPublisher:
+    """Publishes packets and reports of the switch `name` through `write`.
+
+    `by_digest`: record batches come from digests, else from copied frames.
+    """
+
+    def __init__(
+        self, name: str, program: ProgramInfo, base_us: int, write: Write, *, by_digest: bool = False
+    ) -> None:
+        self.progress = LossTracker()
+        self._name = name
+        self._write = write
+        self._by_digest = by_digest
+        self._packets = PacketReader(program, base_us, self.progress)
+        self._digests = DigestReader(program, base_us, self.progress)
+        self._counts = CountReader(program, base_us, self.progress)
+        self.answers = 0
+        """Answers about counting cells."""
+        self.counts_reported = 0
+        """Differences that the switch reported when their window was over."""
+        self._routes: dict[Kind, list[tuple[str, int]]] = {}
+        self._unison = SequenceMerger()
+        self._waited = 0
+
+    @property
+    def fell_back(self) -> int:
+        """Records made from copied frames because digests do not cover them."""
+        return self._unison.copies
+
+    @property
+    def skipped(self) -> int:
+        """Frames missing from the records because they came too late, or not at all."""
+        return self._unison.skipped
+
+    @property
+    def second(self) -> int:
+        """Capture time of the newest frame seen, in seconds."""
+        return self.progress.time_us // _SECOND_US
+
+    def route(self, demand: Demand) -> None:
+        """Publish according to this demand from now on."""
+        self._routes = {
+            kind: [(key_of(kind, self._name, which), bit) for which, bit in routes.items()]
+            for kind, routes in demand.routes.items()
+        }
+        expected: set[Source] = set()
+        for request in demand.requests:
+            expected |= {"packet"} if request.copy else set()
+            expected |= {"digest"} if request.digest else set()
+        self.progress.expected = frozenset(expected)
+
+    def packets(self, messages: list[Any]) -> None:
+        """Publish packet-ins, in the order of their stream."""
+        packets = self._packets.read(messages)
+        if packets.cells is not None and len(packets.cells):
+            self.answers += len(packets.cells)
+            self._write(f"network.cell.{APP}.{self._name}", packets.cells, self.progress.time_us * 1000)
+        if self._by_digest:
+            self._write_records(self._unison.packets(_rows(packets)))
+        elif self._routes.get("packets") and len(packets):
+            # headers are parsed once for all keys: under a flood most packets are wanted under several keys
+            self._write_records([_rows(packets)])
+        for key, bit in self._routes.get("frames", ()):
+            chosen = packets.matching(bit)
+            if len(chosen):
+                self._write(key, chosen.raw(), int(chosen.time_us[-1]) * 1000)
+
+    def digests(self, lists: list[Any]) -> None:
+        """Publish digest lists, in the order of their stream; lists of counts after those of frames."""
+        ours, theirs = self._counts.digest_id, self._digests.digest_id
+        counts = [each for each in lists if each.digest_id == ours] if ours else []
+        frames = [each for each in lists if each.digest_id == theirs]
+        self.progress.malformed += len(lists) - len(counts) - len(frames)
+        if frames:
+            self._write_reports(frames)
+        if counts:
+            self._write_counts(counts)
+
+    def _write_reports(self, lists: list[Any]) -> None:
+        reports = self._digests.read(lists)
+        if self._by_digest:
+            rows = PacketRows(reports.columns, reports.queries, reports.covered)
+            self._write_records(self._unison.digests(rows))
+        for key, bit in self._routes.get("digests", ()):
+            batch = reports.counted(bit)
+            if len(batch):
+                self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+
+    def _write_counts(self, lists: list[Any]) -> None:
+        counts = self._counts.read(lists)
+        self.counts_reported += len(counts)
+        for key, bit in self._routes.get("counts", ()):
+            batch = counts.of(bit)
+            if len(batch):
+                self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+
+    def settle(self) -> None:
+        """Called at intervals: publish records that have waited since the last call, without missing ones."""
+        waits = self._unison.waits_for
+        if waits and waits == self._waited:
+            self._write_records(self._unison.flush())
+        self._waited = waits
+
+    def _write_records(self, told: list[PacketRows]) -> None:
+        for rows in told:
+            for key, bit in self._routes.get("packets", ()):
+                batch = rows.matching(bit)
+                if len(batch):
+                    self._write(key, batch, int(batch["time_us"][-1]) * 1000)
+
+
+def _rows(packets: PacketInBatch) -> PacketRows:
+    return PacketRows(
+        dict(packets.batch(read_frames)), packets.queries, np.ones(len(packets), dtype=np.bool_)
+    )

@@ -1,0 +1,1 @@
+"""P4Runtime towards the switch: connection, program, and its messages as columns."""

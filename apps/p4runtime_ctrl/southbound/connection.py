@@ -1,0 +1,267 @@
+"""The stream to one switch: arbitration, packet-ins, notifications; opened again whenever it ends.  I/O.
+
+A lost stream is opened again, with growing pauses.  The active controller claims to be primary with its rank, a
+standby with the lowest election id.  When the switch reports that there is no primary, a standby waits a
+moment for the active one, then asks to be primary.
+"""
+
+import threading
+import time
+from typing import Any, Final, Protocol
+
+import grpc
+
+from apps.p4runtime_ctrl.southbound.session import (
+    Address,
+    CompiledProgram,
+    Outgoing,
+    P4RuntimeSession,
+    translated,
+)
+from p4rt import P4RuntimeStub, p4runtime
+
+_FIRST_PAUSE: Final = 0.05
+_DEPUTY_WAITS_S: Final = 0.5
+_LONGEST_LINGER_S: Final = 0.01
+_SHARE: Final = 4
+"""A list waits this many times as long as the previous one took to handle."""
+_PRIMARY, _NO_PRIMARY = 0, 5
+_HIGHEST_ID: Final = (1 << 128) - 1
+
+
+class Listener(Protocol):
+    """Callbacks for one switch; called from the connection's threads."""
+
+    def became_primary(self, session: "P4RuntimeSession") -> None: ...
+    def became_backup(self) -> None: ...
+    def lost(self, cause: str) -> None: ...
+    def packets(self, messages: list[Any]) -> None: ...
+    def digests(self, lists: list[Any]) -> None: ...
+    def other(self, message: Any) -> None: ...
+
+
+class Connection:
+    """Keeps the stream to one switch open and its listener informed.
+
+    Packet-ins and digests are handed over in lists, each in its order: as soon as the listener is free again and at most
+    `linger_s` after the first of them, never more than `batch` at once.  If the listener needs long for a list
+    the next one waits four times as long, 10 ms at most: each list costs milliseconds however short it is, and under
+    a flood many short ones would keep packets from being read.  While the listener is busy at most four batches
+    wait; then reading stops and gRPC's flow control stops the switch.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        pipeline: CompiledProgram,
+        listener: Listener,
+        *,
+        batch: int = 1024,
+        linger_s: float = 0.002,
+        longest_pause_s: float = 0.2,
+        active: bool = True,
+        patience_s: float = _DEPUTY_WAITS_S,
+    ) -> None:
+        self._address = address
+        self._pipeline = pipeline
+        self._listener = listener
+        self._batch = batch
+        self._linger_s = linger_s
+        self._longest_pause_s = longest_pause_s
+        self._closing = threading.Event()
+        self._gathered: list[Any] = []
+        self._changed = threading.Condition()
+        self._call: Any = None
+        self._stub: Any = None
+        self._requests = Outgoing()
+        self._election_id: Any = None
+        self._opened_ms = 0
+        self._told: tuple[bool, Any] | None = None
+        """What the listener knows: primary or not, and the election id of its writes."""
+        self._active = active
+        self._patience_s = patience_s
+        self._patience: threading.Timer | None = None
+        name = address.target
+        self._threads = [
+            threading.Thread(target=self._keep_open, name=f"stream {name}", daemon=True),
+            threading.Thread(target=self._hand_over, name=f"packets {name}", daemon=True),
+        ]
+
+    def open(self) -> None:
+        """Start; the listener is told of success and failure."""
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End the stream (a backup takes over at once) and wait for the threads."""
+        self._closing.set()
+        self._stop_waiting()
+        self.break_off()
+        with self._changed:
+            self._changed.notify_all()
+        for thread in self._threads:
+            if thread.is_alive() and thread is not threading.current_thread():
+                thread.join(timeout=5)
+
+    @property
+    def works(self) -> bool:
+        """Whether its threads run; a thread that raised an error has ended, and the error is in the log."""
+        return self._closing.is_set() or all(thread.is_alive() for thread in self._threads)
+
+    def stand(self, *, active: bool) -> None:
+        """Become active or standby of the controllers of this switch."""
+        if active != self._active:
+            self._active = active
+            self._claim(self._usual_id())
+
+    def break_off(self) -> None:
+        """Close this stream; a new one is opened unless `close` was called."""
+        call = self._call
+        if call is not None:
+            call.cancel()
+
+    def _keep_open(self) -> None:
+        # The channels stay for good and reconnect by themselves: a channel that is closed while its stream is being
+        # cancelled corrupts gRPC's memory once in some eighty times (grpcio 1.85 without EventEngine).
+        with self._address.channel() as stream, self._address.channel() as calls:
+            self._stub = P4RuntimeStub(calls)
+            self._keep_streaming(P4RuntimeStub(stream))
+
+    def _keep_streaming(self, stub: Any) -> None:
+        pause = _FIRST_PAUSE
+        while not self._closing.is_set():
+            opened = time.monotonic()
+            cause = self._one_stream(stub)
+            if self._closing.is_set():
+                return
+            self._listener.lost(cause)
+            if time.monotonic() - opened > self._longest_pause_s * 2:
+                pause = _FIRST_PAUSE
+            self._closing.wait(pause)
+            pause = min(pause * 2, self._longest_pause_s)
+
+    def _one_stream(self, stub: Any) -> str:
+        """Open the stream and read it to its end; returns why it ended."""
+        self._requests = Outgoing()
+        self._told = None
+        self._claim(self._usual_id())
+        self._call = stub.StreamChannel(iter(self._requests))
+        try:
+            for message in self._call:
+                self._take(message)
+        except grpc.RpcError as error:
+            return str(translated(error, self._address.target))
+        else:
+            return f"switch at {self._address.target} closed the stream"
+        finally:
+            self._stop_waiting()
+            self._requests.end()
+            self._call = None
+
+    def _usual_id(self) -> int:
+        rank = self._address.rank if self._active else 0
+        # even if the wall clock is set back, a new stream must win over the previous one
+        self._opened_ms = max(time.time_ns() // 1_000_000, self._opened_ms + 1)
+        return rank << 64 | self._opened_ms
+
+    def _claim(self, election_id: int) -> None:
+        """Ask to be primary under this id."""
+        self._election_id = p4runtime.Uint128(high=election_id >> 64, low=election_id & (1 << 64) - 1)
+        request = p4runtime.StreamMessageRequest()
+        request.arbitration.device_id = self._address.device_id
+        request.arbitration.election_id.CopyFrom(self._election_id)
+        self._requests.put(request)
+
+    def _take(self, message: Any) -> None:
+        kind = message.WhichOneof("update")
+        if kind == "packet":
+            self._gather(message.packet)
+        elif kind == "digest":
+            self._acknowledge(message.digest)
+            self._gather(message.digest)
+        elif kind == "arbitration":
+            self._arbitrated(message.arbitration)
+        else:
+            self._listener.other(message)
+
+    def _arbitrated(self, arbitration: Any) -> None:
+        """The switch repeats its status whenever a controller comes or goes; only changes are passed on."""
+        self._stop_waiting()
+        if arbitration.status.code == _NO_PRIMARY:
+            highest = arbitration.election_id.high << 64 | arbitration.election_id.low
+            self._fill_the_place(min(max(highest + 1, self._usual_id()), _HIGHEST_ID))
+            return
+        primary = arbitration.status.code == _PRIMARY
+        told = (primary, self._election_id if primary else None)
+        if told == self._told:
+            return
+        self._told = told
+        if primary:
+            session = P4RuntimeSession(
+                self._stub, self._address, self._pipeline, self._election_id, self._requests
+            )
+            self._listener.became_primary(session)
+        else:
+            self._listener.became_backup()
+
+    def _fill_the_place(self, election_id: int) -> None:
+        if self._active:
+            self._claim(election_id)
+            return
+        self._patience = threading.Timer(self._patience_s, self._claim, (election_id,))
+        self._patience.daemon = True
+        self._patience.start()
+
+    def _stop_waiting(self) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+            self._patience = None
+
+    def _acknowledge(self, digest: Any) -> None:
+        request = p4runtime.StreamMessageRequest()
+        request.digest_ack.digest_id = digest.digest_id
+        request.digest_ack.list_id = digest.list_id
+        self._requests.offer(request)
+
+    def _gather(self, message: Any) -> None:
+        gathered = self._gathered
+        gathered.append(message)
+        count = len(gathered)
+        if count != 1 and count % self._batch:
+            return
+        with self._changed:
+            self._changed.notify_all()
+            while len(self._gathered) >= 4 * self._batch and not self._closing.is_set():
+                self._changed.wait(timeout=1)
+
+    def _hand_over(self) -> None:
+        spent = 0.0
+        while not self._closing.is_set():
+            with self._changed:
+                while not self._gathered and not self._closing.is_set():
+                    self._changed.wait(timeout=1)
+                if len(self._gathered) < self._batch:
+                    self._changed.wait(timeout=max(self._linger_s, min(_SHARE * spent, _LONGEST_LINGER_S)))
+            began = time.monotonic()
+            while self._gathered and not self._closing.is_set():
+                # appends go to the same list from the other thread; both slices are atomic
+                messages = self._gathered[: self._batch]
+                del self._gathered[: len(messages)]
+                with self._changed:
+                    self._changed.notify_all()
+                self._tell(messages)
+                if len(self._gathered) < self._batch:
+                    break
+            spent = time.monotonic() - began
+
+    def _tell(self, messages: list[Any]) -> None:
+        """One list of each kind.
+
+        Under load a digest arrives every 2 ms; handling it at once would split packet-ins into tiny batches.
+        """
+        packets = [each for each in messages if type(each) is p4runtime.PacketIn]
+        digests = [each for each in messages if type(each) is not p4runtime.PacketIn]
+        if digests:
+            self._listener.digests(digests)
+        if packets:
+            self._listener.packets(packets)

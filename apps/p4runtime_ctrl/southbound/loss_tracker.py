@@ -1,0 +1,153 @@
+"""Progress of a switch's stream: sequence numbers, losses, capture time.
+
+The switch numbers the frames that it copies or reports, in one sequence.  They arrive in two ordered
+streams, packet-ins and digests.  A number is lost when all expected streams have passed it, or when the
+silent one is far behind.
+"""
+
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.packets import SteadyTime
+
+Source = Literal["packet", "digest"]
+_WRAP: Final = 1 << 32
+_HALF: Final = _WRAP // 2
+_STEP_US: Final = 3_600_000_000
+_HORIZON: Final = 1 << 16
+"""A stream that is this many numbers behind the other is not waited for."""
+
+
+class LossTracker:
+    """Counts of one switch."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        """Packet-ins."""
+        self.reported = 0
+        """Digests."""
+        self.malformed = 0
+        """Messages that do not fit the program; dropped."""
+        self.restarts = 0
+        """How often the numbers restarted."""
+        self.arrival = 0
+        """Arrival number of the newest frame seen."""
+        self.time_us = 0
+        """Capture time of the newest frame seen."""
+        self.expected: frozenset[Source] = frozenset(("packet",))
+        """Expected streams."""
+        self._clock = SteadyTime(_STEP_US)
+        self._lost = 0
+        self._passed: dict[Source, int] = {}
+        self._gaps: list[tuple[int, int]] = []
+        self._highest: int | None = None
+
+    @property
+    def lost(self) -> int:
+        """Numbers that never arrived."""
+        return self._lost
+
+    def expect_first(self) -> None:
+        """The switch has just loaded its program: the next number is 1."""
+        if self._highest is None:
+            self._highest = 0
+
+    def packets(
+        self, sequence: NDArray[np.uint64], arrival: NDArray[np.uint64], time_us: NDArray[np.int64]
+    ) -> None:
+        """Record copied frames, in the order of their stream."""
+        self.received += len(sequence)
+        self._note("packet", sequence, arrival, time_us)
+
+    def digests(
+        self, sequence: NDArray[np.uint64], arrival: NDArray[np.uint64], time_us: NDArray[np.int64]
+    ) -> None:
+        """Record reported frames; a frame that was neither copied nor requested has number 0."""
+        self.reported += len(sequence)
+        self._note("digest", sequence, arrival, time_us)
+
+    def passed(self, time_us: NDArray[np.int64]) -> None:
+        """Record reports without numbers, at these capture times."""
+        if len(time_us) and self._clock.hear(int(time_us[-1])):
+            self.time_us = self._clock.now or 0
+
+    @property
+    def times_doubted(self) -> int:
+        """Times that were too far from the previous ones."""
+        return self._clock.doubted
+
+    def _note(
+        self,
+        source: Source,
+        sequence: NDArray[np.uint64],
+        arrival: NDArray[np.uint64],
+        time_us: NDArray[np.int64],
+    ) -> None:
+        self.passed(time_us)
+        numbers = sequence[sequence != 0].astype(np.int64)
+        if not len(numbers):
+            return
+        # after a break in both streams a lower first number means that the switch restarted
+        first = self._highest if self._highest and not self._passed else int(numbers[0]) - 1
+        before = self._passed.get(source, first)
+        previous = np.concatenate(([before], numbers[:-1]))
+        backwards = np.flatnonzero((numbers - previous) % _WRAP >= _HALF)
+        start = 0
+        for begin in backwards:
+            self._pass(source, numbers[start:begin])
+            self._begin_anew()
+            start = int(begin)
+        self._pass(source, numbers[start:])
+        self.arrival = int(arrival[-1])
+
+    def _begin_anew(self) -> None:
+        """A switch that counts from 1 again: the numbers before the first to arrive are lost, too."""
+        self._settle(everything=True)
+        self.restarts += 1
+        self._passed.clear()
+        self._highest = 0
+
+    def _pass(self, source: Source, numbers: NDArray[np.int64]) -> None:
+        if not len(numbers):
+            return
+        if self._highest is None:
+            self._highest = int(numbers[0]) - 1
+        highest = self._highest
+        known = numbers[numbers <= highest]
+        if len(known) and self._gaps:
+            self._fill(known)
+        fresh = numbers[len(known) :]
+        if len(fresh):
+            starts = np.concatenate(([highest], fresh[:-1]))
+            for row in np.flatnonzero(fresh - starts > 1):
+                self._gaps.append((int(starts[row]) + 1, int(fresh[row])))
+            self._highest = int(fresh[-1])
+        self._passed[source] = int(numbers[-1])
+        self._settle()
+
+    def _fill(self, numbers: NDArray[np.int64]) -> None:
+        """Numbers that fill gaps of the other stream."""
+        left: list[tuple[int, int]] = []
+        for first, end in self._gaps:
+            inside = numbers[(numbers >= first) & (numbers < end)].tolist()
+            edges = [first - 1, *inside, end]
+            left += [(a + 1, b) for a, b in pairwise(edges) if b - a > 1]
+        self._gaps = left
+
+    def _settle(self, *, everything: bool = False) -> None:
+        """Gaps that can no longer be filled are losses."""
+        if not self._gaps:
+            return
+        highest = self._highest or 0
+        passed = min((self._passed.get(source, 0) for source in self.expected), default=highest)
+        passed = max(passed, highest - _HORIZON)
+        waiting = []
+        for first, end in self._gaps:
+            over = end if everything else min(end, passed + 1)
+            self._lost += max(0, over - first)
+            if max(first, over) < end:
+                waiting.append((max(first, over), end))
+        self._gaps = waiting

@@ -1,0 +1,167 @@
+"""Digests and packet-ins of one switch → packet records, each frame once, in the order of their numbers.
+
+The switch numbers the frames that it reports or copies, in one sequence.  A frame arrives as digest, as
+packet-in, or as both.  A copy has all fields; a digest has them if the switch's parser covers the frame.
+
+    digests     1 2 3 · 5 6 7       (4 came as a copy only)
+    packet-ins  · · · 4 · 6         (6 is not covered by the parser)
+    records     1 2 3 4 5 6 7
+
+A missing number is waited for until it arrives, until both streams have passed it, or until `flush`.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.p4runtime_ctrl.southbound.loss_tracker import Source
+from apps.p4runtime_ctrl.southbound.rows import has_bit
+from due import RecordBatch
+
+_LONGEST: Final = 1 << 16
+"""Most rows that wait."""
+_WRAP: Final = 1 << 32
+
+_Columns = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class PacketRows:
+    """Packet records with the requests that each meets; `whole`: whether the row has all fields."""
+
+    columns: _Columns
+    queries: NDArray[np.uint8]
+    whole: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.queries)
+
+    @property
+    def sequence(self) -> NDArray[np.int64]:
+        return self.columns["sequence"].astype(np.int64)
+
+    def only(self, rows: NDArray[Any] | slice) -> "PacketRows":
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return PacketRows(columns, self.queries[rows], self.whole[rows])
+
+    def matching(self, bit: int) -> RecordBatch:
+        """The records that meet a request."""
+        rows = has_bit(self.queries, bit)
+        return RecordBatch(
+            self.columns if rows.all() else {name: column[rows] for name, column in self.columns.items()}
+        )
+
+
+class SequenceMerger:
+    """Merges the two streams of one switch.  Not thread-safe."""
+
+    def __init__(self) -> None:
+        self.copies = 0
+        """Records that were made from copied frames."""
+        self.skipped = 0
+        """Numbers that were given up; their frames are dropped if they arrive later."""
+        self._held: dict[Source, PacketRows | None] = {"digest": None, "packet": None}
+        self._passed: dict[Source, int] = {"digest": 0, "packet": 0}
+        self._told = 0
+        """All numbers up to this one are finished."""
+
+    def __len__(self) -> int:
+        """Rows that wait."""
+        return sum(len(rows) for rows in self._held.values() if rows is not None)
+
+    @property
+    def waits_for(self) -> int:
+        """The missing number that rows wait for; 0 if none wait."""
+        return self._told + 1 if len(self) else 0
+
+    def digests(self, rows: PacketRows) -> list[PacketRows]:
+        """Add reported frames, in the order of their stream; returns the rows that are complete."""
+        return self._take("digest", rows)
+
+    def packets(self, rows: PacketRows) -> list[PacketRows]:
+        """Add copied frames, in the order of their stream; returns the rows that are complete."""
+        return self._take("packet", rows)
+
+    def flush(self) -> list[PacketRows]:
+        """Return all waiting rows and give up missing numbers."""
+        before = self._told
+        told = self._tell(_WRAP)
+        if told:
+            first = before + 1 if before else int(told[0].sequence[0])
+            self.skipped += self._told + 1 - first - sum(map(len, told))
+        return told
+
+    def _take(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
+        if self._is_next(rows):
+            self._told = self._passed[stream] = self._told + len(rows)
+            self.copies += len(rows) if stream == "packet" else 0
+            return [rows]
+        rows = rows.only(np.flatnonzero(rows.sequence))
+        if not len(rows):
+            return []
+        told: list[PacketRows] = []
+        back = np.flatnonzero(np.diff(rows.sequence, prepend=self._passed[stream]) <= 0)
+        for begin, end in pairwise(sorted({0, *back.tolist(), len(rows)})):
+            if begin in back:  # the switch counts from 1 again
+                told += self.flush()
+                self._passed = dict.fromkeys(self._passed, 0)
+                self._told = 0
+            told += self._follow(stream, rows.only(slice(begin, end)))
+        return told
+
+    def _is_next(self, rows: PacketRows) -> bool:
+        """The usual case: nothing waits, nothing is missing."""
+        if len(self) or not len(rows) or not rows.whole.all():
+            return False
+        return bool((rows.sequence == np.arange(self._told + 1, self._told + 1 + len(rows))).all())
+
+    def _follow(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
+        self._passed[stream] = int(rows.sequence[-1])
+        fresh = rows.sequence > self._told
+        if not fresh.all():
+            rows = rows.only(fresh)
+        held = self._held[stream]
+        self._held[stream] = rows if held is None else _joined(held, rows)
+        return self._tell(self._decided()) if len(self) <= _LONGEST else self.flush()
+
+    def _decided(self) -> int:
+        """The highest number up to which each number has arrived or is given up."""
+        both = max(self._told, min(self._passed.values()))
+        there = [rows.sequence[rows.whole] for rows in self._held.values() if rows is not None and len(rows)]
+        numbers = np.unique(np.concatenate(there)) if there else np.zeros(0, np.int64)
+        numbers = numbers[numbers > both]
+        run = numbers == both + 1 + np.arange(len(numbers))
+        return both + (len(run) if run.all() else int(run.argmin()))
+
+    def _tell(self, end: int) -> list[PacketRows]:
+        """The rows up to a number; a copy is preferred to a digest of the same frame."""
+        chosen: dict[Source, PacketRows] = {}
+        for stream, rows in self._held.items():
+            if rows is None:
+                continue
+            ripe = rows.sequence <= end
+            if ripe.all():
+                self._held[stream] = None
+            else:
+                self._held[stream] = rows.only(~ripe)
+            chosen[stream] = rows.only(ripe)
+        self._told = max(self._told, min(end, max(self._passed.values())))
+        chosen = {stream: rows for stream, rows in chosen.items() if len(rows)}
+        self.copies += len(chosen.get("packet", ()))
+        return [self._merged(**chosen)] if len(chosen) > 1 else list(chosen.values())
+
+    def _merged(self, packet: PacketRows, digest: PacketRows) -> PacketRows:
+        fresh = ~np.isin(digest.sequence, packet.sequence)
+        rows = _joined(packet, digest if fresh.all() else digest.only(fresh))
+        return rows.only(np.argsort(rows.sequence, kind="stable"))
+
+
+def _joined(first: PacketRows, second: PacketRows) -> PacketRows:
+    return PacketRows(
+        {name: np.concatenate((first.columns[name], second.columns[name])) for name in first.columns},
+        np.concatenate((first.queries, second.queries)),
+        np.concatenate((first.whole, second.whole)),
+    )

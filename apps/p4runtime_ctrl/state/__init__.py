@@ -1,0 +1,1 @@
+"""The desired state of a switch, and the updates that establish it."""

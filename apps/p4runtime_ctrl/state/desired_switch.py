@@ -1,0 +1,445 @@
+"""The desired state of one switch: its entries, who asked for them, and reconciliation.
+
+All that the controller wants of a switch is kept here, connected or not.  While there is a `Transport`
+changes are written at once; after a lost connection `bring_up` reads the entries of the switch and writes the
+difference.  It has no thread, clock or socket: the worker calls it from one thread.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from apps.messages import Confirmation, Decision, State, TableCommand
+from apps.p4runtime_ctrl.errors import EntryError, P4InfoError, SwitchError
+from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.state.blocks import BLOCK_TABLES
+from apps.p4runtime_ctrl.state.desired_state import (
+    DELETE,
+    INSERT,
+    MODIFY,
+    Change,
+    EntrySet,
+    deletion,
+    difference,
+    entry_body,
+    entry_key,
+    is_standing,
+    table_id,
+)
+from apps.p4runtime_ctrl.state.entry_updates import EntryUpdate, EntryUpdates, Owner, owner_of
+from apps.p4runtime_ctrl.state.guard import SECRET_WORDS, GuardSettings, secrets_entry
+from apps.p4runtime_ctrl.state.mac_learning import GROUP, LearnSettings, MacLearning, new_senders, no_flood
+from apps.p4runtime_ctrl.state.port_forwarding import wires_of
+from apps.p4runtime_ctrl.telemetry.classifier import Classifier, TelemetryRequest
+
+_OK, _NOT_FOUND, _EXISTS = 0, 5, 6
+_MOST_CAUSE = 2_000
+"""Most characters of an error text from a switch."""
+
+
+@dataclass(frozen=True)
+class UpdateOutcome:
+    """The switch's answer to one update: a gRPC status code and its text."""
+
+    code: int = _OK
+    message: str = ""
+
+
+class Transport(Protocol):
+    """A connected switch.  Every method raises `SwitchError`."""
+
+    def ensure_program(self) -> bool:
+        """Load the program unless the switch has it; True if it was loaded (its tables are empty then)."""
+
+    def ensure_copies(self) -> None:
+        """Set up the clone session to the controller."""
+
+    def ensure_digests(self) -> None:
+        """Enable the digests of the program."""
+
+    def ensure_group(self, group: int, ports: Sequence[int]) -> None:
+        """Set up a multicast group of these ports."""
+
+    def write(self, changes: Sequence[Change]) -> list[UpdateOutcome]:
+        """One outcome for each change, in order; each succeeds or fails by itself."""
+
+    def read_entries(self) -> Iterable[Any]:
+        """All entries of all tables, without default actions."""
+
+    def read_standing(self, entries: Iterable[Any]) -> Iterable[Any]:
+        """The switch's values of these default actions and meter cells."""
+
+    def read_counters(self, table_id: int) -> Iterable[Any]:
+        """Entries of one table with their direct counters."""
+
+
+@dataclass
+class BringUp:
+    """The changes that reconciliation made."""
+
+    program_loaded: bool = False
+    inserted: int = 0
+    modified: int = 0
+    removed: int = 0
+    failed: dict[bytes, str] = field(default_factory=dict)
+    confirmations: list[Confirmation] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        parts = ["program loaded"] if self.program_loaded else []
+        counts = {"inserted": self.inserted, "modified": self.modified, "removed": self.removed}
+        parts += [f"{count} {what}" for what, count in counts.items() if count]
+        parts += [f"{len(self.failed)} failed ({next(iter(self.failed.values()))})"] if self.failed else []
+        return ", ".join(parts) or "nothing to change"
+
+
+Clock = Callable[[], tuple[int, int]]
+"""Capture time in ns and arrival number of the newest packet seen."""
+
+
+class DesiredSwitch:
+    """Desired state of the switch `name`.
+
+    `forward` maps ingress to egress ports.  `fail` decides the order of reconciliation: open writes port
+    forwarding first, so that traffic flows; closed writes it last, so that nothing passes unchecked.
+    Raises `P4InfoError` if the program lacks what the controller needs.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        program: ProgramInfo,
+        clock: Clock,
+        *,
+        forward: Mapping[int, int] | None = None,
+        fail: Literal["open", "closed"] = "open",
+        guard: GuardSettings | None = None,
+        learn: LearnSettings | None = None,
+    ) -> None:
+        self.name = name
+        self.program = program
+        self.requests: tuple[TelemetryRequest, ...] | None = None
+        """Telemetry requests; None until they are known: the switch's telemetry is then left as it is."""
+        self.fail = fail
+        self._clock = clock
+        self._classifier = Classifier(program)
+        self._book = EntryUpdates(program, guard or GuardSettings(), self._classifier.table_ids)
+        self._blocks = {program.table(each).id: 0 for each in BLOCK_TABLES}
+        self._forward = wires_of(program, forward or {})
+        self._desired = EntrySet(self._forward)
+        self.stations = MacLearning(program, learn) if learn is not None else None
+        """Learnt MAC addresses, if learning is on."""
+        self._unlearnt = no_flood(program) if self.stations is None else []
+        for entry in new_senders(program, learn=self.stations is not None):
+            self._desired.put(entry)
+        if self.stations is not None:
+            self._desired.put(self.stations.flood())
+        self._owners: dict[bytes, Owner] = {}
+        self._unconfirmed: dict[bytes, EntryUpdate] = {}
+        self._telemetry = EntrySet()
+        self._secrets = (0, (0,) * len(SECRET_WORDS))
+
+    @property
+    def guards(self) -> bool:
+        """Whether any service is protected."""
+        return self._book.guards
+
+    def restore(self, decisions: Iterable[Decision], commands: Iterable[TableCommand]) -> list[str]:
+        """Build the desired state from history, oldest first; returns errors for what did not fit the program."""
+        problems: list[str] = []
+        for decision in decisions:
+            if decision.dry_run:
+                continue
+            try:
+                self._remember(self._book.of_decision(decision))
+            except (EntryError, P4InfoError) as error:
+                problems.append(f"decision {decision.id}: {error}")
+        for command in commands:
+            orders, refused = self._book.of_command(command)
+            problems += [f"command {command.id}: {reason}" for _, reason in refused]
+            for order in [] if refused else orders:
+                self._remember(order)
+        return problems
+
+    def bring_up(self, transport: Transport) -> BringUp:
+        """Read, compare, write the difference in one batch."""
+        report = BringUp(program_loaded=transport.ensure_program())
+        transport.ensure_copies()
+        transport.ensure_digests()
+        if self.stations is not None:
+            transport.ensure_group(GROUP, self.stations.ports)
+        standing = [entry for entry in self._desired if is_standing(entry)]
+        standing += [entry for entry in self._classifier.entries(()) if is_standing(entry)]
+        unlearnt = [entry for entry in self._unlearnt if entry not in self._desired]
+        read = [entry for entry in transport.read_entries() if not entry.is_const]
+        read += transport.read_standing(standing + unlearnt)
+        for entry in unlearnt:  # an earlier controller may have configured flooding
+            if entry in EntrySet(each for each in read if is_standing(each)):
+                self._desired.put(entry)
+        for learnt in self.stations.adopt(read) if self.stations is not None else ():
+            self._desired.put(learnt)
+        ids = self._classifier.table_ids
+        present = EntrySet(entry for entry in read if table_id(entry) not in ids)
+        telemetry = EntrySet(entry for entry in read if table_id(entry) in ids)
+        changes = self._plan(present, telemetry)
+        for change, outcome in zip(changes, transport.write(changes) if changes else [], strict=True):
+            self._note(report, change, outcome)
+        self._telemetry = telemetry if self.requests is None else self._classifier.entries(self.requests)
+        report.confirmations = self._confirm_pending(report)
+        return report
+
+    def decide(self, decisions: Sequence[Decision], transport: Transport | None) -> list[Confirmation]:
+        """Carry decisions out; dry runs are ignored and not confirmed."""
+        orders: list[EntryUpdate] = []
+        answers: list[Confirmation] = []
+        for decision in decisions:
+            if decision.dry_run:
+                continue
+            try:
+                orders.append(self._book.of_decision(decision))
+            except (EntryError, P4InfoError) as error:
+                answers.append(self._confirmation(owner_of(decision), "failed", cause=str(error)))
+        return answers + self._carry_out(orders, transport)
+
+    def command(self, command: TableCommand, transport: Transport | None) -> list[Confirmation]:
+        """Carry a command out: one confirmation for each of its updates, in order.
+
+        A command with an update that does not fit the program is refused as a whole.
+        """
+        orders, refused = self._book.of_command(command)
+        if refused:
+            return [self._confirmation(owner, "failed", cause=reason) for owner, reason in refused]
+        return self._carry_out(orders, transport)
+
+    def want(self, requests: Sequence[TelemetryRequest], transport: Transport | None) -> list[str]:
+        """Change the telemetry requests; returns what the switch refused.
+
+        Raises `TelemetryError` or `EntryError` for requests that cannot be held: then nothing changes.
+        """
+        wanted = tuple(requests)
+        kept = [request for request in wanted if request in (self.requests or ())]
+        desired = self._classifier.entries(wanted)
+        self.requests = wanted
+        if transport is None:
+            return []
+        changes = self._classifier.transition(self._telemetry, desired, kept)
+        outcomes = transport.write(changes) if changes else []
+        self._telemetry = desired
+        return [
+            f"{self.program.describe(change.entry)}: {outcome.message}"
+            for change, outcome in zip(changes, outcomes, strict=True)
+            if outcome.code != _OK
+        ]
+
+    def learn(self, lists: Iterable[Any], transport: Transport) -> None:
+        """Add entries for MAC addresses that the switch reports; a refused one is reported again."""
+        if self.stations is not None:
+            self._write_stations(self.stations.learn(lists), transport)
+
+    def change_secret(self, first: int, second: int, transport: Transport | None) -> None:
+        """Replace the older of the two cookie secrets, and use it from now on."""
+        current, words = self._secrets
+        current = 1 - current
+        words = (*words[:2], first, second) if current else (first, second, *words[2:])
+        self._secrets = (current, words)
+        entry = secrets_entry(self.program, current, words)
+        self._desired.put(entry)
+        if transport is not None:
+            transport.write([Change(MODIFY, entry)])
+
+    def expire(self, entries: Iterable[Any], transport: Transport) -> list[Confirmation]:
+        """Delete entries that the switch reports as idle; those already gone are not confirmed twice."""
+        idle = [entry for entry in entries if entry in self._desired]
+        if self.stations is not None:
+            silent = [entry for entry in idle if self.stations.owns(entry)]
+            gone = [change for entry in silent for change in self.stations.forget(entry)]
+            self._write_stations(gone, transport)
+            idle = [entry for entry in idle if entry in self._desired]
+        outcomes = transport.write([deletion(entry) for entry in idle]) if idle else []
+        answers = []
+        for entry, outcome in zip(idle, outcomes, strict=True):
+            owner = self._owners.get(entry_key(entry), Owner("", "expire"))
+            self._forget(entry)
+            state: State = "expired" if outcome.code in (_OK, _NOT_FOUND) else "failed"
+            answers.append(self._confirmation(owner, state, entry, cause=outcome.message or "idle"))
+        return answers
+
+    @property
+    def blocks(self) -> int:
+        """Entries that drop traffic."""
+        return sum(self._blocks.values())
+
+    @property
+    def counted_tables(self) -> list[int]:
+        """Tables with entries that drop traffic."""
+        return sorted(table for table, blocks in self._blocks.items() if blocks)
+
+    def readings(self, entries: Iterable[Any]) -> list[dict[str, Any]]:
+        """Results of `read_counters` for these tables, with the decisions that the entries come from.
+
+        The only method that another thread may call: with many entries it takes long.
+        """
+        found = []
+        for entry in entries:
+            owner = self._owners.get(entry_key(entry))
+            found.append(
+                {
+                    "id": owner.id if owner else "",
+                    "handle": self.program.describe(entry),
+                    "packets": entry.counter_data.packet_count,
+                    "bytes": entry.counter_data.byte_count,
+                }
+            )
+        return found
+
+    def withdraw(self, transport: Transport) -> None:
+        """Fail closed: remove port forwarding before the controller ends."""
+        if self.fail == "closed" and self._forward:
+            transport.write([deletion(entry) for entry in self._forward])
+
+    def _write_stations(self, changes: list[Change], transport: Transport) -> None:
+        for change in changes:
+            if change.kind == DELETE:
+                self._desired.discard(change.entry)
+            else:
+                self._desired.put(change.entry)
+        outcomes = transport.write([_bare(change) for change in changes]) if changes else []
+        bad = [change for change, said in zip(changes, outcomes, strict=True) if not _achieved(change, said)]
+        if bad and self.stations is not None:
+            self.stations.undo(bad)
+            for change in bad:
+                self._desired.discard(change.entry)
+
+    def _plan(self, present: EntrySet, telemetry: EntrySet) -> list[Change]:
+        wires = {entry_key(entry) for entry in self._forward}
+        plain = difference(self._desired, present)
+        forward = [change for change in plain if entry_key(change.entry) in wires]
+        others = [change for change in plain if entry_key(change.entry) not in wires]
+        packets: list[Change] = []
+        if self.requests is not None:
+            packets = self._classifier.transition(telemetry, self._classifier.entries(self.requests), kept=())
+        return forward + others + packets if self.fail == "open" else others + packets + forward
+
+    def _note(self, report: BringUp, change: Change, outcome: UpdateOutcome) -> None:
+        if outcome.code != _OK:
+            name = self.program.describe(change.entry)
+            report.failed[entry_key(change.entry)] = f"{name}: {outcome.message}"
+        elif change.kind == INSERT:
+            report.inserted += 1
+        elif change.kind == MODIFY:
+            report.modified += 1
+        else:
+            report.removed += 1
+
+    def _confirm_pending(self, report: BringUp) -> list[Confirmation]:
+        """Confirm postponed updates as done or failed."""
+        pending, self._unconfirmed = self._unconfirmed, {}
+        answers = []
+        for key, order in pending.items():
+            done: State = "removed" if order.main.kind == DELETE else "installed"
+            cause = report.failed.get(key)
+            state: State = "failed" if cause else done
+            text = cause or "done when the switch was connected again"
+            answers.append(self._confirmation(order.owner, state, order.main.entry, cause=text))
+        return answers
+
+    def _remember(self, order: EntryUpdate) -> None:
+        for change in order.changes:
+            if change.kind == DELETE:
+                self._forget(change.entry)
+                continue
+            if table_id(change.entry) in self._blocks and change.entry not in self._desired:
+                self._blocks[table_id(change.entry)] += 1
+            self._desired.put(change.entry)
+            self._owners[entry_key(change.entry)] = order.owner
+
+    def _forget(self, entry: Any) -> None:
+        if self._desired.discard(entry) and table_id(entry) in self._blocks:
+            self._blocks[table_id(entry)] -= 1
+        self._owners.pop(entry_key(entry), None)
+
+    def _carry_out(self, orders: Sequence[EntryUpdate], transport: Transport | None) -> list[Confirmation]:
+        """In batches without repeated keys: P4Runtime leaves the order within a batch open."""
+        answers: list[Confirmation] = []
+        batch: list[EntryUpdate] = []
+        taken: set[bytes] = set()
+        for order in orders:
+            if taken & order.keys:
+                answers += self._write(batch, transport)
+                batch, taken = [], set()
+            batch.append(order)
+            taken |= order.keys
+        return answers + self._write(batch, transport)
+
+    def _write(self, orders: list[EntryUpdate], transport: Transport | None) -> list[Confirmation]:
+        if not orders:
+            return []
+        if transport is None:
+            return [self._postpone(order, "the switch is not connected") for order in orders]
+        try:
+            outcomes = iter(transport.write([change for order in orders for change in order.changes]))
+        except SwitchError as error:
+            return [self._postpone(order, str(error)) for order in orders]
+        return [self._conclude(order, [next(outcomes) for _ in order.changes]) for order in orders]
+
+    def _postpone(self, order: EntryUpdate, cause: str) -> Confirmation:
+        """Kept as desired; written and confirmed when the switch is connected again."""
+        self._remember(order)
+        self._unconfirmed[entry_key(order.main.entry)] = order
+        text = f"{cause}; it is kept, and written when the switch is connected again"
+        return self._confirmation(order.owner, "failed", order.main.entry, cause=text)
+
+    def _conclude(self, order: EntryUpdate, outcomes: list[UpdateOutcome]) -> Confirmation:
+        main = order.main
+        results = list(zip(order.changes, outcomes, strict=True))
+        bad = [(change, outcome) for change, outcome in results if not _achieved(change, outcome)]
+        if bad:
+            self._book.give_up(order)
+            return self._confirmation(order.owner, "failed", bad[0][0].entry, cause=bad[0][1].message)
+        said = next(outcome for change, outcome in results if change is main)
+        if main.kind == DELETE:
+            self._remember(order)
+            return self._confirmation(order.owner, "removed", main.entry, cause=said.message)
+        if said.code == _EXISTS:
+            return self._confirmation(
+                order.owner, "exists", main.entry, cause=self._kept(order, said.message)
+            )
+        self._remember(order)
+        return self._confirmation(order.owner, "installed", main.entry)
+
+    def _kept(self, order: EntryUpdate, said: str) -> str:
+        """The existing entry stays; returns the text for the confirmation."""
+        held = self._desired.get(order.main.entry)
+        if held is None:
+            self._remember(order)
+        elif entry_body(held) != entry_body(order.main.entry):
+            return "it exists with another action or other parameters; use modify to change it"
+        return said
+
+    def _confirmation(
+        self, owner: Owner, state: State, entry: Any | None = None, *, cause: str = ""
+    ) -> Confirmation:
+        event_time, arrival = self._clock()
+        handle = self.program.describe(entry) if entry is not None else ""
+        if state == "failed" and handle and handle not in cause:
+            cause = f"{handle}: {cause}"
+        return Confirmation(
+            id=owner.id,
+            switch=self.name,
+            state=state,
+            action=owner.action,
+            target=owner.target,
+            handle=handle,
+            cause=cause[:_MOST_CAUSE],
+            event_time=event_time or owner.event_time,
+            arrival=arrival,
+        )
+
+
+def _bare(change: Change) -> Change:
+    return deletion(change.entry) if change.kind == DELETE else change
+
+
+def _achieved(change: Change, outcome: UpdateOutcome) -> bool:
+    """Whether the switch now has the state that the change asks for, even if it had it before."""
+    also = {INSERT: _EXISTS, DELETE: _NOT_FOUND}.get(change.kind)
+    return outcome.code in (_OK, also)

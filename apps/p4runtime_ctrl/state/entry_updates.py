@@ -1,0 +1,121 @@
+"""Decisions and commands → `EntryUpdate`s: the changes to a switch that carry one out, and their owner."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+from apps.messages import Decision, TableCommand, TableUpdate, Target
+from apps.p4runtime_ctrl.errors import EntryError
+from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.state import guard
+from apps.p4runtime_ctrl.state.blocks import table_update
+from apps.p4runtime_ctrl.state.desired_state import DELETE, INSERT, MODIFY, Change, entry_key, table_id
+from apps.p4runtime_ctrl.state.guard import GuardSettings, Service
+
+_KINDS: Final = {"insert": INSERT, "modify": MODIFY, "delete": DELETE}
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Who asked for an entry, for confirmations."""
+
+    id: str
+    action: str
+    target: Target | None = None
+    event_time: int = 0
+    """Time of the decision, capture time in ns."""
+
+
+def owner_of(decision: Decision) -> Owner:
+    return Owner(decision.id, decision.action, decision.target, decision.event_time)
+
+
+@dataclass(frozen=True)
+class EntryUpdate:
+    """Changes that belong together; the last insert or the first delete stands for them in confirmations."""
+
+    owner: Owner
+    changes: tuple[Change, ...]
+    service: Service | None = None
+
+    @property
+    def main(self) -> Change:
+        """The change that stands for the update in confirmations."""
+        return self.changes[0] if self.changes[0].kind == DELETE else self.changes[-1]
+
+    @cached_property
+    def keys(self) -> set[bytes]:
+        return {entry_key(change.entry) for change in self.changes}
+
+
+class EntryUpdates:
+    """Makes `EntryUpdate`s for one program, and assigns the slots of protected services.
+
+    `reserved` are tables that no command may touch.
+    """
+
+    def __init__(self, program: ProgramInfo, settings: GuardSettings, reserved: Iterable[int]) -> None:
+        self._program = program
+        self._settings = settings
+        self._reserved = frozenset(reserved)
+        self._slots: dict[Service, int] = {}
+        self._metered = program.table(guard.KNOWN_SOURCES).id if guard.KNOWN_SOURCES in program.names else 0
+
+    @property
+    def guards(self) -> bool:
+        """Whether any service is protected."""
+        return bool(self._slots)
+
+    def of_decision(self, decision: Decision) -> EntryUpdate:
+        """Raises `EntryError` or `ProgramError` for a decision that cannot be carried out."""
+        owner = owner_of(decision)
+        if decision.action in ("block", "unblock"):
+            return EntryUpdate(owner, (self._change(table_update(decision, self._program)),))
+        service = guard.service_of(decision.target)
+        if decision.action == "protect":
+            changes = guard.protection(self._program, service, self._slot(service), self._settings)
+        else:
+            others = [each for each in self._slots if each[0] == service[0] and each != service]
+            changes = guard.release(self._program, service, last_of_host=not others)
+            self._slots.pop(service, None)
+        return EntryUpdate(owner, tuple(changes), service)
+
+    def of_command(self, command: TableCommand) -> tuple[list[EntryUpdate], list[tuple[Owner, str]]]:
+        """One `EntryUpdate` for each update that fits the program; owner and reason of those that do not."""
+        orders: list[EntryUpdate] = []
+        refused: list[tuple[Owner, str]] = []
+        for update in command.updates:
+            owner = Owner(command.id, update.kind)
+            try:
+                orders.append(EntryUpdate(owner, (self._checked(update),)))
+            except EntryError as error:
+                refused.append((owner, str(error)))
+        return orders, refused
+
+    def give_up(self, order: EntryUpdate) -> None:
+        """The switch refused the update: free its slot."""
+        if order.owner.action == "protect" and order.service is not None:
+            self._slots.pop(order.service, None)
+
+    def _slot(self, service: Service) -> int:
+        if service not in self._slots:
+            taken = set(self._slots.values())
+            free = next((slot for slot in range(guard.SLOTS) if slot not in taken), None)
+            if free is None:
+                raise EntryError(f"{guard.SLOTS} services are protected already; release one first")
+            self._slots[service] = free
+        return self._slots[service]
+
+    def _change(self, update: TableUpdate) -> Change:
+        return Change(_KINDS[update.kind], self._program.entry(update))
+
+    def _checked(self, update: TableUpdate) -> Change:
+        change = self._change(update)
+        if table_id(change.entry) in self._reserved:
+            raise EntryError(
+                f"{update.table}: the classifier is shared by all requests; ask for packets by a request"
+            )
+        if change.kind != DELETE and table_id(change.entry) == self._metered:
+            change.entry.meter_config.CopyFrom(self._settings.known.config())
+        return change

@@ -1,0 +1,1 @@
+"""Demand of consumers as entries of a switch's classifier."""

@@ -1,0 +1,496 @@
+"""The worker of one switch, between DUE and the switch.  I/O.
+
+packets thread of a connection   packet-ins → record batch → DUE (blocks while consumers are behind)
+worker thread of a switch        decisions first; then commands, requests and state, in order
+thread of a counter read         reads a switch's counters, which may take tenths of a second
+DUE's dispatcher                 puts work into the worker's bounded queue
+"""
+
+import logging
+import queue
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from apps.messages import Confirmation, Decision, Intake, MessageError, TableCommand, one_line, youngest
+from apps.p4runtime_ctrl.arrivals import FramesToSend
+from apps.p4runtime_ctrl.errors import ControllerError, EntryError, Malformed, SwitchError
+from apps.p4runtime_ctrl.packet_publisher import PacketPublisher
+from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.southbound.connection import Connection, Listener
+from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
+from apps.p4runtime_ctrl.southbound.session import P4RuntimeSession
+from apps.p4runtime_ctrl.state.desired_state import check_entry
+from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
+from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
+from apps.p4runtime_ctrl.state.mac_learning import DIGEST
+from apps.p4runtime_ctrl.state.readings import Readings
+from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
+from apps.p4runtime_ctrl.telemetry.demand import Demand
+from due import NO_WAIT, Engine, Item, RecordBatch
+
+_LOG = logging.getLogger(__name__)
+_JOBS: Final = 10_000
+_RESTORED: Final = 100_000
+"""Most archived decisions of a kind, and commands, that are read at a start, the newest."""
+_ALIVE_S: Final = 1.0
+_SETTLE_S: Final = 1.0
+_CALM_S: Final = 0.25
+"""Seconds; counters are read once for decisions in quick succession, since reading all blocks costs as much as
+carrying out several decisions."""
+_COUNTING_SHARE: Final = 5
+"""Counter reads take at most this fraction (1/n) of the time."""
+
+Connect = Callable[[Listener], Connection]
+
+
+_Job = Callable[[], None]
+
+
+class SwitchWorker:
+    """Keeps one switch as desired, and publishes what it sends."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        settings: Settings,
+        mine: SwitchSettings,
+        program: ProgramInfo,
+        connect: Connect,
+        intake: Intake | None = None,
+    ) -> None:
+        self.name = mine.name
+        self._engine = engine
+        self._intake = intake or Intake(_LOG)
+        self._mine = mine
+        self._settings = settings
+        self._program = program
+        by_digest = settings.telemetry == "digest"
+        self._outbound = PacketPublisher(
+            mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest
+        )
+        self._progress = self._outbound.progress
+        self._packet_outs = PacketOuts(self._program, mine.base_us)
+        self._sent = {"cells_asked": 0, "frames_sent": 0, "packet_outs_refused": 0}
+        self._program_name = Path(settings.program).name
+        forward = {int(port): egress for port, egress in mine.forward.items()}
+        self._switch = DesiredSwitch(
+            mine.name,
+            self._program,
+            self._now,
+            forward=forward,
+            fail=mine.fail,
+            guard=settings.guard,
+            learn=mine.learn,
+        )
+        self._learn_id = self._program.digest_id(DIGEST)
+        self._connection = connect(self)
+        self._jobs: queue.Queue[_Job] = queue.Queue(_JOBS)
+        self._closing = threading.Event()
+        self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
+        self._session: P4RuntimeSession | None = None
+        self._connected = False
+        self._was_backup = False
+        self._recent: deque[Decision] = deque(maxlen=_JOBS)
+        self._urgent: deque[Decision] = deque()
+        """Decisions to carry out, before any other work."""
+        self._readings = Readings()
+        self._publishing = threading.Lock()
+        self._counting = threading.Event()
+        self._uncounted = False
+        """Decisions were carried out since the last counter read."""
+        self._counted_second = 0
+        self._counted_at = 0.0
+        self._count_after = 0.0
+        self._alive_at = 0.0
+        self._settled_at = 0.0
+        self._secret_at = float("-inf")
+        self._stated = (0, 0, 0.0)
+        self._change = "starting"
+        self._brought_up_ms = 0.0
+        self.settled = threading.Event()
+        """The first attempt to reach the switch has succeeded or failed."""
+
+    # -- from the service ---------------------------------------------------------------------
+
+    def start(self, *, active: bool) -> None:
+        self._restore()
+        self._worker.start()
+        self._connection.stand(active=active)
+        self._connection.open()
+
+    def stand(self, *, active: bool) -> None:
+        self._connection.stand(active=active)
+
+    def stop(self) -> None:
+        self._put(self._leave)
+        self._closing.set()
+        self._worker.join(timeout=self._settings.timeout_s * 2)
+        self._connection.close()
+
+    def decide(self, decision: Decision) -> None:
+        self._recent.append(decision)
+        self._urgent.append(decision)
+        self._put(self._decide)
+
+    def command(self, command: TableCommand) -> None:
+        self._put(partial(self._command, command))
+
+    def want(self, demand: Demand) -> None:
+        self._put(partial(self._want, demand))
+
+    def ask(self, questions: RecordBatch) -> None:
+        """Queue a request to read cells of counting stages."""
+        self._put(partial(self._ask, questions))
+
+    def send(self, frames: FramesToSend) -> None:
+        """Queue frames for the switch to send."""
+        self._put(partial(self._send, frames))
+
+    def say_again(self) -> None:
+        """Publish the state again for a new consumer: it is best effort and published on change only."""
+        self._put(self._write_state)
+
+    def tick(self) -> None:
+        """Periodic work by wall clock: check that the switch answers, read counters, publish state changes."""
+        if not self._worker.is_alive() or not self._connection.works:
+            raise ControllerError(f"{self.name}: a thread has ended with an error; the log has the reason")
+        now = time.monotonic()
+        if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
+            self._alive_at = now
+            self._put(self._check_alive)
+        if now - self._counted_at > (_CALM_S if self._uncounted else 1):
+            self._count_soon()
+        self._settle(now)
+        if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
+            self._secret_at = now
+            self._put(self._change_secret)
+        received, lost, stated_at = self._stated
+        if now - stated_at > 1 and (received, lost) != (self._heard(), self._progress.lost):
+            self._put(self._write_state)
+
+    def _settle(self, now: float) -> None:
+        """Not while packets are published, which blocks while consumers are behind."""
+        if now - self._settled_at > _SETTLE_S and self._publishing.acquire(blocking=False):
+            try:
+                self._settled_at = now
+                self._outbound.settle()
+            finally:
+                self._publishing.release()
+
+    def health(self) -> dict[str, Any]:
+        return self._state()
+
+    # -- from the connection ------------------------------------------------------------------
+
+    def became_primary(self, session: P4RuntimeSession) -> None:
+        self._put(partial(self._take_over, session))
+
+    def became_backup(self) -> None:
+        self._put(self._stand_back)
+
+    def lost(self, cause: str) -> None:
+        self._session = None
+        self._put(partial(self._lose, cause))
+
+    def packets(self, messages: list[Any]) -> None:
+        with self._publishing:
+            self._outbound.packets(messages)
+        self._count_each_second()
+
+    def digests(self, lists: list[Any]) -> None:
+        learnt = [each for each in lists if each.digest_id == self._learn_id]
+        if learnt:
+            self._put(partial(self._learn, learnt))
+            lists = [each for each in lists if each.digest_id != self._learn_id]
+        if lists:
+            with self._publishing:
+                self._outbound.digests(lists)
+        self._count_each_second()
+
+    def other(self, message: Any) -> None:
+        if message.WhichOneof("update") != "idle_timeout_notification":
+            self._progress.malformed += 1
+            return
+        entries = list(message.idle_timeout_notification.table_entry)
+        try:
+            idle = [check_entry(entry) for entry in entries]
+        except Malformed:
+            self._progress.malformed += 1
+            return
+        self._put(partial(self._expire, idle))
+
+    def _publish(self, key: str, value: Any, event_time: int) -> None:
+        self._engine.write(key, value, [NO_WAIT], event_time=event_time or None)
+
+    def _count_each_second(self) -> None:
+        if self._outbound.second != self._counted_second:
+            self._count_soon()
+
+    # -- the worker ---------------------------------------------------------------------------
+
+    def _put(self, job: _Job) -> None:
+        while not self._closing.is_set():
+            try:
+                self._jobs.put(job, timeout=1)
+            except queue.Full:
+                continue
+            return
+
+    def _work(self) -> None:
+        while not (self._closing.is_set() and self._jobs.empty()):
+            try:
+                jobs = [self._jobs.get(timeout=0.2)]
+            except queue.Empty:
+                continue
+            while len(jobs) < _JOBS and not self._jobs.empty():
+                jobs.append(self._jobs.get())
+            self._run(jobs)
+
+    def _run(self, jobs: Sequence[_Job]) -> None:
+        for job in jobs:
+            if self._session is not None:  # otherwise they stay queued: the switch may connect soon
+                self._decide()
+            try:
+                job()
+            except ControllerError as error:
+                _LOG.error("%s: %s", self.name, error)
+                self._say(str(error))
+        if self._session is not None and self._session.broken:
+            self._session = None
+            self._connection.break_off()
+
+    def _take_over(self, session: P4RuntimeSession) -> None:
+        self._connected = True
+        if self._was_backup:
+            self._was_backup = False
+            self._restore()
+        began = time.monotonic()
+        try:
+            report = self._switch.bring_up(session)
+        except SwitchError:
+            self._connection.break_off()
+            raise
+        finally:
+            self.settled.set()
+        if report.program_loaded:
+            self._progress.expect_first()
+        self._brought_up_ms = (time.monotonic() - began) * 1000
+        self._session = session
+        self._confirm(report.confirmations)
+        _LOG.info("%s: primary; %s", self.name, report)
+        self._say(f"primary: {report}")
+
+    def _stand_back(self) -> None:
+        self._connected = True
+        self._was_backup = True
+        self._session = None
+        self.settled.set()
+        self._say("backup: another controller is primary")
+
+    def _lose(self, cause: str) -> None:
+        if self._connected:
+            _LOG.warning("%s: lost: %s", self.name, cause)
+        self._connected = False
+        self.settled.set()
+        self._say(f"lost: {cause}")
+
+    def _leave(self) -> None:
+        if self._session is not None:
+            self._switch.withdraw(self._session)
+
+    def _decide(self) -> None:
+        decisions = [self._urgent.popleft() for _ in range(len(self._urgent))]
+        if decisions:
+            self._confirm(self._switch.decide(decisions, self._session))
+            self._uncounted = True
+            if time.monotonic() - self._counted_at > _CALM_S:
+                self._count_soon()
+
+    def _command(self, command: TableCommand) -> None:
+        self._confirm(self._switch.command(command, self._session))
+
+    def _want(self, demand: Demand) -> None:
+        """Unwanted keys are no longer published; new keys are, before they are requested of the switch."""
+        self._outbound.route(demand)
+        for text in self._switch.want(demand.requests, self._session):
+            _LOG.error("%s: %s", self.name, text)
+        names = ", ".join(each.name for each in demand.requests if each not in FALLBACK) or "nothing"
+        self._say(f"telemetry: {names}")
+
+    def _expire(self, entries: Iterable[Any]) -> None:
+        if self._session is not None:
+            self._confirm(self._switch.expire(entries, self._session))
+
+    def _ask(self, batch: RecordBatch) -> None:
+        questions, refused = self._packet_outs.questions(batch)
+        self._sent["packet_outs_refused"] += refused
+        self._send_out(questions, "cells_asked")
+
+    def _send(self, frames: FramesToSend) -> None:
+        try:
+            packets = self._packet_outs.frames(frames)
+        except EntryError as error:
+            self._sent["packet_outs_refused"] += len(frames.ports)
+            self._intake.refuse("packet_out", MessageError("range", str(error)), self.name)
+            return
+        self._send_out(packets, "frames_sent")
+
+    def _send_out(self, packets: Sequence[Any], what: str) -> None:
+        """Best effort, like frames; what cannot be sent is counted."""
+        if self._session is None:
+            self._sent["packet_outs_refused"] += len(packets)
+            return
+        sent = self._session.send(packets)
+        self._sent[what] += sent
+        self._sent["packet_outs_refused"] += len(packets) - sent
+
+    def _learn(self, lists: Iterable[Any]) -> None:
+        if self._session is not None:
+            self._switch.learn(lists, self._session)
+
+    def _check_alive(self) -> None:
+        if self._session is not None:
+            self._session.alive()
+
+    def _change_secret(self) -> None:
+        self._switch.change_secret(secrets.randbits(32), secrets.randbits(32), self._session)
+
+    def _count_soon(self) -> None:
+        """Start a read of block counters, unless one runs, none is due, or there are no blocks."""
+        if self._counting.is_set() or self._session is None or not self._switch.blocks:
+            return
+        if time.monotonic() < self._count_after:
+            return
+        self._counting.set()
+        self._put(self._count)
+
+    def _count(self) -> None:
+        """Not in this thread: a switch under a flood answers late, and a decision must not wait for it."""
+        self._uncounted = False
+        told = (self._session, self._switch.counted_tables, time.monotonic())
+        threading.Thread(
+            target=self._read_counters, args=told, name=f"counters {self.name}", daemon=True
+        ).start()
+
+    def _read_counters(self, session: P4RuntimeSession | None, tables: Sequence[int], began: float) -> None:
+        found: list[dict[str, Any]] = []
+        failed: Exception | None = None
+        try:
+            if session is not None:
+                entries = [entry for table in tables for entry in session.read_counters(table)]
+                found = self._switch.readings(entries)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the worker says it, or ends with it
+            failed = error
+        finally:
+            self._put(partial(self._counted, session, found, began, failed))
+
+    def _counted(
+        self,
+        session: P4RuntimeSession | None,
+        found: list[dict[str, Any]],
+        began: float,
+        failed: Exception | None,
+    ) -> None:
+        self._counted_second = self._outbound.second
+        self._counted_at = time.monotonic()
+        spent = self._counted_at - began
+        self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
+        self._counting.clear()
+        if failed is not None:
+            raise failed
+        if session is not None and session is self._session:
+            self._readings.take(found)
+            self._write_state()
+
+    def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
+        key = f"network.confirmation.p4runtime_ctrl.{self.name}"
+        waiting = list(confirmations)
+        for place, confirmation in enumerate(waiting, start=1):
+            flags = [NO_WAIT] if place == len(waiting) else []
+            at = confirmation.event_time or None
+            self._engine.write(key, confirmation.to_value(), flags, event_time=at)
+
+    def _say(self, change: str) -> None:
+        self._change = change
+        self._write_state()
+
+    def _write_state(self) -> None:
+        self._stated = (self._heard(), self._progress.lost, time.monotonic())
+        if not self._switch.blocks:
+            self._readings.take([])
+        key = f"network.switch.p4runtime_ctrl.{self.name}"
+        self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
+
+    def _heard(self) -> int:
+        sent = sum(self._sent.values()) + self._outbound.answers + self._outbound.counts_reported
+        return self._progress.received + self._progress.reported + sent
+
+    def _state(self) -> dict[str, Any]:
+        event_time, arrival = self._now()
+        return {
+            "switch": self.name,
+            "connected": self._connected,
+            "primary": self._session is not None,
+            "target": self._mine.target or self._mine.address,
+            "program": self._program_name,
+            "base_us": self._mine.base_us,
+            "fail": self._mine.fail,
+            "telemetry": [each.name for each in self._switch.requests or () if each not in FALLBACK],
+            "packet_in": self._progress.received,
+            "digests": self._progress.reported,
+            "fell_back": self._outbound.fell_back,
+            "skipped": self._outbound.skipped,
+            "lost": self._progress.lost,
+            "malformed": self._progress.malformed,
+            "times_doubted": self._progress.times_doubted,
+            "restarts": self._progress.restarts,
+            "cells_answered": self._outbound.answers,
+            "counts_reported": self._outbound.counts_reported,
+            **self._sent,
+            "arrival": arrival,
+            "event_time": event_time,
+            "blocks": self._readings.shown,
+            "blocks_total": self._switch.blocks,
+            **self._stations(),
+            "change": self._change,
+            "brought_up_ms": self._brought_up_ms,
+        }
+
+    def _stations(self) -> dict[str, Any]:
+        stations = self._switch.stations
+        if stations is None:
+            return {}
+        return {
+            "stations": len(stations),
+            "moved": stations.moved,
+            "stations_refused": stations.refused,
+            "stations_malformed": stations.malformed,
+        }
+
+    def _now(self) -> tuple[int, int]:
+        return self._progress.time_us * 1000, self._progress.arrival
+
+    def _restore(self) -> None:
+        """Restore the desired state from Data Archives and from items received since."""
+        if not self._settings.restore:
+            return
+        since = self._settings.restore_since
+        recently = max(since, time.time_ns() - LONGEST_S * 1_000_000_000)
+        items = [item for key in DECISIONS for item in self._archived(key, recently)]
+        decisions = decisions_for(self.name, items, list(self._recent), since, self._intake)
+        archived = self._archived(f"network.p4_command.*.{self.name}", since)
+        for problem in self._switch.restore(decisions, commands_of(archived, since, self._intake)):
+            _LOG.warning("%s: not restored: %s", self.name, one_line(problem))
+
+    def _archived(self, key: str, since: int) -> list[Item]:
+        def find(query: Mapping[str, Any], limit: int) -> list[Item]:
+            return self._engine.get(query, limit=limit)
+
+        return youngest(find, {"dataKey": key}, since, _RESTORED)

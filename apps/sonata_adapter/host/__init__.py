@@ -1,0 +1,1 @@
+"""Operators over batches of packets on the host."""

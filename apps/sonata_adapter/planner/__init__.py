@@ -1,0 +1,1 @@
+"""Which operators run in the switch and which on the host."""

@@ -1,0 +1,1 @@
+"""Queries: their language, catalogue and dataflow."""

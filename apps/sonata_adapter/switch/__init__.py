@@ -1,0 +1,1 @@
+"""Counting in the switch: reading its cells and its reports."""

@@ -1,0 +1,198 @@
+"""The pipeline of `sdnator up` as the faults find it: own disk, own wires, a relay before each app, settable clocks."""
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from benchmarks.chaos_links import UnixLink
+from benchmarks.chaos_schedule import APPS
+from sdnator.capture.interfaces import VethPair
+from sdnator.config.planned_switches import PlannedSwitch
+from sdnator.supervisor import Supervisor
+from sdnator.supervisor.spec import PartSpec
+from sdnator.up.parts import UpParts
+from sdnator.up.plan import StandingPlan
+
+DISK_MIB = 192
+_LIBRARY = "*/faketime/libfaketimeMT.so.1"
+
+
+def may_mount() -> bool:
+    """Whether a small disk and veth pairs can be had."""
+    return os.geteuid() == 0 and shutil.which("mount") is not None and shutil.which("ip") is not None
+
+
+def faketime_library() -> Path | None:
+    """libfaketime, where the package is installed."""
+    return next(iter(Path("/usr/lib").glob(_LIBRARY)), None)
+
+
+class ChaosStage:
+    """All parts under the supervisor of `sdnator up`; a context manager.
+
+    Args:
+        folder: for the disk, sockets and what the probes keep.
+        tell: gets the supervisor's words.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.told: list[str] = []
+        self.clocks: dict[str, int] = {}
+        """Seconds that a part's wall clock is off from its next start on."""
+        self._stack = ExitStack()
+        self.disk = folder / "disk"
+        self.disk.mkdir()
+        self.wires: tuple[VethPair, VethPair] | None = None
+        try:
+            if may_mount():
+                self._mount()
+                self.wires = (
+                    VethPair.make(self._stack, "ci"),
+                    VethPair.make(self._stack, "co"),
+                )
+            self.parts = UpParts(self._plan(), self._stack)
+            self.links = {name: self._link(name) for name in APPS}
+            specs = tuple(self._prepared(spec) for spec in self.parts.specs())
+            self.supervisor = Supervisor(specs, self._tell)
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def __enter__(self) -> Self:
+        try:
+            self.parts.logs.mkdir(parents=True)
+            self.supervisor.start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all parts, then what they stood on."""
+        try:
+            self.supervisor.stop()
+        finally:
+            self._stack.close()
+
+    @property
+    def archive(self) -> str:
+        """URL of Data Archives."""
+        return self.parts.plan.archive
+
+    @property
+    def switch_address(self) -> str:
+        """Of its P4Runtime server."""
+        return self.parts.switch_address(self.parts.plan.switches[0])
+
+    def spool(self, name: str) -> Path:
+        """Where a part's engine keeps what the archive could not take."""
+        return self.parts.plan.state / "due" / name
+
+    def away(self) -> list[str]:
+        """Parts that do not run now; `degraded` ones run, but have died often."""
+        return [
+            f"{each.name} ({each.state}: {each.cause})"
+            for each in self.supervisor.reports()
+            if each.state not in ("running", "degraded") or not Path(f"/proc/{each.pid}").exists()
+        ]
+
+    def _tell(self, text: str) -> None:
+        self.told.append(f"{time.monotonic():.1f} {text}")
+
+    def _mount(self) -> None:
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "sdnator-chaos", str(self.disk)], check=True
+        )
+        # lazily: a part that is still ending may have a file open
+        self._stack.callback(subprocess.run, ["umount", "-l", str(self.disk)], check=False)
+
+    def _plan(self) -> StandingPlan:
+        ports = {1: "null", 2: "null"}
+        if self.wires is not None:
+            ports = {1: f"veth:{self.wires[0].far}", 2: f"veth:{self.wires[1].near}"}
+        state = self.disk / "state"
+        state.mkdir()
+        token = self.folder / "token"
+        token.write_text("a-token-of-the-benchmark\n")
+        return StandingPlan(
+            state=state,
+            archive=f"sqlite://{self.disk / 'archive.db'}",
+            switches=(PlannedSwitch(ports=ports, forward={1: 2, 2: 1}),),
+            settings={"coordinator": {"retain_bytes": 96 << 20}},
+            dashboard={"port": 0, "token_file": str(token)},
+        )
+
+    def _link(self, name: str) -> UnixLink:
+        server = Path(self.parts.updates.removeprefix("unix://"))
+        link = UnixLink(self.folder / f"{name}.sock", server)
+        self._stack.callback(link.close)
+        return link
+
+    def _prepared(self, spec: PartSpec) -> PartSpec:
+        if spec.name in APPS:
+            return replace(spec, inside=lambda: self._around_app(spec.name))
+        if spec.name == "updates":
+            return replace(spec, inside=lambda: _environment(_server_clock(self.clocks.get("updates", 0))))
+        return spec
+
+    @contextmanager
+    def _around_app(self, name: str) -> Iterator[None]:
+        """The start of an app: its own way to Data Updates, and its own clock."""
+        direct, self.parts.updates = self.parts.updates, self.links[name].url
+        try:
+            with _environment(self._python_clock(self.clocks.get(name, 0))):
+                yield
+        finally:
+            self.parts.updates = direct
+
+    def _python_clock(self, offset: int) -> dict[str, str]:
+        """Environment of a Python program with a wrong wall clock.
+
+        Not by libfaketime: `time.sleep` waits for an absolute monotonic time, and that library shifts it as if it
+        were a wall time.
+        """
+        if not offset:
+            return {}
+        folder = self.folder / "clock"
+        folder.mkdir(exist_ok=True)
+        (folder / "sitecustomize.py").write_text(_WRONG_CLOCK)
+        return {"PYTHONPATH": str(folder), "CHAOS_CLOCK_S": str(offset)}
+
+
+_WRONG_CLOCK = """
+import os, time
+offset, wall = int(os.environ["CHAOS_CLOCK_S"]), time.time_ns
+time.time_ns = lambda: wall() + offset * 10**9
+time.time = lambda: time.time_ns() / 1e9
+"""
+
+
+def _server_clock(offset: int) -> dict[str, str]:
+    library = faketime_library()
+    if library is None or not offset:
+        return {}
+    return {"LD_PRELOAD": str(library), "FAKETIME": f"{offset:+d}", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+
+
+@contextmanager
+def _environment(added: dict[str, str]) -> Iterator[None]:
+    """What is started inside inherits these variables."""
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for variable in added:
+            del os.environ[variable]

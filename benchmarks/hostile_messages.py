@@ -1,0 +1,234 @@
+"""Messages between the apps, as values of DUE: each app's decoders, and what is made of packet columns behind them."""
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from apps.firewall import arrivals as firewall
+from apps.kitsune import service as kitsune
+from apps.messages import (
+    Alert,
+    Answer,
+    Confirmation,
+    Decision,
+    Evidence,
+    Instruction,
+    MessageError,
+    Sender,
+    TableCommand,
+    TableUpdate,
+    Target,
+)
+from apps.p4runtime_ctrl import arrivals as controller
+from apps.p4runtime_ctrl.errors import EntryError
+from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
+from apps.p4runtime_ctrl.telemetry.demand import Offer
+from apps.packets import read_frames
+from apps.sonata_adapter import arrivals as adapter
+from benchmarks.hostile_mutation import mutate_value
+from benchmarks.hostile_target import DecoderTarget
+from coordinator.admission import Admission
+from coordinator.checkpoint import checkpoint_in
+from coordinator.registry import Checkpoint, Registry
+from due import Item, RecordBatch
+from due.codec import decode_value, encode_value
+from due.errors import DecodeError
+from due.membership import Registration
+from sdnator.p4_program import find
+from sdnator.testing.switch_traffic import network_frame
+
+_NOW = 1_700_000_000_000_000_000
+_WRITERS = {"sonata": "sonata_adapter", "firewall_kept": "firewall"}
+Decode = Callable[[Item], object]
+
+
+def frames(count: int = 40) -> list[bytes]:
+    """Network frames of all kinds that the product's tests know."""
+    chance = random.Random(3)
+    return [network_frame(chance) for _ in range(count)]
+
+
+def packets() -> RecordBatch:
+    """The columns of some frames."""
+    found = frames()
+    rows = np.arange(len(found))
+    lengths = [len(frame) for frame in found]
+    return read_frames(
+        found,
+        lengths=lengths,
+        times_us=(rows + _NOW // 1000).tolist(),
+        ports=[1] * len(found),
+        sequence=(rows + 1).tolist(),
+        arrival=rows.tolist(),
+    )
+
+
+def _decoding(key: str, decode: Decode) -> Callable[[bytes], object]:
+    named = key.split(".")[2]
+    app = _WRITERS.get(named, named)
+
+    def attack(data: bytes) -> object:
+        return decode(Item(key, decode_value(data), _NOW, _NOW, app, "i1", 1))
+
+    return attack
+
+
+def _target(app: str, key: str, decode: Decode, *values: Any) -> DecoderTarget:
+    name = f"{app} {decode.__name__.removesuffix('_in').strip('_')} {key.split('.')[1]}"
+    errors = (MessageError, DecodeError, EntryError)
+    return DecoderTarget(name, _decoding(key, decode), errors, tuple(map(encode_value, values)), mutate_value)
+
+
+_SENDER = Sender(switch="s1", port=3, mac="aa:bb:cc:dd:ee:ff", ip="10.0.0.1")
+_ALERT = Alert(
+    id="a1", sender=_SENDER, event_time=_NOW, first_packet=7, packets=9, over=8, peak_score=2.5,
+    anomalous_seconds=3, rate=9.0, training_rate=1.0, mac_addresses=1, reason="many",
+)  # fmt: skip
+_TARGET = Target(kind="ip", address="10.0.0.0/8")
+_DECISION = Decision(
+    id="d1", action="block", switch="s1", target=_TARGET, reason="anomalous", event_time=_NOW, expires=_NOW + 1,
+    evidence=(Evidence(key="network.anomaly.kitsune.alert", timestamp=_NOW, summary="3 of 10"),),
+)  # fmt: skip
+_CONFIRMATION = Confirmation(
+    id="d1", switch="s1", state="installed", action="block", target=_TARGET, handle="t[a=1]", event_time=_NOW
+)
+_COMMAND = TableCommand(
+    id="c1",
+    updates=(
+        TableUpdate(
+            kind="insert",
+            table="ingress.block_src",
+            match={"is_ipv4": 1, "src": "10.0.0.1"},
+            action="ingress.drop_src",
+        ),
+    ),
+)
+_INSTRUCTION = Instruction(id="i1", verb="block", subject="10.0.0.1", reason="mine", seconds=60)
+_STATE = {
+    "switch": "s1", "primary": True, "event_time": _NOW, "base_us": _NOW // 1000,
+    "blocks": [{"id": "d1", "packets": 5}], "change": "primary",
+}  # fmt: skip
+_OFFER = Offer(name="q1", bit=3, switch="s1", conditions={"ip.dst": "10.0.0.0/8", "tcp.flags": [2, 18]})
+_QUESTIONS = RecordBatch({name: np.arange(4).astype(kind) for name, kind in controller.QUESTION.items()})
+_SEND = {"port": [1, 2], "length": [3, 4], "frames": b"abcdefg"}
+
+
+def _reported() -> RecordBatch:
+    batch = packets()
+    mark = np.ones(len(batch), "u1")
+    return RecordBatch({**batch, "crossed": mark, "overflow": mark})
+
+
+def _raw() -> dict[str, Any]:
+    found, batch = frames(), packets()
+    names = {
+        "lengths": "length",
+        "times_us": "time_us",
+        "ports": "port",
+        "sequence": "sequence",
+        "arrival": "arrival",
+    }
+    return {"frames": found, **{name: batch[column] for name, column in names.items()}}
+
+
+def _ones(**kinds: str) -> RecordBatch:
+    return RecordBatch({name: np.ones(5, kind) for name, kind in kinds.items()})
+
+
+_PROGRAM = ProgramInfo.from_text(find().p4info.read_text(encoding="utf-8"))
+_OUTS = PacketOuts(_PROGRAM, _NOW // 1000)
+
+
+def entries_in(item: Item) -> list[Any]:
+    """A command, and the entries that it means."""
+    return [_PROGRAM.entry(update) for update in controller.command_in(item).updates]
+
+
+def send_in(item: Item) -> list[Any]:
+    """Frames for a switch, as packet-outs."""
+    return _OUTS.frames(controller.frames_in(item))
+
+
+def ask_in(item: Item) -> object:
+    """A request for cells, as packet-outs."""
+    return _OUTS.questions(controller.questions_in(item))
+
+
+_CHECKPOINT = Checkpoint(
+    epochs={"app": 7, "other": 9},
+    active={"app": "i"},
+    registrations=(Registration(app_id="app", instance_id="i", revision=1, heartbeat=0.5, started=1),),
+)
+
+
+def _checkpoint(data: bytes) -> Checkpoint:
+    registry = Registry("c")
+    return Admission(registry).checkpoint(checkpoint_in(decode_value(data)))
+
+
+_COUNTED = {
+    "window": "u4", "count": "i8", "src_hi": "u8", "src_lo": "u8", "dst_hi": "u8", "dst_lo": "u8", "port": "u2",
+    "length": "u2", "source_port": "u2", "time_us": "i8",
+}  # fmt: skip
+_PACKETS = packets()
+_SWITCH_KEY = "network.switch.p4runtime_ctrl.s1"
+
+TARGETS = (
+    _target("firewall", "network.anomaly.kitsune.alert", firewall.alert_in, _ALERT.to_value()),
+    _target(
+        "firewall",
+        "network.confirmation.p4runtime_ctrl.s1",
+        firewall.confirmation_in,
+        _CONFIRMATION.to_value(),
+    ),
+    _target("firewall", "network.block.firewall.ipv4", firewall.decision_in, _DECISION.to_value()),
+    _target("firewall", "network.p4_command.firewall.s1", firewall.command_in, _COMMAND.to_value()),
+    _target("firewall", "network.instruction.cli.firewall", firewall.instruction_in, _INSTRUCTION.to_value()),
+    _target(
+        "firewall",
+        "network.answer.firewall.cli",
+        firewall.answer_in,
+        Answer(id="i1", done=True, text="x").to_value(),
+    ),
+    _target("firewall", _SWITCH_KEY, firewall.state_in, _STATE),
+    _target(
+        "firewall",
+        "network.handshake.sonata.tcp",
+        firewall.handshake_in,
+        {"source": "10.0.0.1", "service": "10.0.0.2", "port": 80, "at": _NOW},
+    ),
+    _target(
+        "firewall",
+        "network.traffic_query.sonata.syn_flood",
+        firewall.flood_in,
+        {"dst": "10.0.0.1", "count": 9, "window_start": _NOW},
+    ),
+    _target("firewall", "network.traffic_capture.sonata.tcp", firewall.syns_in, _PACKETS),
+    _target("firewall", "network.traffic_capture.sonata.tcp", firewall.syn_acks_in, _PACKETS),
+    _target("firewall", "network.traffic_capture.sonata.arp", firewall.arps_in, _PACKETS),
+    _target("kitsune", "network.packets.p4runtime_ctrl.s1.all", kitsune.packets_in, _PACKETS),
+    _target("kitsune", "network.block.firewall.ipv4", kitsune.decision_in, _DECISION.to_value()),
+    _target("controller", "network.block.firewall.ipv4", controller.decision_in, _DECISION.to_value()),
+    _target("controller", "network.p4_command.app.s1", entries_in, _COMMAND.to_value()),
+    _target("controller", "network.telemetry.sonata.q1", controller.offer_in, _OFFER.to_value()),
+    _target("controller", "network.cell_request.sonata.s1", ask_in, _QUESTIONS),
+    _target("controller", "network.packet_out.firewall.s1", send_in, _SEND),
+    _target("sonata", _SWITCH_KEY, adapter.state_in, _STATE),
+    _target("sonata", "network.p4_command.sonata.s1", adapter.command_in, _COMMAND.to_value()),
+    _target("sonata", "network.packets.p4runtime_ctrl.s1.q", adapter.data_in, _PACKETS),
+    _target("sonata", "network.frames.p4runtime_ctrl.s1.q", adapter.data_in, _raw()),
+    _target("sonata", "network.digests.p4runtime_ctrl.s1.q", adapter.data_in, _reported()),
+    _target("sonata", "network.counts.p4runtime_ctrl.s1.q", adapter.data_in, _ones(**_COUNTED)),
+    _target("sonata", "network.cell.p4runtime_ctrl.s1", adapter.cells_in, _ones(id="u8", count="u4")),
+    DecoderTarget(
+        "coordinator checkpoint",
+        _checkpoint,
+        (DecodeError,),
+        (encode_value(msgspec.to_builtins(_CHECKPOINT)),),
+        mutate_value,
+    ),
+)

@@ -1,0 +1,76 @@
+"""A pipeline that is set: the program, its schema, a running switch and the entities on it.
+
+ForwardingPipelineConfig ── verify() ──► Verified ── Pipeline(…) ──► writes.py, reads.py, packet_loop.py
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from dataplane.errors import DataplaneError, ProgramError
+from dataplane.p4runtime.array_entities import ArrayEntities
+from dataplane.p4runtime.digests import DigestLists
+from dataplane.p4runtime.packet_io import PacketInEncoder, PacketOutDecoder
+from dataplane.p4runtime.replication_entities import ReplicationEntities
+from dataplane.p4runtime.schema import Schema, bind
+from dataplane.p4runtime.status import InvalidArgument
+from dataplane.p4runtime.table_entities import TableEntities
+from dataplane.v1model.program import load
+from dataplane.v1model.switch import Backend, Switch
+from dataplane.v1model.tree import Program
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """A configuration that this target can realise."""
+
+    config: Any
+    program: Program
+    schema: Schema
+
+
+def verify(config: Any) -> Verified:
+    """Check a ForwardingPipelineConfig: the BMv2 JSON loads, and the p4info fits it.
+
+    Raises InvalidArgument with the reason.
+    """
+    if not config.p4_device_config:
+        raise InvalidArgument("the configuration has no p4_device_config: send the BMv2 JSON that p4c wrote")
+    try:
+        program = load(bytes(config.p4_device_config))
+    except ProgramError as error:
+        raise InvalidArgument(f"p4_device_config: {error}") from error
+    kept = type(config)()
+    kept.CopyFrom(config)
+    return Verified(kept, program, bind(config.p4info, program))
+
+
+class ForwardingPipeline:
+    """A verified configuration in force.
+
+    cpu_port: number of the port that packet-ins leave by
+    backend: see Switch
+    clock: the packets' clock, µs
+
+    Raises InvalidArgument where the program cannot be compiled.
+    """
+
+    def __init__(
+        self, verified: Verified, *, cpu_port: int, backend: Backend = "auto", clock: Callable[[], int]
+    ) -> None:
+        self.config = verified.config
+        self.schema = verified.schema
+        try:
+            self.switch = Switch(verified.program, cpu_port=cpu_port, backend=backend)
+        except DataplaneError as error:
+            raise InvalidArgument(f"p4_device_config: {error}") from error
+        self.tables = TableEntities(self.schema, self.switch, clock)
+        self.arrays = ArrayEntities(self.schema, self.switch)
+        self.replication = ReplicationEntities(self.switch)
+        self.digests = DigestLists(self.schema)
+        self.packet_in = PacketInEncoder(self.schema.packet_in)
+        self.packet_out = PacketOutDecoder(self.schema.packet_out)
+
+    def close(self) -> None:
+        """Free the switch."""
+        self.switch.close()

@@ -1,0 +1,201 @@
+"""The thread for membership: heartbeats, assignments, leases, reconnects.  It never waits for data."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+import msgspec
+
+from due.codec import decode_frame
+from due.dispatcher import Dispatcher
+from due.drivers.base import Publisher, Receiver
+from due.errors import DueError, RefusedFrame
+from due.logs import LogLimit
+from due.membership import (
+    ASSIGNMENT,
+    HEARTBEAT,
+    REGISTRATION,
+    Assignments,
+    Heartbeat,
+    Member,
+    Phase,
+    Registration,
+)
+from due.threads import Failed, LoudThread
+
+log = logging.getLogger("due")
+
+_TICK = 0.1
+"""Seconds between checks for a slow callback, while best-effort payloads arrive."""
+_SLOW_TICK = 0.01
+"""Seconds between two drains of the server while a callback is slow and payloads are found."""
+_LATE = 0.01
+"""A wake-up delayed by more than this means that the CPU cores are overloaded."""
+_EASING = 0.8
+_RENEW_SECONDS = 1.0
+_SLOW_CALLBACK = 0.02
+
+Say = Callable[[str, object], None]
+
+
+class Rhythm:
+    """Sleep times of the heartbeat thread; each of its wake-ups interrupts a busy app several times."""
+
+    def __init__(self, longest: float) -> None:
+        self._longest = longest
+        self._tick = _TICK
+        self._slow_tick = _SLOW_TICK
+
+    def rest(self, *, coming: bool, slow: bool) -> float:
+        """Seconds to sleep; `coming`: best-effort payloads arrived meanwhile; `slow`: a callback is slow."""
+        wanted = self._slow_tick if slow else self._tick if coming else self._longest
+        return min(wanted, self._longest)
+
+    def got_up(self, *, late: bool) -> None:
+        """Note a wake-up; if it was late, check less often and leave the CPU to the callbacks."""
+        self._tick = (
+            min(2 * self._tick, max(_TICK, self._longest)) if late else max(_TICK, _EASING * self._tick)
+        )
+
+    def drained(self, *, some: bool) -> None:
+        """Note a drain; if it found nothing, the next one may come later."""
+        self._slow_tick = _SLOW_TICK if some else min(2 * self._slow_tick, _TICK)
+
+
+class HeartbeatThread:
+    """Drives a `Member`: timers, messages and leases."""
+
+    def __init__(
+        self,
+        member: Member,
+        control: Receiver,
+        publisher: Publisher,
+        dispatcher: Dispatcher,
+        *,
+        pause: float,
+        failed: Failed | None = None,
+    ) -> None:
+        self.member = member
+        self.lock = threading.Lock()
+        """Guards `member`."""
+        self.alive_until = 0
+        """A write after this time (UTC, ns) shows that the process was suspended meanwhile."""
+        self.turned = time.monotonic()
+        """Start of the last loop iteration, monotonic seconds."""
+        self.say: Say = lambda _path, _value: None
+        """How to write a membership message; set by the engine."""
+        self.changed: Callable[[], None] = lambda: None
+        """Called when permissions may have changed; set by the engine."""
+        self.written: Callable[[], int] = lambda: 0
+        self._control = control
+        self._publisher = publisher
+        self._dispatcher = dispatcher
+        self._pause = pause
+        self.misunderstood = 0
+        """Assignments that were refused."""
+        self._seen = -1
+        self._renew_at = 0.0
+        self._poll_again = 0.0
+        self._rhythm = Rhythm(pause / 3)
+        self._heard = 0
+        self._errors = LogLimit(log)
+        self._closed = False
+        self._thread = LoudThread("due-keeper", self._run, failed)
+
+    def start(self) -> None:
+        """Register and begin."""
+        self.alive_until = time.time_ns() + int(self._pause * 1e9)
+        self._control.subscribe(f"{ASSIGNMENT}.{self.member.registration.app_id}")
+        self._turn()
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Run the next iteration now."""
+        self._control.wake()
+
+    def check_pause(self) -> None:
+        """Check for a suspension; called by writers after `alive_until` and by this thread."""
+        with self.lock:
+            now = time.time_ns()
+            if now <= self.alive_until:
+                return
+            late = (now - self.alive_until) / 1e9 + self._pause
+            self.alive_until = now + int(self._pause * 1e9)
+            if self.member.paused(time.monotonic()):
+                log.warning("suspended for %.1f s: asking which instance is active before writing more", late)
+        self.changed()
+
+    def close(self) -> None:
+        """Send the offline heartbeat and stop."""
+        self._closed = True
+        self._control.wake()
+        if self._thread.is_alive() and threading.current_thread() is not self._thread:
+            self._thread.join(5)
+        with self.lock:
+            goodbye = self.member.beat("offline")
+        if self.member.announced:
+            self._send(goodbye)
+        self._control.close()
+
+    def _run(self) -> None:
+        while not self._closed:
+            try:
+                self._listen()
+                self.check_pause()
+                self.alive_until = time.time_ns() + int(self._pause * 1e9)
+                self._turn()
+                self.turned = time.monotonic()
+            except DueError as error:
+                self._errors.error("membership", error=error)
+                time.sleep(_TICK)
+
+    def _listen(self) -> None:
+        busy = self._dispatcher.busy_since
+        began = time.monotonic()
+        slow = busy is not None and began - busy > _SLOW_CALLBACK
+        heard, self._heard = self._heard, self._dispatcher.best_effort
+        rest = min(self._rhythm.rest(coming=self._heard != heard, slow=slow), self._poll_again)
+        wait = min(rest, max(0.0, self.member.next_tick() - began))
+        deliveries = self._control.receive(wait)
+        self._rhythm.got_up(late=time.monotonic() - began - wait > _LATE)
+        for delivery in deliveries:
+            try:
+                frame = decode_frame(delivery.payload)
+                if frame.key != delivery.path:
+                    raise RefusedFrame("misplaced", f"a frame of {frame.key} arrived under {delivery.path}")
+                message = Assignments.from_value(frame.values[-1])
+            except (DueError, msgspec.ValidationError) as error:
+                self.misunderstood += 1
+                if self.misunderstood == 1:
+                    log.warning("an assignment was refused: %s; further ones are only counted", error)
+                continue
+            with self.lock:
+                self.member.assigned(message, time.monotonic())
+
+    def _turn(self) -> None:
+        now = time.monotonic()
+        with self.lock:
+            messages = self.member.tick(now, written=self.written(), received=self._dispatcher.received)
+            changes, active, reading = self.member.changes, self.member.active, self.member.reading
+        for message in messages:
+            self._send(message)
+        if changes != self._seen:
+            take_over = self.member.phase is Phase.COORDINATED
+            self._seen = changes
+            self._dispatcher.activate(active, reading=reading, take_over=take_over)
+            self.changed()
+        self._poll_again = self._publisher.poll()
+        if now >= self._renew_at:
+            self._renew_at = now + _RENEW_SECONDS
+            self._dispatcher.receiver.renew()
+        busy = self._dispatcher.busy_since
+        if busy is not None and now - busy > _SLOW_CALLBACK:
+            self._rhythm.drained(some=self._dispatcher.receiver.drain())
+
+    def _send(self, message: Registration | Heartbeat) -> None:
+        path = REGISTRATION if isinstance(message, Registration) else HEARTBEAT
+        try:
+            self.say(f"{path}.{message.app_id}", message.to_value())
+        except DueError as error:
+            log.debug("%s could not be sent: %s", path, error)

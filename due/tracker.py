@@ -1,0 +1,162 @@
+"""Which frames are new: the numbers of each (instance, key), and the epochs of each (app, path).
+
+    begins where the last one ended      next: deliver
+    begins later                         items are missing: count them, deliver
+    … by more than FAR                   no outage loses so many: refuse
+    begins earlier                       a repeat: drop
+    … by more than KEPT                  no producer keeps so many for resending: the earlier number was false;
+                                         deliver, and continue from here
+    begins where a jump started          a producer never goes back, so the jump was false: deliver, too
+
+The last rule applies until `CONFIRMED` frames have continued the numbers after the jump, and not to the first
+jump after this instance was a standby: another one may have read the frames in between.
+A restarted producer is a new instance, whose first frame may begin anywhere.
+
+A frame with an older epoch than one seen from this app under this path is fenced off: its writer was replaced.
+If the same instance wrote both, the higher epoch was false, because an instance's epoch never falls.
+
+Frames carry no signature.  These rules keep a damaged or stray frame from displacing later ones; a program that
+can write to the server and imitates an instance's numbers exactly can still replace a frame.
+"""
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from due.codec import Frame
+from due.errors import RefusedFrame
+
+log = logging.getLogger("due")
+
+FAR = 1 << 36
+"""Items: 19 hours at a million a second."""
+KEPT = 1 << 27
+"""Items: over a gigabyte of the smallest."""
+CONFIRMED = 64
+_MOST_COUNTED = 1 << 62
+
+
+class Tracker:
+    """Per (instance, key): detects repeated frames and gaps."""
+
+    def __init__(self, *, shared: bool, remember: int = 65536) -> None:
+        self._shared = shared
+        self._remember = remember
+        self._expected: OrderedDict[tuple[str, str], int] = OrderedDict()
+        self._left_off: OrderedDict[tuple[str, str], tuple[int, int]] = OrderedDict()
+        """Where a jump started, and how many frames must still follow before it is accepted."""
+        self._rested: set[tuple[str, str]] = set()
+        self._seen: OrderedDict[tuple[str, str, int], None] = OrderedDict()
+        self._epochs: OrderedDict[tuple[str, str], tuple[int, str]] = OrderedDict()
+        """The highest epoch, and the instance that wrote it."""
+        self.gaps = 0
+        """Items known to be missing."""
+        self.repeats = 0
+        """Repeated items that were dropped."""
+        self.fenced = 0
+        """Items of an instance that is no longer the active one."""
+        self.refuted = 0
+        """Numbers and epochs that later frames showed to be false."""
+
+    def admit(self, frame: Frame, *, reliable: bool) -> bool:
+        """Whether to deliver it; counts gaps, repeats and items of an older epoch.
+
+        Raises `RefusedFrame` for a frame with impossible numbers.
+        """
+        count = len(frame.timestamps)
+        if frame.epoch and not self._current(frame):
+            self.fenced += count
+            return False
+        if reliable and self._shared:
+            return self._unseen(frame, count)
+        name = (frame.instance_id, frame.key)
+        expected = self._expected.get(name)
+        if expected is None:
+            self._make_space(self._expected)
+        elif frame.before != expected:
+            if not self._moves(frame, name, expected):
+                self.repeats += count
+                return False
+        elif self._left_off and name in self._left_off:
+            self._confirm(name)
+        self._expected[name] = frame.before + count
+        return True
+
+    def forget(self, keep: Callable[[str], bool]) -> None:
+        """Forget keys without observers: items missed meanwhile are not a gap."""
+        for name in [n for n in self._expected if not keep(n[1])]:
+            del self._expected[name]
+            self._left_off.pop(name, None)
+
+    def rested(self) -> None:
+        """This instance did not read for a while; another one of its app may have."""
+        self._rested = set(self._expected)
+
+    def _moves(self, frame: Frame, name: tuple[str, str], expected: int) -> bool:
+        """Whether to deliver a frame that is not the next one."""
+        jump = frame.before - expected
+        left_off = self._left_off.get(name)
+        if jump < -KEPT or (left_off is not None and frame.before == left_off[0]):
+            self._left_off.pop(name, None)
+            self._refute(f"{expected} items of {frame.key} were announced, {frame.before} were published")
+            return True
+        if jump < 0:
+            return False
+        if jump > FAR:
+            raise RefusedFrame(
+                "out_of_range", f"{frame.before} items of {frame.key} before it, {expected} were expected"
+            )
+        self._miss(frame, jump)
+        if name in self._rested:
+            self._rested.discard(name)
+        elif left_off is None:
+            self._make_space(self._left_off)
+            self._left_off[name] = (expected, CONFIRMED)
+        return True
+
+    def _miss(self, frame: Frame, items: int) -> None:
+        if not self.gaps:
+            log.warning("%d items of %s are missing; further gaps are only counted", items, frame.key)
+        self.gaps = min(self.gaps + items, _MOST_COUNTED)
+
+    def _refute(self, what: str) -> None:
+        self.refuted += 1
+        if self.refuted == 1:
+            log.error("an earlier frame had false numbers: %s; further ones are only counted", what)
+
+    def _confirm(self, name: tuple[str, str]) -> None:
+        place, frames = self._left_off[name]
+        if frames > 1:
+            self._left_off[name] = (place, frames - 1)
+        else:
+            del self._left_off[name]
+
+    def _current(self, frame: Frame) -> bool:
+        path = (frame.app_id, frame.key.partition(":")[0])
+        known = self._epochs.get(path)
+        if known is None:
+            self._make_space(self._epochs)
+        elif frame.epoch == known[0]:
+            return True
+        elif frame.epoch < known[0]:
+            if frame.instance_id != known[1]:
+                return False
+            if frame.before < self._expected.get((frame.instance_id, frame.key), 0):
+                return True  # a resent older frame does not move the tracker
+            self._refute(f"epoch {known[0]} of {frame.key}, its writer's is {frame.epoch}")
+        self._epochs[path] = (frame.epoch, frame.instance_id)
+        return True
+
+    def _unseen(self, frame: Frame, count: int) -> bool:
+        name = (frame.instance_id, frame.key, frame.before)
+        if name in self._seen:
+            self.repeats += count
+            return False
+        self._make_space(self._seen)
+        self._seen[name] = None
+        return True
+
+    def _make_space(self, table: OrderedDict[Any, Any]) -> None:
+        if len(table) >= self._remember:
+            table.popitem(last=False)

@@ -1,0 +1,1 @@
+"""Blocks outside a running pipeline: the archive's view, panic on a switch, nftables, reasons."""

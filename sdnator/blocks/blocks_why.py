@@ -1,0 +1,107 @@
+"""A decision's whole life for people: what led to it, what the archive knew, what the switches did."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any
+
+from apps.firewall.evidence.history import DECISIONS, count_offences, instructions_in, offences_query
+from apps.messages import Decision, Evidence
+from due import Item
+from sdnator.blocks.blocks_archive import find
+from sdnator.counted import counted
+from sdnator.errors import BadInput
+
+_SHOWN = 200
+
+
+def life_of(decision_id: str, archive: str) -> dict[str, Any]:
+    """Everything that the archive has about a decision; raises `BadInput` where there is none."""
+    found = [each for key in DECISIONS for each in find(archive, {"dataKey": key, "value.id": decision_id})]
+    if not found:
+        raise BadInput(f"no decision has the id {decision_id}; see `sdnator blocks list --all`")
+    steps = [Decision.from_value(item.value) for item in found]
+    first = steps[0]
+    earlier = find(archive, offences_query(first.target))
+    confirmations = find(
+        archive, {"dataKey": "network.confirmation.p4runtime_ctrl.*", "value.id": decision_id}
+    )
+    return {
+        "id": decision_id,
+        "target": first.target.address,
+        "steps": [
+            {"written": item.timestamp} | made.to_value() for item, made in zip(found, steps, strict=True)
+        ],
+        "evidence": [_evidence(each, archive) for each in dict.fromkeys(_all_evidence(steps))],
+        "offences_before": count_offences(earlier, first.target, first.event_time),
+        "confirmations": [{"written": item.timestamp} | dict(item.value) for item in confirmations],
+        "stopped": _stopped(decision_id, archive),
+        "events": [
+            {"written": item.timestamp} | dict(item.value)
+            for item in find(archive, "network.event.firewall.*")
+            if decision_id in str(item.value.get("text", ""))
+        ],
+    }
+
+
+def _all_evidence(steps: list[Decision]) -> Iterator[Evidence]:
+    for step in steps:
+        yield from step.evidence
+
+
+def _evidence(evidence: Evidence, archive: str) -> dict[str, Any]:
+    """With what the archive has of it: alerts and instructions are kept, packets are not."""
+    items = find(archive, {"dataKey": evidence.key, "timestamp": evidence.timestamp})
+    asked = instructions_in(items)
+    who = {"reason_given": asked[0].reason} if asked else {}
+    return evidence.to_value() | {"archived": bool(items)} | who
+
+
+def _stopped(decision_id: str, archive: str) -> dict[str, dict[str, int]]:
+    """By switch: the last reading of the decision's drop counter."""
+    query = {"dataKey": "network.switch.p4runtime_ctrl.*", "value.blocks.id": decision_id}
+    last: dict[str, dict[str, int]] = {}
+    for item in find(archive, query):
+        for reading in _readings(item, decision_id):
+            last[str(item.value["switch"])] = reading
+    return last
+
+
+def _readings(item: Item, decision_id: str) -> Iterator[dict[str, int]]:
+    for reading in item.value.get("blocks", ()):
+        if reading["id"] == decision_id:
+            yield {"packets": int(reading["packets"]), "bytes": int(reading["bytes"])}
+
+
+def as_text(life: dict[str, Any]) -> Iterator[str]:
+    """The life in lines, in the order of what happened."""
+    events: list[tuple[int, str]] = []
+    for step in life["steps"]:
+        made = Decision.from_value(step)
+        events.append((step["written"], decision_line(made)))
+    for said in life["confirmations"]:
+        words = f"{said['state']} {said['handle']} {said['cause']}"
+        events.append((said["written"], f"  switch {said['switch']}: {words}".rstrip()))
+    events += [(said["written"], f"  {said['text']}") for said in life["events"]]
+    yield from (f"{time_text(at)} {text}" for at, text in sorted(events, key=lambda event: event[0]))
+    before = life["offences_before"]
+    yield f"blocked before: {counted(before, 'time')}" if before else "blocked before: never"
+    yield "evidence:" if life["evidence"] else "evidence: none, the settings name it"
+    for each in life["evidence"]:
+        kept = "" if each["archived"] else " (not kept in the archive)"
+        yield f"  {time_text(each['timestamp'])} {each['key']}: {each['summary'][:_SHOWN]}{kept}"
+    for switch, reading in life["stopped"].items():
+        yield f"stopped by {switch}: {counted(reading['packets'], 'packet')}, {counted(reading['bytes'], 'byte')}"
+
+
+def decision_line(decision: Decision) -> str:
+    """A decision in one line."""
+    until = f"until {time_text(decision.expires)}" if decision.expires else "without end"
+    target = decision.target
+    where = f"{target.address} port {target.port}" if target.port is not None else target.address
+    dry = " (dry run)" if decision.dry_run else ""
+    return f"{decision.id} {decision.action} {where} on {decision.switch} {until}{dry}: {decision.reason}"
+
+
+def time_text(time_ns: int) -> str:
+    """UTC, to the second."""
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S}Z"

@@ -1,0 +1,1 @@
+"""Captures and live interfaces: reading, writing, labels."""

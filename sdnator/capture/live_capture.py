@@ -1,0 +1,82 @@
+"""Frames of a network interface as record batches (AF_PACKET; Linux, needs CAP_NET_RAW)."""
+
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import numpy as np
+
+from sdnator.capture.packet_sources import BATCH, Batch, frame_batch
+from sdnator.errors import BadInput
+
+_ETH_P_ALL: Final = 3
+_SOL_PACKET, _PACKET_AUXDATA = 263, 8
+_AUXDATA: Final = struct.Struct("=IIIHHHH")
+_VLAN_VALID, _VLAN_TPID_VALID = 0x10, 0x40
+_MOST: Final = 65_536
+_PERIOD_S: Final = 0.1
+
+
+class LiveSource:
+    """Frames that arrive at an interface, in batches about every tenth of a second, until `stop()` is true.
+
+    VLAN tags that the network card took off are put back.  Raises `BadInput` when there is no such
+    interface or the rights are missing.
+    """
+
+    def __init__(self, interface: str, stop: Callable[[], bool] = lambda: False) -> None:
+        self._stop = stop
+        try:
+            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_ETH_P_ALL))
+        except PermissionError:
+            raise BadInput(
+                f"{interface}: listening needs root or CAP_NET_RAW; use sudo, or give a capture"
+            ) from None
+        try:
+            self._socket.setsockopt(_SOL_PACKET, _PACKET_AUXDATA, 1)
+            self._socket.bind((interface, 0))
+        except OSError as error:
+            self._socket.close()
+            raise BadInput(
+                f"{interface}: cannot listen ({error.strerror}); see `ip link` for names"
+            ) from error
+        self._socket.setblocking(False)
+
+    def __iter__(self) -> Iterator[Batch]:
+        start = 0
+        with self._socket:
+            while not self._stop():
+                received = self._receive()
+                if received:
+                    frames, lengths, times = zip(*received, strict=True)
+                    yield frame_batch(frames, lengths, np.array(times, dtype=np.int64), start)
+                    start += len(received)
+
+    def _receive(self) -> list[tuple[bytes, int, int]]:
+        received: list[tuple[bytes, int, int]] = []
+        deadline = time.monotonic() + _PERIOD_S
+        while len(received) < BATCH and (left := deadline - time.monotonic()) > 0:
+            if not select.select([self._socket], [], [], left)[0]:
+                break
+            data, extra, _, sender = self._socket.recvmsg(
+                _MOST, socket.CMSG_SPACE(_AUXDATA.size), socket.MSG_TRUNC
+            )
+            if sender[2] != socket.PACKET_OUTGOING:
+                frame, length = _whole(data, extra)
+                received.append((frame, length, time.time_ns()))
+        return received
+
+
+def _whole(data: bytes, extra: list[tuple[int, int, bytes]]) -> tuple[bytes, int]:
+    """The frame with its VLAN tag, and its length on the wire."""
+    for level, kind, value in extra:
+        if level == _SOL_PACKET and kind == _PACKET_AUXDATA:
+            status, length, _, _, _, tag, tpid = _AUXDATA.unpack(value[: _AUXDATA.size])
+            if status & _VLAN_VALID:
+                tpid = tpid if status & _VLAN_TPID_VALID else 0x8100
+                return data[:12] + struct.pack(">HH", tpid, tag) + data[12:], length + 4
+            return data, length
+    return data, len(data)

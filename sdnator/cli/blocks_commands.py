@@ -1,0 +1,310 @@
+"""`sdnator blocks …` and `sdnator allow …`: the firewall's decisions, their reasons, and manual changes.
+
+Reading needs Data Archives only.  Instructions go to the running firewall through Data Updates.  Without a
+firewall, `panic` lifts all decisions in Data Archives and clears the switch itself.
+"""
+
+import json
+import os
+import queue
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Annotated, Final, Literal
+from uuid import uuid4
+
+import typer
+
+from apps.firewall.evidence.history import (
+    ANSWERS,
+    INSTRUCTIONS,
+    allowed_by,
+    carried_out,
+    in_force,
+    instructions_in,
+)
+from apps.firewall.policy.instructions import target_in
+from apps.firewall.policy.rules import AllowList
+from apps.messages import Answer, Instruction
+from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item
+from due.config import Options
+from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
+from sdnator.blocks.blocks_direct import lift_in_switch
+from sdnator.blocks.blocks_nft import nft_sets
+from sdnator.blocks.blocks_why import as_text, decision_line, life_of
+from sdnator.counted import counted
+from sdnator.errors import BadInput, PipelineError
+from sdnator.up import running
+
+blocks = typer.Typer(help="Blocks and guards: list, add, remove, explain, lift all.", no_args_is_help=True)
+allow = typer.Typer(help="Addresses, prefixes and MACs that are never blocked.", no_args_is_help=True)
+
+_ANSWER: Final = "network.answer.firewall.operator"
+_LOOK_SECONDS: Final = 0.5
+_CLOCKS_DIFFER_NS: Final = 60 * 10**9
+_ANSWER_SECONDS: Final = 10.0
+_PANIC_SECONDS: Final = 3.0
+
+UpdatesOption = Annotated[str, typer.Option("--updates", help="Data Updates URL; default: $DUE_UPDATES.")]
+ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
+ReasonOption = Annotated[str, typer.Option(help="Reason; it is stored with the decision.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard output.")]
+
+
+@blocks.command("list")
+def list_blocks(
+    *,
+    archive: ArchiveOption = "",
+    every: Annotated[bool, typer.Option("--all", help="Include lifted ones.")] = False,
+    nft: Annotated[
+        bool, typer.Option("--nft", help="Print sets for `nft -f`, for hosts without a switch.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Decisions in force, from Data Archives.
+
+    Example: sdnator blocks list
+    """
+    decisions = all_decisions(archive)
+    shown = decisions if every else in_force(decisions)
+    if nft:
+        typer.echo(nft_sets(shown))
+    elif as_json:
+        typer.echo(json.dumps([decision.to_value() for decision in shown]))
+    elif not shown:
+        typer.echo("nothing is blocked or guarded")
+    else:
+        for decision in shown:
+            typer.echo(decision_line(decision))
+
+
+@blocks.command("why")
+def why(
+    decision: Annotated[str, typer.Argument(metavar="ID", help="As `blocks list` shows it.")],
+    *,
+    archive: ArchiveOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """History of a decision: reasons, evidence, earlier offences, switch confirmations, drops.
+
+    Example: sdnator blocks why 1f0c2a9be771
+    """
+    life = life_of(decision, archive)
+    typer.echo(json.dumps(life) if as_json else "\n".join(as_text(life)))
+
+
+@blocks.command("add")
+def add_block(
+    address: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC|MAC@PORT")],
+    *,
+    reason: ReasonOption = "",
+    seconds: Annotated[int, typer.Option(help="Length of the block in seconds.", min=1)] = 600,
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+) -> None:
+    """Block an address, a prefix or a MAC (on one port) on all switches; the allow-list wins.
+
+    Example: sdnator blocks add 192.0.2.66 --reason "ticket 4711" --seconds 3600
+    """
+    _instruct("block", address, reason, updates, archive, seconds=seconds)
+
+
+@blocks.command("remove")
+def remove_block(
+    subject: Annotated[str, typer.Argument(metavar="ID|ADDRESS")],
+    *,
+    reason: ReasonOption = "",
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+) -> None:
+    """Lift blocks, or guards set because of a flood, by decision id or address.
+
+    Example: sdnator blocks remove 192.0.2.66
+    """
+    _instruct("unblock", subject, reason, updates, archive)
+
+
+@blocks.command("panic")
+def panic(
+    *,
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+    direct: Annotated[
+        bool, typer.Option("--direct", help="Do not ask the firewall; change archive and switch directly.")
+    ] = False,
+    switch: Annotated[
+        str,
+        typer.Option(help="P4Runtime switch to clear; default: the running pipeline's.", metavar="HOST:PORT"),
+    ] = "",
+    device_id: Annotated[int, typer.Option(help="P4Runtime device id of --switch.", min=1)] = 1,
+) -> None:
+    """Lift everything at once, except the guards that the settings name.
+
+    If the firewall does not answer, the decisions are lifted in Data Archives and the switch is cleared
+    over P4Runtime. Its controller, if there is one, is not primary for a moment.
+
+    Example: sdnator blocks panic
+    """
+    if not direct:
+        try:
+            _instruct("panic", "", "panic", updates, archive, patience=_PANIC_SECONDS)
+        except (DueError, PipelineError) as error:
+            typer.echo(f"the firewall does not answer ({error})", err=True)
+        else:
+            return
+    guards = _lift_in_archive(archive)
+    place = (switch, device_id) if switch else _running_switch()
+    address, number = place
+    count = lift_in_switch(address, number, guards)
+    typer.echo(f"{counted(count, 'entry')} deleted in the switch at {address}")
+
+
+def _running_switch() -> tuple[str, int]:
+    found = running.find()
+    if found is None:
+        raise PipelineError(
+            "no switch is known: give --switch HOST:PORT; controllers remove the entries when they are restarted"
+        )
+    return str(found.switch["address"]), int(found.switch["device_id"])
+
+
+def _lift_in_archive(archive: str) -> list[tuple[str, int]]:
+    """The decisions that were lifted; the switch is cleared even if the archive is unreachable."""
+    try:
+        lifted = lift_in_archive(archive)
+    except BadInput as error:
+        typer.echo(f"{error}; guards stay, and a controller may bring blocks back", err=True)
+        return []
+    typer.echo(f"{counted(len(lifted), 'decision')} lifted in Data Archives")
+    targets = (each.target for each in lifted if each.action == "protect")
+    return [(target.address, target.port or 0) for target in targets]
+
+
+@allow.command("add")
+def allow_add(
+    entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC")],
+    *,
+    reason: ReasonOption = "",
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+) -> None:
+    """Never block this entry; blocks that overlap it are lifted.
+
+    Example: sdnator allow add 10.0.0.0/24
+    """
+    _instruct("allow", entry, reason, updates, archive)
+
+
+@allow.command("remove")
+def allow_remove(
+    entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC")],
+    *,
+    reason: ReasonOption = "",
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+) -> None:
+    """Take an entry off the allow-list.
+
+    Example: sdnator allow remove 10.0.0.0/24
+    """
+    _instruct("disallow", entry, reason, updates, archive)
+
+
+@allow.command("list")
+def allow_list(*, archive: ArchiveOption = "") -> None:
+    """Entries that operators have added; those of the firewall's settings are not listed.
+
+    Example: sdnator allow list
+    """
+    answered = {str(item.value["id"]) for item in find(archive, f"{ANSWERS}.*")}
+    instructions = carried_out(instructions_in(find(archive, INSTRUCTIONS)), answered)
+    typer.echo("\n".join(allowed_by(instructions)) or "the allow-list has no entries added by operators")
+
+
+Verb = Literal["block", "unblock", "allow", "disallow", "panic"]
+
+
+def _instruct(
+    verb: Verb,
+    subject: str,
+    reason: str,
+    updates: str,
+    archive: str,
+    *,
+    seconds: int = 600,
+    patience: float = _ANSWER_SECONDS,
+) -> None:
+    """Tell the firewall and wait for its answer.
+
+    Raises:
+        BadInput: the subject is nothing that can be blocked or allowed, or the firewall refuses.
+    PipelineError: no pipeline runs, or its firewall does not answer; the instruction is then withdrawn.
+    """
+    _check_subject(verb, subject)
+    url = updates or os.environ.get("DUE_UPDATES") or running.need().updates
+    instruction = Instruction(
+        id=uuid4().hex[:12],
+        verb=verb,
+        subject=subject,
+        reason=reason,
+        seconds=seconds,
+        expires=time.time_ns() + round(patience * 1e9),
+    )
+    engine = Engine(Options(connect_timeout=2.0))
+    engine.set_pubsub(url)
+    engine.set_db(archive_url(archive))
+    answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+
+    def on_answer(item: Item) -> None:
+        answer = Answer.from_value(item.value)
+        if answer.id == instruction.id:
+            answers.put(answer)
+
+    told = Capability(INSTRUCTION, delivery="reliable", archive="always")
+    engine.init("operator", PRODUCER | CONSUMER, capabilities=[told], instances="shared")
+    try:
+        engine.observe(_ANSWER).subscribe(on_answer)
+        engine.write(INSTRUCTION, instruction.to_value())
+        engine.flush(patience)
+        answer = _answer(engine, answers, on_answer, patience)
+    except DueError as error:
+        raise PipelineError(
+            f"the firewall cannot be reached ({error}); the instruction was not and will not be carried out"
+        ) from error
+    finally:
+        engine.close()
+    if not answer.done:
+        raise BadInput(answer.text)
+    typer.echo(answer.text)
+
+
+def _check_subject(verb: Verb, subject: str) -> None:
+    """Refuse at once what no firewall would accept; raises BadInput."""
+    try:
+        if verb == "block":
+            target_in(subject)
+        elif verb == "allow":
+            AllowList.parse((subject,))
+    except ValueError as error:
+        raise BadInput(str(error)) from None
+
+
+def _answer(
+    engine: Engine, answers: "queue.SimpleQueue[Answer]", look: Callable[[Item], None], patience: float
+) -> Answer:
+    """The next of `answers`; raises PipelineError after `patience` seconds.
+
+    The firewall may answer before our interest has reached it; then only the archive has the answer.
+    """
+    begun, deadline = time.time_ns() - _CLOCKS_DIFFER_NS, time.monotonic() + patience
+    while time.monotonic() < deadline:
+        try:
+            return answers.get(timeout=_LOOK_SECONDS)
+        except queue.Empty:
+            with suppress(DueError):
+                for item in engine.get({"dataKey": _ANSWER, "timestamp": {"$gte": begun}}):
+                    look(item)
+    raise PipelineError(
+        f"the firewall did not answer within {patience:.0f} s, so the instruction is withdrawn; "
+        "see `sdnator status` and try again"
+    )

@@ -1,0 +1,251 @@
+"""`sdnator observe` and `sdnator get`: live items, and archived items."""
+
+import json
+import math
+import os
+import queue
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import unquote, urlsplit
+
+import typer
+
+from sdnator.cli.item_rates import SECONDS, Rates, headline
+from sdnator.counted import counted
+from sdnator.errors import BadInput, PipelineError
+from sdnator.northbound import latest
+from sdnator.notation import brief, duration_ns, instant_ns, typed_key
+from sdnator.up import running
+
+if TYPE_CHECKING:
+    from due import Item
+
+_WAITING = 10_000
+"""Items that may wait for the terminal; more are counted as missed, since a viewer must not slow down producers."""
+_LOOK_SECONDS = 0.1
+_TEXT_WIDTH = 200
+_PLOTTED = SECONDS
+
+KeyArgument = Annotated[
+    str, typer.Argument(help="A key; * matches one segment, ** at the end any number.", metavar="KEY")
+]
+Updates = Annotated[
+    str,
+    typer.Option(help="Data Updates; default: of the running pipeline.", metavar="URL", envvar="DUE_UPDATES"),
+]
+Archive = Annotated[
+    str,
+    typer.Option(
+        help="Data Archives; default: those of the running or last pipeline.",
+        metavar="URL",
+        envvar="DUE_ARCHIVE",
+    ),
+]
+
+
+def observe(
+    key: KeyArgument,
+    *,
+    duration: Annotated[
+        str, typer.Option("--for", help="How long: 30s, 5m, 1h; default: until Ctrl-C.")
+    ] = "",
+    count: Annotated[int, typer.Option(help="Stop after this many items; 0: never.", min=0)] = 0,
+    updates: Updates = "",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per item and line.")] = False,
+    plot: Annotated[
+        bool, typer.Option("--plot", help="A line of rates with a sparkline each second, instead of items.")
+    ] = False,
+) -> None:
+    """Show items as they arrive.  While it runs, producers make the data on demand.
+
+    Items that arrive faster than they can be shown are skipped, and counted on standard error.  With
+    --plot and --json it prints one JSON object per second with the rates.
+
+    Example: sdnator observe 'network.anomaly.kitsune.*' --for 30s --json
+    """
+    wanted = typed_key(key)
+    seconds = duration_ns(duration, "--for") / 1e9 if duration else math.inf
+    url = updates or running.need().updates
+    with _stopping() as stopped, _items(wanted, url) as (waiting, lost):
+        begin = time.monotonic()
+        rates = Rates(begin)
+        shown = _Shown(as_json, plot, rates)
+        while not stopped() and (not count or rates.items < count):
+            now = time.monotonic()
+            if now - begin >= seconds:
+                break
+            if rates.pass_time(now):
+                shown.second()
+            try:
+                item = waiting.get(timeout=min(begin + seconds - now, _LOOK_SECONDS))
+            except queue.Empty:
+                continue
+            rates.add(item.value)
+            shown.item(item, last=waiting.empty())
+        shown.end()
+        missed, mean = lost(), rates.mean(time.monotonic())
+    more = f", {missed:,} missed: they arrived faster than they could be shown" if missed else ""
+    hint = "" if rates.items else "; `sdnator keys` shows what is made"
+    rows = f", {rates.records:,} records" if rates.records != rates.items else ""
+    print(f"sdnator: {counted(rates.items, 'item')}{rows}, {mean:,.1f} a second{more}{hint}", file=sys.stderr)
+
+
+class _Shown:
+    """What `observe` prints: items, or a line of rates each second (in place, on a terminal)."""
+
+    def __init__(self, as_json: bool, plot: bool, rates: Rates) -> None:
+        self._as_json = as_json
+        self._plot = plot
+        self._rates = rates
+        self._newest = ""
+        self._in_place = plot and not as_json and sys.stdout.isatty()
+
+    def item(self, item: "Item", *, last: bool) -> None:
+        if not self._plot:
+            print(_json_line(item) if self._as_json else text_line(item), flush=last)
+        elif not self._as_json:
+            self._newest = headline(item.value)
+
+    def second(self) -> None:
+        if not self._plot:
+            return
+        rates = self._rates
+        if self._as_json:
+            now = {"items": rates.items, "records": rates.records, "records_per_s": rates.last}
+            print(json.dumps(now), flush=True)
+            return
+        text = f"{rates.last:>9,}/s  {rates.line():<{_PLOTTED}}  {self._newest}"
+        width = shutil.get_terminal_size().columns
+        print(f"\r{text[: width - 1]}\x1b[K" if self._in_place else text, end=self._ending, flush=True)
+
+    @property
+    def _ending(self) -> str:
+        return "" if self._in_place else "\n"
+
+    def end(self) -> None:
+        if self._in_place:
+            print()
+
+
+@contextmanager
+def _items(key: str, url: str) -> "Iterator[tuple[queue.Queue[Item], Callable[[], int]]]":
+    """A bounded queue of the items under a key, and the number of items that did not fit."""
+    import tempfile
+
+    from due import CONSUMER, Engine, Options
+    from due.errors import DueError
+
+    waiting: queue.Queue[Item] = queue.Queue(_WAITING)
+    lost = [0]
+
+    def put(item: "Item") -> None:
+        try:
+            waiting.put_nowait(item)
+        except queue.Full:
+            lost[0] += 1
+
+    with tempfile.TemporaryDirectory(prefix="sdnator-observe-") as folder:
+        engine = Engine(
+            Options(updates=url, archive=f"sqlite://{folder}/none.db", directory=folder, spool_bytes=0)
+        )
+        try:
+            # a unique name: instances of one app would share a reliable stream between them
+            engine.init(f"observe-{os.getpid()}-{time.time_ns() % 10**6:06d}", CONSUMER)
+            engine.observe(key).subscribe(put)
+            yield waiting, lambda: lost[0]
+        except DueError as error:
+            raise PipelineError(str(error)) from None
+        finally:
+            engine.close()
+
+
+@contextmanager
+def _stopping() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM end the command normally."""
+    came: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda got, _: came.append(got)) for number in numbers}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def get(
+    key: KeyArgument,
+    *,
+    since: Annotated[
+        str, typer.Option(help="Start: 1h or 7d ago, or a UTC time such as 2024-05-01T12:00.")
+    ] = "",
+    until: Annotated[str, typer.Option(help="End, like --since.")] = "",
+    limit: Annotated[int, typer.Option(help="Most items to show, the newest.", min=1)] = 1_000,
+    archive: Archive = "",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per item and line.")] = False,
+) -> None:
+    """Show archived items, oldest first; works without a running pipeline.
+
+    Example: sdnator get 'network.block.firewall.*' --since 1h
+    """
+    from due.errors import DueError, InvalidOption, InvalidQuery
+
+    wanted = {"dataKey": typed_key(key)}
+    now = time.time_ns()
+    start = instant_ns(since, now, "--since") if since else 0
+    end = instant_ns(until, now, "--until") if until else now + 1
+    try:
+        items, more = _from_archive(archive or known_archive(), wanted, start, end, limit)
+    except (InvalidOption, InvalidQuery) as error:
+        raise BadInput(str(error)) from None
+    except DueError as error:
+        raise PipelineError(str(error)) from None
+    for item in items:
+        print(_json_line(item) if as_json else text_line(item))
+    if more:
+        print(f"sdnator: there are older items; raise --limit {limit} to see them", file=sys.stderr)
+    elif not items:
+        print(f"sdnator: no items under {wanted['dataKey']} in that time", file=sys.stderr)
+
+
+def known_archive() -> str:
+    """Data Archives of the running pipeline, or the file of the last one."""
+    found = running.find()
+    return found.archive if found is not None else running.default_archive()
+
+
+def _from_archive(
+    url: str, query: Mapping[str, Any], start: int, end: int, limit: int
+) -> "tuple[list[Item], bool]":
+    from due.backends import open_archive
+
+    # opening would create the file
+    if url.startswith("sqlite:") and not Path(unquote(urlsplit(url).path)).exists():
+        raise BadInput(
+            f"there is no archive at {url} yet: start a pipeline with `sdnator up`, or give --archive"
+        )
+    driver = open_archive(url)
+    try:
+        return latest(driver.find, query, start, end, limit)
+    finally:
+        driver.close()
+
+
+def _json_line(item: "Item") -> str:
+    from coordinator.views import item as as_json
+
+    return json.dumps(as_json(item), ensure_ascii=False)
+
+
+def text_line(item: "Item") -> str:
+    """Time, key and value on one line; of a long value only its size."""
+    when = datetime.fromtimestamp(item.event_time / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+    value = brief(item.value)
+    shown = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return f"{when}  {item.key}  {shown if len(shown) <= _TEXT_WIDTH else shown[:_TEXT_WIDTH] + '…'}"

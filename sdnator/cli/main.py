@@ -1,0 +1,242 @@
+"""The `sdnator` command: options and exit codes; the work is in modules imported on demand.
+
+Exit codes: 0 done, 1 a part of the pipeline failed, 2 bad input or misuse, 130 interrupted,
+143 terminated.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, ClassVar, NoReturn
+
+import typer
+
+from sdnator import __version__
+from sdnator.cli.lazy_group import LazyGroup, register
+from sdnator.errors import SdnatorError
+from sdnator.redaction import redacted
+
+COMMANDS = {
+    "allow": ("sdnator.cli.blocks_commands:allow", "Addresses, prefixes and MACs that are never blocked."),
+    "apps": (
+        "sdnator.cli.coordinator_commands:apps",
+        "List apps and their instances: state, process, items written and received.",
+    ),
+    "backup": (
+        "sdnator.cli.backup_commands:backup",
+        "Write archive, configuration and trained models into one file.",
+    ),
+    "blocks": (
+        "sdnator.cli.blocks_commands:blocks",
+        "Blocks and guards: list, add, remove, explain, lift all.",
+    ),
+    "config": (
+        "sdnator.cli.config_commands:config",
+        "Configuration: check it, show effective values, print an example.",
+    ),
+    "counters": (
+        "sdnator.cli.switch_commands:counters",
+        "Show counters of a switch's entries, above all of blocks.",
+    ),
+    "dataset": (
+        "sdnator.cli.dataset_commands:dataset",
+        "Captures to replay: public data sets by name, or generated.",
+    ),
+    "demo": (
+        "sdnator.cli.demo_commands:demos",
+        "Generate a capture of an infected home network, replay it, and block the attack.",
+    ),
+    "detect": (
+        "sdnator.cli.detect_command:detect_command",
+        "Score every packet of a capture or an interface with Kitsune, without a switch and without blocking.",
+    ),
+    "doctor": (
+        "sdnator.cli.doctor:doctor",
+        "Check what is installed, reachable and permitted here, and say how to fix the rest.",
+    ),
+    "down": (
+        "sdnator.cli.status_command:down",
+        "Stop the pipeline of `sdnator up` and wait until it has ended.",
+    ),
+    "flow": ("sdnator.cli.coordinator_commands:flow", "Draw the data flow: producers, keys, consumers."),
+    "get": (
+        "sdnator.cli.due_commands:get",
+        "Show archived items, oldest first; works without a running pipeline.",
+    ),
+    "keys": (
+        "sdnator.cli.coordinator_commands:keys",
+        "List all keys with producers, consumers and delivery.",
+    ),
+    "logs": ("sdnator.cli.logs_command:logs", "Show the logs of the pipeline's parts."),
+    "observe": ("sdnator.cli.due_commands:observe", "Show items as they arrive."),
+    "program": (
+        "sdnator.cli.program_commands:program",
+        "Manage the programs that embedded switches may load.",
+    ),
+    "queries": (
+        "sdnator.cli.queries_commands:queries",
+        "Telemetry queries: list, explain, add your own, run over captures or the archive.",
+    ),
+    "restore": (
+        "sdnator.cli.backup_commands:restore",
+        "Restore archive, configuration and models from a backup.",
+    ),
+    "shell": (
+        "sdnator.cli.shell_command:shell",
+        "Open p4runtime-shell on a running switch; its controller stays primary.",
+    ),
+    "status": (
+        "sdnator.cli.status_command:status",
+        "Show what runs: parts, addresses, app states.",
+    ),
+    "switch": (
+        "sdnator.cli.switch_run_command:switch",
+        "Run one embedded switch until Ctrl-C; a controller loads its program.",
+    ),
+    "tables": (
+        "sdnator.cli.switch_commands:tables",
+        "Show tables of a switch: size, entries, default actions; with --table every entry.",
+    ),
+    "up": ("sdnator.cli.up_command:up", "Run the whole pipeline until Ctrl-C, SIGTERM or `sdnator down`."),
+}
+"""Name to module and first line of help."""
+
+
+class _Commands(LazyGroup):
+    PLACES: ClassVar[Mapping[str, str]] = {name: place for name, (place, _) in COMMANDS.items()}
+
+
+app = typer.Typer(
+    name="sdnator",
+    cls=_Commands,
+    help="A network security pipeline: P4 switches, Kitsune, Sonata queries and a firewall.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for _name, (_, _text) in COMMANDS.items():
+    register(app, _name, _text)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sdnator {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def replay(
+    capture: Annotated[
+        Path, typer.Argument(help="pcap or pcapng, plain or gzipped; or the name of a fetched data set.")
+    ],
+    *,
+    labels: Annotated[
+        Path | None, typer.Option(help="Labels: index,label,attacker; or lines of 0/1.")
+    ] = None,
+    switch: Annotated[
+        str, typer.Option(help="embedded, bmv2 (where simple_switch_grpc is installed), or HOST:PORT.")
+    ] = "embedded",
+    inject: Annotated[
+        str | None,
+        typer.Option(
+            help="Interface through which frames enter the switch, for --switch HOST:PORT.", metavar="IFACE"
+        ),
+    ] = None,
+    no_mitigate: Annotated[bool, typer.Option("--no-mitigate", help="Decide, but block nothing.")] = False,
+    train: Annotated[
+        int | None,
+        typer.Option(
+            help="Packets to train on, one in eleven of them for the feature map.",
+            min=11,
+            show_default="55000, or as the data set's publication",
+        ),
+    ] = None,
+    fm_grace: Annotated[int | None, typer.Option(help="Packets that train the feature map.", min=1)] = None,
+    ad_grace: Annotated[int | None, typer.Option(help="Packets that train the autoencoders.", min=1)] = None,
+    pace: Annotated[
+        str, typer.Option(help="Speed: max, or a multiple of real time such as 1x or 10x.")
+    ] = "max",
+    window: Annotated[int, typer.Option(help="Most packets in flight.", min=1, max=65_536)] = 128,
+    telemetry: Annotated[
+        str, typer.Option(help="How packet headers reach the controller: packet-in or digest.")
+    ] = "packet-in",
+    report: Annotated[Path | None, typer.Option(help="Folder for the report.", metavar="DIR")] = None,
+    keep: Annotated[
+        Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Replay a capture through switch, controller, Kitsune and firewall.
+
+    With labels or a report there are two passes: Kitsune alone, then with blocking.
+    Exit codes: 0 replayed, 1 a part of the pipeline failed, 2 bad input or misuse.
+
+    Example: sdnator replay mirai.pcap --labels mirai.labels.csv --report report
+    """
+    from sdnator.cli.replay_command import ReplayRequest, run_replay
+
+    run_replay(
+        ReplayRequest(
+            capture=capture,
+            labels=labels,
+            switch=switch,
+            inject=inject,
+            mitigate=not no_mitigate,
+            train=train,
+            fm_grace=fm_grace,
+            ad_grace=ad_grace,
+            pace=pace,
+            window=window,
+            telemetry=telemetry,
+            report=report,
+            keep=keep,
+            as_json=as_json,
+        )
+    )
+
+
+class _Interrupted(BaseException):
+    """Ctrl-C. Not KeyboardInterrupt: the command line library would end the program without a message."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.exit_code = 128 + number
+
+
+def _interrupt(number: int, _: object) -> NoReturn:
+    signal.signal(number, signal.SIG_DFL)  # a second one does not wait for a clean end
+    raise _Interrupted(number)
+
+
+def main() -> None:
+    """Entry point: errors become one line and an exit code, Ctrl-C becomes 130."""
+    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        app()
+    except SdnatorError as error:
+        print(f"sdnator: {redacted(str(error))}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except _Interrupted as interrupted:
+        print("sdnator: interrupted; all processes are stopped", file=sys.stderr)
+        sys.exit(interrupted.exit_code)
+    except BrokenPipeError:
+        # The reader of our output has closed the pipe; avoid a traceback at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,196 @@
+"""`sdnator queries …`: list and explain queries, add your own, run them over captures.
+
+Options are here; the work is done by the Sonata adapter, used as a library.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.keys import (
+    CAPTURE_PREFIX,
+    HANDSHAKE,
+    PROTOCOLS,
+    QueryRequest,
+    capture_parameters,
+    request_of,
+)
+from apps.sonata_adapter.planner.explain import explain as explain_plan
+from apps.sonata_adapter.planner.plan import plan
+from apps.sonata_adapter.planner.refinement import coarsest
+from apps.sonata_adapter.query.catalogue import Template
+from apps.sonata_adapter.query.templates import QueryFolder, own_queries
+from apps.sonata_adapter.query.text import parse_queries
+from due import DueError
+from sdnator.capture.captures import CaptureError
+from sdnator.cli.due_commands import known_archive
+from sdnator.cli.queries_run import PastPackets, archived, as_line, as_text, captured, engine_of
+from sdnator.errors import BadInput
+
+queries = typer.Typer(
+    help="Telemetry queries: list, explain, add your own, run over captures or the archive.",
+    no_args_is_help=True,
+)
+
+KeyArgument = Annotated[
+    str, typer.Argument(help="network.traffic_query.sonata.NAME:window=3s,…", metavar="KEY")
+]
+
+
+def templates() -> dict[str, Template]:
+    """The catalogue and the user's own queries."""
+    return QueryFolder(own_queries()).templates()
+
+
+@queries.command("list")
+def list_queries(
+    *, as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False
+) -> None:
+    """List all queries with meaning, parameters (default, bounds) and where they run.
+
+    Example: sdnator queries list
+    """
+    rows = [_description(template) for template in templates().values()]
+    if as_json:
+        typer.echo(json.dumps({"queries": rows, "streams": _streams()}))
+        return
+    out = Console(highlight=False)
+    for row in rows:
+        out.print(f"[bold]{row['name']}[/]  {row['meaning']}")
+        table = Table(show_header=False, box=None, padding=(0, 2, 0, 4))
+        for each in row["parameters"]:
+            table.add_row(each["name"], each["default"], each["bounds"], each["meaning"])
+        out.print(table)
+        out.print(f"    results: {row['result']}")
+        out.print(f"    runs: {row['cost']}\n")
+    for name, stream in _streams().items():
+        out.print(f"[bold]{name}[/]  {stream['meaning']}")
+        out.print(f"    {', '.join(stream['parameters'])}\n" if stream["parameters"] else "")
+
+
+@queries.command("explain")
+def explain_query(key: KeyArgument) -> None:
+    """Show which operators of a query run in the switch and which on the host.
+
+    Example: sdnator queries explain network.traffic_query.sonata.ddos:window=1s
+    """
+    known = templates()
+    request = _request(key, known)
+    meaning = known[request.name].meaning if request.kind == "query" else ""
+    typer.echo(explain_plan(request, plan([coarsest(request)]), meaning=meaning))
+
+
+@queries.command("add")
+def add_queries(
+    file: Annotated[Path, typer.Argument(help="Text file with queries.", metavar="FILE")],
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Add your own queries, replacing those of the same name.  A running adapter loads them.
+
+    Example: sdnator queries add my_scan.sonata
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeError) as error:
+        raise BadInput(f"{file}: cannot be read ({error}); give a text file with queries") from None
+    try:
+        found = parse_queries(text, str(file))
+        folder = QueryFolder(own_queries())
+        folder.add(found, text)
+    except SonataError as error:
+        raise BadInput(str(error)) from None
+    if as_json:
+        typer.echo(json.dumps({"added": [template.name for template in found], "folder": str(folder.path)}))
+        return
+    for template in found:
+        typer.echo(f"{template.name}: network.traffic_query.sonata.{template.name}")
+
+
+@queries.command("run")
+def run_query(
+    key: KeyArgument,
+    *,
+    capture: Annotated[
+        list[Path] | None, typer.Option(help="pcap or pcapng; several are read one after the other.")
+    ] = None,
+    since: Annotated[
+        str, typer.Option(help="Use archived packets of this time instead: 30s, 10m, 1h, 7d.")
+    ] = "",
+    archive: Annotated[
+        str,
+        typer.Option(
+            help="Data Archives URL, for --since; default: those of the pipeline.", envvar="DUE_ARCHIVE"
+        ),
+    ] = "",
+    engine: Annotated[
+        str, typer.Option(help="Engine of the operators: numpy, or spark (extra `spark`).")
+    ] = "numpy",
+    master: Annotated[
+        str, typer.Option(help="Where Spark runs: local[N] or spark://HOST:PORT.")
+    ] = "local[2]",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line for each result.")] = False,
+) -> None:
+    """Run a query over captures or the archive; results are the same as live.
+
+    Example: sdnator queries run network.traffic_query.sonata.new_tcp:threshold=20 --capture day.pcap
+    """
+    request = _request(key, templates())
+    if request.kind == "handshake":
+        raise BadInput(f"{HANDSHAKE} is followed live only; run a query or a raw stream")
+    if bool(capture) == bool(since):
+        raise BadInput("give either --capture FILE or --since 1h")
+    try:
+        past = PastPackets(request, engine_of(engine, master))
+        streams = captured(capture) if capture else archived(archive or known_archive(), since)
+        for output in past.run(streams):
+            typer.echo(json.dumps(as_line(output)) if as_json else as_text(output))
+    except (CaptureError, DueError, SonataError) as error:
+        raise BadInput(str(error)) from None
+    if past.notes:
+        typer.echo(f"sdnator: {past.notes}", err=True)
+
+
+def _request(key: str, known: dict[str, Template]) -> QueryRequest:
+    try:
+        request = request_of(key if "." in key else f"network.traffic_query.sonata.{key}", known)
+    except (SonataError, DueError) as error:
+        raise BadInput(str(error)) from None
+    if request is None:
+        raise BadInput(f"{key}: a wildcard only follows queries that others ask for; name one query")
+    return request
+
+
+def _description(template: Template) -> dict[str, Any]:
+    request = _request(template.name, {template.name: template})
+    found = plan([request]).of(request.identity)
+    return {
+        "name": template.name,
+        "key": request.identity,
+        "meaning": template.meaning,
+        "result": template.result,
+        "parameters": [
+            {"name": p.name, "default": p.text(p.default), "bounds": p.bounds, "meaning": p.meaning}
+            for p in template.parameters
+        ],
+        "cost": "in the switch, results only"
+        if found.in_switch
+        else f"on the host, about {found.tuples_per_second:,.0f} of 10,000 packets are copied",
+    }
+
+
+def _streams() -> dict[str, Any]:
+    streams: dict[str, Any] = {
+        f"{CAPTURE_PREFIX}.{name}": {
+            "meaning": f"{protocol.meaning}, as packets",
+            "parameters": sorted(capture_parameters(protocol)),
+        }
+        for name, protocol in PROTOCOLS.items()
+    }
+    streams[HANDSHAKE] = {"meaning": "completed TCP handshakes", "parameters": []}
+    return streams

@@ -1,0 +1,208 @@
+"""`sdnator status` and `down`: show and stop the running pipeline."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sdnator.cli.plain_table import plain_table
+from sdnator.counted import counted
+from sdnator.errors import PipelineError
+from sdnator.redaction import redacted
+from sdnator.up import running
+from sdnator.up.running import shown
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+
+
+def status(*, as_json: Json = False) -> None:
+    """Show what runs: parts, addresses, app states.
+
+    Exit codes: 0 all parts run, 1 nothing runs or a part is missing.
+
+    Example: sdnator status --json
+    """
+    found = running.find()
+    if found is None:
+        holder = running.holder(running.state_folder())
+        if as_json:
+            print(json.dumps({"running": False, "pid": holder}))
+        elif holder is None:
+            print("no pipeline is running: start one with `sdnator up`")
+        else:
+            print(f"a pipeline is starting or stopping (process {holder})")
+        raise typer.Exit(1)
+    parts = {
+        name: {"pid": pid, "alive": _alive(pid), **found.health.get(name, {})}
+        for name, pid in found.parts.items()
+    }
+    apps = _states(found.coordinator)
+    control = _control(found.coordinator) if apps is not None else None
+    away = [name for name, one in found.health.items() if one["state"] != "running"]
+    well = all(part["alive"] for part in parts.values()) and apps is not None and not away
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "running": True,
+                    "well": well,
+                    **shown(found),
+                    "parts": parts,
+                    "apps": apps,
+                    "control": control,
+                }
+            )
+        )
+    else:
+        _show_status(found, parts, apps)
+        wired = {str(one["name"]) for one in found.switches if one.get("forward")}
+        for line in control_lines(control, wired):
+            print(line)
+    raise typer.Exit(0 if well else 1)
+
+
+def _show_status(
+    found: running.Running, parts: Mapping[str, Mapping[str, Any]], apps: Mapping[str, str] | None
+) -> None:
+    print(f"running for {_age(found.started)} as process {found.pid}; logs in {found.logs}")
+    where = {
+        "updates": redacted(found.updates),
+        "coordinator": found.coordinator,
+        "dashboard": found.dashboard,
+    }
+    single = len(found.switches) == 1
+    where |= {"switch" if single else f"switch-{one['name']}": one["address"] for one in found.switches}
+    where |= {name: f"metrics at {at}" for name, at in found.metrics.items() if not where.get(name)}
+    rows = []
+    for name, part in parts.items():
+        rows.append((name, str(part["pid"]), _state(name, part, apps or {}), where.get(name, "")))
+    print(plain_table(("part", "process", "state", "where"), rows))
+    for line in trouble_lines(found.health):
+        print(line)
+    print(f"logs take {sum(one['log_bytes'] for one in found.health.values()) / 1e6:.1f} MB")
+    if found.dashboard:
+        print(f"sign in to the dashboard with the token in {found.token_file}")
+    if apps is None:
+        print(f"the Coordinator at {found.coordinator} does not answer")
+
+
+def _state(name: str, part: Mapping[str, Any], apps: Mapping[str, str]) -> str:
+    supervised = part.get("state", "running")
+    if supervised != "running":
+        return str(supervised).upper()
+    return apps.get(name, "runs") if part["alive"] else "DEAD"
+
+
+def trouble_lines(health: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Text: a line for each part that was restarted, or whose log lines were suppressed."""
+    for name, one in health.items():
+        if one["restarts"]:
+            times = "once" if one["restarts"] == 1 else f"{one['restarts']} times"
+            cause = f"; the last death: {redacted(one['cause'])}" if one["cause"] else ""
+            yield f"{name} was restarted {times}{cause}"
+        if one["suppressed_lines"]:
+            yield f"{name} logged too much: {one['suppressed_lines']:,} lines were suppressed"
+
+
+def _age(started: int) -> str:
+    seconds = max(0, (time.time_ns() - started) // 10**9)
+    minutes, hours = seconds // 60, seconds // 3_600
+    return f"{hours} h {minutes % 60} min" if hours else f"{minutes} min {seconds % 60} s"
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return True
+
+
+def _states(coordinator: str) -> dict[str, str] | None:
+    """By app: the states of its instances; None where the Coordinator does not answer."""
+    from sdnator.northbound import ask
+
+    try:
+        return {app["app_id"]: ", ".join(app["states"]) for app in ask(coordinator, "/apps")}
+    except PipelineError:
+        return None
+
+
+def _control(coordinator: str) -> dict[str, Any] | None:
+    """The controller's state of its switches; None if there is none."""
+    from sdnator.northbound import ask
+
+    try:
+        return controlled(ask(coordinator, "/health"))
+    except PipelineError:
+        return None
+
+
+def controlled(health: Mapping[str, Any]) -> dict[str, Any] | None:
+    """From the Coordinator's /health: whether the watchdog runs, and each switch's state and failure mode."""
+    told = health.get("apps", {}).get("p4runtime_ctrl", {}).get("health", {}).get("app", {})
+    if "switches" not in told:
+        return None
+    names = ("connected", "primary", "fail", "stations")
+    switches = {one["switch"]: {name: one[name] for name in names if name in one} for one in told["switches"]}
+    return {"sentinel": bool(told.get("sentinel")), "switches": switches}
+
+
+def control_lines(control: Mapping[str, Any] | None, wired: Collection[str]) -> Iterator[str]:
+    """Text: a line for each switch; the watchdog covers those that are `wired`."""
+    for name, one in (control or {"switches": {}})["switches"].items():
+        state = "under control" if one.get("connected") and one.get("primary") else "NOT under control"
+        if one.get("fail") == "closed":
+            watch = "a watchdog runs" if control and control["sentinel"] else "but NO watchdog runs"
+            fails = f"fails closed, {watch if name in wired else 'and has no port forwarding'}"
+        else:
+            fails = "fails open: port forwarding stays without a controller"
+        learnt = f"; {counted(one['stations'], 'MAC address')} learnt" if "stations" in one else ""
+        yield f"switch {name} is {state}; it {fails}{learnt}"
+
+
+def down(
+    *,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait until it has ended.", min=0)] = 30.0,
+    as_json: Json = False,
+) -> None:
+    """Stop the pipeline of `sdnator up` and wait until it has ended.  No error if none runs.
+
+    Exit codes: 0 nothing runs any more, 1 it did not end in time.
+
+    Example: sdnator down
+    """
+    pid = running.holder(running.state_folder())
+    if pid is not None:
+        _end(pid, timeout)
+    if as_json:
+        print(json.dumps({"stopped": pid}))
+    else:
+        print(f"stopped (process {pid})" if pid is not None else "no pipeline was running")
+
+
+def _end(pid: int, timeout: float) -> None:
+    try:
+        os.kill(pid, signal.SIGTERM)
+    except ProcessLookupError:
+        return
+    except PermissionError:
+        raise PipelineError(f"process {pid} is another user's: stop it as that user") from None
+    deadline = time.monotonic() + timeout
+    while running.holder(running.state_folder()) == pid:
+        if time.monotonic() > deadline:
+            raise PipelineError(
+                f"process {pid} has not ended within {timeout:g} s: see {running.state_folder() / 'logs'}, "
+                f"or kill -9 {pid}"
+            )
+        time.sleep(0.05)

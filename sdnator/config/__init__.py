@@ -1,0 +1,1 @@
+"""`sdnator.toml`: model, parsing, and the switches in it."""

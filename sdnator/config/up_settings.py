@@ -1,0 +1,85 @@
+"""Options of `sdnator up` itself; those of the apps are in their own Settings."""
+
+from typing import Literal
+
+import msgspec
+
+
+class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the pipeline keeps and shares its data."""
+
+    updates: str = ""
+    """Data Updates, redis://, rediss:// or unix://; empty: an embedded server."""
+    archive: str = ""
+    """Data Archives, mongodb:// or sqlite:///; empty: a file in the data folder."""
+    quota: float = 10.0
+    """GiB that the embedded archive may take; the oldest items go first."""
+
+    def __post_init__(self) -> None:
+        if not self.quota >= 0.01:
+            raise ValueError(f"quota={self.quota}: at least 0.01 GiB")
+
+
+class LearnPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """MAC learning by the controller; off without ports."""
+
+    ports: tuple[int, ...] = ()
+    """Ports between which frames are switched by learnt MAC addresses, unless `wires` joins them; empty: off."""
+    age_s: float = 300.0
+    """Seconds without a frame after which a learnt MAC address is removed."""
+    limit: int = 8192
+    """Most MAC addresses to learn; frames to further ones are flooded to all of the ports."""
+
+    def __post_init__(self) -> None:
+        if len(self.ports) == 1 or len(set(self.ports)) < len(self.ports):
+            raise ValueError(f"learn.ports={list(self.ports)}: give two or more, each once")
+        if not self.age_s >= 1:
+            raise ValueError(f"learn.age_s={self.age_s}: at least 1 s")
+        if self.limit < 1:
+            raise ValueError(f"learn.limit={self.limit}: at least 1")
+
+
+class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A switch that is started with the pipeline, or an external one."""
+
+    name: str = "s1"
+    """Name of the switch in keys."""
+    kind: str = "embedded"
+    """embedded, bmv2, or HOST:PORT of a P4Runtime switch."""
+    device_id: int = 1
+    """P4Runtime device id."""
+    ports: tuple[str, ...] = ()
+    """Ports of a switch that `sdnator up` starts: N=veth:INTERFACE or N=null."""
+    wires: tuple[str, ...] = ()
+    """Port forwarding in both directions, N-M; default: two ports are joined unless they learn; "none": no
+    forwarding."""
+    learn: LearnPlan = LearnPlan()
+    fail: Literal["open", "closed"] = "open"
+    """Without a controller: open keeps port forwarding, closed removes it."""
+    listen: str = ""
+    """HOST:PORT on which a switch that `sdnator up` starts serves P4Runtime; empty: a Unix socket that only its
+    user can reach (embedded), or 127.0.0.1 (BMv2)."""
+
+    def __post_init__(self) -> None:
+        if not self.name or not self.name.replace("-", "").replace("_", "").isalnum():
+            raise ValueError(f"name {self.name!r}: letters, digits, - and _")
+        if self.device_id < 1:
+            raise ValueError(f"device_id={self.device_id}: at least 1")
+
+
+class LogSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The logs of all parts."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    """Lowest level that is logged."""
+    format: Literal["console", "json"] = "console"
+    """console: plain lines; json: one object per line, for log collectors."""
+
+
+class MetricsSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Prometheus endpoints of the apps."""
+
+    host: str = "127.0.0.1"
+    """Address on which each app serves its metrics; empty: none."""
+    targets: str = ""
+    """File to which the endpoints are written for Prometheus (file_sd_configs); empty: none."""

@@ -1,0 +1,32 @@
+"""What the pages may ask of the app that serves them; panels know this and not the app."""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from apps.messages import Answer
+from due import Item
+from sdnator.dashboard.board import Board
+from sdnator.dashboard.settings import Settings
+from sdnator.dashboard.sign_in import Sessions
+
+
+class PageBackend(Protocol):
+    """The dashboard as its pages see it."""
+
+    settings: Settings
+    board: Board
+    """The latest of everything that is shown."""
+    sessions: Sessions
+    """Who has signed in."""
+
+    def instruct(self, verb: Any, subject: str, answered: Callable[[Answer], None]) -> str:
+        """Tell the firewall; returns the instruction's id, and `answered` gets its answer.  Raises DueError."""
+        ...
+
+    def forget(self, instruction: str) -> None:
+        """Nobody waits for its answer any more."""
+        ...
+
+    def find(self, key: str, start: int, end: int, limit: int) -> tuple[list[Item], bool]:
+        """The latest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
+        ...

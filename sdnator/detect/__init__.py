@@ -1,0 +1,1 @@
+"""Kitsune alone on a capture or an interface."""

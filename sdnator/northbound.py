@@ -1,0 +1,52 @@
+"""Reads from a running pipeline: the Coordinator's HTTP API, and the latest items of the archive."""
+
+import json
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from sdnator.errors import BadInput, PipelineError
+
+if TYPE_CHECKING:
+    from due import Item
+
+_SECONDS = 5.0
+_WINDOWS_NS = (60 * 10**9, 3_600 * 10**9, 86_400 * 10**9)
+
+
+def ask(url: str, path: str) -> Any:
+    """The JSON answer of the API.  Raises BadInput for a malformed URL, PipelineError without an answer."""
+    import http.client
+    from urllib.error import URLError
+    from urllib.request import ProxyHandler, build_opener
+
+    if not url.startswith(("http://", "https://")):
+        raise BadInput(f"--url {url}: give http://HOST:PORT of a Coordinator")
+    opener = build_opener(ProxyHandler({}))  # it is on loopback: a proxy would connect to the wrong machine
+    try:
+        with opener.open(url.rstrip("/") + path, timeout=_SECONDS) as answer:
+            return json.load(answer)
+    except (URLError, OSError, ValueError, http.client.HTTPException) as error:
+        cause = getattr(error, "reason", None) or error
+        raise PipelineError(
+            f"no Coordinator answers at {url}{path} ({cause}); see `sdnator status`"
+        ) from None
+
+
+def latest(
+    find: "Callable[[Mapping[str, Any]], list[Item]]",
+    query: Mapping[str, Any],
+    start: int,
+    end: int,
+    limit: int,
+) -> "tuple[list[Item], bool]":
+    """The newest items, oldest first, and whether there are older ones; times in ns, `end` not included.
+
+    Looks at the last minute first, then farther back until there are enough: the archive may be large.
+    """
+    items: list[Item] = []
+    for window in (*_WINDOWS_NS, end - start):
+        left = max(start, end - window)
+        items = find({"$and": [query, {"timestamp": {"$gte": left, "$lt": end}}]})
+        if len(items) > limit or left == start:
+            break
+    return items[-limit:], len(items) > limit

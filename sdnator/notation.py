@@ -1,0 +1,79 @@
+"""Notation for the command line: addresses in keys, times such as `1h`, sizes in place of long values."""
+
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from sdnator.errors import BadInput
+
+_UNITS_NS = {
+    "ms": 10**6,
+    "s": 10**9,
+    "min": 60 * 10**9,
+    "m": 60 * 10**9,
+    "h": 3_600 * 10**9,
+    "d": 86_400 * 10**9,
+}
+_DURATION = re.compile(r"(\d+(?:\.\d+)?)(ms|s|min|m|h|d)")
+
+
+def typed_key(text: str) -> str:
+    """The canonical form of a typed key: addresses in specs need not be encoded.  Raises BadInput."""
+    from due.errors import InvalidKey
+    from due.keys import Key, encode
+
+    path, colon, specs = text.partition(":")
+    encoded = []
+    for spec in specs.split(",") if colon else ():
+        name, equals, value = spec.partition("=")
+        values = (
+            one if one == "*" or re.search("%[0-9A-F]{2}", one) else encode(one) for one in value.split("|")
+        )
+        encoded.append(name + equals + "|".join(values))
+    try:
+        return Key.parse(path + colon + ",".join(encoded)).text
+    except InvalidKey as error:
+        raise BadInput(str(error)) from None
+
+
+def duration_ns(text: str, option: str) -> int:
+    """`30s`, `10m`, `1.5h`, `7d` as ns; raises BadInput."""
+    found = _DURATION.fullmatch(text.strip())
+    if found is None:
+        raise BadInput(f"{option} {text}: give a time such as 30s, 10m, 1h or 7d")
+    return round(float(found[1]) * _UNITS_NS[found[2]])
+
+
+def instant_ns(text: str, now: int, option: str) -> int:
+    """A time ago, or a point in time (UTC unless it says otherwise), as ns since the epoch; raises BadInput."""
+    if _DURATION.fullmatch(text.strip()):
+        return now - duration_ns(text, option)
+    try:
+        when = datetime.fromisoformat(text.strip())
+    except ValueError:
+        raise BadInput(
+            f"{option} {text}: give a time ago such as 1h, or one such as 2024-05-01T12:00"
+        ) from None
+    aware = when if when.tzinfo else when.replace(tzinfo=UTC)
+    return int(aware.timestamp()) * 10**9 + aware.microsecond * 1_000
+
+
+def brief(value: Any) -> Any:
+    """A value fit for one line of JSON: batches, arrays and bytes by their size."""
+    import numpy as np
+
+    from coordinator.views import value as as_json
+    from due import RecordBatch
+
+    if isinstance(value, RecordBatch):
+        return f"{len(value)} records of {', '.join(value.columns)}"
+    if isinstance(value, np.ndarray):
+        return f"{value.size} of {value.dtype}"
+    if isinstance(value, bytes | memoryview):
+        return f"{len(value)} bytes"
+    if isinstance(value, Mapping):
+        return {str(name): brief(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [brief(part) for part in value]
+    return as_json(value)

@@ -1,0 +1,1 @@
+"""Replay of a capture: feeding, packet accounting, summary."""

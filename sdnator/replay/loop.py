@@ -1,0 +1,409 @@
+"""Replay a capture through the whole loop.
+
+    Capture ─► feed ─► switch ─► controller ─► Kitsune ─► scores ─┐
+                 ▲                                                │ window of packets in flight
+                 └────────────────────────────────────────────────┘
+
+The feeder keeps a bounded number of packets in flight, counted by scored + dropped, so that no queue
+of the loop can overflow and the loop's delay, in packets, is small and known.
+"""
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+from apps.messages import Alert, Confirmation, Decision
+from dataplane.ports.capture_port import CapturePortError
+from due import CONSUMER, Engine, Interest, Item
+from sdnator.capture.captures import Capture
+from sdnator.capture.interfaces import Feed
+from sdnator.errors import PipelineError
+from sdnator.replay.drop_counters import DropCounters
+from sdnator.replay.packet_accounting import PacketAccounting, PacketState
+from sdnator.replay.pipeline import SWITCH_NAME, PipelinePlan, ReplayPipeline
+from sdnator.replay.survey import Survey
+
+CONFIRM_SECONDS = 5.0
+"""Seconds for the confirmation of the last decisions."""
+CHUNK = 64
+"""Most packets sent at a time."""
+STALL_SECONDS = 30.0
+"""Seconds without any result after which the loop has failed."""
+SETTLE_SECONDS = 0.5
+"""Without verdicts: seconds of silence after which packets in flight count as dropped or lost."""
+ASK_SECONDS = 0.003
+"""Without verdicts: seconds of silence after which drop counters are read."""
+WIRE_WINDOW = 16
+"""Most packets in flight into a real interface: BMv2's capture ring has 32 slots, the kernel drops the rest."""
+POLL_SECONDS = 0.002
+LOOK_SECONDS = 0.1
+DEATH_SECONDS = 5.0
+"""Seconds from a part's closed sockets to the end of its process."""
+COORDINATED = "coordinated"
+"""Phase of an engine whose declarations the Coordinator knows."""
+PACKETS = "packets"
+"""The controller's name for the request of every packet."""
+INTERESTS = (
+    Interest("network.anomaly.kitsune.score"),
+    Interest("network.anomaly.kitsune.alert"),
+    Interest("network.block.firewall.*"),
+    Interest("network.confirmation.p4runtime_ctrl.*"),
+    Interest("network.switch.p4runtime_ctrl.*"),
+)
+
+
+Telemetry = Literal["packet-in", "digest"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """How a capture is replayed."""
+
+    switch: str = "embedded"
+    inject: str | None = None
+    """Interface to send frames into, for a switch that is already running."""
+    fm_grace: int = 5_000
+    """Packets from which the feature map is learnt."""
+    ad_grace: int = 50_000
+    """Packets on which the autoencoders are trained."""
+    pace: float | None = None
+    """Capture seconds a wall second; None = as fast as the loop goes."""
+    window: int = 128
+    """Most packets in flight."""
+    telemetry: Telemetry = "packet-in"
+    """How headers come from the switch."""
+    keep: Path | None = None
+    """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
+
+    @property
+    def in_flight_limit(self) -> int:
+        """Most packets in flight on the chosen switch."""
+        return self.window if self.switch == "embedded" else min(self.window, WIRE_WINDOW)
+
+    @property
+    def training_packets(self) -> int:
+        """Packets that Kitsune trains on: the reference trains on one more than asked for."""
+        return self.fm_grace + self.ad_grace + 1
+
+
+@dataclass(eq=False)
+class PassResult:
+    """Result of one pass through the loop."""
+
+    flight: PacketAccounting
+    mitigate: bool
+    seconds: float = 0.0
+    lost_on_the_way: int = 0
+    """Gaps in the packet-in sequence numbers, as the controller counted them."""
+    uncounted_drops: int = 0
+    """Packets taken for dropped that no drop counter has: they were lost."""
+    drops_counted: dict[str, int] = field(default_factory=dict)
+    """Last drop counter of each block, by its id."""
+    alerts: list[Alert] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+    confirmations: list[Confirmation] = field(default_factory=list)
+    sent_at: dict[int, float] = field(default_factory=dict)
+    """Wall time (monotonic) at which watched packets were sent."""
+    confirmed_at: list[float] = field(default_factory=list)
+    """Wall time of each confirmation."""
+
+
+Progress = Callable[[PacketAccounting, int], None]
+"""Called at intervals with the packet accounting and the number of blocks so far."""
+
+
+class _Observer:
+    """Items that the replay receives over DUE; callbacks run in the engine's thread."""
+
+    def __init__(self, result: PassResult) -> None:
+        self._result = result
+        self.moved = threading.Condition()
+        self.switch: dict[str, Any] = {}
+        self.blocks = 0
+
+    def subscribe(self, engine: Engine) -> None:
+        engine.observe("network.anomaly.kitsune.score").subscribe(self._on_score)
+        engine.observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
+        engine.observe("network.block.firewall.*").subscribe(self._on_decision)
+        engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
+        engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
+
+    def _on_score(self, item: Item) -> None:
+        value = item.value
+        with self.moved:
+            self._result.flight.scored(value["arrival"], value["score"], value["state"] == 0)
+            self.moved.notify_all()
+
+    def _on_alert(self, item: Item) -> None:
+        with self.moved:
+            self._result.alerts.append(Alert.from_value(item.value))
+
+    def _on_decision(self, item: Item) -> None:
+        with self.moved:
+            self._result.decisions.append(Decision.from_value(item.value))
+
+    def _on_confirmation(self, item: Item) -> None:
+        confirmation = Confirmation.from_value(item.value)
+        with self.moved:
+            self._result.confirmations.append(confirmation)
+            self._result.confirmed_at.append(time.monotonic())
+            if confirmation.state == "installed":
+                self.blocks += 1
+
+    def _on_switch(self, item: Item) -> None:
+        with self.moved:
+            self.switch = item.value
+            self._result.lost_on_the_way = int(item.value["lost"])
+            for block in item.value["blocks"]:
+                self._result.drops_counted[str(block["id"])] = int(block["packets"])
+            self.moved.notify_all()
+
+
+class ReplayPass:
+    """One pass of a capture through a fresh pipeline.
+
+    Args:
+        survey: the capture, read once before.
+        options: how to replay.
+        mitigate: False = the firewall decides but nothing is installed.
+        watch: indices of packets whose time of sending matters.
+    """
+
+    def __init__(
+        self, survey: Survey, options: ReplayOptions, *, mitigate: bool, watch: frozenset[int]
+    ) -> None:
+        self._survey = survey
+        self._options = options
+        self._watch = watch
+        flight = PacketAccounting(
+            survey.packets,
+            verdicts=options.switch == "embedded",
+            by_digest=options.telemetry == "digest",
+        )
+        self._result = PassResult(flight, mitigate)
+        self._observer = _Observer(self._result)
+        self._drops: DropCounters | None = None
+        self._looked = 0.0
+
+    def run(self, progress: Progress | None = None) -> PassResult:
+        """Run it to the last packet; raises PipelineError if a part fails or the loop stalls."""
+        options = self._options
+        name = "with-blocking" if self._result.mitigate else "kitsune-alone"
+        with tempfile.TemporaryDirectory(prefix="sdnator-", ignore_cleanup_errors=True) as temporary:
+            folder = Path(temporary) if options.keep is None else options.keep.absolute() / name
+            folder.mkdir(parents=True, exist_ok=True)
+            engine = Engine()
+            plan = PipelinePlan(
+                folder=folder,
+                switch=options.switch,
+                inject=options.inject,
+                base_us=self._survey.base_us,
+                telemetry=options.telemetry,
+                first=partial(self._join, engine),
+                kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},
+                firewall={"rules": {"dry_run": not self._result.mitigate}},
+            )
+            with ReplayPipeline(plan) as pipeline:
+                self._run(pipeline, engine, progress)
+        return self._result
+
+    def _join(self, engine: Engine, pipeline: ReplayPipeline) -> None:
+        """Register our interests before any app runs, so that Kitsune's first scores are wanted."""
+        pipeline.before_stop(engine.close)
+        engine.set_pubsub(pipeline.updates)
+        engine.set_db(pipeline.archive)
+        engine.init("replay", CONSUMER, interests=INTERESTS)
+        self._observer.subscribe(engine)
+        deadline = time.monotonic() + STALL_SECONDS
+        while engine.health()["phase"] != COORDINATED:
+            pipeline.check()
+            if time.monotonic() > deadline:
+                raise PipelineError(f"the coordinator did not answer within {STALL_SECONDS:.0f} s")
+            time.sleep(0.01)
+
+    def _run(self, pipeline: ReplayPipeline, engine: Engine, progress: Progress | None) -> None:
+        self._wait_for_packets(pipeline, engine)
+        started = time.monotonic()
+        with ExitStack() as stack:
+            try:
+                feed = pipeline.feed()
+                stack.callback(feed.close)
+                if not pipeline.gives_verdicts:
+                    self._drops = stack.enter_context(pipeline.drop_counters())
+                self._feed(pipeline, feed, progress)
+            except CapturePortError as error:
+                _name_the_dead(pipeline)
+                raise PipelineError(str(error)) from error
+        self._result.seconds = time.monotonic() - started
+
+    def _wait_for_packets(self, pipeline: ReplayPipeline, engine: Engine) -> None:
+        """Wait until the controller has told the switch to send packets, because Kitsune wants them.
+
+        Its state item may be older than our subscription, so the archive is read as well.
+        """
+        deadline = time.monotonic() + STALL_SECONDS
+        while True:
+            states = [item.value for item in engine.get(f"network.switch.p4runtime_ctrl.{SWITCH_NAME}")]
+            with self._observer.moved:
+                latest = self._observer.switch or (states[-1] if states else {})
+            if latest.get("primary") and PACKETS in latest.get("telemetry", ()):
+                return
+            pipeline.check()
+            if time.monotonic() > deadline:
+                raise PipelineError(
+                    f"switch {SWITCH_NAME} did not begin to send packets within {STALL_SECONDS:.0f} s; "
+                    f"its last state: {latest or 'none'}"
+                )
+            time.sleep(0.05)
+
+    def _feed(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
+        flight = self._result.flight
+        begun = time.monotonic()
+        first_ns = int(self._survey.time_ns[0])
+        with Capture(self._survey.path) as capture:
+            frames = iter(capture)
+            while flight.sent < self._survey.packets:
+                room = self._wait_for_room(pipeline, feed, progress)
+                chunk = list(islice(frames, min(room, CHUNK)))
+                self._keep_pace(pipeline, progress, begun, (chunk[0].time_ns - first_ns) / 1e9)
+                self._look(pipeline, progress)
+                # Counted first: a verdict or score may come back before `send` returns.
+                self._note_watched(flight.sent, len(chunk))
+                with self._observer.moved:
+                    flight.send(len(chunk))
+                feed.send(
+                    [frame.time_ns // 1_000 - self._survey.base_us for frame in chunk],
+                    [frame.length for frame in chunk],
+                    [frame.data for frame in chunk],
+                )
+        self._drain(pipeline, feed, progress)
+        self._looked = 0.0
+        self._look(pipeline, progress)
+        self._await_confirmations(pipeline)
+        if not pipeline.gives_verdicts:
+            self._await_drop_counters(pipeline)
+
+    def _await_confirmations(self, pipeline: ReplayPipeline) -> None:
+        """Wait until the firewall's decisions are confirmed by the switch."""
+        deadline = time.monotonic() + CONFIRM_SECONDS
+
+        def confirmed() -> bool:
+            answered = {confirmation.id for confirmation in self._result.confirmations}
+            return all(decision.dry_run or decision.id in answered for decision in self._result.decisions)
+
+        with self._observer.moved:
+            while not confirmed() and time.monotonic() < deadline:
+                pipeline.check()
+                self._observer.moved.wait(0.05)
+
+    def _await_drop_counters(self, pipeline: ReplayPipeline) -> None:
+        """Without verdicts, check by the switch's counters which packets were really dropped."""
+        deadline = time.monotonic() + CONFIRM_SECONDS
+        dropped = self._result.flight.count(PacketState.DROPPED)
+        with self._observer.moved:
+            while sum(self._result.drops_counted.values()) < dropped and time.monotonic() < deadline:
+                pipeline.check()
+                self._observer.moved.wait(0.05)
+            self._result.uncounted_drops = max(0, dropped - sum(self._result.drops_counted.values()))
+
+    def _note_watched(self, first: int, count: int) -> None:
+        for index in self._watch.intersection(range(first, first + count)):
+            self._result.sent_at[index] = time.monotonic()
+
+    def _keep_pace(
+        self, pipeline: ReplayPipeline, progress: Progress | None, begun: float, capture_seconds: float
+    ) -> None:
+        if self._options.pace is None:
+            return
+        due_at = begun + capture_seconds / self._options.pace
+        while (ahead := due_at - time.monotonic()) > 0:
+            time.sleep(min(ahead, LOOK_SECONDS))
+            self._look(pipeline, progress)
+
+    def _look(self, pipeline: ReplayPipeline, progress: Progress | None) -> None:
+        """At intervals: check that every part runs, and report progress."""
+        now = time.monotonic()
+        if now - self._looked > LOOK_SECONDS:
+            self._looked = now
+            pipeline.check()
+            if progress is not None:
+                progress(self._result.flight, self._observer.blocks)
+
+    def _wait_for_room(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> int:
+        self._await(pipeline, feed, progress, lambda flight: flight.in_flight < self._options.in_flight_limit)
+        return self._options.in_flight_limit - self._result.flight.in_flight
+
+    def _drain(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
+        self._await(pipeline, feed, progress, lambda flight: flight.in_flight == 0)
+
+    def _await(
+        self,
+        pipeline: ReplayPipeline,
+        feed: Feed,
+        progress: Progress | None,
+        done: Callable[[PacketAccounting], bool],
+    ) -> None:
+        """Receive verdicts and scores until `done`; raises PipelineError if the loop stalls."""
+        flight = self._result.flight
+        last, since = -1, time.monotonic()
+        while True:
+            with self._observer.moved:
+                flight.judge(feed.verdicts())
+                if done(flight):
+                    return
+                self._observer.moved.wait(POLL_SECONDS)
+            now = time.monotonic()
+            if flight.decided != last:
+                last, since = flight.decided, now
+            elif self._observer.blocks:
+                self._settle(now - since)
+            self._look(pipeline, progress)
+            if now - since > STALL_SECONDS:
+                raise PipelineError(
+                    f"the loop stands still: {flight.in_flight} of {flight.sent} packets sent are neither scored "
+                    f"nor dropped after {STALL_SECONDS:.0f} s"
+                    + (
+                        ""
+                        if pipeline.gives_verdicts
+                        else "; frames were lost on the wire: try a smaller --window"
+                    )
+                )
+
+    def _settle(self, silence: float) -> None:
+        """Check whether all packets in flight were dropped."""
+        flight = self._result.flight
+        if self._drops is not None and silence > ASK_SECONDS:
+            drops = self._drops.dropped()
+            with self._observer.moved:
+                flight.settle_counted(drops)
+        if silence > SETTLE_SECONDS:
+            with self._observer.moved:
+                flight.settle()
+
+
+def _name_the_dead(pipeline: ReplayPipeline) -> None:
+    """Raise PipelineError with the part that died, and its cause; return if none has."""
+    deadline = time.monotonic() + DEATH_SECONDS
+    while time.monotonic() < deadline:
+        pipeline.check()
+        time.sleep(POLL_SECONDS)
+
+
+def wall_seconds_to_block(result: PassResult, first_attack: int | None) -> float | None:
+    """Wall seconds from the sending of the first attack packet to the first installed block."""
+    begun = result.sent_at.get(first_attack) if first_attack is not None else None
+    if begun is None:
+        return None
+    installed = [
+        at
+        for confirmation, at in zip(result.confirmations, result.confirmed_at, strict=True)
+        if confirmation.state == "installed"
+    ]
+    return installed[0] - begun if installed else None

@@ -1,0 +1,216 @@
+"""The whole pipeline as processes of this machine, for one replay: started in order, watched, stopped in order.
+
+Valkey (Data Updates) ─ coordinator ─┬─ switch ◄─ P4Runtime ─ p4runtime_ctrl
+SQLite (Data Archives)               ├─ kitsune
+                                     └─ firewall
+
+No part is restarted: the results of a disturbed replay are not valid.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from dataplane.ports.capture_port import CaptureFeed
+from due.drivers.embedded_redis import EmbeddedServer
+from sdnator import p4_program
+from sdnator.capture.interfaces import Feed, VethPair, WireFeed
+from sdnator.errors import PipelineError
+from sdnator.replay.drop_counters import DropCounters
+from sdnator.supervisor import Child, PartSpec, Supervisor
+from sdnator.supervisor.app_command import Backends, app_command
+from sdnator.supervisor.spec import PartProcess
+from sdnator.supervisor.switch_program import SwitchProgram
+from sdnator.supervisor.updates_server import UpdatesProcess
+
+SWITCH_NAME = "s1"
+INGRESS_PORT = 1
+EGRESS_PORT = 2
+_APPS = ("p4runtime_ctrl", "kitsune", "firewall")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelinePlan:
+    """What to start."""
+
+    folder: Path
+    """Empty folder for the archive, settings and logs."""
+    switch: str = "embedded"
+    """embedded, bmv2, or HOST:PORT of an external P4Runtime switch."""
+    inject: str | None = None
+    """Interface through which frames enter an external switch."""
+    device_id: int = 1
+    base_us: int = 0
+    """Microseconds that the controller adds to the switch's time stamps."""
+    first: "Callable[[ReplayPipeline], None] | None" = None
+    """Called when Data Updates and the Coordinator run, before any app starts: data is made on demand,
+    so a consumer that must not miss any registers its interests here."""
+    telemetry: str = "packet-in"
+    """How headers come from the switch: packet-in, or digest."""
+    kitsune: Mapping[str, Any] = field(default_factory=dict)
+    firewall: Mapping[str, Any] = field(default_factory=dict)
+
+
+class ReplayPipeline:
+    """A running pipeline; a context manager.
+
+    Raises:
+        PipelineError: from entering and `check`, naming the part, with the end of its log.
+    """
+
+    def __init__(self, plan: PipelinePlan) -> None:
+        self._plan = plan
+        self._logs = plan.folder / "logs"
+        self._stack = ExitStack()
+        self._guests = ExitStack()
+        self._supervisor = Supervisor((), _tell)
+        self._begun_ns = time.time_ns()
+        self._base_us = plan.base_us
+        self._inject = plan.inject
+        self._switch: SwitchProgram | None = None
+        self.updates = ""
+        """URL of Data Updates."""
+        self.archive = f"sqlite:///{plan.folder.absolute() / 'archive.db'}"
+        """URL of Data Archives."""
+        # Sockets live in a folder of their own: their paths must be short, the plan's may be long.
+        self._run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-run-")))
+        self._capture_socket = str(self._run / "capture.sock")
+
+    def __enter__(self) -> Self:
+        try:
+            self._start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _start(self) -> None:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        server = EmbeddedServer(self._run / "updates")
+        self._stack.callback(server.stop)
+        self.updates = server.url
+        self._add("updates", partial(UpdatesProcess, server))
+        self._add("coordinator", partial(self._app, "coordinator", {}), after=("updates",))
+        self._add_switch()
+        self._supervisor.start()
+        if self._plan.first is not None:
+            self._plan.first(self)
+        settings = {
+            "p4runtime_ctrl": self._controller_settings(),
+            "kitsune": self._plan.kitsune,
+            "firewall": self._plan.firewall,
+        }
+        for name in _APPS:
+            self._add(name, partial(self._app, name, settings[name]))
+        self._supervisor.start()
+
+    def _add(self, name: str, start: Callable[[], PartProcess], after: tuple[str, ...] = ()) -> None:
+        self._supervisor.add(PartSpec(name=name, start=start, after=after, restart=None))
+
+    def _add_switch(self) -> None:
+        if self._plan.switch == "embedded":
+            self._switch = SwitchProgram(
+                "embedded",
+                name="switch",
+                logs=self._logs,
+                ports={INGRESS_PORT: f"capture:{self._capture_socket}", EGRESS_PORT: "null"},
+                address=f"unix:{self._run / 'switch.sock'}",
+                device_id=self._plan.device_id,
+                options=("--state-json", str(self._plan.folder / "switch.json")),
+            )
+        elif self._plan.switch == "bmv2":
+            entry = VethPair.make(self._stack, "in")
+            leave = VethPair.make(self._stack, "out")
+            self._inject = entry.near
+            ports = {INGRESS_PORT: entry.far, EGRESS_PORT: leave.near}
+            self._switch = SwitchProgram(
+                "bmv2", name="switch", logs=self._logs, ports=ports, device_id=self._plan.device_id
+            )
+        else:
+            self._base_us = time.time_ns() // 1_000
+            return
+        self._add("switch", self._switch.start)
+
+    @property
+    def _address(self) -> str:
+        return self._switch.address if self._switch is not None else self._plan.switch
+
+    @property
+    def gives_verdicts(self) -> bool:
+        """Whether the switch gives a verdict on each frame."""
+        return self._inject is None
+
+    def drop_counters(self) -> DropCounters:
+        """Counters of the switch's block entries, for switches without verdicts."""
+        return DropCounters(self._address, self._plan.device_id)
+
+    def feed(self) -> Feed:
+        """The input for frames."""
+        return CaptureFeed(self._capture_socket) if self._inject is None else WireFeed(self._inject)
+
+    def _controller_settings(self) -> dict[str, Any]:
+        program = p4_program.find()
+        # the capture's times drive the embedded switch's clock
+        own_clock = self._switch is not None and self._plan.switch == "bmv2"
+        return {
+            "program": str(program.bmv2_json),
+            "p4info": str(program.p4info),
+            "telemetry": self._plan.telemetry,
+            # the archive of a folder that was used before holds an earlier run's blocks
+            "restore_since": self._begun_ns,
+            "switches": [
+                {
+                    "name": SWITCH_NAME,
+                    "address": self._address,
+                    "device_id": self._plan.device_id,
+                    "base_us": self._switch.base_us if self._switch and own_clock else self._base_us,
+                    "target": self._plan.switch,
+                    "forward": {str(INGRESS_PORT): EGRESS_PORT},
+                }
+            ],
+        }
+
+    def _app(self, name: str, settings: Mapping[str, Any]) -> Child:
+        backends = Backends(updates=self.updates, archive=self.archive)
+        return Child(name, app_command(name, self._plan.folder, backends, settings), self._logs)
+
+    def check(self) -> None:
+        """Raise PipelineError if a part has died."""
+        self._supervisor.watch()
+
+    def before_stop(self, leave: Callable[[], None]) -> None:
+        """Call `leave` before any part is stopped, even if the start fails: for users of Data Updates."""
+        self._guests.callback(leave)
+
+    def stop(self) -> None:
+        """Stop all parts, the last started first."""
+        try:
+            self._guests.close()
+        finally:
+            try:
+                self._supervisor.stop()
+            finally:
+                self._stack.close()
+
+    def pids(self) -> dict[str, int]:
+        """Process ids by name."""
+        return self._supervisor.pids()
+
+
+def _tell(text: str) -> None:
+    print(f"sdnator: {text}", file=sys.stderr, flush=True)
+
+
+__all__ = ["EGRESS_PORT", "INGRESS_PORT", "SWITCH_NAME", "PipelineError", "PipelinePlan", "ReplayPipeline"]

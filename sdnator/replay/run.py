@@ -1,0 +1,134 @@
+"""`sdnator replay` from options to result: check the input, run the passes, summarise."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdnator.capture.captures import CaptureError
+from sdnator.capture.labels import Labels, LabelsError, read_labels
+from sdnator.errors import BadInput
+from sdnator.replay.loop import PassResult, Progress, ReplayOptions, ReplayPass, wall_seconds_to_block
+from sdnator.replay.packet_accounting import PacketState
+from sdnator.replay.summary import attack_figures, auc, block_rows
+from sdnator.replay.survey import Survey, survey
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayOutcome:
+    """All passes of a replay and its figures."""
+
+    survey: Survey
+    labels: Labels | None
+    alone: PassResult | None
+    """The pass without mitigation, if there was one."""
+    blocking: PassResult | None
+    """The pass with mitigation, if there was one."""
+    notes: list[str]
+    seconds: float
+
+    @property
+    def reported(self) -> PassResult:
+        """The pass that the figures describe: with mitigation unless it was switched off."""
+        chosen = self.blocking or self.alone
+        assert chosen is not None  # noqa: S101 - there is at least one pass
+        return chosen
+
+
+def prepare(
+    capture: Path,
+    labels: Path | None,
+    options: ReplayOptions,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Survey, Labels | None]:
+    """Read capture and labels once; raises BadInput with one clear line."""
+    try:
+        surveyed = survey(capture, progress)
+        read = read_labels(labels) if labels is not None else None
+        if read is not None:
+            read = read.for_packets(surveyed.packets, cut=surveyed.cut is not None)
+    except (CaptureError, LabelsError) as error:
+        raise BadInput(str(error)) from error
+    if surveyed.packets <= options.training_packets:
+        raise BadInput(
+            f"{capture}: {surveyed.packets:,} packets, but training alone needs {options.training_packets:,}; "
+            f"give a longer capture, or train on fewer with --train N (or --fm-grace N --ad-grace N), "
+            f"for instance --train {max(surveyed.packets // 3, 11)}"
+        )
+    return surveyed, read
+
+
+def run(
+    surveyed: Survey,
+    labels: Labels | None,
+    options: ReplayOptions,
+    *,
+    mitigate: bool,
+    both: bool,
+    progress: Callable[[str], Progress] | None = None,
+) -> ReplayOutcome:
+    """Run one pass, or two (`both`): Kitsune alone first, then with blocking.
+
+    Raises:
+        PipelineError: a part failed.
+    """
+    begun = time.monotonic()
+    watch = frozenset[int]()
+    if labels is not None and bool(labels.attack.any()):
+        watch = frozenset({int(np.argmax(labels.attack))})
+
+    def one_pass(title: str, mitigating: bool) -> PassResult:
+        replay = ReplayPass(surveyed, options, mitigate=mitigating, watch=watch)
+        return replay.run(progress(title) if progress is not None else None)
+
+    alone = one_pass("Kitsune alone", False) if both or not mitigate else None
+    blocking = one_pass("with blocking", True) if mitigate else None
+    notes = surveyed.notes()
+    if options.switch != "embedded":
+        notes.append(
+            f"switch {options.switch} stamps packets with its own clock, not with capture time: features and scores "
+            "follow the speed of the replay (--pace 1x keeps them comparable), and block times are wall times"
+        )
+    return ReplayOutcome(surveyed, labels, alone, blocking, notes, time.monotonic() - begun)
+
+
+def figures(outcome: ReplayOutcome) -> dict[str, Any]:
+    """The JSON object of `sdnator replay --json`."""
+    result = outcome.reported
+    flight = result.flight
+    trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
+    blocks = block_rows(outcome.survey, result.decisions, result.confirmations)
+    first_attack = None
+    attack: dict[str, Any] = {}
+    if outcome.labels is not None:
+        attack = attack_figures(outcome.survey, outcome.labels, flight, blocks[0] if blocks else None)
+        first_attack = attack["first_attack_packet"]
+    capture_seconds = attack.pop("time_to_block_capture_s", None)
+    time_to_block = (
+        {"capture": capture_seconds, "wall": wall_seconds_to_block(result, first_attack)}
+        if blocks and attack
+        else None
+    )
+    return {
+        "capture": str(outcome.survey.path),
+        "mitigation": result.mitigate,
+        "packets_in": flight.sent,
+        "packets_scored": trained + scored,
+        "packets_dropped": flight.count(PacketState.DROPPED) - result.uncounted_drops,
+        "packets_not_copied": flight.count(PacketState.NOT_COPIED),
+        "packets_lost": max(flight.in_flight + result.uncounted_drops, result.lost_on_the_way),
+        "training_packets": trained,
+        "alerts": len(result.alerts),
+        "blocks": blocks,
+        "first_alert_packet": min((alert.first_packet for alert in result.alerts), default=None),
+        "first_block_packet": blocks[0]["packet"] if blocks else None,
+        "time_to_block_s": time_to_block,
+        **attack,
+        "auc": auc(outcome.alone.flight, outcome.labels) if outcome.alone and outcome.labels else None,
+        "seconds": round(outcome.seconds, 3),
+        "packets_per_second": round(flight.sent / result.seconds, 1) if result.seconds else None,
+        "notes": outcome.notes,
+    }

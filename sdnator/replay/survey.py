@@ -1,0 +1,93 @@
+"""First reading of a capture: number of packets, times, and notes."""
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sdnator.capture.captures import Capture, CutCapture
+
+_BATCH = 16_384
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Facts that a replay needs about its capture before it begins."""
+
+    path: Path
+    time_ns: NDArray[np.int64]
+    """Capture time of each packet, ns since the epoch (UTC)."""
+    eth_src: NDArray[np.uint64]
+    ipv4_src: NDArray[np.uint32]
+    """Source address of IPv4 frames (behind up to two VLAN tags) and of ARP; 0 for others."""
+    bytes: int
+    cut: CutCapture | None
+
+    @property
+    def packets(self) -> int:
+        return len(self.time_ns)
+
+    @cached_property
+    def base_us(self) -> int:
+        """Start of the earliest packet's second, us since the epoch: the switch counts from here."""
+        return int(self.time_ns.min()) // 1_000_000_000 * 1_000_000
+
+    def notes(self) -> list[str]:
+        """Notes about the capture for the report."""
+        found = [] if self.cut is None else [str(self.cut)]
+        if bool((self.time_ns % 1_000 != 0).any()):
+            found.append(
+                "the capture has nanosecond times; the switch's clock counts microseconds, the rest is cut off"
+            )
+        backwards = int(np.count_nonzero(np.diff(self.time_ns) < 0))
+        if backwards:
+            found.append(f"time runs backwards at {backwards:,} packets of the capture")
+        return found
+
+
+def survey(path: Path, progress: Callable[[int, int], None] | None = None) -> Survey:
+    """Read a capture once.
+
+    Args:
+        path: the capture.
+        progress: called with (bytes read, bytes in the file) now and then.
+
+    Raises:
+        CaptureError: as `Capture` does.
+    """
+    times, macs, addresses = array("q"), array("Q"), array("I")  # lists would take ten times as much memory
+    total = 0
+    with Capture(path) as capture:
+        for time_ns, length, data in capture:
+            times.append(time_ns)
+            macs.append(int.from_bytes(data[6:12], "big"))
+            addresses.append(_ipv4_source(data))
+            total += length
+            if progress is not None and len(times) % _BATCH == 0:
+                progress(capture.position, capture.size)
+        cut = capture.cut
+    return Survey(
+        path,
+        np.array(times, np.int64),
+        np.array(macs, np.uint64),
+        np.array(addresses, np.uint32),
+        total,
+        cut,
+    )
+
+
+def _ipv4_source(data: bytes) -> int:
+    offset = 12
+    ethertype = data[12:14]
+    while ethertype in (b"\x81\x00", b"\x88\xa8") and offset < 20:
+        offset += 4
+        ethertype = data[offset : offset + 2]
+    if ethertype == b"\x08\x00":
+        return int.from_bytes(data[offset + 14 : offset + 18], "big")
+    if ethertype == b"\x08\x06":
+        return int.from_bytes(data[offset + 16 : offset + 20], "big")
+    return 0

@@ -1,0 +1,1 @@
+"""Report of a replay: page, plots and machine-readable files."""

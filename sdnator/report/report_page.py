@@ -1,0 +1,191 @@
+"""The page of a report: one HTML file without anything outside it.  Pure: data in, text out.
+
+Everything that comes from traffic or from a capture's name is escaped.
+"""
+
+import base64
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from typing import Any
+
+_STYLE = """
+:root{color-scheme:light}
+body{font:15px/1.5 system-ui,sans-serif;margin:0;color:#1c1c1c;background:#fff}
+main{max-width:1180px;margin:0 auto;padding:28px 24px 60px}
+h1{font-size:26px;line-height:1.25;margin:0 0 4px}
+h2{font-size:17px;margin:34px 0 10px}
+.from{color:#666;margin:0 0 22px}
+.tiles{display:flex;flex-wrap:wrap;gap:12px;margin:0 0 22px}
+.tile{border:1px solid #ddd;border-radius:8px;padding:10px 16px;min-width:150px;flex:1}
+.tile b{display:block;font-size:24px;font-weight:650}
+.tile span{color:#555;font-size:13px}
+.good{border-left:5px solid #2e8b57}.bad{border-left:5px solid #d1342f}.plain{border-left:5px solid #3b78c3}
+img{width:100%;height:auto;border:1px solid #eee}
+table{border-collapse:collapse;width:100%;font-size:14px}
+th,td{text-align:left;padding:6px 10px;border-bottom:1px solid #e6e6e6;vertical-align:top}
+th{color:#555;font-weight:600}
+td.n{font-variant-numeric:tabular-nums;white-space:nowrap}
+code{font-size:13px;overflow-wrap:anywhere}
+.wide{overflow-x:auto}
+.note{background:#fff7e0;border-left:5px solid #e0a800;padding:8px 14px;margin:6px 0}
+"""
+
+
+def render(
+    *,
+    title: str,
+    summary: Mapping[str, Any],
+    decisions: Sequence[Mapping[str, Any]],
+    notes: Sequence[str],
+    extra: Mapping[str, str],
+    png: bytes,
+    passes: Sequence[tuple[str, Mapping[str, float]]],
+) -> str:
+    """The whole page."""
+    picture = base64.b64encode(png).decode("ascii")
+    parts = [
+        "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'>",
+        "<meta name='viewport' content='width=device-width,initial-scale=1'>",
+        f"<title>SDNator: {escape(title)}</title><style>{_STYLE}</style></head><body><main>",
+        f"<h1>{escape(verdict(summary))}</h1><p class='from'>Replay of {escape(title)}</p>",
+        f"<div class='tiles'>{''.join(_tiles(summary))}</div>",
+        *(f"<p class='note'>{escape(note)}</p>" for note in notes),
+        f"<img alt='Anomaly score of each packet over time' src='data:image/png;base64,{picture}'>",
+        _explanation(summary),
+        _blocks(summary),
+        _decisions(decisions),
+        _figures(summary, extra, passes),
+        "<p>Beside this page: <code>scores.csv</code>, <code>decisions.csv</code>, <code>eve.json</code>, ",
+        "<code>scores.png</code>.</p></main></body></html>\n",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def verdict(summary: Mapping[str, Any]) -> str:
+    """What happened, in one sentence."""
+    blocks, alerts = summary.get("blocks") or [], int(summary.get("alerts") or 0)
+    attack = summary.get("attack_packets")
+    if blocks:
+        senders = len({block["address"] for block in blocks})
+        return f"{_count(senders, 'sender')} blocked{_delay(summary)}{_stopped(summary)}"
+    if summary.get("mitigation") is False:
+        return f"Kitsune alone, nothing blocked: {_count(alerts, 'alert')}"
+    if attack:
+        return (
+            f"The attack was not blocked: {_count(int(attack), 'attack packet')}, {_count(alerts, 'alert')}"
+        )
+    return f"Nothing to block: {_count(alerts, 'alert')}"
+
+
+def _delay(summary: Mapping[str, Any]) -> str:
+    delay = (summary.get("time_to_block_s") or {}).get("capture")
+    return "" if delay is None else f" {delay:.1f} s after the first attack packet"
+
+
+def _stopped(summary: Mapping[str, Any]) -> str:
+    share = _share(summary.get("attack_dropped"), summary.get("attack_after_first_block"))
+    if share is None:
+        return ""
+    hit = summary.get("benign_dropped")
+    others = (
+        "" if hit is None else "; nobody else was hit" if hit == 0 else f"; {hit:,} harmless packets were hit"
+    )
+    return f"; {share} of the attack stopped from then on{others}"
+
+
+def _share(part: Any, whole: Any) -> str | None:
+    """A percentage that says 100 only when nothing is missing."""
+    if part is None or not whole:
+        return None
+    percent = 100 * part / whole
+    if part < whole:
+        percent = min(percent, 99.9)
+    return f"{percent:.1f} %" if percent < 100 else "100 %"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def _tile(kind: str, value: str, text: str) -> str:
+    return f"<div class='tile {kind}'><b>{escape(value)}</b><span>{escape(text)}</span></div>"
+
+
+def _tiles(summary: Mapping[str, Any]) -> Iterator[str]:
+    delay = (summary.get("time_to_block_s") or {}).get("capture")
+    if delay is not None:
+        yield _tile("plain", f"{delay:.1f} s", "from the first attack packet to the block (capture time)")
+    share = _share(summary.get("attack_dropped"), summary.get("attack_after_first_block"))
+    if share is not None:
+        yield _tile(
+            "good" if summary["attack_dropped"] >= 0.95 * summary["attack_after_first_block"] else "bad",
+            share,
+            f"of {summary['attack_after_first_block']:,} attack packets after the block were dropped",
+        )
+    if (hit := summary.get("benign_dropped")) is not None:
+        yield _tile("good" if hit == 0 else "bad", f"{hit:,}", "packets of harmless senders dropped")
+    if (collateral := summary.get("collateral_dropped")) is not None:
+        yield _tile("plain", f"{collateral:,}", "harmless packets of the attacker itself dropped with it")
+    if (lost := summary.get("packets_lost")) is not None:
+        yield _tile("good" if lost == 0 else "bad", f"{lost:,}", "packets lost on the way")
+    if (area := summary.get("auc")) is not None:
+        yield _tile("plain", f"{area:.3f}", "ROC AUC of the scores (Kitsune alone)")
+
+
+def _explanation(summary: Mapping[str, Any]) -> str:
+    both = "The upper plot is Kitsune alone, the lower one the same capture with blocking. "
+    return (
+        f"<p>Each dot is a packet, with the anomaly score that Kitsune gave it; packets over the dashed line are "
+        f"anomalous. {both if summary.get('mitigation') else ''}"
+        "Packets that the switch drops are not scored and are drawn below the scale. "
+        "Answers of an attack's victims count as benign.</p>"
+    )
+
+
+def _blocks(summary: Mapping[str, Any]) -> str:
+    blocks = summary.get("blocks") or []
+    if not blocks:
+        return ""
+    rows = "".join(
+        f"<tr><td><b>{escape(str(block['address']))}</b></td><td class='n'>{escape(str(block['time']))}</td>"
+        f"<td class='n'>{escape(_number(block['packet']))}</td><td>{escape(str(block['reason']))}</td>"
+        f"<td><code>{escape(str(block['handle']))}</code></td></tr>"
+        for block in blocks
+    )
+    head = "<tr><th>Blocked</th><th>Capture time</th><th>At packet</th><th>Why</th><th>Entry in the switch</th></tr>"
+    return f"<h2>Blocks</h2><div class='wide'><table>{head}{rows}</table></div>"
+
+
+def _decisions(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return ""
+    names = ("time", "action", "address", "state", "expires", "reason", "cause")
+    head = "".join(f"<th>{name}</th>" for name in names)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(str(row[name]))}</td>" for name in names) + "</tr>"
+        for row in rows[:200]
+    )
+    more = f"<p>… and {len(rows) - 200:,} more in decisions.csv</p>" if len(rows) > 200 else ""
+    return f"<h2>Decisions</h2><div class='wide'><table><tr>{head}</tr>{body}</table></div>{more}"
+
+
+def _figures(
+    summary: Mapping[str, Any], extra: Mapping[str, str], passes: Sequence[tuple[str, Mapping[str, float]]]
+) -> str:
+    rows = [
+        (name.replace("_", " "), _number(value))
+        for name, value in summary.items()
+        if isinstance(value, int | float | str) and not isinstance(value, bool)
+    ]
+    rows += list(extra.items())
+    rows += [(f"{title}: {name}", f"{value:.4g}") for title, facts in passes for name, value in facts.items()]
+    body = "".join(
+        f"<tr><td>{escape(name)}</td><td class='n'>{escape(value)}</td></tr>" for name, value in rows
+    )
+    return f"<h2>Figures</h2><table>{body}</table>"
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:,.4g}" if isinstance(value, float) else str(value)

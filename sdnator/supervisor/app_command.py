@@ -1,0 +1,47 @@
+"""Command of a DUE app: URLs and settings are in private files, so that arguments hold no secrets."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sdnator.app_catalogue import OURS
+from sdnator.private_files import write_private_json
+
+MODULES: Mapping[str, str] = {
+    "coordinator": "coordinator.service",
+    "dashboard": "sdnator.dashboard",
+    **{name: f"apps.{name}.service" for name in OURS},
+}
+"""Of the parts that belong to the product; others are run by their id."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backends:
+    """URLs of both backends; may hold passwords."""
+
+    updates: str
+    archive: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Further options of the DUE engine."""
+
+
+def app_command(
+    name: str, folder: Path, backends: Backends, settings: Mapping[str, Any], *, directory: Path | None = None
+) -> list[str]:
+    """The arguments of `python -m`; writes NAME.settings.json and NAME.engine.json into the folder, mode 0600.
+
+    Args:
+        name: of the part.
+        folder: for both files.
+        backends: of the engine.
+        settings: of the app.
+        directory: where the engine keeps its spool; None: its default.
+    """
+    places = {"updates": backends.updates, "archive": backends.archive}
+    if directory is not None:
+        places["directory"] = str(directory)
+    engine = write_private_json(folder / f"{name}.engine.json", {**backends.options, **places})
+    chosen = write_private_json(folder / f"{name}.settings.json", settings)
+    program = [MODULES[name]] if name in MODULES else ["sdnator.run_app", name]
+    return [*program, "--engine", engine, "--settings", chosen]

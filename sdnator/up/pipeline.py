@@ -1,0 +1,137 @@
+"""The pipeline that `sdnator up` keeps running: a supervisor with the parts of its plan."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+from due.drivers.redis_wire import Wire
+from due.errors import DueError, InvalidOption
+from sdnator.errors import BadInput, PipelineError
+from sdnator.redaction import redacted
+from sdnator.supervisor import LogLimits, PartReport, Supervisor
+from sdnator.supervisor.log_rotation import put_aside
+from sdnator.up.parts import UpParts
+from sdnator.up.plan import StandingPlan, changes, taken_up
+
+
+class StandingPipeline:
+    """A running pipeline; a context manager.  `tell` gets a line for each part that is restarted.
+
+    Raises:
+        BadInput: for a malformed Data Updates URL.
+        PipelineError: from entering, naming the part that did not start, with the end of its log.
+    """
+
+    def __init__(self, plan: StandingPlan, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._stack = ExitStack()
+        self._parts = UpParts(plan, self._stack)
+        chosen = plan.supervisor
+        self._limits = LogLimits(
+            file_bytes=chosen.file_bytes, files=chosen.log_files, minute_bytes=chosen.minute_bytes
+        )
+        self._supervisor = Supervisor(self._parts.specs(), tell, self._limits)
+
+    def __enter__(self) -> Self:
+        try:
+            self._start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _start(self) -> None:
+        logs = self._parts.logs
+        logs.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for log in logs.glob("*.log"):
+            put_aside(log, self._limits.files)
+        self._parts.address_file.unlink(missing_ok=True)
+        if self.plan.updates:
+            _try(self.plan.updates)
+        self._supervisor.start()
+
+    @property
+    def plan(self) -> StandingPlan:
+        """What holds now."""
+        return self._parts.plan
+
+    @property
+    def updates(self) -> str:
+        """URL of Data Updates; may hold a password."""
+        return self._parts.updates
+
+    @property
+    def coordinator(self) -> str:
+        """URL of the Coordinator's HTTP API."""
+        try:
+            return self._parts.address_file.read_text(encoding="utf-8")
+        except OSError:
+            return ""
+
+    @property
+    def switch_addresses(self) -> dict[str, str]:
+        """Of the P4Runtime servers, by switch."""
+        return {one.name: self._parts.switch_address(one) for one in self.plan.switches}
+
+    @property
+    def dashboard(self) -> str:
+        """URL of the page; empty where there is none."""
+        return self.endpoints("dashboard").get("dashboard", "")
+
+    def endpoints(self, what: str) -> dict[str, str]:
+        """Addresses from the parts' ready lines, by part: `metrics`, `http`."""
+        said = {report.name: self._supervisor.said(report.name) for report in self.reports()}
+        return {name: str(line[what]) for name, line in said.items() if line.get(what)}
+
+    def pids(self) -> dict[str, int]:
+        """Process ids by name; the last one if a part does not run."""
+        return self._supervisor.pids()
+
+    def reports(self) -> list[PartReport]:
+        """State of every part."""
+        return self._supervisor.reports()
+
+    def logs(self) -> dict[str, tuple[int, int]]:
+        """By part: bytes of its logs, and lines that were suppressed."""
+        return self._supervisor.logs()
+
+    def watch(self) -> bool:
+        """Restart parts that have died or hang; True if anything has changed.  Never blocks."""
+        return self._supervisor.watch()
+
+    def wait(self, seconds: float) -> None:
+        """Return after a time limit, or as soon as a part has become ready or has ended."""
+        self._supervisor.wait(seconds)
+
+    def reload(self, plan: StandingPlan) -> None:
+        """Apply the changes of another plan that can be applied now, and report the rest."""
+        found = changes(self.plan, plan)
+        self._parts.plan = taken_up(self.plan, plan, found.again)
+        for name in found.again:
+            self._supervisor.renew(name)
+        for text in found.waits:
+            self._tell(text)
+        self._tell(f"restarted with new settings: {', '.join(found.again) or 'nothing'}")
+
+    def stop(self) -> None:
+        """Stop all parts, the last started first."""
+        try:
+            self._supervisor.stop()
+        finally:
+            self._stack.close()
+
+
+def _try(updates: str) -> None:
+    """Whether a given server is there, before anything is started."""
+    try:
+        Wire(updates).close()
+    except InvalidOption as error:
+        raise BadInput(f"--updates: {redacted(str(error))}") from None
+    except DueError as error:
+        raise PipelineError(redacted(str(error))) from None

@@ -1,0 +1,209 @@
+"""From command line and configuration to the plan of `sdnator up`; errors are reported before anything starts."""
+
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from sdnator import app_catalogue
+from sdnator.config import config_file
+from sdnator.config.planned_switches import PlannedSwitch, planned
+from sdnator.errors import BadInput
+from sdnator.up import running
+from sdnator.up.plan import StandingPlan
+
+if TYPE_CHECKING:
+    from sdnator.config.config_file import Config
+    from sdnator.config.up_settings import SwitchPlan, UpSettings
+
+TRAIN_SHARE = 11
+"""`--train N` gives one packet in eleven to the feature map, as in `sdnator replay`."""
+TOKEN = "SDNATOR_DASHBOARD_TOKEN"  # noqa: S105 - a variable's name
+_GIB = 1 << 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """Options of the command line; empty or None: not given."""
+
+    config: Path | None = None
+    ports: tuple[str, ...] = ()
+    wires: tuple[str, ...] = ()
+    switch: str = ""
+    device_id: int | None = None
+    listen: str = ""
+    updates: str = ""
+    archive: str = ""
+    train: int | None = None
+    model: Path | None = None
+    mitigate: bool = True
+    quota: float | None = None
+    dashboard: bool = True
+    engine: str = ""
+    spark_master: str = ""
+
+    def file(self) -> Path | None:
+        """The configuration that holds."""
+        return self.config.absolute() if self.config is not None else config_file.find()
+
+
+def plan_for(given: Given, state: Path) -> StandingPlan:
+    """The plan; raises BadInput naming what is wrong.  Makes the data folder and the dashboard's token."""
+    config = config_file.load(given.file())
+    own: UpSettings = config.struct("up")
+    archive = given.archive or own.archive
+    settings = {"p4runtime_ctrl": config.section("p4runtime_ctrl"), "sonata_adapter": _adapter(config, given)}
+    settings["coordinator"] = _coordinator(config, given.quota or own.quota, embedded=not archive)
+    settings["kitsune"] = _kitsune(config, given)
+    settings["firewall"] = _firewall(config, given)
+    installed = app_catalogue.names()
+    settings |= {name: config.section(name) for name in installed if name not in settings}
+    log, metrics = config.struct("log"), config.struct("metrics")
+    return StandingPlan(
+        state=state,
+        updates=given.updates or own.updates,
+        archive=_checked_archive(archive) if archive else _own_archive(),
+        switches=tuple(_planned(each) for each in _switches(config, given)),
+        settings=settings,
+        apps=installed,
+        engine=config.section("due"),
+        log_level=log.level,
+        log_format=log.format,
+        metrics_host=metrics.host,
+        metrics_targets=metrics.targets,
+        dashboard=_dashboard(config, state) if given.dashboard else None,
+        supervisor=config.struct("supervisor"),
+    )
+
+
+def _coordinator(config: "Config", quota: float, *, embedded: bool) -> dict[str, Any]:
+    limit = {"retain_bytes": int(quota * _GIB)} if embedded else {}
+    return limit | config.section("coordinator")
+
+
+def _adapter(config: "Config", given: Given) -> dict[str, Any]:
+    """The adapter's settings; an engine that cannot run is reported now, not in its log."""
+    said = {"engine": given.engine, "spark_master": given.spark_master}
+    settings = config.section("sonata_adapter") | {name: value for name, value in said.items() if value}
+    engine = settings.get("engine", "numpy")
+    if engine not in ("numpy", "spark"):
+        raise BadInput(f"--engine {engine}: give numpy or spark")
+    if given.spark_master and engine != "spark":
+        raise BadInput(f"--spark-master {given.spark_master}: only with --engine spark")
+    if engine == "spark":
+        from apps.sonata_adapter.host.spark import SparkMissing, require_spark
+
+        try:
+            require_spark()
+        except SparkMissing as error:
+            raise BadInput(str(error)) from None
+    return settings
+
+
+def _kitsune(config: "Config", given: Given) -> dict[str, Any]:
+    settings = config.section("kitsune")
+    if given.train is not None:
+        fm_grace = given.train // TRAIN_SHARE
+        settings |= {"fm_grace": fm_grace, "ad_grace": given.train - fm_grace}
+    return settings | model_settings(given.model)
+
+
+def model_settings(model: Path | None) -> dict[str, Any]:
+    """Settings of Kitsune for a model file; raises BadInput for an impossible path."""
+    if model is None:
+        return {}
+    path = model.absolute()
+    if not path.parent.is_dir():
+        raise BadInput(f"--model {model}: there is no folder {path.parent}")
+    # only a missing model is written: a later run must not replace a trained model
+    return {"load_model" if path.exists() else "save_model": str(path)}
+
+
+def _firewall(config: "Config", given: Given) -> dict[str, Any]:
+    settings = config.section("firewall")
+    if not given.mitigate:
+        settings["rules"] = {**settings.get("rules", {}), "dry_run": True}
+    return settings
+
+
+def _switches(config: "Config", given: Given) -> "list[SwitchPlan]":
+    """Those of the configuration; options of the command line are about the only one."""
+    switches: list[SwitchPlan] = config.switches()
+    said: dict[str, Any] = {
+        "kind": given.switch,
+        "device_id": given.device_id,
+        "ports": given.ports,
+        "wires": given.wires,
+        "listen": given.listen,
+    }
+    changed = {name: value for name, value in said.items() if value}
+    if changed and len(switches) > 1:
+        option = {
+            "kind": "switch",
+            "ports": "port",
+            "wires": "wire",
+            "device_id": "device-id",
+            "listen": "grpc",
+        }
+        raise BadInput(
+            f"--{option[next(iter(changed))]}: {config.file} has {len(switches)} switches; set it there"
+        )
+    return [msgspec.structs.replace(switches[0], **changed)] if changed else switches
+
+
+def _planned(plan: "SwitchPlan") -> PlannedSwitch:
+    try:
+        return planned(plan)
+    except BadInput as error:
+        raise BadInput(f"switch {plan.name}: {error}" if plan.name != "s1" else str(error)) from None
+
+
+def _dashboard(config: "Config", state: Path) -> dict[str, Any] | None:
+    options = config.struct("dashboard")
+    if not options.enabled:
+        return None
+    settings = config.section("dashboard")
+    named = Path(options.token_file).absolute() if options.token_file else state / "dashboard.token"
+    if not options.token_file:
+        _make_token(named)
+    elif not named.is_file() and not os.environ.get(TOKEN):
+        raise BadInput(
+            f"dashboard.token_file {named}: there is no such file; write a long random text into it"
+        )
+    return {**settings, "token_file": str(named)}
+
+
+def _make_token(path: Path) -> None:
+    """Written once, so that a noted token stays valid."""
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        return
+    except OSError as error:
+        raise BadInput(f"{path}: {error.strerror}; set XDG_STATE_HOME to a folder of yours") from None
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(secrets.token_urlsafe(24) + "\n")
+
+
+def _checked_archive(url: str) -> str:
+    from due.backends import open_archive
+    from due.errors import InvalidOption
+
+    try:
+        open_archive(url).close()
+    except InvalidOption as error:
+        raise BadInput(f"--archive: {error}") from None
+    return url
+
+
+def _own_archive() -> str:
+    folder = running.data_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{folder}: {error.strerror}; set XDG_DATA_HOME to a folder of yours") from None
+    return running.default_archive()

@@ -1,0 +1,174 @@
+"""Which pipeline runs on this machine: the run file of `sdnator up`, and the folders of the product.
+
+    $XDG_STATE_HOME/sdnator   run.json, run.lock (with the process id), logs, settings of the parts, spools
+    $XDG_DATA_HOME/sdnator    archive.db
+    $XDG_CONFIG_HOME/sdnator  sdnator.toml
+
+A running pipeline holds `run.lock`; the kernel releases it even after kill -9, so a stale run file is harmless.
+"""
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sdnator.errors import BadInput, PipelineError
+from sdnator.private_files import write_private_json
+from sdnator.redaction import redacted_values
+
+SCHEMA = 3
+"""Version of the run file; grows when a reader of the old one would misunderstand it."""
+_CLAIM_SECONDS = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Running:
+    """A running pipeline, from its run file."""
+
+    pid: int
+    """Of `sdnator up`; SIGTERM ends it in order."""
+    started: int
+    """UTC, ns."""
+    updates: str
+    archive: str
+    coordinator: str
+    """URL of the HTTP API."""
+    switch: Mapping[str, Any] = field(default_factory=dict)
+    """The first: name, address, device_id, target, ports, forward."""
+    switches: Sequence[Mapping[str, Any]] = field(default_factory=list)
+    """All, each with the same."""
+    parts: Mapping[str, int] = field(default_factory=dict)
+    """Process ids by name; the last one if a part does not run."""
+    health: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """By part: state, restarts, cause of the last death, log_bytes, suppressed_lines."""
+    logs: str = ""
+    dashboard: str = ""
+    """URL of the page; empty: there is none."""
+    token_file: str = ""
+    """File with the token that signs in there."""
+    metrics: Mapping[str, str] = field(default_factory=dict)
+    """HOST:PORT of Prometheus endpoints, by part."""
+    config: str = ""
+    """File that was read."""
+    schema: int = SCHEMA
+
+
+def shown(found: Running) -> dict[str, Any]:
+    """The run file's content for other programs, without passwords."""
+    return redacted_values(
+        {name: getattr(found, name) for name in found.__dataclass_fields__ if name != "schema"}
+    )
+
+
+def state_folder() -> Path:
+    """Folder for state that the next run or other commands use."""
+    return _xdg("XDG_STATE_HOME", ".local/state")
+
+
+def data_folder() -> Path:
+    """Folder for data that the user keeps."""
+    return _xdg("XDG_DATA_HOME", ".local/share")
+
+
+def default_archive() -> str:
+    """URL of the embedded archive."""
+    return f"sqlite://{quote(str(data_folder() / 'archive.db'))}"
+
+
+def _xdg(variable: str, default: str) -> Path:
+    named = Path(os.environ.get(variable, ""))
+    # the XDG standard says to ignore relative paths
+    return (named if named.is_absolute() else Path.home() / default) / "sdnator"
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Be the one pipeline of a state folder; raises PipelineError where there is one, BadInput for the folder."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(folder / "run.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise BadInput(f"{folder}: {error.strerror}; set XDG_STATE_HOME to a folder of yours") from None
+    try:
+        _lock(descriptor, folder)
+        (folder / "run.json").unlink(missing_ok=True)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+        yield
+        (folder / "run.json").unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    """Retries for a moment: commands that check hold the lock while they do so."""
+    deadline = time.monotonic() + _CLAIM_SECONDS
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                raise PipelineError(
+                    f"a pipeline runs already ({folder}): stop it with `sdnator down`"
+                ) from None
+            time.sleep(0.02)
+        else:
+            return
+
+
+def write(folder: Path, running: Running) -> None:
+    """Replace the run file.  Raises OSError."""
+    write_private_json(folder / "run.json", asdict(running))
+
+
+def holder(folder: Path) -> int | None:
+    """Process id of the pipeline of this state folder, also while it starts and stops; None where there is none."""
+    try:
+        descriptor = os.open(folder / "run.lock", os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        written = os.read(descriptor, 32)
+        return int(written) if written.isdigit() else None
+    else:
+        return None
+    finally:
+        os.close(descriptor)
+
+
+def find(folder: Path | None = None) -> Running | None:
+    """The running pipeline, None if there is none; raises BadInput for a run file of another version."""
+    folder = folder or state_folder()
+    if holder(folder) is None:
+        return None
+    path = folder / "run.json"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path} cannot be read ({error}): restart the pipeline") from None
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        raise BadInput(
+            f"{path} was written by another version of sdnator: stop and start the pipeline with this one"
+        )
+    try:
+        return Running(**found)
+    except TypeError as error:
+        raise BadInput(f"{path} is damaged ({error}): stop the pipeline and start it again") from None
+
+
+def need() -> Running:
+    """The running pipeline; raises PipelineError with a remedy if there is none."""
+    found = find()
+    if found is None:
+        raise PipelineError("no pipeline is running: start one with `sdnator up`")
+    return found

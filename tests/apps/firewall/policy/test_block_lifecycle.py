@@ -1,0 +1,124 @@
+"""The life of a block: expiry, extension, probation, escalation, caps."""
+
+from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
+from apps.firewall.policy.rules import Rules, target_of
+from apps.messages import Confirmation, Decision, Sender, Target
+from tests.apps.firewall.alerts import CAMERA, alert
+
+
+def opened(ledger: BlockLifecycle, at_s: int = 100, offences: int = 0) -> Decision:
+    first = alert(at_s)
+    target = target_of(first)
+    assert target is not None
+    return ledger.block(first, target, "hot", (), offences)
+
+
+def confirmation(decision: Decision, state: str) -> Confirmation:
+    return Confirmation.from_value(
+        {"id": decision.id, "switch": "s1", "state": state, "action": "block", "event_time": 101 * SECOND}
+    )
+
+
+def test_first_block_lasts_ten_minutes_and_later_ones_longer():
+    """Repeat offenders stay out for an hour, a day, a week."""
+    lengths = [
+        (d.expires - d.event_time) // SECOND
+        for d in (opened(BlockLifecycle(Rules()), offences=n) for n in range(6))
+    ]
+    assert lengths == [600, 3600, 86_400, 604_800, 604_800, 604_800]
+
+
+def test_block_covers_its_station_and_nobody_else():
+    """A MAC block is of one port of one switch."""
+    ledger = BlockLifecycle(Rules())
+    opened(ledger)
+    assert ledger.covering(CAMERA) is not None
+    assert ledger.covering(Sender(switch="s1", port=2, mac=CAMERA.mac, ip=CAMERA.ip)) is None
+    assert ledger.covering(Sender(switch="s2", port=1, mac=CAMERA.mac, ip=CAMERA.ip)) is None
+
+
+def test_quiet_block_runs_out_into_probation():
+    """It is lifted at its expiry, and for ten minutes one anomalous second blocks again."""
+    ledger = BlockLifecycle(Rules())
+    decision = opened(ledger)
+    assert ledger.due(decision.expires - 1) == []
+    (lifted,) = ledger.due(decision.expires)
+    assert (lifted.action, lifted.id) == ("unblock", decision.id)
+    assert ledger.covering(CAMERA) is None
+    assert ledger.on_probation(CAMERA, decision.expires + 599 * SECOND)
+    assert not ledger.on_probation(CAMERA, decision.expires + 600 * SECOND)
+
+
+def test_probation_that_is_over_takes_no_room():
+    ledger = BlockLifecycle(Rules())
+    for number in range(3):
+        target = Target(kind="ip", address=f"10.0.0.{number}")
+        ledger.open("s1", target, "hot", (), number * 1000 * SECOND, seconds=10)
+        ledger.due((number * 1000 + 10) * SECOND)
+    assert list(ledger.probation) == [("s1", "ip", "10.0.0.2")]
+
+
+def test_block_is_extended_while_the_attack_goes_on():
+    """Sixty-one drops a second are more than three times a training rate of twenty."""
+    ledger = BlockLifecycle(Rules())
+    decision = opened(ledger)
+    ledger.count_drops(decision.id, 61 * 600, decision.expires)
+    (extended,) = ledger.due(decision.expires)
+    assert (extended.action, extended.expires) == ("block", decision.expires + 600 * SECOND)
+    assert "still going on" in extended.reason
+
+
+def test_pause_of_the_flood_does_not_end_the_block():
+    """The rate counts over a minute: half a minute of silence is a pause."""
+    ledger = BlockLifecycle(Rules())
+    decision = opened(ledger)
+    end = decision.expires
+    for before_end, drops in ((120, 0), (60, 6_000), (30, 12_000), (1, 12_000), (0, 12_000)):
+        ledger.count_drops(decision.id, drops, end - before_end * SECOND)
+    assert ledger.due(end)[0].action == "block"
+
+
+def test_drops_at_the_training_rate_do_not_extend():
+    """A camera that only does its usual work is given another chance."""
+    ledger = BlockLifecycle(Rules())
+    decision = opened(ledger)
+    ledger.count_drops(decision.id, 20 * 600, decision.expires)
+    assert ledger.due(decision.expires)[0].action == "unblock"
+
+
+def test_block_refused_by_the_switch_is_not_in_force():
+    """What failed does not count as covered: the next alert tries again."""
+    ledger = BlockLifecycle(Rules())
+    ledger.confirm(confirmation(opened(ledger), "installed"))
+    assert ledger.covering(CAMERA) is not None
+    ledger.confirm(confirmation(opened(ledger), "failed"))
+    assert ledger.covering(CAMERA) is None
+
+
+def test_caps_stop_blocking():
+    """Too many decisions a minute, or blocks in force, stop the firewall."""
+    ledger = BlockLifecycle(Rules(max_decisions_per_minute=2))
+    for second in (100, 101):
+        assert ledger.cap_reached(second * SECOND) is None
+        opened(ledger, second)
+    assert "max_decisions_per_minute" in (ledger.cap_reached(102 * SECOND) or "")
+    assert ledger.cap_reached(161 * SECOND) is None
+    assert "max_blocks" in (BlockLifecycle(Rules(max_blocks=0)).cap_reached(0) or "")
+
+
+def test_dry_run_is_marked():
+    """Decisions of a dry run say so, and are never extended."""
+    ledger = BlockLifecycle(Rules(dry_run=True))
+    decision = opened(ledger)
+    assert decision.dry_run
+    ledger.count_drops(decision.id, 10**6, decision.expires)
+    assert ledger.due(decision.expires)[0].action == "unblock"
+
+
+def test_same_decision_has_the_same_id_in_every_replay():
+    """Ids follow from switch, target and capture time."""
+    assert opened(BlockLifecycle(Rules())).id == opened(BlockLifecycle(Rules())).id
+    other = alert(100, Sender(switch="s1", port=1, mac="00:00:00:00:00:01"))
+    ledger = BlockLifecycle(Rules())
+    made = ledger.block(other, Target(kind="mac", address="00:00:00:00:00:01", port=1), "hot", (), 0)
+    assert made.id != opened(ledger).id

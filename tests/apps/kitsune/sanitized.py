@@ -1,0 +1,115 @@
+"""Runs in a process of its own, with the sanitizers' library: random and extreme columns through the C kernel.
+
+LD_PRELOAD=libasan.so python -m tests.apps.kitsune.sanitized LIBRARY SEED ROUNDS
+"""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from apps.kitsune.afterimage import WIDTH, AfterImage, Mode
+from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, Kernel, load_kernel
+from apps.kitsune.kitnet import KitNet, Layer
+
+EDGES = (0, 1, -1, 4, 6, 255, 65_535, 65_536, 2**31 - 1, -(2**31), 2**32 - 1, 2**48, 2**63 - 1, -(2**63))
+TIMES = (0.0, -1.0, 1e-300, 1e9, -1e18, float(2**63), 1.8e308, math.inf, -math.inf, math.nan)
+
+
+def column(random: np.random.Generator, kind: str, rows: int) -> np.ndarray:
+    """Numbers of few values, so that streams meet, with extremes among them."""
+    if kind == "f8":
+        steady = np.cumsum(random.exponential(0.1, rows)) * random.choice([1.0, 1000.0, -1.0])
+        return np.where(random.random(rows) < 0.1, random.choice(TIMES, rows), steady)
+    size = np.dtype(kind).itemsize
+    small = random.integers(0, 9, rows)
+    wild = np.array([edge & ((1 << 8 * size) - 1) for edge in EDGES], f"u{size}")
+    return np.where(random.random(rows) < 0.2, random.choice(wild, rows), small.astype(f"u{size}")).view(kind)
+
+
+def batch(random: np.random.Generator, rows: int) -> dict[str, np.ndarray]:
+    found = {name: column(random, kind, rows) for name, _, kind in PACKET_FIELDS}
+    found["time_s"] = found.pop("time")
+    found["ip_version"] = random.choice(np.array([0, 4, 6, 7], "u1"), rows)
+    return found
+
+
+def features(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
+    modes: tuple[Mode, ...] = ("reference", "bounded")
+    for number in range(rounds):
+        limits = {"max_streams": int(random.choice([2, 5, 64])), "max_links": int(random.choice([1, 3, 64]))}
+        image = AfterImage(
+            modes[number % 2], horizon=float(random.choice([0.1, 3000])), kernel=kernel, **limits
+        )
+        for _ in range(5):
+            found = image.update(batch(random, int(random.integers(0, 300))))
+            assert found.shape[1] == WIDTH
+        short = batch(random, 50)
+        name = random.choice([name for name, _, _ in PACKET_FIELDS if name != "time"])
+        for wrong in (short[name][:10], np.repeat(short[name], 2), short[name].reshape(5, 10)):
+            try:
+                image.update({**short, name: wrong})
+            except ColumnError:
+                continue
+            raise AssertionError(f"{name} of another length was taken")
+        entry(kernel, short)
+
+
+def entry(kernel: Kernel, columns: dict[str, np.ndarray]) -> None:
+    """The C function refuses what Python would not hand it."""
+    state = kernel.ffi.gc(kernel.lib.afterimage_new(0, 2, 1, 1.0), kernel.lib.afterimage_free)
+    struct, out = kernel.ffi.new("Columns *"), np.empty(10 * WIDTH)
+    arrays = {name: columns["time_s" if name == "time" else name][:10].copy() for name, _, _ in PACKET_FIELDS}
+    for name, kind, _ in PACKET_FIELDS:
+        setattr(struct, name, kernel.pointer(f"const {kind}", arrays[name]))
+    whole = [10] * len(PACKET_FIELDS)
+    for rows, lengths, room in (
+        (11, whole, 2000),
+        (10, [*whole[:-1], 9], 1000),
+        (10, whole, 999),
+        (-1, whole, 1000),
+    ):
+        given = kernel.ffi.new("long[]", lengths)
+        assert (
+            kernel.lib.afterimage_update(state, struct, given, rows, kernel.pointer("double", out), room)
+            == -2
+        )
+    given = kernel.ffi.new("long[]", whole)
+    assert kernel.lib.afterimage_update(state, struct, given, 10, kernel.pointer("double", out), 1000) == 0
+
+
+def network(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
+    for number in range(rounds):
+        width = int(random.integers(2, 30))
+        net = KitNet(
+            width, fm_grace=20, ad_grace=30, max_ae=int(random.integers(1, 9)), clip=number % 2, kernel=kernel
+        )
+        rows = random.normal(size=(90, width))
+        rows[60:][random.random((30, width)) < 0.2] = random.choice(TIMES)
+        net.process(rows)
+        assert net.ensemble is not None
+        broken = Layer.fresh([[0, 1]])
+        broken.index[0, 1] = width
+        net.ensemble = broken
+        for act in (net.learn, net.score):
+            try:
+                act(rows[:16])
+            except ValueError:
+                continue
+            raise AssertionError("an index out of range was taken")
+
+
+def main() -> None:
+    library, seed, rounds = sys.argv[1:]
+    kernel = load_kernel(Path(library))
+    assert kernel is not None
+    random = np.random.default_rng(int(seed))
+    with np.errstate(all="ignore"):
+        features(kernel, random, int(rounds))
+        network(kernel, random, int(rounds))
+    print("clean")
+
+
+if __name__ == "__main__":
+    main()

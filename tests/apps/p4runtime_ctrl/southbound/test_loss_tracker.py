@@ -1,0 +1,79 @@
+"""Losses are counted exactly: gaps, restarts and wrap-around of one stream, and numbers shared by two."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
+
+
+def note(progress, numbers, source="packets"):
+    sequence = np.array(numbers, dtype=np.uint64)
+    getattr(progress, source)(sequence, sequence, sequence.astype(np.int64))
+
+
+@pytest.mark.parametrize(
+    ("fresh", "batches", "lost", "restarts"),
+    [
+        (True, [[1, 2, 3], [4]], 0, 0),
+        (True, [[3, 4]], 2, 0),
+        (False, [[5000, 5001]], 0, 0),  # the controller came later than the switch
+        (False, [[5000, 5003], [5010]], 2 + 6, 0),
+        (False, [[900, 901], [1, 2]], 0, 1),
+        (False, [[900, 901, 1, 2]], 0, 1),
+        (False, [[900, 901], [4]], 3, 1),
+        (False, [[9], [3, 1], [2]], 2, 2),
+    ],
+)  # fmt: skip
+def test_one_stream(fresh, batches, lost, restarts):
+    progress = LossTracker()
+    if fresh:
+        progress.expect_first()
+    for batch in batches:
+        note(progress, batch)
+    assert (progress.lost, progress.restarts) == (lost, restarts)
+    assert progress.received == sum(map(len, batches))
+
+
+@given(
+    st.sets(st.integers(1, 60), min_size=1),
+    st.sets(st.integers(1, 60), min_size=1),
+    st.lists(st.integers(1, 7), min_size=1),
+)
+def test_two_streams_share_their_numbers(packets, digests, steps):
+    progress = LossTracker()
+    progress.expected = frozenset(("packet", "digest"))
+    progress.expect_first()
+    streams = {"packets": sorted(packets), "digests": sorted(digests)}
+    turn = 0
+    while any(streams.values()):
+        source = list(streams)[turn % 2]
+        step = steps[turn % len(steps)]
+        note(progress, streams[source][:step], source)
+        streams[source] = streams[source][step:]
+        turn += 1
+    for source in streams:
+        note(progress, [61], source)
+    missing = set(range(1, 61)) - packets - digests
+    assert progress.lost == len(missing)
+    assert (progress.received, progress.reported) == (len(packets) + 1, len(digests) + 1)
+
+
+def test_a_silent_stream_is_not_waited_for_for_ever():
+    progress = LossTracker()
+    progress.expected = frozenset(("packet", "digest"))
+    note(progress, [1], "digests")
+    note(progress, [2, 4])
+    assert progress.lost == 0
+    note(progress, [100_000])
+    assert progress.lost > 0
+
+
+def test_digests_without_a_number_are_no_gap():
+    progress = LossTracker()
+    note(progress, [0, 0, 0], "digests")
+    note(progress, [1, 2])
+    note(progress, [0, 3, 0], "digests")
+    note(progress, [4])
+    assert (progress.lost, progress.restarts, progress.reported) == (0, 0, 6)

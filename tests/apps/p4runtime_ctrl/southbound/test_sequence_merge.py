@@ -1,0 +1,91 @@
+"""However two streams of one switch interleave, every frame is told once, in order, a copy before a digest."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from apps.p4runtime_ctrl.southbound.sequence_merge import PacketRows, SequenceMerger
+
+BIT = 255
+
+
+def rows(numbers, whole=True, mark=0):
+    numbers = np.asarray(list(numbers), dtype=np.uint64)
+    queries = np.zeros((len(numbers), 32), dtype=np.uint8)
+    queries[:, 0] = 0x80
+    columns = {"sequence": numbers, "mark": np.full(len(numbers), mark)}
+    return PacketRows(columns, queries, np.broadcast_to(np.asarray(whole, dtype=np.bool_), numbers.shape))
+
+
+def told(found):
+    return [int(number) for each in found for number in each.matching(BIT)["sequence"]]
+
+
+def test_covered_digests_wait_for_nothing():
+    unison = SequenceMerger()
+    assert told(unison.digests(rows(range(1, 6)))) == [1, 2, 3, 4, 5]
+    assert (len(unison), unison.waits_for) == (0, 0)
+
+
+def test_a_frame_that_came_as_a_copy_only_takes_its_place():
+    unison = SequenceMerger()
+    assert told(unison.digests(rows([1, 2, 3, 5, 6]))) == [1, 2, 3]
+    assert unison.waits_for == 4
+    assert told(unison.packets(rows([4]))) == [4, 5, 6]
+    assert unison.copies == 1
+
+
+def test_a_copy_stands_for_a_digest_that_does_not_say_all():
+    unison = SequenceMerger()
+    assert told(unison.digests(rows([1, 2, 3], whole=[True, False, True]))) == [1]
+    found = unison.packets(rows([2], mark=1))
+    assert told(found) == [2, 3]
+    assert [each["mark"].tolist() for each in (f.matching(BIT) for f in found)] == [[1, 0]]
+
+
+def test_a_lost_copy_is_not_waited_for_when_its_stream_has_passed():
+    unison = SequenceMerger()
+    assert told(unison.digests(rows([1, 2, 3, 4], whole=[True, False, True, False]))) == [1]
+    assert told(unison.packets(rows([4]))) == [2, 3, 4]
+
+
+def test_what_waits_is_told_when_nothing_more_comes():
+    unison = SequenceMerger()
+    assert not unison.digests(rows([5, 6]))
+    assert told(unison.flush()) == [5, 6]
+    assert not unison.packets(rows([5]))
+    assert not unison.digests(rows([8, 10]))
+    assert told(unison.flush()) == [8, 10]
+    assert unison.skipped == 2
+
+
+def test_a_switch_that_counts_from_one_again():
+    unison = SequenceMerger()
+    assert told(unison.digests(rows([1, 2, 4]))) == [1, 2]
+    assert told(unison.digests(rows([5, 1, 2]))) == [4, 5, 1, 2]
+    assert told(unison.packets(rows([3]))) == [3]
+    assert not unison.digests(rows([0, 0]))
+
+
+@given(
+    kinds=st.lists(st.sampled_from(["digest", "copy", "both", "unread", "lost"]), max_size=60),
+    turns=st.lists(st.tuples(st.booleans(), st.integers(1, 9)), max_size=60),
+)
+def test_any_interleaving_tells_the_same(kinds, turns):
+    streams = {True: [], False: []}
+    for number, kind in enumerate(kinds, start=1):
+        if kind in ("digest", "both", "unread"):
+            streams[True].append((number, kind != "unread"))
+        if kind in ("copy", "both", "unread"):
+            streams[False].append((number, True))
+    unison, got = SequenceMerger(), []
+    everything = [*turns, *[(True, 60), (False, 60)]]
+    for digests, count in everything:
+        taken, streams[digests] = streams[digests][:count], streams[digests][count:]
+        if taken:
+            numbers, whole = zip(*taken, strict=True)
+            take = unison.digests if digests else unison.packets
+            got += told(take(rows(numbers, whole=list(whole))))
+    got += told(unison.flush())
+    assert got == [number for number, kind in enumerate(kinds, start=1) if kind != "lost"]
+    assert len(unison) == 0

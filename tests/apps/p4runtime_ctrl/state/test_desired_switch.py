@@ -1,0 +1,359 @@
+"""A switch is brought to its desired state whatever happened to it, and every decision is confirmed."""
+
+from apps.messages import Decision, TableCommand, TableUpdate, Target
+from apps.p4runtime_ctrl.errors import Unreachable
+from apps.p4runtime_ctrl.state.desired_state import DELETE, INSERT, MODIFY, EntrySet, is_standing
+from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch, UpdateOutcome
+from apps.p4runtime_ctrl.telemetry.classifier import TelemetryRequest
+from sdnator.testing.product_program import program
+
+PACKETS = TelemetryRequest(name="packets", bit=255)
+
+
+class Held:
+    """A transport that keeps entries in memory."""
+
+    def __init__(self):
+        self.loaded = False
+        self.entries, self.standing = EntrySet(), EntrySet()
+        self.batches = []
+        self.refuse = {}
+        self.broken = False
+
+    def ensure_program(self):
+        was, self.loaded = self.loaded, True
+        return not was
+
+    def ensure_copies(self):
+        pass
+
+    def ensure_digests(self):
+        pass
+
+    def read_entries(self):
+        return list(self.entries)
+
+    def read_standing(self, entries):
+        found = [self.standing.get(entry) for entry in entries]
+        return [entry for entry in found if entry is not None]
+
+    def read_counters(self, table_id):
+        return [entry for entry in self.entries if entry.table_id == table_id]
+
+    def write(self, changes):
+        if self.broken:
+            raise Unreachable("gone")
+        self.batches.append([program().describe(change.entry) for change in changes])
+        return [self.one(change) for change in changes]
+
+    def one(self, change):
+        name = program().describe(change.entry)
+        if name in self.refuse:
+            return UpdateOutcome(*self.refuse[name])
+        if is_standing(change.entry):
+            self.standing.put(change.entry)
+        elif change.kind == INSERT:
+            if change.entry in self.entries:
+                return UpdateOutcome(6, "it exists")
+            self.entries.put(change.entry)
+        elif change.kind == MODIFY:
+            self.entries.put(change.entry)
+        elif change.kind == DELETE and not self.entries.discard(change.entry):
+            return UpdateOutcome(5, "there is no such entry")
+        return UpdateOutcome()
+
+    def names(self):
+        return {program().describe(entry) for entry in self.entries}
+
+
+def make(**options):
+    return DesiredSwitch("s1", program(), lambda: (77, 5), **options)
+
+
+def decision(number, action="block", address="10.0.0.1", **fields):
+    target = Target(kind="ip", address=address)
+    return Decision(
+        id=f"d{number}",
+        action=action,
+        switch="s1",
+        target=target,
+        reason="",
+        event_time=1,
+        expires=0,
+        **fields,
+    )
+
+
+def block_name(address):
+    return f"ingress.block_src[is_ipv4=1,src={address}]"
+
+
+def said(confirmations):
+    return [(c.id, c.state) for c in confirmations]
+
+
+def test_a_fresh_switch_gets_everything_and_a_second_time_nothing():
+    held, switch = Held(), make(forward={1: 2, 2: 1})
+    switch.want([PACKETS], None)
+    report = switch.bring_up(held)
+    assert report.program_loaded
+    assert (report.inserted, report.removed, report.failed) == (2, 0, {})
+    assert len(held.batches) == 1
+    again = switch.bring_up(held)
+    assert str(again) == "nothing to change"
+    assert len(held.batches) == 1
+
+
+def test_fail_open_puts_wires_first_and_fail_closed_last():
+    for fail, place in (("open", 0), ("closed", -1)):
+        held, switch = Held(), make(forward={1: 2}, fail=fail)
+        switch.decide([decision(1)], None)
+        switch.want([PACKETS], None)
+        switch.bring_up(held)
+        assert held.batches[0][place] == "ingress.forward_port[ingress_port=1]"
+        switch.withdraw(held)
+        assert ("ingress.forward_port[ingress_port=1]" in held.names()) == (fail == "open")
+
+
+def test_decisions_are_installed_confirmed_and_undone():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    first, second = switch.decide([decision(1), decision(2, address="10.0.0.2")], held)
+    assert (first.state, first.handle, first.event_time, first.arrival) == (
+        "installed", block_name("10.0.0.1"), 77, 5,
+    )  # fmt: skip
+    assert second.target == Target(kind="ip", address="10.0.0.2")
+    assert len(held.batches[-1]) == 2
+    assert said(switch.decide([decision(3)], held)) == [("d3", "exists")]
+    assert switch.blocks == 2
+    assert said(switch.decide([decision(4, "unblock")], held)) == [("d4", "removed")]
+    assert said(switch.decide([decision(5, "unblock")], held)) == [("d5", "removed")]
+    assert held.names() == {block_name("10.0.0.2")}
+
+
+def test_a_block_and_its_undoing_in_one_go_keep_their_order():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    done = switch.decide([decision(1), decision(2, "unblock"), decision(3)], held)
+    assert said(done) == [("d1", "installed"), ("d2", "removed"), ("d3", "installed")]
+    assert held.names() == {block_name("10.0.0.1")}
+
+
+def test_dry_runs_leave_no_trace():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    assert switch.decide([decision(1, dry_run=True)], held) == []
+    assert switch.restore([decision(1, dry_run=True)], []) == []
+    assert not switch.blocks
+    assert not held.names()
+
+
+def test_a_refused_block_is_failed_with_its_name_and_not_tried_for_ever():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    held.refuse[block_name("10.0.0.1")] = (8, "table is full")
+    (answer,) = switch.decide([decision(1)], held)
+    assert answer.state == "failed"
+    assert answer.cause == f"{block_name('10.0.0.1')}: table is full"
+    assert not switch.blocks
+    (answer,) = switch.decide([decision(2, address="nonsense")], held)
+    assert (answer.state, answer.cause) == ("failed", "target 'nonsense' is no IP address")
+
+
+def test_decisions_made_while_the_switch_is_away_are_carried_out_later():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([decision(1)], held)
+    held.broken = True
+    away = switch.decide([decision(2, address="10.0.0.2"), decision(3, "unblock")], held)
+    away += switch.decide([decision(4, address="10.0.0.4")], None)
+    assert {state for _, state in said(away)} == {"failed"}
+    assert "is kept" in away[0].cause
+    held.broken = False
+    report = switch.bring_up(held)
+    assert held.names() == {block_name("10.0.0.2"), block_name("10.0.0.4")}
+    assert sorted(said(report.confirmations)) == [("d2", "installed"), ("d3", "removed"), ("d4", "installed")]
+    assert str(report) == "2 inserted, 1 removed"
+
+
+def test_a_restarted_switch_and_a_restarted_controller():
+    held, switch = Held(), make(forward={1: 2})
+    switch.bring_up(held)
+    switch.decide([decision(1), decision(2, address="10.0.0.2"), decision(3, "unblock")], held)
+    anew = Held()
+    assert switch.bring_up(anew).program_loaded
+    assert anew.names() == held.names()
+    history = [decision(1), decision(2, address="10.0.0.2"), decision(3, "unblock")]
+    heir = make(forward={1: 2})
+    assert heir.restore(history, []) == []
+    assert str(heir.bring_up(held)) == "nothing to change"
+    assert counted(heir, held)[0]["id"] == "d2"
+
+
+def test_entries_that_nobody_asked_for_are_removed():
+    held = Held()
+    other = make()
+    other.bring_up(held)
+    other.decide([decision(9, address="10.9.9.9")], held)
+    report = make().bring_up(held)
+    assert str(report) == "1 removed"
+    assert not held.names()
+
+
+def test_commands_are_confirmed_update_by_update():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    good = TableUpdate(
+        kind="insert", table="allow", match={"src": "10.0.0.7"}, action="allow_frame", priority=3
+    )
+    bad = TableUpdate(kind="insert", table="block", match={"port": 5}, action="drop_frame", priority=1)
+    (answer,) = switch.command(TableCommand(id="c1", updates=(good, bad)), held)
+    assert (answer.id, answer.state, answer.action) == ("c1", "failed", "insert")
+    assert "ingress.block: no match field 'port'" in answer.cause
+    assert not held.names()
+    gone = TableUpdate(kind="delete", table="allow", match={"src": "10.0.0.8"}, priority=3)
+    answers = switch.command(TableCommand(id="c2", updates=(good, gone)), held)
+    assert said(answers) == [("c2", "installed"), ("c2", "removed")]
+    assert held.names() == {"ingress.allow[src=10.0.0.7]@3"}
+
+
+def test_an_insert_never_changes_what_is_there():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+
+    def wire(kind, port):
+        update = TableUpdate(
+            kind=kind,
+            table="forward_port",
+            match={"ingress_port": 5},
+            action="to_port",
+            params={"port": port},
+        )
+        (answer,) = switch.command(TableCommand(id="c", updates=(update,)), held)
+        return answer.state, answer.cause
+
+    assert wire("insert", 6) == ("installed", "")
+    assert wire("insert", 6) == ("exists", "it exists")
+    state, cause = wire("insert", 7)
+    assert (state, "use modify" in cause) == ("exists", True)
+    assert str(switch.bring_up(held)) == "nothing to change"
+    assert wire("modify", 7) == ("installed", "")
+
+
+def test_a_command_may_not_touch_the_classifier():
+    update = TableUpdate(
+        kind="modify",
+        table="telemetry_active",
+        action="set_active",
+        params={"active": 0, "copies": 0, "digests": 0},
+    )
+    (answer,) = make().command(TableCommand(id="c1", updates=(update,)), Held())
+    assert "ask for packets by a request" in answer.cause
+
+
+def test_idle_entries_are_deleted_and_confirmed_once():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([decision(1)], held)
+    idle = list(held.entries)
+    assert said(switch.expire(idle, held)) == [("d1", "expired")]
+    assert switch.expire(idle, held) == []
+    assert not held.names()
+
+
+def test_telemetry_follows_what_is_wanted():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.want([PACKETS], held)
+    assert held.batches[-1][-1] == "ingress.telemetry_active[default]"
+    switch.want([PACKETS], held)
+    before = len(held.batches)
+    switch.want([], held)
+    assert held.batches[before][0] == "ingress.telemetry_active[default]"
+    assert str(switch.bring_up(held)) == "nothing to change"
+
+
+def test_while_demand_is_unknown_telemetry_is_left_as_it_is():
+    held, switch = Held(), make()
+    switch.want([PACKETS], None)
+    switch.bring_up(held)
+    heir = make()
+    assert str(heir.bring_up(held)) == "nothing to change"
+    before = len(held.batches)
+    assert heir.want([PACKETS], held) == []
+    assert len(held.batches) == before
+    heir.want([], held)
+    assert held.batches[before][0] == "ingress.telemetry_active[default]"
+
+
+def counted(switch, transport):
+    return switch.readings(
+        entry for table in switch.counted_tables for entry in transport.read_counters(table)
+    )
+
+
+def test_counters_name_the_decision():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([decision(1)], held)
+    assert counted(switch, held) == [{"id": "d1", "handle": block_name("10.0.0.1"), "packets": 0, "bytes": 0}]
+
+
+def service(number, action, port, address="10.0.0.80"):
+    target = Target(kind="ip", address=address, port=port)
+    return Decision(
+        id=f"p{number}", action=action, switch="s1", target=target, reason="", event_time=1, expires=0
+    )
+
+
+def test_a_protected_service_gets_its_meters_and_its_host():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    answers = switch.decide([service(1, "protect", 80), service(2, "protect", 443)], held)
+    assert said(answers) == [("p1", "installed"), ("p2", "installed")]
+    assert answers[0].handle == "ingress.protect[is_ipv4=1,dst=10.0.0.80,dport=80]"
+    host = "ingress.protected_hosts[is_ipv4=1,dst=10.0.0.80]"
+    assert held.names() == {
+        "ingress.protect[is_ipv4=1,dst=10.0.0.80,dport=80]",
+        "ingress.protect[is_ipv4=1,dst=10.0.0.80,dport=443]",
+        host,
+    }
+    slots = {
+        entry.index.index for entry in held.standing if is_standing(entry) and hasattr(entry, "meter_id")
+    }
+    assert slots == {0, 1}
+    assert switch.guards
+    assert str(switch.bring_up(held)) == "nothing to change"
+    assert said(switch.decide([service(3, "unprotect", 80)], held)) == [("p3", "removed")]
+    assert host in held.names()
+    assert said(switch.decide([service(4, "unprotect", 443)], held)) == [("p4", "removed")]
+    assert not held.names()
+    assert not switch.guards
+
+
+def test_a_service_needs_a_port():
+    (answer,) = make().decide([service(1, "protect", None)], Held())
+    assert answer.cause == "protect 10.0.0.80: a service is an IP address and a TCP port"
+
+
+def test_secrets_take_turns_and_survive_a_restart_of_the_switch():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.change_secret(1, 2, held)
+    switch.change_secret(3, 4, held)
+    anew = Held()
+    switch.bring_up(anew)
+    secrets = program().table("guard_secrets").id
+    (entry,) = (e for e in anew.standing if getattr(e, "table_id", 0) == secrets)
+    assert [int.from_bytes(p.value, "big") for p in entry.action.action.params] == [0, 3, 4, 1, 2]
+
+
+def test_known_sources_are_metered():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    update = TableUpdate(
+        kind="insert", table="known_sources", match={"is_ipv4": 1, "src": "10.0.0.5"}, action="known"
+    )
+    assert said(switch.command(TableCommand(id="c", updates=(update,)), held)) == [("c", "installed")]
+    (entry,) = held.entries
+    assert entry.meter_config.cir == 20

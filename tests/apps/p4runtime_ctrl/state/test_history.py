@@ -1,0 +1,55 @@
+"""Decisions come out of the archive in order, once, for the right switch, and none from before."""
+
+import logging
+
+from apps.messages import Decision, Intake, Target
+from apps.p4runtime_ctrl.arrivals import decision_in
+from apps.p4runtime_ctrl.state.history import commands_of, decisions_for
+from due import Item
+
+
+def intake():
+    return Intake(logging.getLogger("test"))
+
+
+def decision(number, switch="s1"):
+    target = Target(kind="ip", address="10.0.0.1")
+    return Decision(
+        id=f"d{number}", action="block", switch=switch, target=target, reason="", event_time=1, expires=0
+    )
+
+
+def item(value, timestamp, key="network.block.firewall.ipv4"):
+    return Item(
+        key=key,
+        value=value,
+        timestamp=timestamp,
+        event_time=1,
+        app_id="firewall",
+        instance_id="i",
+        sequence=timestamp,
+    )
+
+
+def test_order_identity_and_age():
+    archived = [item(decision(n).to_value(), 100 - n) for n in range(5)]
+    recent = [decision(3), decision(9)]
+    found = decisions_for("s1", archived, recent, since=96, intake=intake())
+    assert [each.id for each in found] == ["d3", "d2", "d1", "d0", "d9"]
+
+
+def test_other_switches_and_all_switches():
+    names = ("s1", "s2", "", "*")
+    archived = [item(decision(n, name).to_value(), n + 1) for n, name in enumerate(names)]
+    assert [each.switch for each in decisions_for("s1", archived, [], 0, intake())] == ["s1", "", "*"]
+
+
+def test_what_cannot_be_read_is_left_out(caplog):
+    heard = intake()
+    assert heard.read("decision", decision_in, item({"id": 5}, 1)) is None
+    assert "(fields): Decision:" in caplog.text
+    good = {"id": "c1", "updates": [{"kind": "delete", "table": "t"}]}
+    key = "network.p4_command.firewall.s1"
+    archived = [item({"no": 1}, 1, key), item(good, 2, key), item(good, 0, key)]
+    assert [command.id for command in commands_of(archived, 1, heard)] == ["c1"]
+    assert heard.health()["refused_by_cause"] == {"fields": 1}

@@ -1,0 +1,80 @@
+"""What a switch's worker does first."""
+
+import threading
+
+from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.worker import SwitchWorker
+from sdnator.testing.product_program import program
+from sdnator.testing.waiting import wait_for
+from tests.apps.p4runtime_ctrl.state.test_desired_switch import Held, decision
+
+MINE = SwitchSettings(name="s1", address="", device_id=1)
+
+
+class Written:
+    """What the agent uses of an engine."""
+
+    def __init__(self):
+        self.items = []
+
+    def write(self, key, value, *_, **__):
+        self.items.append((key, value))
+        return True
+
+    def confirmed(self):
+        return [(value["id"], value["state"]) for key, value in self.items if "confirmation" in key]
+
+    def counted(self):
+        return [block["id"] for key, value in self.items if ".switch." in key for block in value["blocks"]]
+
+
+class Connected:
+    """A connection that is there from the start."""
+
+    works = True
+
+    def __init__(self, _):
+        pass
+
+    def stand(self, *, active):
+        pass
+
+    def open(self):
+        pass
+
+    def close(self):
+        pass
+
+    def break_off(self):
+        pass
+
+
+class Slow(Held):
+    """A switch too busy to tell its counters before it is let."""
+
+    broken = False
+
+    def __init__(self):
+        super().__init__()
+        self.asked, self.let = threading.Event(), threading.Event()
+
+    def read_counters(self, table_id):
+        self.asked.set()
+        assert self.let.wait(60)
+        return super().read_counters(table_id)
+
+
+def test_a_decision_does_not_wait_for_counters():
+    engine, switch = Written(), Slow()
+    settings = Settings(switches=(MINE,), program="", p4info="", restore=False)
+    agent = SwitchWorker(engine, settings, MINE, program(), Connected)
+    agent.start(active=True)
+    agent.became_primary(switch)
+    agent.decide(decision(1))
+    assert switch.asked.wait(60)
+    agent.decide(decision(2, address="10.0.0.2"))
+    wait_for(lambda: ("d2", "installed") in engine.confirmed(), 60)
+    assert not engine.counted()
+    switch.let.set()
+    wait_for(lambda: set(engine.counted()) >= {"d1", "d2"}, 60)
+    agent.stop()

@@ -1,0 +1,237 @@
+"""Every Data Updates driver keeps one contract: order, acknowledgement, groups, replay, back-pressure."""
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from due.backends import open_updates
+from due.config import Options
+from due.drivers.base import Delivery, Receiver, UpdatesDriver
+from due.drivers.embedded_redis import EmbeddedServer
+from tests.due.conftest import wait_for
+
+_spaces = itertools.count()
+Open = Callable[..., UpdatesDriver]
+
+
+@pytest.fixture(params=["redis", "memory"])
+def open_driver(request: pytest.FixtureRequest) -> Iterator[Open]:
+    """Opens drivers of one empty place."""
+    name = next(_spaces)
+    server: EmbeddedServer | None = None
+    if request.param == "redis":
+        folder = request.getfixturevalue("tmp_path") / "updates"
+        server = EmbeddedServer(folder)
+        server.start()
+    url = server.url if server is not None else f"memory://contract{name}"
+    opened: list[UpdatesDriver] = []
+
+    def make(**options: object) -> UpdatesDriver:
+        opened.append(open_updates(url, Options(**options)))
+        return opened[-1]
+
+    yield make
+    for driver in opened:
+        driver.close()
+    if server is not None:
+        server.stop()
+
+
+def received(receiver: Receiver, count: int, seconds: float = 30.0) -> list[Delivery]:
+    """The next `count` deliveries, not acknowledged."""
+    found: list[Delivery] = []
+    deadline = time.monotonic() + seconds
+    while len(found) < count:
+        assert time.monotonic() < deadline, f"only {len(found)} of {count} came"
+        found += receiver.receive(0.1)
+    return found
+
+
+def numbers(deliveries: list[Delivery]) -> list[int]:
+    return [int(delivery.payload) for delivery in deliveries]
+
+
+def test_best_effort_reaches_all_who_subscribed_in_order(open_driver: Open) -> None:
+    driver = open_driver()
+    exact, wild, other = (driver.receiver(name, name) for name in ("exact", "wild", "other"))
+    exact.subscribe("a.b.c")
+    wild.subscribe("a.**")
+    other.subscribe("x.y.z")
+    publisher = driver.publisher()
+    publisher.publish("a.b.c", b"1", b"2")
+    publisher.publish("a.b.c", b"3")
+    assert numbers(received(exact, 3)) == numbers(received(wild, 3)) == [1, 2, 3]
+    assert other.receive(0.05) == []
+    exact.unsubscribe("a.b.c")
+    publisher.publish("a.b.c", b"4")
+    assert numbers(received(wild, 1)) == [4]
+    assert exact.receive(0.05) == []
+    for half in (exact, wild, other, publisher):
+        half.close()
+
+
+def test_each_group_reads_a_stream_whole_and_in_order(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher = driver.publisher()
+    groups = [driver.receiver(name, f"{name}1") for name in ("one", "two")]
+    for receiver in groups:
+        receiver.follow("r.x.y")
+    for number in range(200):
+        publisher.append("r.x.y", b"%d" % number)
+    publisher.settle(10)
+    for receiver in groups:
+        found = received(receiver, 200)
+        assert numbers(found) == list(range(200))
+        assert all(delivery.token and delivery.path == "r.x.y" for delivery in found)
+        receiver.close()
+    publisher.close()
+
+
+def test_what_was_not_acknowledged_goes_to_the_next_member_first(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher = driver.publisher()
+    first = driver.receiver("group", "first")
+    first.follow("r.x.y")
+    for number in range(6):
+        publisher.append("r.x.y", b"%d" % number)
+    found = received(first, 6)
+    for delivery in found[:3]:
+        first.acknowledge(delivery)
+    first.close()
+    second = driver.receiver("group", "second")
+    second.follow("r.x.y")
+    second.activate(True, take_over=True)
+    publisher.append("r.x.y", b"6")
+    again = received(second, 4)
+    assert numbers(again) == [3, 4, 5, 6]
+    assert [delivery.tries for delivery in again] == [2, 2, 2, 1]
+    second.close()
+    publisher.close()
+
+
+def test_members_of_a_shared_group_divide_a_stream(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher = driver.publisher()
+    members = [driver.receiver("group", name, shared=True) for name in ("a", "b")]
+    for member in members:
+        member.follow("r.x.y")
+    got: list[list[int]] = [[], []]
+    sent = 0
+    while not all(got):
+        for _ in range(50):
+            publisher.append("r.x.y", b"%d" % sent)
+            sent += 1
+        for mine, member in zip(got, members, strict=True):
+            for delivery in member.receive(0.05):
+                mine.append(int(delivery.payload))
+                member.acknowledge(delivery)
+
+    def read_on() -> bool:
+        for mine, member in zip(got, members, strict=True):
+            for delivery in member.receive(0.05):
+                mine.append(int(delivery.payload))
+                member.acknowledge(delivery)
+        return sum(map(len, got)) >= sent
+
+    wait_for(read_on)
+    assert sorted(got[0] + got[1]) == list(range(sent))
+    for half in (*members, publisher):
+        half.close()
+
+
+def test_a_group_may_begin_again_with_what_is_kept(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher = driver.publisher()
+    for number in range(5):
+        publisher.append("r.x.y", b"%d" % number)
+    publisher.settle(10)
+    late = driver.receiver("late", "l1")
+    late.follow("r.x.y")
+    publisher.append("r.x.y", b"5")
+    assert numbers(received(late, 1)) == [5]
+    replay = driver.receiver("replay", "r1")
+    replay.follow("r.x.y", start="0")
+    assert numbers(received(replay, 6)) == [0, 1, 2, 3, 4, 5]
+    for half in (late, replay, publisher):
+        half.close()
+
+
+def test_a_stream_that_begins_later_is_read_from_its_beginning(open_driver: Open) -> None:
+    driver = open_driver()
+    receiver, publisher = driver.receiver("group", "g1"), driver.publisher()
+    receiver.follow("r.**")
+    publisher.append("r.new.path", b"1")
+    publisher.append("s.other.path", b"2")
+    assert numbers(received(receiver, 1)) == [1]
+    for half in (receiver, publisher):
+        half.close()
+
+
+def test_a_full_window_makes_the_producer_wait_for_its_readers(open_driver: Open) -> None:
+    driver = open_driver(window_bytes=10_000, retain_bytes=0)
+    publisher, receiver = driver.publisher(), driver.receiver("group", "g1")
+    receiver.follow("r.x.y")
+    publisher.append("r.x.y", b"first")
+    receiver.acknowledge(received(receiver, 1)[0])  # from here on the producer knows of this reader
+    sent: list[int] = []
+
+    def write() -> None:
+        for number in range(40):
+            publisher.append("r.x.y", b"%01000d" % number)
+            sent.append(number)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    wait_for(lambda: not publisher.has_room("r.x.y") or len(sent) == 40)
+    assert len(sent) < 40, "it waits"
+    got: list[int] = []
+    while len(got) < 40:
+        receiver.renew()  # as an engine does every second: producers wait for readers that live
+        for delivery in receiver.receive(0.1):
+            got.append(int(delivery.payload))
+            receiver.acknowledge(delivery)
+    writer.join(30)
+    assert got == sent == list(range(40))
+    for half in (receiver, publisher):
+        half.close()
+
+
+def test_a_member_that_rests_receives_nothing_reliable(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher, receiver = driver.publisher(), driver.receiver("group", "g1")
+    receiver.follow("r.x.y")
+    receiver.activate(False)
+    publisher.append("r.x.y", b"1")
+    publisher.settle(10)
+    assert receiver.receive(0.2) == []
+    receiver.activate(True)
+    assert numbers(received(receiver, 1)) == [1]
+    for half in (receiver, publisher):
+        half.close()
+
+
+def test_what_is_set_aside_can_be_listed(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher, receiver = driver.publisher(), driver.receiver("group", "g1")
+    receiver.follow("r.x.y")
+    publisher.append("r.x.y", b"7")
+    (delivery,) = received(receiver, 1)
+    receiver.set_aside(delivery, b"payload", "a callback failed")
+    assert receiver.aside() == [(b"payload", "a callback failed")]
+    assert receiver.statistics()["set_aside"] == 1
+    for half in (receiver, publisher):
+        half.close()
+
+
+def test_wake_ends_a_wait(open_driver: Open) -> None:
+    receiver = open_driver().receiver("group", "g1")
+    receiver.subscribe("a.b.c")
+    waiting = threading.Thread(target=lambda: receiver.receive(600.0))
+    waiting.start()
+    receiver.wake()
+    waiting.join(60)
+    assert not waiting.is_alive()
+    receiver.close()

@@ -1,0 +1,32 @@
+"""A switch comes back as the same one: where it was, with its clock going on."""
+
+import stat
+from contextlib import ExitStack
+from pathlib import Path
+
+from sdnator.supervisor.switch_program import SwitchProgram, socket_address
+
+
+def test_the_embedded_switch_keeps_address_and_clock(tmp_path):
+    switch = SwitchProgram(
+        "embedded", name="switch", logs=tmp_path, ports={1: "null"}, address=f"unix:{tmp_path}/s.sock"
+    )
+    said = []
+    for _ in range(2):
+        child = switch.start()
+        try:
+            child.wait_ready()
+            said.append((switch.address, switch.base_us, child.ready()["base_us"]))
+        finally:
+            child.stop()
+    assert said[0] == said[1]
+    assert said[0][0] == f"unix:{tmp_path}/s.sock"
+
+
+def test_a_long_path_has_its_socket_in_a_short_folder_of_its_own(tmp_path):
+    with ExitStack() as stack:
+        assert socket_address(tmp_path, "s1", stack) == f"unix:{tmp_path}/switch-s1.sock"
+        short = Path(socket_address(tmp_path / ("x" * 90), "s1", stack).removeprefix("unix:"))
+        assert len(str(short)) < 100
+        assert stat.S_IMODE(short.parent.stat().st_mode) == 0o700
+    assert not short.parent.exists()
