@@ -428,7 +428,7 @@ class Target(Message, frozen=True, kw_only=True):
             raise MessageError("range", f"target: {self.address[:80]!r} is no IP address or prefix") from None
 
 
-class Evidence(Message, frozen=True, kw_only=True):
+class Exhibit(Message, frozen=True, kw_only=True):
     """An archived item that supports a decision."""
 
     key: Annotated[str, Meta(max_length=4096)]
@@ -445,7 +445,7 @@ class Decision(Message, frozen=True, kw_only=True):
     switch: Name
     target: Target
     reason: Text
-    evidence: Annotated[tuple[Evidence, ...], Meta(max_length=1000)] = ()
+    evidence: Annotated[tuple[Exhibit, ...], Meta(max_length=1000)] = ()
     event_time: Time
     expires: Time
     """0 = never."""

@@ -14,7 +14,7 @@ from apps.messages import (
     Answer,
     Confirmation,
     Decision,
-    Evidence,
+    Exhibit,
     Instruction,
     MessageError,
     Sender,
@@ -91,7 +91,7 @@ _ALERT = Alert(
 _TARGET = Target(kind="ip", address="10.0.0.0/8")
 _DECISION = Decision(
     id="d1", action="block", switch="s1", target=_TARGET, reason="anomalous", event_time=_NOW, expires=_NOW + 1,
-    evidence=(Evidence(key="network.anomaly.kitsune.alert", timestamp=_NOW, summary="3 of 10"),),
+    evidence=(Exhibit(key="network.anomaly.kitsune.alert", timestamp=_NOW, summary="3 of 10"),),
 )  # fmt: skip
 _CONFIRMATION = Confirmation(
     id="d1", switch="s1", state="installed", action="block", target=_TARGET, handle="t[a=1]", event_time=_NOW

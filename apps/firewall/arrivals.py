@@ -16,7 +16,7 @@ from apps.messages import (
     Alert,
     Confirmation,
     Decision,
-    Evidence,
+    Exhibit,
     Instruction,
     Message,
     MessageError,
@@ -153,7 +153,7 @@ def arps_in(item: Item) -> RecordBatch:
     return read_columns(item.value, {name: PACKET_COLUMNS[name] for name in ARP_COLUMNS}, "ARP")
 
 
-def evidence_of(item: Item, summary: str) -> Evidence:
+def evidence_of(item: Item, summary: str) -> Exhibit:
     """The item as evidence of a decision."""
     at = min(max(0, item.timestamp), LATEST_NS)
-    return Evidence(key=item.key, timestamp=at, summary=summary[:_MOST_SUMMARY])
+    return Exhibit(key=item.key, timestamp=at, summary=summary[:_MOST_SUMMARY])

@@ -43,7 +43,7 @@ from apps.messages import (
     Answer,
     Confirmation,
     Decision,
-    Evidence,
+    Exhibit,
     Instruction,
     Intake,
     MessageError,
@@ -115,7 +115,7 @@ class FirewallService:
         self._rules = settings.rules
         self._known = KnownSources(settings.known_limit)
         self._ledger = BlockLifecycle(settings.rules, known=self._known)
-        self._evidence: defaultdict[Sender, deque[Evidence]] = defaultdict(
+        self._evidence: defaultdict[Sender, deque[Exhibit]] = defaultdict(
             lambda: deque(maxlen=EVIDENCE_KEPT)
         )
         self._counts = dict.fromkeys(("alerts", "handshakes", "syns", "syn_acks", "arp_thefts"), 0)
@@ -482,7 +482,7 @@ class FirewallService:
             return PolicyVerdict(None, f"{target.address} is known from handshakes and may be forged")
         return verdict
 
-    def _remember(self, item: Item, alert: Alert) -> deque[Evidence]:
+    def _remember(self, item: Item, alert: Alert) -> deque[Exhibit]:
         if len(self._evidence) >= SENDERS_KEPT and alert.sender not in self._evidence:
             self._evidence.pop(next(iter(self._evidence)))
         evidence = self._evidence[alert.sender]

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from apps.firewall.evidence.history import DECISIONS, count_offences, instructions_in, offences_query
-from apps.messages import Decision, Evidence
+from apps.messages import Decision, Exhibit
 from due import Item
 from sdnator.blocks.blocks_archive import find
 from sdnator.counted import counted
@@ -43,12 +43,12 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
     }
 
 
-def _all_evidence(steps: list[Decision]) -> Iterator[Evidence]:
+def _all_evidence(steps: list[Decision]) -> Iterator[Exhibit]:
     for step in steps:
         yield from step.evidence
 
 
-def _evidence(evidence: Evidence, archive: str) -> dict[str, Any]:
+def _evidence(evidence: Exhibit, archive: str) -> dict[str, Any]:
     """With what the archive has of it: alerts and instructions are kept, packets are not."""
     items = find(archive, {"dataKey": evidence.key, "timestamp": evidence.timestamp})
     asked = instructions_in(items)

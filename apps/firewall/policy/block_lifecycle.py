@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from apps.firewall.policy.rules import Rules
-from apps.messages import Alert, Confirmation, Decision, Evidence, Sender, Target
+from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
@@ -122,7 +122,7 @@ class BlockLifecycle:
             self.notices.append(OperatorNotice("cap", text, now))
 
     def block(
-        self, alert: Alert, target: Target, reason: str, evidence: Iterable[Evidence], offences: int
+        self, alert: Alert, target: Target, reason: str, evidence: Iterable[Exhibit], offences: int
     ) -> Decision:
         """Open a block; `offences` is the number of earlier ones in the archive."""
         return self.open(
@@ -142,7 +142,7 @@ class BlockLifecycle:
         switch: str,
         target: Target,
         reason: str,
-        evidence: Iterable[Evidence],
+        evidence: Iterable[Exhibit],
         now: int,
         *,
         offences: int = 0,

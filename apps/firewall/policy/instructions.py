@@ -7,7 +7,7 @@ from apps.firewall.evidence.history import allowed_by
 from apps.firewall.policy.block_lifecycle import BlockLifecycle
 from apps.firewall.policy.rules import AllowList, is_mac
 from apps.firewall.syn.syn_defence import EVERY_SWITCH, SynDefence
-from apps.messages import Answer, Decision, Evidence, Instruction, Target
+from apps.messages import Answer, Decision, Exhibit, Instruction, Target
 
 _MOST_ENTRIES = 10_000
 Outcome = tuple[list[Decision], Answer]
@@ -26,7 +26,7 @@ class Desk:
         """Restore the allow-list from before a restart; refused instructions are in the archive, too."""
         self._set_entries(tuple(filter(_is_entry, allowed_by(instructions, self.entries))))
 
-    def carry_out(self, instruction: Instruction, evidence: Evidence, now: int) -> Outcome:
+    def carry_out(self, instruction: Instruction, evidence: Exhibit, now: int) -> Outcome:
         """Decisions to publish, and the answer; a refused instruction changes nothing."""
         try:
             decisions, text = getattr(self, f"_{instruction.verb}")(instruction, evidence, now)
@@ -34,7 +34,7 @@ class Desk:
             return [], Answer(id=instruction.id, done=False, text=str(error))
         return decisions, Answer(id=instruction.id, done=True, text=text)
 
-    def _block(self, instruction: Instruction, evidence: Evidence, now: int) -> tuple[list[Decision], str]:
+    def _block(self, instruction: Instruction, evidence: Exhibit, now: int) -> tuple[list[Decision], str]:
         target = target_in(instruction.subject)
         if self.allow.covers_target(target):
             raise ValueError(
@@ -50,7 +50,7 @@ class Desk:
         )
         return [decision], f"block {decision.id} of {target.address} for {instruction.seconds} s"
 
-    def _unblock(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
+    def _unblock(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
         found = self._ledger.matching(instruction.subject)
         guards = self._syn.release(instruction.subject, now, "by hand")
         if not found and not guards:
@@ -60,13 +60,13 @@ class Desk:
             )
         return self._lift(found, now, "by hand") + guards, f"{len(found) + len(guards)} lifted"
 
-    def _panic(self, _: Instruction, __: Evidence, now: int) -> tuple[list[Decision], str]:
+    def _panic(self, _: Instruction, __: Exhibit, now: int) -> tuple[list[Decision], str]:
         blocks = [block.decision for block in self._ledger.blocks.values()]
         decisions = self._lift(blocks, now, "panic: everything is lifted")
         decisions += self._syn.release_all(now, "panic: everything is lifted")
         return decisions, f"{len(decisions)} lifted; guards that the settings name stay"
 
-    def _allow(self, instruction: Instruction, _: Evidence, now: int) -> tuple[list[Decision], str]:
+    def _allow(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
         if len(self.entries) >= _MOST_ENTRIES:
             raise ValueError(f"the allow-list has {_MOST_ENTRIES} entries; remove some, or name prefixes")
         self._set_entries((*self.entries, instruction.subject))
@@ -76,7 +76,7 @@ class Desk:
         blocks_lifted = "1 block" if len(lifted) == 1 else f"{len(lifted)} blocks"
         return lifted, f"{instruction.subject} is allowed; {blocks_lifted} lifted"
 
-    def _disallow(self, instruction: Instruction, _: Evidence, __: int) -> tuple[list[Decision], str]:
+    def _disallow(self, instruction: Instruction, _: Exhibit, __: int) -> tuple[list[Decision], str]:
         if instruction.subject not in self.entries:
             raise ValueError(
                 f"{instruction.subject} is not on the allow-list: {', '.join(self.entries) or 'empty'}"

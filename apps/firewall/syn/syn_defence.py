@@ -21,7 +21,7 @@ from apps.firewall.policy.rules import AllowList
 from apps.firewall.syn.recent_syns import RecentSyns
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_policy import Sample, SynRules, SynVerdict, judge_syns
-from apps.messages import Decision, Evidence, Target
+from apps.messages import Decision, Exhibit, Target
 
 EVERY_SWITCH = "*"
 UNKNOWN_HISTORY = "history unknown: Data Archives do not answer"
@@ -35,7 +35,7 @@ class Suspicion:
     """A flood towards a host; times are capture time in ns."""
 
     host: str
-    evidence: Evidence
+    evidence: Exhibit
     now: int
     since: int
 
@@ -43,7 +43,7 @@ class Suspicion:
 class Watch:
     """The SYNs towards one host, under examination."""
 
-    def __init__(self, host: str, evidence: Evidence, now: int) -> None:
+    def __init__(self, host: str, evidence: Exhibit, now: int) -> None:
         self.host = host
         self.evidence = evidence
         self.now = now
@@ -267,7 +267,7 @@ class SynDefence:
         service: TcpService,
         switch: str,
         reason: str,
-        evidence: tuple[Evidence, ...],
+        evidence: tuple[Exhibit, ...],
         now: int,
         *,
         expires: int,

@@ -11,7 +11,7 @@ from apps.firewall.syn.recent_syns import HOSTS, Surges
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_defence import SOURCES_SAMPLED, Suspicion, SynDefence
 from apps.firewall.syn.syn_policy import SynRules
-from apps.messages import Decision, Evidence
+from apps.messages import Decision, Exhibit
 from apps.packets import read_frames
 from apps.sonata_adapter.host.handshake import Handshakes
 from due import RecordBatch
@@ -28,7 +28,7 @@ WEB = TcpService("10.0.0.1", 80)
 GATEWAY, RESOLVER, KNOWN, NEIGHBOUR = "10.0.0.254", "10.0.0.253", "10.3.0.7", "10.3.0.8"
 WEB6, KNOWN6 = TcpService("fd00::1", 80), "fd03::7"
 ATTACKER, HOST = 0x02_00_00_00_00_66, 0x02_00_00_00_00_07
-ANY = Evidence(key="k", timestamp=1, summary="a surge")
+ANY = Exhibit(key="k", timestamp=1, summary="a surge")
 
 
 def defence(allow: tuple[str, ...] = (), known: int = 4000) -> SynDefence:

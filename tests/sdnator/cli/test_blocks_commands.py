@@ -6,7 +6,7 @@ import time
 import pytest
 from typer.testing import CliRunner
 
-from apps.messages import Confirmation, Evidence
+from apps.messages import Confirmation, Exhibit
 from due import Item
 from due.backends import open_archive
 from due.drivers.embedded_redis import EmbeddedServer
@@ -156,7 +156,7 @@ def test_a_request_that_nobody_answered_is_not_carried_out_later(tmp_path):
 def test_why_tells_what_switches_did(tmp_path):
     """Confirmations, drop counters, earlier offences and events, in the order of time."""
     url = f"sqlite://{tmp_path / 'archive.db'}"
-    evidence = Evidence(key="network.anomaly.kitsune.alert", timestamp=5, summary="hot")
+    evidence = Exhibit(key="network.anomaly.kitsune.alert", timestamp=5, summary="hot")
     before = decision(id="d0", event_time=1)
     made = decision(evidence=(evidence,))
     said = Confirmation(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apps.messages import Alert, Confirmation, Decision, Evidence, Sender, Target
+from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
 from sdnator.replay.packet_accounting import PacketState
 from sdnator.report import report_files
 from sdnator.report.writer import FILES, PassData, ReportData, ReportError, check_folder, write_report
@@ -24,7 +24,7 @@ def decision(**changes: Any) -> Decision:
         "switch": "s1",
         "target": Target(kind="mac", address=MAC, port=1),
         "reason": "5 anomalous seconds of 10",
-        "evidence": (Evidence(key="network.anomaly.kitsune.alert", timestamp=7, summary="hot"),),
+        "evidence": (Exhibit(key="network.anomaly.kitsune.alert", timestamp=7, summary="hot"),),
         "event_time": T0 + BLOCKED_AT * 10**9,
         "expires": T0 + 900 * 10**9,
     }

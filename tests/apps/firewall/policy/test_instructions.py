@@ -9,12 +9,12 @@ from apps.firewall.policy.rules import AllowList, Rules
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_defence import Suspicion, SynDefence
 from apps.firewall.syn.syn_policy import SynRules
-from apps.messages import Decision, Evidence, Instruction, Target
+from apps.messages import Decision, Exhibit, Instruction, Target
 from tests.apps.firewall.syn.test_recent_syns import batch
 
 WEB = TcpService("10.0.0.1", 80)
 NOW = 1_000 * SECOND
-SAID = Evidence(key="network.instruction.operator.firewall", timestamp=1, summary="said")
+SAID = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary="said")
 
 
 def desk(*allowed: str) -> Desk:

@@ -5,7 +5,7 @@ import ipaddress
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.prefix_aggregation import any_within, crowded_prefixes, gather_blocks, prefix_of
 from apps.firewall.policy.rules import Rules
-from apps.messages import Evidence, Target
+from apps.messages import Exhibit, Target
 
 NOW = 1000 * SECOND
 
@@ -39,7 +39,7 @@ def test_prefix_comes_first_then_its_addresses_are_lifted():
     """No moment without a block; evidence of the latest is kept."""
     ledger = BlockLifecycle(Rules())
     for address in hosts("192.0.2.", 130):
-        evidence = [Evidence(key="k", timestamp=1, summary=address)]
+        evidence = [Exhibit(key="k", timestamp=1, summary=address)]
         ledger.open("*", Target(kind="ip", address=address), "why", evidence, NOW)
     made = list(gather_blocks(ledger, lambda each: {"192.0.2.0/24": list(each)}, NOW))
     assert [each.action for each in made] == ["block"] + ["unblock"] * 130

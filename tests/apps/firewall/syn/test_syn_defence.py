@@ -7,11 +7,11 @@ from apps.firewall.syn.recent_syns import RecentSyns
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_defence import SERVICES_LEARNT, SOURCES_SAMPLED, Suspicion, SynDefence, Watch
 from apps.firewall.syn.syn_policy import SynRules
-from apps.messages import Decision, Evidence
+from apps.messages import Decision, Exhibit
 from tests.apps.firewall.syn.test_recent_syns import batch
 
 WEB = TcpService("10.0.0.1", 80)
-FLOOD = Evidence(key="network.traffic_query.sonata.syn_flood", timestamp=1, summary="120 half-open")
+FLOOD = Exhibit(key="network.traffic_query.sonata.syn_flood", timestamp=1, summary="120 half-open")
 NOW = 1_000 * SECOND
 
 

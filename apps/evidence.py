@@ -1,0 +1,104 @@
+"""What speaks against a sender, or for the protection of a victim: one message for every source of evidence.
+
+    kitsune, sonata_adapter, any app ──Evidence──► firewall   network.evidence.<app>.<kind>
+    kitsune ──TrainingState──► firewall, page                 network.training.<app>
+
+The weight of evidence is a number of nats, so that evidence of different sources adds up: how much more likely
+an attack makes what was seen than the benign traffic of training does.
+"""
+
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
+
+from apps.messages import (
+    Message,
+    MessageError,
+    Name,
+    Number,
+    Rate,
+    Role,
+    Sender,
+    Time,
+    Words,
+    address_in,
+)
+
+EVIDENCE: Final = "network.evidence"
+"""`<EVIDENCE>.<app>.<kind>`"""
+TRAINING: Final = "network.training"
+"""`<TRAINING>.<app>`"""
+MOST_VICTIMS: Final = 16
+MOST_NATS: Final = 1_000.0
+
+Kind = Literal["scan", "flood", "guessing", "spoofing", "unlike_training", "offence", "other"]
+"""What the operator calls it."""
+
+
+class Evidence(Message, frozen=True, kw_only=True):
+    """Something that was seen and that benign traffic does not explain."""
+
+    id: Name
+    kind: Kind
+    source: Name
+    """What found it, the last segment of its key: a statistic, a query."""
+    sender: Sender | None = None
+    """Who did it; None if the senders' addresses are forged or too many to name."""
+    forgeable: bool = True
+    """Whether a third party could have sent this under the sender's address; False after a handshake."""
+    answered: bool = False
+    """Whether the other side took part: two-way conversations alone are never enough for a block."""
+    victims: Annotated[tuple[Name, ...], Meta(max_length=MOST_VICTIMS)] = ()
+    """Addresses of the first victims; `victim_count` says how many there are."""
+    victim_count: Number = 0
+    service: Annotated[str, Meta(max_length=32)] = ""
+    """`tcp/22`, `udp/53`, `arp`; empty if there is no single one."""
+    nats: Annotated[float, Meta(ge=0, le=MOST_NATS)]
+    """Log-likelihood ratio of what is new since the source's last evidence about the same sender."""
+    since: Time
+    """Capture time of the first packet that it rests on, ns."""
+    event_time: Time
+    """Capture time of the last one, ns."""
+    packets: Number
+    """Packets that it rests on."""
+    first_packet: Number = 0
+    """Arrival number at the switch of the packet that made it due."""
+    rate: Rate = 0.0
+    """Packets a second of the sender at that time."""
+    training_rate: Rate = 0.0
+    """The highest rate of any second of training; 0 for a sender never seen in training."""
+    mac_addresses: Number = 0
+    """How many IP addresses were seen behind the sender's MAC."""
+    role: Role = "host"
+    text: Words
+    """In words, with the figures of training beside it."""
+
+    def check(self) -> None:
+        """Check sender, victims and times.
+
+        Raises:
+            MessageError: an address is invalid, or nobody is accused and nobody is a victim.
+        """
+        if self.sender is not None:
+            self.sender.check()
+        for victim in self.victims:
+            address_in(victim, "evidence")
+        if self.sender is None and not self.victims:
+            raise MessageError("fields", "evidence: it names neither a sender nor a victim")
+        if self.since > self.event_time:
+            raise MessageError("time", "evidence: it ends before it begins")
+
+
+class TrainingState(Message, frozen=True, kw_only=True):
+    """How far training is, and what evidence can rest on when it is done."""
+
+    packets: Number
+    """Packets learnt so far."""
+    wanted: Number
+    """Packets of a whole training."""
+    done: bool
+    seconds: Rate
+    """Capture time of training."""
+    senders: Number
+    """Senders that training has seen."""
+    event_time: Time

@@ -1,0 +1,1 @@
+"""What senders do, beside how their packets look: contacts, attempts and floods, against what training saw."""

@@ -1,0 +1,359 @@
+"""What senders do beyond what training saw of them, as findings with a weight.
+
+    contacts that fail     of a sender: in all, by target (port scan), by service (sweep)
+    logins                 connections of a sender to one login service
+    one-way traffic        packets of a sender to one host that does not take part
+    claims                 ARP replies that nobody asked for
+    strange sources        of a victim: unknown addresses whose contacts fail (forged floods)
+    scores                 of a sender: how far Kitsune's scores lie over those of training
+
+Pure.  Each statistic has a `Baseline`; what is above it is weighed in nats, and a finding says what has been
+added since the last one about the same subject.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.behaviour.baseline import BLOCKS, WINDOWS_S, Baseline, SlidingSums
+from apps.kitsune.behaviour.contacts import (
+    ARP,
+    TCP,
+    ContactTracker,
+    FailedContact,
+    PacketRow,
+    service_text,
+)
+from apps.kitsune.behaviour.rows import SenderId, packet_rows
+from apps.kitsune.kernel import Columns
+
+Statistic = Literal["contacts", "ports", "targets", "logins", "one_way", "claims", "strangers", "scores"]
+LOGINS: Final = frozenset(
+    (21, 22, 23, 110, 143, 389, 445, 512, 513, 514, 1433, 1521, 2222, 2323, 3306, 3389, 5432, 5900, 5985, 6379)
+)
+"""TCP ports where passwords are asked for."""
+HALF_LIFE_S: Final = 600.0
+"""After so many seconds without more, half of what was found is forgotten."""
+LEAST_NATS: Final = 1.0
+"""Less is not worth a message."""
+REPLIES_COUNT: Final = 10
+"""A reply makes up for so many packets: bulk transfers are acknowledged now and then."""
+_KEPT: Final = 65_536
+_SYN, _RST, _ACK = 0x02, 0x04, 0x10
+_ASKED_S: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """More than training saw; `nats` is what has been added since the last finding about the same subject."""
+
+    statistic: Statistic
+    sender: SenderId | None
+    """None: strangers towards a victim."""
+    victim: int
+    """Address; 0: several."""
+    service: int
+    """As in `contacts`; -1: several."""
+    nats: float
+    total: float
+    """With what was found before."""
+    count: float
+    """In the window that weighs most."""
+    window_s: float
+    usual: float
+    """The highest of training."""
+    time: float
+    arrival: int
+    answered: bool = False
+
+
+@dataclass(slots=True)
+class _Reported:
+    nats: float
+    time: float
+
+
+class FoundSoFar:
+    """What was reported about each subject, fading with time."""
+
+    def __init__(self) -> None:
+        self._reported: dict[Any, _Reported] = {}
+
+    def added(self, subject: Any, nats: float, time: float) -> float:
+        """The part that is new, if it is worth a message; else 0."""
+        former = self._reported.get(subject)
+        faded = 0.0
+        if former is not None:
+            faded = former.nats * 0.5 ** (max(0.0, time - former.time) / HALF_LIFE_S)
+        if nats - faded < LEAST_NATS:
+            return 0.0
+        if former is None and len(self._reported) >= _KEPT:
+            del self._reported[next(iter(self._reported))]
+        self._reported[subject] = _Reported(nats, time)
+        return nats - faded
+
+
+class _Counter:
+    """One statistic: sliding sums, their baseline, and what was reported."""
+
+    def __init__(self, windows: tuple[float, ...] = WINDOWS_S) -> None:
+        self.sums = SlidingSums(windows)
+        self.baseline = Baseline(len(windows))
+        self.found = FoundSoFar()
+
+    def see(
+        self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0
+    ) -> tuple[float, float, float, float, float] | None:
+        """Count; returns what was added, the weight, the sum, its window and the highest of training."""
+        sums = self.sums.add(subject, time, weight)
+        if block >= 0:
+            self.baseline.learn(whose, block, sums)
+            return None
+        nats, which = self.baseline.nats(whose, sums)
+        if nats < LEAST_NATS:
+            return None
+        added = self.found.added(subject, nats, time)
+        if not added:
+            return None
+        return added, nats, sums[which], self.sums.windows[which], self.baseline.usual(whose, which)
+
+
+@dataclass(slots=True)
+class _Exchange:
+    second: int = -1
+    out: int = 0
+    back: int = 0
+    due: int = 0
+
+
+class Behaviour:
+    """Follows all senders of all switches.
+
+    Args:
+        training_packets: packets of training, to divide it into blocks.
+    """
+
+    def __init__(self, training_packets: int) -> None:
+        self._per_block = max(1, -(-training_packets // BLOCKS))
+        self._packets = 0
+        self._learning = True
+        self.begun = self.seconds = 0.0
+        """Capture time of the first packet, and length of training."""
+        self.senders: set[SenderId] = set()
+        """Senders of training."""
+        self._addresses: set[int] = set()
+        self.contacts = ContactTracker()
+        self._counters: dict[Statistic, _Counter] = {
+            "contacts": _Counter(),
+            "ports": _Counter(),
+            "targets": _Counter(),
+            "logins": _Counter(),
+            "one_way": _Counter(),
+            "claims": _Counter(),
+            "strangers": _Counter((1.0, 10.0)),
+            "scores": _Counter(),
+        }
+        self._exchanges: dict[tuple[int, int], _Exchange] = {}
+        self._asked: dict[tuple[int, int], float] = {}
+        self._logins: dict[tuple[int, int, int, int], None] = {}
+        self._strangers: dict[tuple[int, int], None] = {}
+
+    def add(
+        self, batch: Columns, switch: str, scores: npt.NDArray[np.float64], trained: int, line: float
+    ) -> list[Finding]:
+        """Takes a batch of which the first `trained` packets were training.
+
+        Args:
+            batch: packet columns.
+            switch: where they were seen.
+            scores: Kitsune's, one a packet.
+            trained: packets at the beginning that belong to training.
+            line: score above which benign packets hardly ever lie.
+
+        Returns:
+            What is worth a message.
+        """
+        found: list[Finding] = []
+        logs = np.log(np.maximum(scores, 1e-300) / line).tolist()
+        for number, row in enumerate(packet_rows(batch, switch)):
+            block = -1
+            if number < trained:
+                block = self._train(row)
+            elif self._learning:
+                self._close_training(row.time)
+            for failed in self.contacts.due(row.time):
+                found += self._failed(failed, block)
+            ended = self.contacts.add(row)
+            if ended is not None:
+                found += self._failed(ended, block)
+            found += self._login(row, block)
+            found += self._one_way(row, block)
+            if row.answer and row.reverse == ARP:
+                found += self._claim(row, block)
+            elif row.service == ARP:
+                self._ask(row)
+            if logs[number] > 0 and block < 0:
+                found += self._score(row, logs[number])
+        return found
+
+    def calibrate(self, sender: SenderId, time: float, block: int, log: float) -> None:
+        """Note a benign score over the line, `log` above it."""
+        self._counters["scores"].see(sender, sender, time, block, log)
+
+    def _train(self, row: PacketRow) -> int:
+        block = min(self._packets // self._per_block, BLOCKS - 1)
+        if not self._packets:
+            self.begun = row.time
+        self._packets += 1
+        self.senders.add(row.sender)
+        if row.source:
+            self._addresses.add(row.source)
+        return block
+
+    def _close_training(self, now: float) -> None:
+        self._learning = False
+        self.seconds = max(now - self.begun, 1.0)
+        self.contacts.close_training()
+        for name, counter in self._counters.items():
+            # at the beginning every contact was new
+            early = BLOCKS // 2 if name in ("contacts", "ports", "targets", "strangers") else 0
+            counter.baseline.close(early)
+
+    def _failed(self, failed: FailedContact, block: int) -> list[Finding]:
+        found: list[Finding | None] = []
+        sender, target, service, time = failed.sender, failed.target, failed.service, failed.time
+        if not failed.half_open:
+            for statistic, subject in (
+                ("contacts", sender),
+                ("ports", (sender, target)),
+                ("targets", (sender, service)),
+            ):
+                found.append(self._see(statistic, subject, sender, failed, block))
+        if block >= 0 or sender[3] not in self._addresses:
+            key = (target, service if service < ARP else service)
+            if self._fresh_stranger(sender[3], key):
+                found.append(self._see("strangers", key, key, failed, block))
+        return [each for each in found if each is not None]
+
+    def _fresh_stranger(self, source: int, victim: tuple[int, int]) -> bool:
+        key = (source, hash(victim))
+        if key in self._strangers:
+            return False
+        if len(self._strangers) >= _KEPT:
+            self._strangers.clear()
+        self._strangers[key] = None
+        return True
+
+    def _see(
+        self, statistic: Any, subject: Any, whose: Any, failed: FailedContact, block: int
+    ) -> Finding | None:
+        seen = self._counters[statistic].see(subject, whose, failed.time, block)
+        if seen is None:
+            return None
+        stranger = statistic == "strangers"
+        return Finding(
+            statistic,
+            None if stranger else failed.sender,
+            0 if statistic in ("contacts", "targets") else failed.target,
+            -1 if statistic in ("contacts", "ports") else failed.service,
+            *seen,
+            failed.time,
+            failed.arrival,
+        )
+
+    def _login(self, row: PacketRow, block: int) -> list[Finding]:
+        if row.flags & (_SYN | _ACK | _RST) != _SYN or row.service - TCP not in LOGINS or row.quoted:
+            return []
+        key = (row.source, row.target, row.service, row.reverse)
+        if key in self._logins:
+            return []  # the same SYN again
+        if len(self._logins) >= _KEPT:
+            self._logins.clear()
+        self._logins[key] = None
+        seen = self._counters["logins"].see((row.sender, row.target, row.service), row.sender, row.time, block)
+        return [] if seen is None else [self._finding("logins", row, seen, answered=True)]
+
+    def _one_way(self, row: PacketRow, block: int) -> list[Finding]:
+        if row.group or row.quoted or not row.source or row.service >= ARP:
+            return []
+        second = int(row.time)
+        back = self._exchanges.get((row.target, row.source))
+        if back is not None and back.second == second and not (row.is_tcp and _refuses(row.flags)):
+            back.back += 1
+        if row.answer or (row.is_tcp and _refuses(row.flags)):
+            return []
+        key = (row.source, row.target)
+        mine = self._exchanges.get(key)
+        if mine is None:
+            if len(self._exchanges) >= _KEPT:
+                self._exchanges.clear()
+            mine = self._exchanges[key] = _Exchange()
+        if mine.second != second:
+            mine.second, mine.out, mine.back, mine.due = second, 0, 0, 0
+        mine.out += 1
+        alone = mine.out - REPLIES_COUNT * mine.back
+        counter = self._counters["one_way"]
+        if block >= 0:
+            counter.baseline.learn(row.sender, block, (float(alone), 0.0, 0.0, 0.0))
+            return []
+        if alone < mine.due:
+            return []
+        mine.due = alone + max(1, alone // 8)
+        nats, _ = counter.baseline.nats(row.sender, (float(alone), 0.0, 0.0, 0.0))
+        added = counter.found.added(key, nats, row.time) if nats >= LEAST_NATS else 0.0
+        if not added:
+            return []
+        usual = counter.baseline.usual(row.sender, 0)
+        return [self._finding("one_way", row, (added, nats, float(alone), 1.0, usual))]
+
+    def _ask(self, row: PacketRow) -> None:
+        if len(self._asked) >= _KEPT:
+            self._asked.clear()
+        self._asked[row.source, row.target] = row.time
+
+    def _claim(self, row: PacketRow, block: int) -> list[Finding]:
+        """An ARP reply; one that was asked for is none."""
+        asked = self._asked.get((row.target, row.source))
+        if asked is not None and row.time - asked <= _ASKED_S:
+            return []
+        who: SenderId = (*row.sender[:3], 0)  # it may claim several addresses
+        seen = self._counters["claims"].see(who, who, row.time, block)
+        return [] if seen is None else [self._finding("claims", row, seen)]
+
+    def _score(self, row: PacketRow, log: float) -> list[Finding]:
+        seen = self._counters["scores"].see(row.sender, row.sender, row.time, -1, log)
+        if seen is None:
+            return []
+        there = (row.source, row.target, row.service)
+        back = (row.target, row.source, row.reverse)
+        waits = self.contacts.waits(there) or self.contacts.waits(back)
+        answered = not waits and (self.contacts.knows(there) or self.contacts.knows(back))
+        return [self._finding("scores", row, seen, answered=answered)]
+
+    @staticmethod
+    def _finding(
+        statistic: Statistic,
+        row: PacketRow,
+        seen: tuple[float, float, float, float, float],
+        *,
+        answered: bool = False,
+    ) -> Finding:
+        return Finding(
+            statistic, row.sender, row.target, row.service, *seen, row.time, row.arrival, answered
+        )
+
+
+def _refuses(flags: int) -> bool:
+    """A RST, or a SYN-ACK, which a flooded host sends as well."""
+    return bool(flags & _RST) or flags & (_SYN | _ACK) == _SYN | _ACK
+
+
+def line_of(scores: npt.NDArray[np.float64]) -> float:
+    """The score that one benign packet in a hundred reaches, and never less than a tenth of the paper's threshold."""
+    finite = scores[np.isfinite(scores) & (scores > 0)]
+    if not len(finite):
+        return 1.0
+    return max(math.exp(float(np.quantile(np.log(finite), 0.99))), 0.1)

@@ -1,0 +1,172 @@
+"""Who tries to reach whom, and whether that comes about.
+
+    first packet towards a service ──► pending ──► completed (an answer; for TCP the handshake's end)
+                                          └──► failed: RST, or nothing within the grace period
+
+A contact is an address, another address and a service: a TCP or UDP port, ICMP echo, or ARP.  Only its first
+attempt counts; contacts that training knows never do.  A scanner is known by its contacts that fail (Jung et
+al., Fast Portscan Detection Using Sequential Hypothesis Testing, 2004).
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+GRACE_S: Final = 0.4
+"""Seconds of capture time within which a contact must come about."""
+MOST_CONTACTS: Final = 131_072
+ECHO: Final = 1 << 24
+ARP: Final = 2 << 24
+OTHER: Final = 3 << 24
+TCP: Final = 6 << 16
+UDP: Final = 17 << 16
+_SYN, _RST, _ACK = 0x02, 0x04, 0x10
+_GROUP_BIT: Final = 1 << 40
+_BROADCAST: Final = 0xFFFF_FFFF
+
+Contact = tuple[int, int, int]
+"""Initiator's address, the other's, service."""
+
+
+def service_text(service: int) -> str:
+    """`tcp/22`, `udp/53`, `icmp`, `arp`."""
+    if service >= OTHER:
+        return "ip"
+    if service >= ARP:
+        return "arp"
+    if service >= ECHO:
+        return "icmp"
+    return f"{'tcp' if service >> 16 == 6 else 'udp'}/{service & 0xFFFF}"
+
+
+@dataclass(slots=True)
+class _Pending:
+    time: float
+    sender: Any
+    arrival: int
+    half_open: bool = False
+
+
+class FailedContact(NamedTuple):
+    """A contact that did not come about."""
+
+    time: float
+    sender: Any
+    target: int
+    service: int
+    arrival: int
+    half_open: bool
+    """The other side answered a SYN, and the handshake was not completed."""
+
+
+class PacketRow(NamedTuple):
+    """What the trackers need of a packet."""
+
+    time: float
+    arrival: int
+    sender: Any
+    """Identity of the sender."""
+    source: int
+    target: int
+    service: int
+    """Of the initiator, if this packet is from it: its destination port."""
+    reverse: int
+    """Of the initiator, if this packet answers it: its source port."""
+    flags: int
+    """TCP flags; 0 for others."""
+    is_tcp: bool
+    group: bool
+    """To a multicast or broadcast address."""
+    quoted: bool
+    answer: bool
+    """An ARP reply or an echo reply, which begins nothing."""
+
+
+class ContactTracker:
+    """Follows contacts; bounded by two generations of `MOST_CONTACTS`."""
+
+    def __init__(self) -> None:
+        self.trained: set[Contact] = set()
+        """Contacts of training."""
+        self._learning = True
+        self._young: set[Contact] = set()
+        self._old: set[Contact] = set()
+        self._pending: dict[Contact, _Pending] = {}
+        self._order: deque[tuple[float, Contact]] = deque()
+
+    def close_training(self) -> None:
+        """What is known by now is never counted again."""
+        self.trained = self._young | self._old | self.trained
+        self._young, self._old = set(), set()
+        self._learning = False
+
+    def knows(self, contact: Contact) -> bool:
+        """Whether training or the recent past have seen it."""
+        return contact in self.trained or contact in self._young or contact in self._old
+
+    def waits(self, contact: Contact) -> bool:
+        """Whether it has not come about yet."""
+        return contact in self._pending
+
+    def add(self, row: PacketRow) -> FailedContact | None:
+        """Follow one packet; returns the contact that it ends, if it failed."""
+        if row.quoted or row.group:
+            return None
+        back: Contact = (row.target, row.source, row.reverse)
+        waiting = self._pending.get(back)
+        if waiting is not None:
+            return self._answered(row, back, waiting)
+        if row.answer or self.knows(back):
+            return None
+        there: Contact = (row.source, row.target, row.service)
+        mine = self._pending.get(there)
+        if mine is not None:
+            if mine.half_open and row.flags & _ACK and not row.flags & (_RST | _SYN):
+                self._complete(there)
+            return None
+        if self.knows(there) or (row.is_tcp and _never_begins(row.flags)):
+            return None
+        self._remember(there)
+        if len(self._pending) < MOST_CONTACTS:
+            self._pending[there] = _Pending(row.time, row.sender, row.arrival)
+            self._order.append((row.time + GRACE_S, there))
+        return None
+
+    def due(self, now: float) -> list[FailedContact]:
+        """Contacts whose grace period is over at `now` (seconds of capture time)."""
+        failed = []
+        while self._order and self._order[0][0] <= now:
+            _, contact = self._order.popleft()
+            pending = self._pending.pop(contact, None)
+            if pending is not None:
+                failed.append(_failed(contact, pending, pending.time + GRACE_S))
+        return failed
+
+    def _answered(self, row: PacketRow, contact: Contact, pending: _Pending) -> FailedContact | None:
+        if not row.is_tcp:
+            self._complete(contact)
+        elif row.flags & _RST:
+            del self._pending[contact]
+            return _failed(contact, pending, row.time)
+        elif row.flags & (_SYN | _ACK) == _SYN | _ACK:
+            pending.half_open = True
+        else:
+            self._complete(contact)
+        return None
+
+    def _complete(self, contact: Contact) -> None:
+        del self._pending[contact]
+
+    def _remember(self, contact: Contact) -> None:
+        self._young.add(contact)
+        if len(self._young) >= MOST_CONTACTS:
+            self._old, self._young = self._young, set()
+
+
+def _never_begins(flags: int) -> bool:
+    return bool(flags & _RST) or flags & (_SYN | _ACK) == _SYN | _ACK
+
+
+def _failed(contact: Contact, pending: _Pending, time: float) -> FailedContact:
+    _, target, service = contact
+    return FailedContact(time, pending.sender, target, service, pending.arrival, pending.half_open)
