@@ -46,8 +46,10 @@ class Evidence(Message, frozen=True, kw_only=True):
     """Who did it; None if the senders' addresses are forged or too many to name."""
     forgeable: bool = True
     """Whether a third party could have sent this under the sender's address; False after a handshake."""
-    answered: bool = False
-    """Whether the other side took part: two-way conversations alone are never enough for a block."""
+    forged: bool = False
+    """The sender's address belonged to another host in training: only the MAC and port are the sender's own."""
+    supporting: bool = False
+    """It supports other evidence and is never enough by itself: what is merely unlike training may be harmless."""
     victims: Annotated[tuple[Name, ...], Meta(max_length=MOST_VICTIMS)] = ()
     """Addresses of the first victims; `victim_count` says how many there are."""
     victim_count: Number = 0

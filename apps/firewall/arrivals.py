@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
+from apps.evidence import Evidence, TrainingState
 from apps.firewall.syn.recent_syns import SYN_COLUMNS
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_ack_buffer import ANSWER_COLUMNS
@@ -78,6 +79,18 @@ def alert_in(item: Item) -> Alert:
     """`network.anomaly.kitsune.alert`."""
     sender_of(item)
     return Alert.from_value(item.value)
+
+
+def spoken_in(item: Item) -> Evidence:
+    """`network.evidence.<app>.<kind>`."""
+    sender_of(item)
+    return Evidence.from_value(item.value)
+
+
+def training_in(item: Item) -> TrainingState:
+    """`network.training.<app>`."""
+    sender_of(item)
+    return TrainingState.from_value(item.value)
 
 
 def confirmation_in(item: Item) -> Confirmation:

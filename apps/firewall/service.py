@@ -16,8 +16,9 @@ from uuid import uuid4
 from msgspec import structs
 
 import due.service
+from apps.evidence import EVIDENCE, TRAINING, Evidence, TrainingState
 from apps.firewall import arrivals
-from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict, BoundHost
+from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
 from apps.firewall.enforcement.eve import alert_line, decision_line
@@ -30,9 +31,10 @@ from apps.firewall.evidence.past import ArchivedPast
 from apps.firewall.evidence.recent_rows import AGED_S
 from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
+from apps.firewall.policy.decider import Decider, Proposal
 from apps.firewall.policy.instructions import Desk, refused_as_late
 from apps.firewall.policy.prefix_aggregation import gather_blocks
-from apps.firewall.policy.rules import AllowList, PolicyVerdict, judge
+from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
 from apps.firewall.syn.recent_syns import Surges
 from apps.firewall.syn.services import TcpService
@@ -58,6 +60,8 @@ from due import Capability, Engine, Interest, Item, Key, RecordBatch
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
+    Interest(f"{EVIDENCE}.*.*"),
+    Interest(f"{TRAINING}.*"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
     Interest(history.INSTRUCTIONS),
@@ -115,10 +119,10 @@ class FirewallService:
         self._rules = settings.rules
         self._known = KnownSources(settings.known_limit)
         self._ledger = BlockLifecycle(settings.rules, known=self._known)
-        self._evidence: defaultdict[Sender, deque[Exhibit]] = defaultdict(
-            lambda: deque(maxlen=EVIDENCE_KEPT)
+        self._evidence: defaultdict[Sender, deque[Exhibit]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
+        self._counts = dict.fromkeys(
+            ("alerts", "evidence", "handshakes", "syns", "syn_acks", "arp_thefts"), 0
         )
-        self._counts = dict.fromkeys(("alerts", "handshakes", "syns", "syn_acks", "arp_thefts"), 0)
         services = tuple(TcpService.parse(text) for text in settings.guard)
         allowed = (*settings.rules.allow, *(surroundings() if settings.allow_surroundings else ()))
         after_s = settings.syn.reset_after_ms / 1000
@@ -140,6 +144,9 @@ class FirewallService:
             training_s=settings.arp_training_s,
             settle_s=settings.arp_settle_s,
             contest_s=settings.arp_contest_s,
+        )
+        self._decider = Decider(
+            settings.rules, self._ledger, self._bindings, self._known, lambda: self._desk.allow
         )
         self._archive = Archive(engine, settings.archive_patience_s)
         self._past = ArchivedPast(self._archive, self._intake, settings)
@@ -172,6 +179,8 @@ class FirewallService:
             self._known.changes()
             self._hear(HANDSHAKES, arrivals.handshake_in, self._on_handshake)
         self._hear("network.anomaly.kitsune.alert", arrivals.alert_in, self._on_alert)
+        self._hear(f"{TRAINING}.*", arrivals.training_in, self._on_training)
+        self._hear(f"{EVIDENCE}.*.*", arrivals.spoken_in, self._on_evidence)
         self._hear("network.confirmation.p4runtime_ctrl.*", arrivals.confirmation_in, self._on_confirmation)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
         self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)
@@ -444,50 +453,84 @@ class FirewallService:
         self._counts["alerts"] += 1
         self._announcer.event(alert_line(alert))
         self._lapse(alert.event_time)
-        evidence = self._remember(item, alert)
+        self._remember(alert.sender, evidence_of(item, alert.reason))
         if self._ledger.covering(alert.sender) is not None:
             return
-        probation = self._ledger.on_probation(alert.sender, alert.event_time)
-        verdict = judge(alert, self._rules, self._desk.allow, on_probation=probation)
-        verdict = self._unforged(alert, verdict)
+        verdict = self._decider.alert(alert)
         if verdict.target is None:
             log.info("no block of %s: %s", alert.sender, verdict.reason)
             return
-        cap = self._ledger.cap_reached(alert.event_time, alert.sender.ip)
+        earlier = self._offences_of(verdict.target, alert.event_time)
+        reason = verdict.reason if earlier is not None else f"{verdict.reason} ({UNKNOWN_HISTORY})"
+        self._block(alert, verdict.target, reason, earlier or 0)
+
+    def _on_training(self, _: Item, state: TrainingState) -> None:
+        with self._lock:
+            self._decider.trained(state)
+
+    def _on_evidence(self, item: Item, evidence: Evidence) -> None:
+        with self._lock:
+            self._counts["evidence"] += 1
+            at = self._time.fit(evidence.event_time)
+            if at != evidence.event_time:
+                evidence = structs.replace(evidence, event_time=at, since=min(evidence.since, at))
+            self._lapse(at)
+            if evidence.sender is not None:
+                self._remember(evidence.sender, evidence_of(item, evidence.text))
+            proposal = self._decider.evidence(
+                evidence, item.app_id, lambda target: self._offences_of(target, at)
+            )
+            if proposal is not None:
+                self._follow(proposal, item)
+
+    def _follow(self, proposal: Proposal, item: Item) -> None:
+        """Carry a proposal out, or report why it is not."""
+        evidence = proposal.evidence
+        if proposal.service is not None:
+            exhibits = (evidence_of(item, evidence.text),)
+            for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
+                self._publish(decision)
+            self._decider.settled(proposal)
+        elif proposal.target is None or evidence.sender is None:
+            self._announcer.say(OperatorNotice("refused", proposal.reason, evidence.event_time))
+        else:
+            unknown = "" if proposal.offences is not None else f" ({UNKNOWN_HISTORY})"
+            self._block(evidence, proposal.target, proposal.reason + unknown, proposal.offences or 0)
+            self._decider.settled(proposal)
+
+    def _block(self, cause: Alert | Evidence, target: Target, reason: str, offences: int) -> None:
+        """Block a sender, unless a cap forbids it."""
+        sender = cause.sender
+        assert sender is not None  # noqa: S101 - callers have a sender
+        cap = self._ledger.cap_reached(cause.event_time, sender.ip)
         if cap is not None:
-            self._ledger.refuse(cap, alert.sender.ip or alert.sender.mac, alert.event_time)
+            self._ledger.refuse(cap, sender.ip or sender.mac, cause.event_time)
             self._say_notices()
             return
-        earlier = self._archive.find(history.offences_query(verdict.target), most=OFFENCES_READ)
-        reason = verdict.reason if earlier is not None else f"{verdict.reason} ({UNKNOWN_HISTORY})"
-        offences = history.count_offences(earlier or (), verdict.target, alert.event_time)
-        self._publish(self._ledger.block(alert, verdict.target, reason, evidence, offences))
-        for decision in gather_blocks(self._ledger, self._syn.gather, alert.event_time):
-            self._publish(decision)
+        decision = self._ledger.open(
+            sender.switch,
+            target,
+            reason,
+            self._evidence[sender],
+            cause.event_time,
+            offences=offences,
+            first_packet=cause.first_packet,
+            training_rate=cause.training_rate,
+            host=sender.ip,
+        )
+        self._publish(decision)
+        for each in gather_blocks(self._ledger, self._syn.gather, cause.event_time):
+            self._publish(each)
 
-    def _unforged(self, alert: Alert, verdict: PolicyVerdict) -> PolicyVerdict:
-        """An address that others can forge is not blocked; the forger is, if it is known for certain."""
-        target, sender = verdict.target, alert.sender
-        if target is None or target.kind != "ip":
-            return verdict
-        station = BoundHost.of(sender.port, sender.mac)
-        if self._bindings.forged(target.address, station):
-            if self._bindings.is_alone(station):
-                forger = Target(kind="mac", address=sender.mac, port=sender.port)
-                return PolicyVerdict(
-                    forger, f"{verdict.reason}; {target.address} belongs to another, so its forger is"
-                )
-            return PolicyVerdict(None, f"{target.address} belongs to another, and its forger shares a port")
-        if target.address in self._known and not self._rules.block_known_addresses:
-            return PolicyVerdict(None, f"{target.address} is known from handshakes and may be forged")
-        return verdict
+    def _offences_of(self, target: Target, now: int) -> int | None:
+        """Earlier blocks of a target; None if the archive does not answer."""
+        earlier = self._archive.find(history.offences_query(target), most=OFFENCES_READ)
+        return None if earlier is None else history.count_offences(earlier, target, now)
 
-    def _remember(self, item: Item, alert: Alert) -> deque[Exhibit]:
-        if len(self._evidence) >= SENDERS_KEPT and alert.sender not in self._evidence:
+    def _remember(self, sender: Sender, exhibit: Exhibit) -> None:
+        if len(self._evidence) >= SENDERS_KEPT and sender not in self._evidence:
             self._evidence.pop(next(iter(self._evidence)))
-        evidence = self._evidence[alert.sender]
-        evidence.append(evidence_of(item, alert.reason))
-        return evidence
+        self._evidence[sender].append(exhibit)
 
     # -- switches -----------------------------------------------------------------------------
 

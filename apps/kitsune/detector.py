@@ -1,5 +1,6 @@
 """Kitsune without I/O: takes record batches, returns scores and alerts."""
 
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -8,7 +9,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from apps.evidence import Evidence
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
+from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS, Behaviour, Finding
+from apps.kitsune.behaviour.contacts import PacketRow
+from apps.kitsune.behaviour.rows import parts_of
+from apps.kitsune.evidence import evidence_of
 from apps.kitsune.kernel import Columns, Kernel
 from apps.kitsune.kitnet import KitNet
 from apps.kitsune.model_file import Model, NotAModelError, save_model
@@ -122,6 +128,10 @@ class Detector:
         self._check = TrainingCheck()
         self._trained_at_us = 0
         self.senders = Senders()
+        self.behaviour = Behaviour(settings.fm_grace + settings.ad_grace + 1)
+        self._evidence: list[Evidence] = []
+        self._tail: deque[npt.NDArray[np.float64]] = deque()
+        """Features of the last packets of training."""
         self.calibration = Calibration(settings.calibration_packets)
         if model is None:
             self.model = KitNet(
@@ -152,6 +162,7 @@ class Detector:
         if trained:
             self._check.see(batch, trained)
             self._trained_at_us = int(batch["time_us"][trained - 1])
+            self._keep_tail(features[:trained])
         state = np.full(len(scores), SCORED, dtype=np.uint8)
         state[:trained] = TRAIN
         line = self.line
@@ -160,6 +171,16 @@ class Detector:
             return Explanation(features[row].copy(), errors[row - trained].copy())
 
         hot = self.senders.add(batch, switch, scores=scores, trained=trained, line=line, evidence=explain)
+        findings = self.behaviour.add(
+            batch,
+            switch,
+            scores,
+            trained,
+            self._rescored,
+            line,
+            self._to_blocked if self.senders.blocked else None,
+        )
+        self._evidence += [self._as_evidence(finding) for finding in findings]
         over = int(np.count_nonzero(~(scores[trained:] < line)))
         if trained and self.model.is_trained:
             self.training_warnings = self._check.warnings(self.senders.known())
@@ -167,11 +188,53 @@ class Detector:
             self.line = self._line()
         return Scored(scores, state, features, over, line), [self._alert(second) for second in hot]
 
+    def take_evidence(self) -> list[Evidence]:
+        """What was found since the last call."""
+        taken, self._evidence = self._evidence, []
+        return taken
+
+    def _keep_tail(self, features: npt.NDArray[np.float64]) -> None:
+        self._tail.append(features[-CALIBRATION_PACKETS:].copy())
+        while sum(map(len, self._tail)) - len(self._tail[0]) >= CALIBRATION_PACKETS:
+            self._tail.popleft()
+
+    def _rescored(self) -> npt.NDArray[np.float64]:
+        """Scores of the last packets of training, now that the model is trained."""
+        if not self._tail:
+            return np.zeros(0)  # a model of an earlier version, which knows scores only
+        features = np.concatenate(list(self._tail))[-CALIBRATION_PACKETS:]
+        self._tail.clear()
+        scores, _ = self.model.score(features)
+        return scores
+
+    def _as_evidence(self, finding: Finding) -> Evidence:
+        rate = training_rate = 0
+        proven = forged = False
+        if finding.sender is not None:
+            switch, port, mac, address = finding.sender
+            rate, training_rate = self.senders.rates((switch, port, mac, parts_of(address)))
+            proven = self.behaviour.contacts.proven(address)
+            forged = self.behaviour.forged(finding.sender)
+        return evidence_of(
+            finding,
+            self.senders.roles,
+            proven=proven,
+            forged=forged,
+            rate=float(rate),
+            training_rate=float(training_rate),
+        )
+
+    def _to_blocked(self, row: PacketRow) -> bool:
+        """Whether a packet goes to a blocked host, whose answers are dropped."""
+        address = ip_text(*parts_of(row.target))
+        return self.senders.blocked.covers(row.sender[0], mac_text(row.to_mac), address)
+
     def notes(self) -> dict[str, Any]:
         """The data that a model file keeps besides the network."""
         benign = self.calibration.benign
         return {
             "senders": self.senders.to_state(),
+            "behaviour": self.behaviour.to_state(),
             "benign": None if benign is None else benign.to_state(),
             "trained_at_us": self._trained_at_us,
             "training_warnings": self.training_warnings,
@@ -192,6 +255,8 @@ class Detector:
         try:
             benign = Benign(**notes["benign"]) if notes.get("benign") else None
             self.senders = Senders.from_state(notes.get("senders"))
+            if notes.get("behaviour"):
+                self.behaviour = Behaviour.from_state(notes["behaviour"])
             self._trained_at_us = int(notes.get("trained_at_us", 0))
             self.training_warnings = [str(warning) for warning in notes.get("training_warnings", ())]
         except (KeyError, TypeError, ValueError) as error:

@@ -166,6 +166,15 @@ class Senders:
         self._second = None
         return hot
 
+    def rates(self, identity: Identity) -> tuple[int, int]:
+        """Packets of a sender in the open second, and the highest of any second of training."""
+        number = self._ids.get(identity)
+        record = self.records[number] if number is not None else None
+        if number is None or record is None:
+            return 0, 0
+        tally = self._tallies.get(number)
+        return tally.packets if tally is not None else 0, record.training_rate
+
     def known(self) -> list[SenderRecord]:
         """All senders that are remembered."""
         return [record for record in self.records if record is not None]

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 import due.service
+from apps.evidence import EVIDENCE, TRAINING, TrainingState
 from apps.kitsune.detector import Detector, DetectorSettings, Scored
 from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
@@ -25,17 +26,21 @@ PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
 BLOCKS: Final = "network.block.firewall.*"
 SCORE: Final = "network.anomaly.kitsune.score"
 ALERT: Final = "network.anomaly.kitsune.alert"
+EVIDENCE_KEY: Final = f"{EVIDENCE}.kitsune"
+TRAINING_KEY: Final = f"{TRAINING}.kitsune"
 
 INTERESTS = (Interest(PACKETS), Interest(BLOCKS))
 CAPABILITIES = (
     Capability(SCORE, delivery="reliable", archive="always"),
     Capability(ALERT, delivery="reliable", archive="always"),
+    Capability(f"{EVIDENCE_KEY}.*", delivery="reliable", archive="always"),
+    Capability(TRAINING_KEY, delivery="reliable", archive="always"),
 )
 
 _USED: Final = {
     name: PACKET_COLUMNS[name]
     for name in (
-        *("time_us", "arrival", "port", "quoted", "tcp_flags"),
+        *("time_us", "arrival", "port", "quoted", "tcp_flags", "icmp6_type"),
         *(name for name, _, _ in PACKET_FIELDS if name != "time"),
     )
 }
@@ -80,6 +85,8 @@ class KitsuneService:
         self._lock = threading.Lock()
         self._packets = 0
         self._alerts = 0
+        self._found = 0
+        self._training_step = -1
         self._subscriptions: list[Any] = []
 
     def start(self) -> None:
@@ -109,6 +116,7 @@ class KitsuneService:
             "trained": self._detector.trained,
             "training_packets": self._detector.model.training_packets,
             "alerts": self._alerts,
+            "evidence": self._found,
             "line": self._detector.line,
             "training_warnings": self._detector.training_warnings,
             "clock_jumps": self._detector.senders.clock_jumps,
@@ -132,7 +140,9 @@ class KitsuneService:
             self._packets += len(batch)
             event_time = int(batch["time_us"][-1]) * 1_000
             self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
+            self._write_evidence()
             self._write_alerts(alerts)
+            self._tell_training(event_time)
             if self._detector.model.is_trained and not self._told:
                 self._end_of_training()
 
@@ -167,6 +177,29 @@ class KitsuneService:
             "time_us": batch["time_us"],
             "state": scored.state,
         }
+
+    def _write_evidence(self) -> None:
+        for evidence in self._detector.take_evidence():
+            self._found += 1
+            key = f"{EVIDENCE_KEY}.{evidence.source}"
+            self._engine.write(key, evidence.to_value(), [NO_WAIT], event_time=evidence.event_time)
+
+    def _tell_training(self, event_time: int) -> None:
+        """Every tenth of training, and its end."""
+        model, behaviour = self._detector.model, self._detector.behaviour
+        step = 10 if model.is_trained else 10 * model.trained // model.training_packets
+        if step == self._training_step:
+            return
+        self._training_step = step
+        state = TrainingState(
+            packets=model.trained,
+            wanted=model.training_packets,
+            done=model.is_trained,
+            seconds=behaviour.seconds,
+            senders=len(behaviour.senders),
+            event_time=event_time,
+        )
+        self._engine.write(TRAINING_KEY, state.to_value(), [NO_WAIT], event_time=event_time)
 
     def _write_alerts(self, alerts: list[Alert]) -> None:
         for alert in alerts:

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from apps.firewall.policy.rules import Rules
-from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
+from apps.messages import Confirmation, Decision, Exhibit, Sender, Target
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
@@ -120,22 +120,6 @@ class BlockLifecycle:
             self._said[name] = now
             text = f"BLOCKING STOPPED, {cap}: {who} stays unblocked, and others after it"
             self.notices.append(OperatorNotice("cap", text, now))
-
-    def block(
-        self, alert: Alert, target: Target, reason: str, evidence: Iterable[Exhibit], offences: int
-    ) -> Decision:
-        """Open a block; `offences` is the number of earlier ones in the archive."""
-        return self.open(
-            alert.sender.switch,
-            target,
-            reason,
-            evidence,
-            alert.event_time,
-            offences=offences,
-            first_packet=alert.first_packet,
-            training_rate=alert.training_rate,
-            host=alert.sender.ip,
-        )
 
     def open(
         self,

@@ -1,12 +1,13 @@
-"""When a sender may be blocked: pure rules over alerts, no clock and no I/O.
+"""Options of blocking, the allow-list, and the rule of seconds: pure, no clock and no I/O.
 
-A sender is blocked at five anomalous seconds of ten, or at two if its rate is also twenty times its highest
+Under the rule of seconds a sender is blocked at five anomalous seconds of ten, or at two if its rate is also twenty times its highest
 rate of any second of training.  A MAC is blocked only if it has a single address, otherwise the address is;
 routers and servers alert but are not blocked unless the operator says so; the allow-list always wins.
 """
 
 import ipaddress
 from dataclasses import dataclass, field
+from typing import Literal
 
 import msgspec
 
@@ -16,8 +17,12 @@ from apps.messages import Alert, Role, Sender, Target
 class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of blocking."""
 
+    rule: Literal["sequential", "seconds", "paper"] = "sequential"
+    """What decides: the sum of all evidence, anomalous seconds, or the first packet over the threshold."""
+    false_blocks_per_day: float = 0.1
+    """Sequential rule: how many false blocks a day are acceptable; the bound follows from it and from training."""
     anomalous_seconds: int = 5
-    """Anomalous seconds among the last ten that lead to a block."""
+    """Rule of seconds: anomalous seconds among the last ten that lead to a block."""
     hot_seconds_fast: int = 2
     """The same for senders far beyond their training rate."""
     fast_rate_ratio: float = 20.0
@@ -44,6 +49,12 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Length of that prefix for IPv6."""
     dry_run: bool = False
     """Decide and archive, but write nothing to the switch."""
+
+    def __post_init__(self) -> None:
+        if not self.false_blocks_per_day > 0:
+            raise ValueError(
+                f"false_blocks_per_day={self.false_blocks_per_day}: must be greater than 0, for instance 0.1"
+            )
 
 
 @dataclass(frozen=True)
@@ -119,7 +130,7 @@ def judge(alert: Alert, rules: Rules, allow_list: AllowList, *, on_probation: bo
         return PolicyVerdict(None, "the sender is on the allow-list")
     if alert.role in rules.protected_roles:
         return PolicyVerdict(None, f"the sender is a {alert.role}: it alerts but is not blocked")
-    target = target_of(alert)
+    target = narrowest_target(alert.sender, alert.mac_addresses)
     if target is None:
         return PolicyVerdict(
             None,
@@ -139,10 +150,14 @@ def _seconds_needed(alert: Alert, rules: Rules, *, on_probation: bool) -> tuple[
     return rules.anomalous_seconds, f"anomalous in {alert.anomalous_seconds} seconds of the last ten"
 
 
-def target_of(alert: Alert) -> Target | None:
-    """The narrowest match that stops this sender and nobody else; None if there is none."""
-    sender = alert.sender
-    if alert.mac_addresses <= 1:
+def narrowest_target(sender: Sender, mac_addresses: int) -> Target | None:
+    """The narrowest match that stops this sender and nobody else; None if there is none.
+
+    Args:
+        sender: whom to stop.
+        mac_addresses: IP addresses seen behind its MAC.
+    """
+    if mac_addresses <= 1:
         return Target(kind="mac", address=sender.mac, port=sender.port)
     if sender.ip:
         return Target(kind="ip", address=sender.ip)

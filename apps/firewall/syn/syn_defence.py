@@ -254,11 +254,19 @@ class SynDefence:
         return decisions
 
     def _guard(self, service: TcpService, reason: str, watch: Watch) -> list[Decision]:
+        return self.guard(service, reason, (watch.evidence,), watch.now)
+
+    def guard(
+        self, service: TcpService, reason: str, evidence: tuple[Exhibit, ...], now: int
+    ) -> list[Decision]:
+        """Guard a service; nothing if it is guarded already."""
+        expires = now + self.rules.protect_s * SECOND
+        if service in self._guarded:
+            self._guarded[service] = _changed(self._guarded[service], expires=expires)
         if service in self._always or service in self._guarded:
             return []
-        expires = watch.now + self.rules.protect_s * SECOND
         reason = reason if len(self.known) else f"{reason} ({COLD_HISTORY})"
-        made = self._protect(service, EVERY_SWITCH, reason, (watch.evidence,), watch.now, expires=expires)
+        made = self._protect(service, EVERY_SWITCH, reason, evidence, now, expires=expires)
         self._guarded[service] = made
         return [made]
 

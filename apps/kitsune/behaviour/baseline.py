@@ -10,7 +10,7 @@ chapter 3; Efron, 1982).
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ BLOCKS: Final = 10
 MOST_EVENTS: Final = 1_024
 """Events remembered of one subject; of more within a window the oldest do not count."""
 MOST_SUBJECTS: Final = 65_536
-_LEAST_SCALE: Final = 0.75
+LEAST_SCALE: Final = 0.75
 """Events: the scale of the tail where training shows no variation at all."""
 _LEAST_SHARE: Final = 0.25
 """The scale is at least this share of the highest count of training."""
@@ -97,10 +97,12 @@ class Baseline:
 
     Args:
         windows: number of window lengths.
+        least_scale: of the tail, where training shows no variation at all.
     """
 
-    def __init__(self, windows: int) -> None:
+    def __init__(self, windows: int, least_scale: float = LEAST_SCALE) -> None:
         self._windows = windows
+        self._least = least_scale
         self._learning: dict[Any, SubjectMaxima] = {}
         self.highest: dict[Any, list[float]] = {}
         """Highest counts by subject and window."""
@@ -127,7 +129,9 @@ class Baseline:
         """
         ratios: list[float] = []
         for subject, maxima in self._learning.items():
-            self.newcomer = [max(pair) for pair in zip(self.newcomer, maxima.highest(self._windows), strict=True)]
+            self.newcomer = [
+                max(pair) for pair in zip(self.newcomer, maxima.highest(self._windows), strict=True)
+            ]
             late = SubjectMaxima({block: counts for block, counts in maxima.blocks.items() if block >= early})
             self.highest[subject] = late.highest(self._windows)
             for block, counts in late.blocks.items():
@@ -155,7 +159,7 @@ class Baseline:
         for number, (count, usual) in enumerate(zip(counts, most, strict=True)):
             if count > usual:
                 share = max(self.relative, _LEAST_SHARE)
-                weight = (count - usual) / max(_LEAST_SCALE, share * usual)
+                weight = (count - usual) / max(self._least, share * usual)
                 if weight > best:
                     best, which = weight, number
         return best, which
@@ -171,3 +175,23 @@ class Baseline:
             "newcomer": self.newcomer,
             "relative": self.relative,
         }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """The inverse of `to_state`; subjects are lists there, tuples here.
+
+        Raises:
+            KeyError, TypeError, ValueError: the state is not one.
+        """
+        self.highest = {_frozen(subject): self._counts(counts) for subject, counts in state["highest"]}
+        self.newcomer = self._counts(state["newcomer"])
+        self.relative = float(state["relative"])
+
+    def _counts(self, counts: Iterable[Any]) -> list[float]:
+        found = [float(count) for count in counts]
+        if len(found) != self._windows:
+            raise ValueError(f"{len(found)} counts for {self._windows} windows")
+        return found
+
+
+def _frozen(subject: Any) -> Any:
+    return tuple(map(_frozen, subject)) if isinstance(subject, list) else subject

@@ -4,46 +4,97 @@
     logins                 connections of a sender to one login service
     one-way traffic        packets of a sender to one host that does not take part
     claims                 ARP replies that nobody asked for
+    thefts                 ARP packets that claim the address of another, who is present
     strange sources        of a victim: unknown addresses whose contacts fail (forged floods)
     scores                 of a sender: how far Kitsune's scores lie over those of training
+    threshold              a packet over Kitsune's threshold, without weight: for the rule of the paper
 
 Pure.  Each statistic has a `Baseline`; what is above it is weighed in nats, and a finding says what has been
 added since the last one about the same subject.
 """
 
 import math
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.behaviour.baseline import BLOCKS, WINDOWS_S, Baseline, SlidingSums
+from apps.kitsune.behaviour.baseline import BLOCKS, LEAST_SCALE, WINDOWS_S, Baseline, SlidingSums
 from apps.kitsune.behaviour.contacts import (
     ARP,
+    FROM_UDP,
+    STRAY_TCP,
     TCP,
+    UDP,
     ContactTracker,
     FailedContact,
     PacketRow,
-    service_text,
 )
 from apps.kitsune.behaviour.rows import SenderId, packet_rows
 from apps.kitsune.kernel import Columns
 
-Statistic = Literal["contacts", "ports", "targets", "logins", "one_way", "claims", "strangers", "scores"]
+Statistic = Literal[
+    "contacts",
+    "ports",
+    "targets",
+    "logins",
+    "one_way",
+    "claims",
+    "thefts",
+    "strangers",
+    "scores",
+    "threshold",
+]
 LOGINS: Final = frozenset(
-    (21, 22, 23, 110, 143, 389, 445, 512, 513, 514, 1433, 1521, 2222, 2323, 3306, 3389, 5432, 5900, 5985, 6379)
+    (
+        21,
+        22,
+        23,
+        110,
+        143,
+        389,
+        445,
+        512,
+        513,
+        514,
+        1433,
+        1521,
+        2222,
+        2323,
+        3306,
+        3389,
+        5432,
+        5900,
+        5985,
+        6379,
+    )
 )
 """TCP ports where passwords are asked for."""
 HALF_LIFE_S: Final = 600.0
 """After so many seconds without more, half of what was found is forgotten."""
 LEAST_NATS: Final = 1.0
-"""Less is not worth a message."""
+"""Less is not worth a message ..."""
+LEAST_STEP: Final = 0.15
+"""... nor is less than this share of what was said already ..."""
+MOST_NATS: Final = 50.0
+"""... nor anything beyond, since it decides everything."""
 REPLIES_COUNT: Final = 10
 """A reply makes up for so many packets: bulk transfers are acknowledged now and then."""
+CALIBRATION_PACKETS: Final = 5_000
+"""Packets at the end of training whose scores say how benign ones lie."""
 _KEPT: Final = 65_536
+_TINY: Final = 1e-300
 _SYN, _RST, _ACK = 0x02, 0x04, 0x10
+_WELL_KNOWN: Final = 1_024
 _ASKED_S: Final = 3.0
+_PRESENT_S: Final = 60.0
+"""Seconds for which a host that has sent something is present."""
+_THEFT: Final = 5.0
+"""Events that a claim of the address of a present host counts as."""
+_AGAIN_S: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +118,8 @@ class Finding:
     """The highest of training."""
     time: float
     arrival: int
-    answered: bool = False
+    supporting: bool = False
+    """Alone it proves nothing: a conversation that both sides want, or a sender that training knows."""
 
 
 @dataclass(slots=True)
@@ -88,7 +140,8 @@ class FoundSoFar:
         faded = 0.0
         if former is not None:
             faded = former.nats * 0.5 ** (max(0.0, time - former.time) / HALF_LIFE_S)
-        if nats - faded < LEAST_NATS:
+        nats = min(nats, MOST_NATS)
+        if nats - faded < max(LEAST_NATS, LEAST_STEP * faded):
             return 0.0
         if former is None and len(self._reported) >= _KEPT:
             del self._reported[next(iter(self._reported))]
@@ -99,9 +152,9 @@ class FoundSoFar:
 class _Counter:
     """One statistic: sliding sums, their baseline, and what was reported."""
 
-    def __init__(self, windows: tuple[float, ...] = WINDOWS_S) -> None:
+    def __init__(self, least_scale: float = LEAST_SCALE, windows: tuple[float, ...] = WINDOWS_S) -> None:
         self.sums = SlidingSums(windows)
-        self.baseline = Baseline(len(windows))
+        self.baseline = Baseline(len(windows), least_scale)
         self.found = FoundSoFar()
 
     def see(
@@ -115,7 +168,7 @@ class _Counter:
         nats, which = self.baseline.nats(whose, sums)
         if nats < LEAST_NATS:
             return None
-        added = self.found.added(subject, nats, time)
+        added = self.found.added(whose, nats, time)
         if not added:
             return None
         return added, nats, sums[which], self.sums.windows[which], self.baseline.usual(whose, which)
@@ -140,29 +193,46 @@ class Behaviour:
         self._per_block = max(1, -(-training_packets // BLOCKS))
         self._packets = 0
         self._learning = True
-        self.begun = self.seconds = 0.0
+        self.begun, self.seconds = 0.0, 1.0
         """Capture time of the first packet, and length of training."""
         self.senders: set[SenderId] = set()
         """Senders of training."""
         self._addresses: set[int] = set()
+        self._owners: dict[int, set[int]] = {}
+        """Address to the MACs that used it in training."""
+        self._spoke: dict[int, float] = {}
+        """When the owner of an address last sent something."""
         self.contacts = ContactTracker()
         self._counters: dict[Statistic, _Counter] = {
             "contacts": _Counter(),
             "ports": _Counter(),
             "targets": _Counter(),
             "logins": _Counter(),
-            "one_way": _Counter(),
+            "one_way": _Counter(8.0),
             "claims": _Counter(),
-            "strangers": _Counter((1.0, 10.0)),
+            "thefts": _Counter(),
+            "strangers": _Counter(1.5, (1.0, 10.0)),
             "scores": _Counter(),
         }
         self._exchanges: dict[tuple[int, int], _Exchange] = {}
         self._asked: dict[tuple[int, int], float] = {}
         self._logins: dict[tuple[int, int, int, int], None] = {}
         self._strangers: dict[tuple[int, int], None] = {}
+        self._tail: deque[tuple[SenderId, float]] = deque(maxlen=CALIBRATION_PACKETS)
+        """Senders and times of the last packets of training."""
+        self._told: dict[SenderId, float] = {}
+        self.line = 1.0
+        """Score over which benign packets hardly ever are."""
 
     def add(
-        self, batch: Columns, switch: str, scores: npt.NDArray[np.float64], trained: int, line: float
+        self,
+        batch: Columns,
+        switch: str,
+        scores: npt.NDArray[np.float64],
+        trained: int,
+        rescored: Callable[[], npt.NDArray[np.float64]],
+        threshold: float = 1.0,
+        cut_off: Callable[[PacketRow], bool] | None = None,
     ) -> list[Finding]:
         """Takes a batch of which the first `trained` packets were training.
 
@@ -171,51 +241,83 @@ class Behaviour:
             switch: where they were seen.
             scores: Kitsune's, one a packet.
             trained: packets at the beginning that belong to training.
-            line: score above which benign packets hardly ever lie.
+            rescored: scores of the last packets of training by the trained model, `CALIBRATION_PACKETS` at most;
+                asked for once, when training ends.
+            threshold: Kitsune's.
+            cut_off: whether a packet goes to somebody whose answers a block drops, so that it proves nothing.
 
         Returns:
             What is worth a message.
         """
         found: list[Finding] = []
-        logs = np.log(np.maximum(scores, 1e-300) / line).tolist()
+        # where training ends within this batch, the line is known only then
+        logs = [] if self._learning else self._logs(scores)
         for number, row in enumerate(packet_rows(batch, switch)):
             block = -1
             if number < trained:
                 block = self._train(row)
             elif self._learning:
-                self._close_training(row.time)
-            for failed in self.contacts.due(row.time):
-                found += self._failed(failed, block)
-            ended = self.contacts.add(row)
-            if ended is not None:
-                found += self._failed(ended, block)
-            found += self._login(row, block)
-            found += self._one_way(row, block)
-            if row.answer and row.reverse == ARP:
-                found += self._claim(row, block)
-            elif row.service == ARP:
-                self._ask(row)
-            if logs[number] > 0 and block < 0:
+                self._close_training(rescored())
+                logs = self._logs(scores)
+            if cut_off is not None and cut_off(row):
+                continue
+            found += self._row(row, block)
+            if block < 0 and logs[number] > 0:
                 found += self._score(row, logs[number])
+                if scores[number] >= threshold:
+                    found += self._over(row, float(scores[number]))
         return found
 
-    def calibrate(self, sender: SenderId, time: float, block: int, log: float) -> None:
-        """Note a benign score over the line, `log` above it."""
-        self._counters["scores"].see(sender, sender, time, block, log)
+    def _row(self, row: PacketRow, block: int) -> list[Finding]:
+        """All statistics of one packet but its score."""
+        found: list[Finding] = []
+        for failed in self.contacts.due(row.time):
+            found += self._failed(failed, block)
+        ended = self.contacts.add(row)
+        if ended is not None:
+            found += self._failed(ended, block)
+        found += self._login(row, block)
+        found += self._one_way(row, block)
+        if row.service == ARP:
+            found += self._theft(row, block)
+            if row.answer:
+                found += self._claim(row, block)
+            else:
+                self._ask(row)
+        if row.source and row.sender[2] in self._owners.get(row.source, ()):
+            self._spoke[row.source] = row.time
+        return found
+
+    def _logs(self, scores: npt.NDArray[np.float64]) -> list[float]:
+        logs: list[float] = np.log(np.maximum(scores, _TINY) / self.line).tolist()
+        return logs
+
+    def _calibrate(self, scores: npt.NDArray[np.float64]) -> None:
+        """Learn from the last packets of training how their scores lie, now that the model is trained."""
+        self.line = line_of(scores)
+        tail = list(self._tail)[-len(scores) :]
+        per_block = max(1, -(-len(tail) // BLOCKS))
+        for number, ((sender, time), log) in enumerate(zip(tail, self._logs(scores), strict=False)):
+            if log > 0:
+                self._counters["scores"].see(sender, sender, time, number // per_block, log)
+        self._tail.clear()
 
     def _train(self, row: PacketRow) -> int:
         block = min(self._packets // self._per_block, BLOCKS - 1)
         if not self._packets:
             self.begun = row.time
         self._packets += 1
+        self.seconds = max(row.time - self.begun, 1.0)
         self.senders.add(row.sender)
         if row.source:
             self._addresses.add(row.source)
+            self._owners.setdefault(row.source, set()).add(row.sender[2])
+        self._tail.append((row.sender, row.time))
         return block
 
-    def _close_training(self, now: float) -> None:
+    def _close_training(self, rescored: npt.NDArray[np.float64]) -> None:
         self._learning = False
-        self.seconds = max(now - self.begun, 1.0)
+        self._calibrate(rescored)
         self.contacts.close_training()
         for name, counter in self._counters.items():
             # at the beginning every contact was new
@@ -224,7 +326,7 @@ class Behaviour:
 
     def _failed(self, failed: FailedContact, block: int) -> list[Finding]:
         found: list[Finding | None] = []
-        sender, target, service, time = failed.sender, failed.target, failed.service, failed.time
+        sender, target, service = failed.sender, failed.target, failed.service
         if not failed.half_open:
             for statistic, subject in (
                 ("contacts", sender),
@@ -233,7 +335,7 @@ class Behaviour:
             ):
                 found.append(self._see(statistic, subject, sender, failed, block))
         if block >= 0 or sender[3] not in self._addresses:
-            key = (target, service if service < ARP else service)
+            key = (target, _flooded(failed))
             if self._fresh_stranger(sender[3], key):
                 found.append(self._see("strangers", key, key, failed, block))
         return [each for each in found if each is not None]
@@ -254,11 +356,12 @@ class Behaviour:
         if seen is None:
             return None
         stranger = statistic == "strangers"
+        service = _flooded(failed) if stranger else failed.service
         return Finding(
             statistic,
             None if stranger else failed.sender,
             0 if statistic in ("contacts", "targets") else failed.target,
-            -1 if statistic in ("contacts", "ports") else failed.service,
+            -1 if statistic in ("contacts", "ports") else service,
             *seen,
             failed.time,
             failed.arrival,
@@ -273,15 +376,22 @@ class Behaviour:
         if len(self._logins) >= _KEPT:
             self._logins.clear()
         self._logins[key] = None
-        seen = self._counters["logins"].see((row.sender, row.target, row.service), row.sender, row.time, block)
-        return [] if seen is None else [self._finding("logins", row, seen, answered=True)]
+        seen = self._counters["logins"].see(
+            (row.sender, row.target, row.service), row.sender, row.time, block
+        )
+        return [] if seen is None else [self._finding("logins", row, seen)]
 
     def _one_way(self, row: PacketRow, block: int) -> list[Finding]:
         if row.group or row.quoted or not row.source or row.service >= ARP:
             return []
         second = int(row.time)
         back = self._exchanges.get((row.target, row.source))
-        if back is not None and back.second == second and not (row.is_tcp and _refuses(row.flags)):
+        if (
+            back is not None
+            and back.second == second
+            and not row.answer
+            and not (row.is_tcp and _refuses(row.flags))
+        ):
             back.back += 1
         if row.answer or (row.is_tcp and _refuses(row.flags)):
             return []
@@ -303,7 +413,7 @@ class Behaviour:
             return []
         mine.due = alone + max(1, alone // 8)
         nats, _ = counter.baseline.nats(row.sender, (float(alone), 0.0, 0.0, 0.0))
-        added = counter.found.added(key, nats, row.time) if nats >= LEAST_NATS else 0.0
+        added = counter.found.added(row.sender, nats, row.time) if nats >= LEAST_NATS else 0.0
         if not added:
             return []
         usual = counter.baseline.usual(row.sender, 0)
@@ -321,7 +431,26 @@ class Behaviour:
             return []
         who: SenderId = (*row.sender[:3], 0)  # it may claim several addresses
         seen = self._counters["claims"].see(who, who, row.time, block)
-        return [] if seen is None else [self._finding("claims", row, seen)]
+        return [] if seen is None else [self._finding("claims", row._replace(sender=who), seen)]
+
+    def forged(self, sender: SenderId) -> bool:
+        """Whether the sender's address belonged to another MAC in training."""
+        owners = self._owners.get(sender[3], set())
+        return bool(owners) and sender[2] not in owners and not self._learning
+
+    def _theft(self, row: PacketRow, block: int) -> list[Finding]:
+        """A claim of an address that belongs to another, who is present."""
+        if block >= 0 or not row.source or not self.forged(row.sender):
+            return []
+        if row.time - self._spoke.get(row.source, -math.inf) > _PRESENT_S:
+            return []
+        who: SenderId = (*row.sender[:3], 0)
+        seen = self._counters["thefts"].see(who, who, row.time, block, _THEFT)
+        return (
+            []
+            if seen is None
+            else [self._finding("thefts", row._replace(sender=who, target=row.source), seen)]
+        )
 
     def _score(self, row: PacketRow, log: float) -> list[Finding]:
         seen = self._counters["scores"].see(row.sender, row.sender, row.time, -1, log)
@@ -329,9 +458,53 @@ class Behaviour:
             return []
         there = (row.source, row.target, row.service)
         back = (row.target, row.source, row.reverse)
-        waits = self.contacts.waits(there) or self.contacts.waits(back)
-        answered = not waits and (self.contacts.knows(there) or self.contacts.knows(back))
-        return [self._finding("scores", row, seen, answered=answered)]
+        answered = self.contacts.came_about(there) or self.contacts.came_about(back)
+        supporting = answered or row.group or row.sender in self.senders
+        return [self._finding("scores", row, seen, supporting=supporting)]
+
+    def _over(self, row: PacketRow, score: float) -> list[Finding]:
+        """At most once in ten seconds for each sender."""
+        if row.time - self._told.get(row.sender, -math.inf) < _AGAIN_S:
+            return []
+        if len(self._told) >= _KEPT:
+            self._told.clear()
+        self._told[row.sender] = row.time
+        seen = (0.0, 0.0, score, 0.0, self.line)
+        return [self._finding("threshold", row, seen, supporting=True)]
+
+    def to_state(self) -> dict[str, Any]:
+        """What training has taught, as plain values for the model file."""
+        return {
+            "seconds": self.seconds,
+            "line": self.line,
+            "senders": [list(sender) for sender in self.senders],
+            "owners": [[address, sorted(macs)] for address, macs in self._owners.items()],
+            "contacts": [list(contact) for contact in self.contacts.trained],
+            "baselines": {name: counter.baseline.to_state() for name, counter in self._counters.items()},
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Self:
+        """The inverse of `to_state`.
+
+        Raises:
+            KeyError, TypeError, ValueError: the state is not one.
+        """
+        self = cls(1)
+        self._learning = False
+        self.seconds, self.line = float(state["seconds"]), float(state["line"])
+        if not (self.seconds > 0 and self.line > 0):
+            raise ValueError(f"training of {self.seconds} s, line {self.line}")
+        self.senders = {
+            (str(switch), int(port), int(mac), int(ip)) for switch, port, mac, ip in state["senders"]
+        }
+        self._owners = {int(address): set(map(int, macs)) for address, macs in state["owners"]}
+        self._addresses = set(self._owners)
+        self.contacts.trained = {(int(one), int(other), int(what)) for one, other, what in state["contacts"]}
+        self.contacts.close_training()
+        for name, counter in self._counters.items():
+            counter.baseline.restore(state["baselines"][name])
+        return self
 
     @staticmethod
     def _finding(
@@ -339,11 +512,20 @@ class Behaviour:
         row: PacketRow,
         seen: tuple[float, float, float, float, float],
         *,
-        answered: bool = False,
+        supporting: bool = False,
     ) -> Finding:
         return Finding(
-            statistic, row.sender, row.target, row.service, *seen, row.time, row.arrival, answered
+            statistic, row.sender, row.target, row.service, *seen, row.time, row.arrival, supporting
         )
+
+
+def _flooded(failed: FailedContact) -> int:
+    """What a victim is flooded with: a service, datagrams from a well-known port, stray segments."""
+    if failed.service & ~0xFFFF == UDP and failed.reverse - UDP < _WELL_KNOWN:
+        return FROM_UDP | failed.reverse - UDP
+    if failed.service & ~0xFFFF == TCP and not failed.is_syn:
+        return STRAY_TCP | failed.service - TCP
+    return failed.service
 
 
 def _refuses(flags: int) -> bool:

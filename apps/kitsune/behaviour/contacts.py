@@ -18,18 +18,24 @@ MOST_CONTACTS: Final = 131_072
 ECHO: Final = 1 << 24
 ARP: Final = 2 << 24
 OTHER: Final = 3 << 24
+FROM_UDP: Final = 4 << 24
+"""Datagrams from a well-known port, as reflectors send them."""
+STRAY_TCP: Final = 5 << 24
+"""Segments of connections that were never opened."""
 TCP: Final = 6 << 16
 UDP: Final = 17 << 16
 _SYN, _RST, _ACK = 0x02, 0x04, 0x10
-_GROUP_BIT: Final = 1 << 40
-_BROADCAST: Final = 0xFFFF_FFFF
 
 Contact = tuple[int, int, int]
 """Initiator's address, the other's, service."""
 
 
 def service_text(service: int) -> str:
-    """`tcp/22`, `udp/53`, `icmp`, `arp`."""
+    """`tcp/22`, `udp/53`, `icmp`, `arp`; `from-udp/53` and `tcp-ack/80` of floods."""
+    if service >= STRAY_TCP:
+        return f"tcp-ack/{service & 0xFFFF}"
+    if service >= FROM_UDP:
+        return f"from-udp/{service & 0xFFFF}"
     if service >= OTHER:
         return "ip"
     if service >= ARP:
@@ -44,6 +50,8 @@ class _Pending:
     time: float
     sender: Any
     arrival: int
+    reverse: int
+    is_syn: bool
     half_open: bool = False
 
 
@@ -54,6 +62,10 @@ class FailedContact(NamedTuple):
     sender: Any
     target: int
     service: int
+    reverse: int
+    """The initiator's port as a service, as of its first packet."""
+    is_syn: bool
+    """It began with a SYN."""
     arrival: int
     half_open: bool
     """The other side answered a SYN, and the handshake was not completed."""
@@ -66,6 +78,7 @@ class PacketRow(NamedTuple):
     arrival: int
     sender: Any
     """Identity of the sender."""
+    to_mac: int
     source: int
     target: int
     service: int
@@ -93,6 +106,8 @@ class ContactTracker:
         self._old: set[Contact] = set()
         self._pending: dict[Contact, _Pending] = {}
         self._order: deque[tuple[float, Contact]] = deque()
+        self._proven: dict[int, None] = {}
+        self._vain: dict[Contact, None] = {}
 
     def close_training(self) -> None:
         """What is known by now is never counted again."""
@@ -104,9 +119,9 @@ class ContactTracker:
         """Whether training or the recent past have seen it."""
         return contact in self.trained or contact in self._young or contact in self._old
 
-    def waits(self, contact: Contact) -> bool:
-        """Whether it has not come about yet."""
-        return contact in self._pending
+    def came_about(self, contact: Contact) -> bool:
+        """Whether it is known and has not failed."""
+        return self.knows(contact) and contact not in self._pending and contact not in self._vain
 
     def add(self, row: PacketRow) -> FailedContact | None:
         """Follow one packet; returns the contact that it ends, if it failed."""
@@ -128,7 +143,9 @@ class ContactTracker:
             return None
         self._remember(there)
         if len(self._pending) < MOST_CONTACTS:
-            self._pending[there] = _Pending(row.time, row.sender, row.arrival)
+            self._pending[there] = _Pending(
+                row.time, row.sender, row.arrival, row.reverse, bool(row.flags & _SYN)
+            )
             self._order.append((row.time + GRACE_S, there))
         return None
 
@@ -137,25 +154,48 @@ class ContactTracker:
         failed = []
         while self._order and self._order[0][0] <= now:
             _, contact = self._order.popleft()
-            pending = self._pending.pop(contact, None)
+            pending = self._pending.get(contact)
             if pending is not None:
-                failed.append(_failed(contact, pending, pending.time + GRACE_S))
+                failed.append(self._fail(contact, pending, pending.time + GRACE_S))
         return failed
+
+    def _fail(self, contact: Contact, pending: _Pending, time: float) -> FailedContact:
+        del self._pending[contact]
+        if len(self._vain) >= MOST_CONTACTS:
+            del self._vain[next(iter(self._vain))]
+        self._vain[contact] = None
+        _, target, service = contact
+        return FailedContact(
+            time,
+            pending.sender,
+            target,
+            service,
+            pending.reverse,
+            pending.is_syn,
+            pending.arrival,
+            pending.half_open,
+        )
 
     def _answered(self, row: PacketRow, contact: Contact, pending: _Pending) -> FailedContact | None:
         if not row.is_tcp:
             self._complete(contact)
         elif row.flags & _RST:
-            del self._pending[contact]
-            return _failed(contact, pending, row.time)
+            return self._fail(contact, pending, row.time)
         elif row.flags & (_SYN | _ACK) == _SYN | _ACK:
             pending.half_open = True
         else:
             self._complete(contact)
         return None
 
+    def proven(self, address: int) -> bool:
+        """Whether the address has completed a TCP handshake, so that nobody else can have sent under it."""
+        return address in self._proven
+
     def _complete(self, contact: Contact) -> None:
-        del self._pending[contact]
+        if self._pending.pop(contact).half_open:
+            if len(self._proven) >= MOST_CONTACTS:
+                del self._proven[next(iter(self._proven))]
+            self._proven[contact[0]] = None
 
     def _remember(self, contact: Contact) -> None:
         self._young.add(contact)
@@ -165,8 +205,3 @@ class ContactTracker:
 
 def _never_begins(flags: int) -> bool:
     return bool(flags & _RST) or flags & (_SYN | _ACK) == _SYN | _ACK
-
-
-def _failed(contact: Contact, pending: _Pending, time: float) -> FailedContact:
-    _, target, service = contact
-    return FailedContact(time, pending.sender, target, service, pending.arrival, pending.half_open)

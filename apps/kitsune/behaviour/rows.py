@@ -42,7 +42,12 @@ def packet_rows(batch: Columns, switch: str) -> Iterator[PacketRow]:
     sources, targets = _addresses(batch, "src", arp), _addresses(batch, "dst", arp)
     group = (batch["eth_dst"] & _GROUP_BIT != 0) & ~(arp & (batch["arp_op"] == 1))
     # an ARP announcement asks for its own address; other ICMP and IP without ports begin nothing
-    mute = (batch["arp_op"] == 2) | reply | (arp & (batch["arp_src_ip"] == batch["arp_dst_ip"])) | (base == OTHER)
+    mute = (
+        (batch["arp_op"] == 2)
+        | reply
+        | (arp & (batch["arp_src_ip"] == batch["arp_dst_ip"]))
+        | (base == OTHER)
+    )
     senders = zip(
         repeat(switch, len(arp)), batch["port"].tolist(), batch["eth_src"].tolist(), sources, strict=True
     )
@@ -52,6 +57,7 @@ def packet_rows(batch: Columns, switch: str) -> Iterator[PacketRow]:
             seconds(batch).tolist(),
             batch["arrival"].tolist(),
             senders,
+            batch["eth_dst"].tolist(),
             sources,
             targets,
             service.tolist(),
@@ -67,8 +73,10 @@ def packet_rows(batch: Columns, switch: str) -> Iterator[PacketRow]:
 
 
 def _addresses(batch: Columns, side: str, arp: npt.NDArray[np.bool_]) -> list[int]:
-    low = np.where(arp, batch[f"arp_{side}_ip"], batch[f"ip_{side}_lo"])
-    addresses: list[int] = low.tolist()
-    for row in np.flatnonzero(batch["ip_version"] == 6).tolist():
-        addresses[row] = _IPV6 | int(batch[f"ip_{side}_hi"][row]) << 64 | addresses[row]
+    low, version = batch[f"ip_{side}_lo"], batch["ip_version"]
+    # received columns may hold anything: an IPv4 address has 32 bits, and a frame without IP none
+    short = np.where(arp, batch[f"arp_{side}_ip"], np.where(version == 4, low & 0xFFFF_FFFF, 0))
+    addresses: list[int] = short.tolist()
+    for row in np.flatnonzero((version == 6) & ~arp).tolist():
+        addresses[row] = _IPV6 | int(batch[f"ip_{side}_hi"][row]) << 64 | int(low[row])
     return addresses

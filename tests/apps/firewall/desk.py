@@ -5,8 +5,10 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
+from msgspec import structs
 from reactivex import Subject
 
+from apps.firewall.policy.rules import Rules
 from apps.firewall.service import FirewallService
 from apps.firewall.settings import Settings
 from apps.messages import Confirmation, Decision
@@ -56,12 +58,18 @@ class FakeEngine:
 
 
 class Desk:
-    """A started service; `switches` are under control from the start."""
+    """A started service; `switches` are under control from the start, and alerts decide by the rule of seconds."""
 
     def __init__(
-        self, *, switches: tuple[str, ...] = ("s1",), engine: FakeEngine | None = None, **settings: Any
+        self,
+        *,
+        switches: tuple[str, ...] = ("s1",),
+        engine: FakeEngine | None = None,
+        rule: str = "seconds",
+        **settings: Any,
     ):
         self.engine = engine or FakeEngine()
+        settings["rules"] = structs.replace(settings.get("rules", Rules()), rule=rule)
         self.service = FirewallService(self.engine, Settings(**settings))  # type: ignore[arg-type]
         self.service.start()
         for switch in switches:

@@ -12,6 +12,7 @@ from due import Item
 from tests.apps.firewall.alerts import CAMERA, SECOND, alert
 from tests.apps.firewall.desk import ALERT, ARP, HANDSHAKE, NOW, SWITCH, SYN_ACKS, SYNS, Desk, FakeEngine
 from tests.apps.firewall.enforcement.test_eve import decision
+from tests.apps.firewall.policy.test_sequential_test import evidence
 from tests.apps.firewall.rows import arp, records, syn_ack
 from tests.apps.firewall.syn.test_recent_syns import batch
 from tests.apps.hostile import carried, mutations, values
@@ -19,11 +20,15 @@ from tests.apps.hostile import carried, mutations, values
 INSTRUCTION = "network.instruction.operator.firewall"
 FLOOD = "network.traffic_query.sonata.syn_flood:threshold=100,window=200ms"
 CONFIRMATION = "network.confirmation.p4runtime_ctrl.s1"
+SPOKEN = "network.evidence.kitsune.ports"
+TRAINED = "network.training.kitsune"
 HUNDRED_YEARS = 100 * 365 * 86_400 * SECOND
 PATTERNS = {
     INSTRUCTION: "network.instruction.*.firewall",
     SWITCH: "network.switch.p4runtime_ctrl.*",
     CONFIRMATION: "network.confirmation.p4runtime_ctrl.*",
+    SPOKEN: "network.evidence.*.*",
+    TRAINED: "network.training.*",
 }
 GENUINE = {
     ALERT: alert(NOW // SECOND).to_value(),
@@ -36,6 +41,8 @@ GENUINE = {
     FLOOD: {"dst": "10.0.0.1", "count": 5, "window_start": NOW},
     SYNS: batch(*[(NOW // 1000, "10.1.0.1", "10.0.0.1", 80)] * 3),
     SYN_ACKS: records([syn_ack("77.0.0.1", 1, "10.0.0.1", 8, time_us=NOW // 1000)]),
+    SPOKEN: evidence(4.0, NOW // SECOND).to_value(),
+    TRAINED: {"packets": 9, "wanted": 9, "done": True, "seconds": 60.0, "senders": 5, "event_time": NOW},
     ARP: records([arp(NOW / 1e9, 1, 0x020000000001, "10.0.0.1")]),
 }  # fmt: skip
 

@@ -10,7 +10,15 @@ import time
 import numpy as np
 import pytest
 
-from apps.kitsune.service import ALERT, CAPABILITIES, INTERESTS, PACKETS, SCORE
+from apps.kitsune.service import (
+    ALERT,
+    CAPABILITIES,
+    EVIDENCE_KEY,
+    INTERESTS,
+    PACKETS,
+    SCORE,
+    TRAINING_KEY,
+)
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.testing.packet_rows import blank, part
@@ -124,5 +132,5 @@ def test_wrong_settings_end_with_a_sentence(server, tmp_path, settings, text):
 
 def test_declares_what_it_does():
     assert Interest(PACKETS) in INTERESTS
-    assert {capability.key for capability in CAPABILITIES} == {SCORE, ALERT}
+    assert {each.key for each in CAPABILITIES} == {SCORE, ALERT, f"{EVIDENCE_KEY}.*", TRAINING_KEY}
     assert all(c.delivery == "reliable" and c.archive == "always" for c in CAPABILITIES)

@@ -1,16 +1,27 @@
 """The life of a block: expiry, extension, probation, escalation, caps."""
 
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
-from apps.firewall.policy.rules import Rules, target_of
-from apps.messages import Confirmation, Decision, Sender, Target
+from apps.firewall.policy.rules import Rules
+from apps.messages import Alert, Confirmation, Decision, Sender, Target
 from tests.apps.firewall.alerts import CAMERA, alert
 
 
 def opened(ledger: BlockLifecycle, at_s: int = 100, offences: int = 0) -> Decision:
-    first = alert(at_s)
-    target = target_of(first)
-    assert target is not None
-    return ledger.block(first, target, "hot", (), offences)
+    return opened_for(ledger, alert(at_s), offences)
+
+
+def opened_for(ledger: BlockLifecycle, cause: Alert, offences: int = 0) -> Decision:
+    return ledger.open(
+        cause.sender.switch,
+        Target(kind="mac", address=cause.sender.mac, port=cause.sender.port),
+        "hot",
+        (),
+        cause.event_time,
+        offences=offences,
+        first_packet=cause.first_packet,
+        training_rate=cause.training_rate,
+        host=cause.sender.ip,
+    )
 
 
 def confirmation(decision: Decision, state: str) -> Confirmation:
@@ -120,5 +131,5 @@ def test_same_decision_has_the_same_id_in_every_replay():
     assert opened(BlockLifecycle(Rules())).id == opened(BlockLifecycle(Rules())).id
     other = alert(100, Sender(switch="s1", port=1, mac="00:00:00:00:00:01"))
     ledger = BlockLifecycle(Rules())
-    made = ledger.block(other, Target(kind="mac", address="00:00:00:00:00:01", port=1), "hot", (), 0)
+    made = opened_for(ledger, other)
     assert made.id != opened(ledger).id

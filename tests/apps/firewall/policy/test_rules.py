@@ -2,7 +2,7 @@
 
 import pytest
 
-from apps.firewall.policy.rules import AllowList, Rules, judge, target_of
+from apps.firewall.policy.rules import AllowList, Rules, judge, narrowest_target
 from apps.messages import Sender, Target
 from tests.apps.firewall.alerts import alert
 
@@ -51,12 +51,12 @@ def test_wrong_allow_entry_is_named():
 
 def test_station_with_one_address_is_blocked_by_mac_and_port():
     """This stops its ARP and spoofed frames too."""
-    assert target_of(alert()) == Target(kind="mac", address="5c:cf:7f:05:f2:c6", port=1)
+    assert narrowest_target(alert().sender, 1) == Target(kind="mac", address="5c:cf:7f:05:f2:c6", port=1)
 
 
 def test_station_with_many_addresses_is_blocked_by_address():
     """Behind a router's MAC stand innocent hosts."""
-    assert target_of(alert(mac_addresses=7)) == Target(kind="ip", address="192.168.2.108")
+    assert narrowest_target(alert().sender, 7) == Target(kind="ip", address="192.168.2.108")
 
 
 def test_frames_without_address_from_a_shared_mac_block_nobody():

@@ -1,0 +1,229 @@
+"""From evidence or alerts to what should be done: pure, no I/O, capture time only.
+
+sequential   evidence of every source adds up until it crosses the bound of the budget (the default)
+seconds      five anomalous seconds of ten (`rules.judge`)
+paper        the first packet over Kitsune's threshold
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Final
+
+from apps.evidence import Evidence, TrainingState
+from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
+from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
+from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
+from apps.firewall.policy.sequential_test import LEAST_BOUND, SequentialTest, Tally
+from apps.firewall.syn.services import TcpService
+from apps.messages import Alert, Sender, Target
+
+OFFENCE_NATS: Final = 2.0
+"""By so much each earlier block lowers the bound ..."""
+MOST_OFFENCES: Final = 3
+"""... up to this many."""
+PROBATION_SHARE: Final = 0.5
+"""Share of the bound that is enough on probation."""
+TELL_AGAIN_S: Final = 600
+MOST_TOLD: Final = 16_384
+_PARTS_SHOWN: Final = 3
+
+Offences = Callable[[Target], int | None]
+"""Earlier blocks of a target; None if the archive does not answer."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What evidence calls for; one of `target`, `service` and `refusal` is set."""
+
+    evidence: Evidence
+    reason: str
+    target: Target | None = None
+    """To be blocked."""
+    service: TcpService | None = None
+    """To be guarded."""
+    refusal: str = ""
+    """Why nothing is done although the bound is crossed."""
+    nats: float = 0.0
+    bound: float = 0.0
+    offences: int | None = 0
+    tally: Tally | None = None
+
+
+class Decider:
+    """Applies one of the three rules.
+
+    Args:
+        rules: options.
+        ledger: blocks in force and senders on probation.
+        bindings: whose an address is.
+        known: addresses known from handshakes.
+        allow: the allow-list of now.
+    """
+
+    def __init__(
+        self,
+        rules: Rules,
+        ledger: BlockLifecycle,
+        bindings: ArpBindings,
+        known: Collection[str],
+        allow: Callable[[], AllowList],
+    ) -> None:
+        self._rules = rules
+        self._ledger = ledger
+        self._bindings = bindings
+        self._known = known
+        self._allow = allow
+        self._told: dict[object, int] = {}
+        self.test = SequentialTest(rules.false_blocks_per_day)
+
+    def trained(self, state: TrainingState) -> None:
+        """Training goes on, or is done."""
+        self.test.training = state
+
+    def alert(self, alert: Alert) -> PolicyVerdict:
+        """The rule of seconds."""
+        if self._rules.rule != "seconds":
+            return PolicyVerdict(None, "alerts alone decide nothing under this rule")
+        probation = self._ledger.on_probation(alert.sender, alert.event_time)
+        verdict = judge(alert, self._rules, self._allow(), on_probation=probation)
+        if verdict.target is None:
+            return verdict
+        target, refusal = self._unforged(verdict.target, alert.sender, forgeable=True)
+        if target == verdict.target:
+            return verdict
+        return PolicyVerdict(target, f"{verdict.reason}; {refusal}" if target else refusal)
+
+    def evidence(self, evidence: Evidence, app: str, offences: Offences) -> Proposal | None:
+        """Hear evidence; a proposal if something is due, or would be.
+
+        Args:
+            evidence: decoded, its time checked.
+            app: who wrote it.
+            offences: looks up earlier blocks; asked only when it can matter.
+        """
+        if self._rules.rule == "paper":
+            return self._paper(evidence)
+        tally = self.test.hear(evidence, app)
+        now, bound = evidence.event_time, self.test.bound
+        total = tally.total(now, bound)
+        if self._rules.rule != "sequential" or total < min(LEAST_BOUND, PROBATION_SHARE * bound):
+            return None
+        if evidence.sender is None:
+            return self._towards(evidence, tally, total, bound) if total >= bound else None
+        return self._against(evidence, evidence.sender, tally, bound, offences)
+
+    def settled(self, proposal: Proposal) -> None:
+        """A decision was made: its evidence is spent."""
+        if proposal.tally is not None:
+            self.test.forget(proposal.tally.subject)
+
+    def _paper(self, evidence: Evidence) -> Proposal | None:
+        sender = evidence.sender
+        if evidence.source != "threshold" or sender is None or self._ledger.covering(sender) is not None:
+            return None
+        target = narrowest_target(sender, evidence.mac_addresses)
+        if target is None or self._allow().covers(sender) or evidence.role in self._rules.protected_roles:
+            return None
+        return Proposal(evidence, f"first packet over the threshold: {evidence.text}", target)
+
+    def _against(
+        self, evidence: Evidence, sender: Sender, tally: Tally, bound: float, offences: Offences
+    ) -> Proposal | None:
+        now = evidence.event_time
+        if self._ledger.covering(sender) is not None:
+            return None
+        total = tally.total(now, bound)
+        target = _target_of(evidence, sender)
+        needed, earlier = bound, 0
+        if self._ledger.on_probation(sender, now):
+            needed = max(LEAST_BOUND, PROBATION_SHARE * bound)
+        if target is not None and needed - MOST_OFFENCES * OFFENCE_NATS <= total:
+            found = offences(target)
+            earlier = found or 0
+            needed = max(LEAST_BOUND, needed - OFFENCE_NATS * min(earlier, MOST_OFFENCES))
+            unknown = found is None
+        else:
+            unknown = False
+        if total < needed:
+            return None
+        reason = _reason(tally, now, bound, total, needed, earlier)
+        target, refusal = self._chosen(evidence, sender, target)
+        if refusal and not self._news(sender, now):
+            return None
+        return Proposal(
+            evidence,
+            f"{reason}; {refusal}" if refusal else reason,
+            target=target,
+            refusal="" if target is not None else refusal,
+            nats=total,
+            bound=needed,
+            offences=None if unknown else earlier,
+            tally=tally,
+        )
+
+    def _chosen(self, evidence: Evidence, sender: Sender, target: Target | None) -> tuple[Target | None, str]:
+        """The target to block, and what is to be said about the choice."""
+        if self._allow().covers(sender):
+            return None, "the sender is on the allow-list"
+        if evidence.role in self._rules.protected_roles:
+            return None, f"the sender is a {evidence.role}: it is reported but not blocked"
+        if self.test.too_short:
+            return None, "training is too short for the budget of false blocks: nobody is blocked"
+        if target is None:
+            behind = f"{evidence.mac_addresses} addresses are behind {sender.mac}"
+            return None, f"{behind}, and the frames carry none"
+        if target.kind == "ip" and evidence.training_rate > 0 and evidence.forgeable:
+            return None, f"{target.address} is known from training, and anybody could have forged it"
+        return self._unforged(target, sender, forgeable=evidence.forgeable)
+
+    def _unforged(self, target: Target, sender: Sender, *, forgeable: bool) -> tuple[Target | None, str]:
+        """An address that others can forge is not blocked; the forger is, if it is known for certain."""
+        if target.kind != "ip":
+            return target, ""
+        station = BoundHost.of(sender.port, sender.mac)
+        if self._bindings.forged(target.address, station):
+            if self._bindings.is_alone(station):
+                forger = Target(kind="mac", address=sender.mac, port=sender.port)
+                return forger, f"{target.address} belongs to another, so its forger is blocked"
+            return None, f"{target.address} belongs to another, and its forger shares a port"
+        if forgeable and target.address in self._known and not self._rules.block_known_addresses:
+            return None, f"{target.address} is known from handshakes and may be forged"
+        return target, ""
+
+    def _towards(self, evidence: Evidence, tally: Tally, total: float, bound: float) -> Proposal | None:
+        """A victim of senders that cannot be told apart, or whose addresses are forged."""
+        now = evidence.event_time
+        reason = _reason(tally, now, bound, total, bound, 0)
+        protocol, _, port = evidence.service.partition("/")
+        if protocol == "tcp" and port.isdecimal():
+            service = TcpService(evidence.victims[0], int(port))
+            return Proposal(evidence, reason, service=service, nats=total, bound=bound, tally=tally)
+        if not self._news(tally.subject, now):
+            return None
+        refusal = f"there is no remedy for floods of {evidence.service or 'this kind'} from forged addresses"
+        return Proposal(
+            evidence, f"{reason}; {refusal}", refusal=refusal, nats=total, bound=bound, tally=tally
+        )
+
+    def _news(self, subject: object, now: int) -> bool:
+        """Whether a refusal about this subject was not told lately."""
+        last = self._told.get(subject)
+        if last is not None and now - last < TELL_AGAIN_S * SECOND:
+            return False
+        if len(self._told) >= MOST_TOLD:
+            self._told.clear()
+        self._told[subject] = now
+        return True
+
+
+def _target_of(evidence: Evidence, sender: Sender) -> Target | None:
+    if evidence.forged or evidence.kind == "spoofing":  # the address is not the sender's own
+        return Target(kind="mac", address=sender.mac, port=sender.port)
+    return narrowest_target(sender, evidence.mac_addresses)
+
+
+def _reason(tally: Tally, now: int, bound: float, total: float, needed: float, earlier: int) -> str:
+    shares = [(nats, each) for nats, each in tally.shares(now, bound) if nats > 0]
+    parts = [f"{each.latest.text} ({nats:.1f})" for nats, each in shares[:_PARTS_SHOWN]]
+    before = f", {earlier} earlier block{'s' if earlier > 1 else ''}" if earlier else ""
+    return f"evidence of {total:.1f} nats, {needed:.1f} needed{before}: " + "; ".join(parts)

@@ -1,0 +1,151 @@
+"""When evidence suffices: a sequential test for each sender and each victim.  Pure.
+
+Nats of evidence add up and fade; a decision is due when the sum crosses a bound.  The bound follows from a
+budget of false blocks: training, which lasted T and saw m senders, showed nothing above its own highest counts,
+so about m of them are to be expected in another T; a sum of A nats is exp(A) times rarer than that.  With a
+budget of b false blocks a day
+
+    A = ln(m · day / (T · b))
+
+Sources that saw the same packets say the same thing twice, so the largest counts in full and the others by a
+quarter.  Evidence that only supports other evidence makes up a part of the bound at most.
+
+Source: Wald, Sequential Analysis, 1947; the fading sum is that of a CUSUM (Page, 1954) with a half-life in place
+of a drift.
+"""
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Final
+
+from apps.evidence import Evidence, TrainingState
+from apps.messages import Sender
+
+DAY_S: Final = 86_400.0
+HALF_LIFE_S: Final = 600.0
+"""Seconds of capture time after which half of the evidence is forgotten."""
+DEPENDENT_SHARE: Final = 0.25
+"""Part of its nats with which evidence counts beside stronger evidence from the same packets."""
+SUPPORTING_SHARE: Final = 0.3
+"""Part of the bound that supporting evidence can make up."""
+MOST_EXTRAPOLATION: Final = 1e6
+"""Training that would have to be multiplied by more than this to reach the budget decides no blocks."""
+LEAST_BOUND: Final = 5.0
+MOST_SUBJECTS: Final = 16_384
+MOST_SOURCES: Final = 32
+"""Sources remembered for one subject."""
+_SECOND: Final = 1_000_000_000
+
+Subject = Sender | tuple[str, str]
+"""A sender; or a victim's address and service."""
+
+
+@dataclass(slots=True)
+class Contribution:
+    """The nats of one source, as of its last evidence."""
+
+    nats: float
+    time: int
+    latest: Evidence
+
+    def at(self, now: int) -> float:
+        """Its nats at a capture time, ns."""
+        return self.nats * math.exp2(-max(0, now - self.time) / _SECOND / HALF_LIFE_S)
+
+
+@dataclass
+class Tally:
+    """All evidence about one subject."""
+
+    subject: Subject
+    contributions: dict[str, Contribution] = field(default_factory=dict)
+    first: Evidence | None = None
+    """The first evidence since the sum was last near zero."""
+
+    def total(self, now: int, bound: float) -> float:
+        """The sum in nats at a capture time, ns."""
+        return sum(nats for nats, _ in self.shares(now, bound))
+
+    def shares(self, now: int, bound: float) -> list[tuple[float, Contribution]]:
+        """What each source adds to the sum, the largest first."""
+        weights = [(each.at(now), each) for each in self.contributions.values()]
+        alone = sorted((pair for pair in weights if not pair[1].latest.supporting), key=lambda pair: -pair[0])
+        shares = [
+            (nats if not place else DEPENDENT_SHARE * nats, each) for place, (nats, each) in enumerate(alone)
+        ]
+        left = SUPPORTING_SHARE * bound
+        for nats, each in weights:
+            if each.latest.supporting:
+                shares.append((min(nats, left), each))
+                left -= min(nats, left)
+        return sorted(shares, key=lambda pair: -pair[0])
+
+
+def subject_of(evidence: Evidence) -> Subject:
+    """Whom evidence is about."""
+    if evidence.sender is not None:
+        return evidence.sender
+    return evidence.victims[0], evidence.service
+
+
+class SequentialTest:
+    """Sums of evidence, and the bound that they have to cross.
+
+    Args:
+        false_blocks_per_day: budget, greater than 0.
+    """
+
+    def __init__(self, false_blocks_per_day: float) -> None:
+        self._budget = false_blocks_per_day
+        self._tallies: OrderedDict[Subject, Tally] = OrderedDict()
+        self.training: TrainingState | None = None
+        """The training that evidence rests on; None: none is done."""
+
+    def __len__(self) -> int:
+        return len(self._tallies)
+
+    @property
+    def extrapolation(self) -> float:
+        """How often training would have to be repeated for one false block of the budget."""
+        training = self.training
+        if training is None or not training.done:
+            return math.inf
+        return max(1, training.senders) * DAY_S / (max(1.0, training.seconds) * self._budget)
+
+    @property
+    def bound(self) -> float:
+        """Nats that a sum has to reach."""
+        return max(LEAST_BOUND, math.log(min(self.extrapolation, MOST_EXTRAPOLATION)))
+
+    @property
+    def too_short(self) -> bool:
+        """Whether training cannot bear out the budget, so that nobody may be blocked."""
+        return self.extrapolation > MOST_EXTRAPOLATION
+
+    def hear(self, evidence: Evidence, app: str) -> Tally:
+        """Add evidence that an app wrote; returns all that there is about its subject."""
+        subject, source = subject_of(evidence), f"{app}.{evidence.source}"
+        now = evidence.event_time
+        tally = self._tallies.get(subject)
+        if tally is None:
+            if len(self._tallies) >= MOST_SUBJECTS:
+                self._tallies.popitem(last=False)
+            tally = self._tallies[subject] = Tally(subject)
+        self._tallies.move_to_end(subject)
+        if tally.first is None or tally.total(now, self.bound) < 0.5:
+            tally.first = evidence
+        former = tally.contributions.get(source)
+        nats = evidence.nats
+        if former is not None:
+            nats += former.at(now)
+            now = max(now, former.time)
+        elif len(tally.contributions) >= MOST_SOURCES:
+            weakest = min(tally.contributions, key=lambda each: tally.contributions[each].at(now))
+            del tally.contributions[weakest]
+        tally.contributions[source] = Contribution(nats, now, evidence)
+        return tally
+
+    def forget(self, subject: Subject) -> None:
+        """Start anew for a subject: after a decision, or a false alarm."""
+        self._tallies.pop(subject, None)

@@ -1,0 +1,99 @@
+"""A finding as a message: who, against whom, how strong, and in words."""
+
+from typing import Final
+
+from apps.evidence import Evidence, Kind
+from apps.kitsune.behaviour.behaviour import Finding, Statistic
+from apps.kitsune.behaviour.contacts import service_text
+from apps.kitsune.behaviour.rows import SenderId, parts_of
+from apps.kitsune.names import ip_text, mac_text
+from apps.kitsune.roles import Roles
+from apps.messages import Sender
+
+KINDS: Final[dict[Statistic, Kind]] = {
+    "contacts": "scan",
+    "ports": "scan",
+    "targets": "scan",
+    "logins": "guessing",
+    "one_way": "flood",
+    "claims": "spoofing",
+    "thefts": "spoofing",
+    "strangers": "flood",
+    "scores": "unlike_training",
+    "threshold": "unlike_training",
+}
+_SECOND: Final = 1_000_000_000
+
+
+def address_text(address: int) -> str:
+    """An address of `behaviour.rows` as text; empty for none."""
+    return ip_text(*parts_of(address))
+
+
+def sender_of(sender: SenderId) -> Sender:
+    """An identity of `behaviour.rows` as a message."""
+    switch, port, mac, address = sender
+    return Sender(switch=switch, port=port, mac=mac_text(mac), ip=address_text(address))
+
+
+def evidence_of(
+    finding: Finding, roles: Roles, *, proven: bool, forged: bool, rate: float, training_rate: float
+) -> Evidence:
+    """The message of a finding.
+
+    Args:
+        finding: what was found.
+        roles: of senders, and the addresses behind their MACs.
+        proven: whether the sender's address has completed a TCP handshake.
+        forged: whether the address belonged to another in training.
+        rate: packets a second of the sender now.
+        training_rate: the highest of training.
+    """
+    sender = finding.sender
+    at = round(finding.time * _SECOND)
+    victim = address_text(finding.victim) if finding.victim else ""
+    name = f"{finding.statistic}-{at}-{finding.arrival}"
+    mac, parts = (sender[2], parts_of(sender[3])) if sender is not None else (0, (0, 0, 0))
+    return Evidence(
+        id=f"kitsune-{name}" if sender is None else f"kitsune-{name}-{mac:012x}",
+        kind=KINDS[finding.statistic],
+        source=finding.statistic,
+        sender=None if sender is None else sender_of(sender),
+        forgeable=not proven,
+        forged=forged,
+        supporting=finding.supporting,
+        victims=(victim,) if victim else (),
+        victim_count=1 if victim else 0,
+        service=service_text(finding.service) if finding.service >= 0 else "",
+        nats=min(finding.nats, 1_000.0),
+        since=max(0, at - round(finding.window_s * _SECOND)),
+        event_time=at,
+        packets=max(1, round(finding.count)),
+        first_packet=finding.arrival,
+        rate=rate,
+        training_rate=training_rate,
+        mac_addresses=roles.addresses(mac) if sender is not None else 0,
+        role=roles.role(mac, parts) if sender is not None else "host",
+        text=_words(finding, victim),
+    )
+
+
+def _words(finding: Finding, victim: str) -> str:
+    sender = finding.sender
+    who = "" if sender is None else (address_text(sender[3]) or mac_text(sender[2]))
+    count, usual = f"{finding.count:,.0f}", f"at most {finding.usual:,.0f} in training"
+    within = f"within {finding.window_s:g} s"
+    service = service_text(finding.service) if finding.service >= 0 else ""
+    texts: dict[Statistic, str] = {
+        "contacts": f"{who} failed to reach {count} new hosts or ports {within}; {usual}",
+        "ports": f"{who} failed to reach {count} new ports of {victim} {within}; {usual}",
+        "targets": f"{who} failed to reach {service} at {count} new hosts {within}; {usual}",
+        "logins": f"{who} opened {count} connections to {service} of {victim} {within}; {usual}",
+        "one_way": f"{who} sent {count} packets a second to {victim}, which does not answer; {usual}",
+        "claims": f"{who} sent {count} ARP replies that nobody had asked for {within}; {usual}",
+        "thefts": f"{who} claims the address of {victim}, which is present",
+        "strangers": f"{count} addresses unknown to training failed to reach {service} of {victim} {within}; {usual}",
+        "scores": f"the packets of {who} are unlike those of training ({finding.total:.0f} nats {within})",
+        "threshold": f"a packet of {who} scored {finding.count:.3g}",
+    }
+    return texts[finding.statistic]

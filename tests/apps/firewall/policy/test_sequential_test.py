@@ -1,0 +1,94 @@
+"""Evidence adds up, fades, and decides at a bound that follows from the budget of false blocks."""
+
+import math
+
+import pytest
+from msgspec import structs
+
+from apps.evidence import Evidence, TrainingState
+from apps.firewall.policy.sequential_test import HALF_LIFE_S, SequentialTest
+from tests.apps.firewall.alerts import CAMERA, SECOND
+
+
+def evidence(nats=4.0, at_s=100, source="ports", **changes):
+    fields = {
+        "id": f"{source}-{at_s}",
+        "kind": "scan",
+        "source": source,
+        "sender": CAMERA,
+        "nats": nats,
+        "since": at_s * SECOND,
+        "event_time": at_s * SECOND,
+        "packets": 5,
+        "mac_addresses": 1,
+        "text": f"{source} of a camera",
+    }
+    return Evidence(**(fields | changes))
+
+
+def trained(seconds=3_600.0, senders=20, budget=0.1, done=True):
+    test = SequentialTest(budget)
+    test.training = TrainingState(
+        packets=9, wanted=9, done=done, seconds=seconds, senders=senders, event_time=1
+    )
+    return test
+
+
+def total(test, *heard):
+    for each in heard:
+        tally = test.hear(each, "kitsune")
+    return tally.total(heard[-1].event_time, test.bound)
+
+
+def test_the_bound_is_the_logarithm_of_what_training_leaves_open():
+    """Twice the training or twice the budget lower it by ln 2; more senders raise it."""
+    bound = trained().bound
+    assert bound == pytest.approx(math.log(20 * 86_400 / (3_600 * 0.1)))
+    assert bound - trained(seconds=7_200).bound == pytest.approx(math.log(2))
+    assert bound - trained(budget=0.2).bound == pytest.approx(math.log(2))
+    assert trained(senders=40).bound > bound
+
+
+@pytest.mark.parametrize("test", [SequentialTest(0.1), trained(done=False), trained(seconds=5)])
+def test_without_enough_training_nobody_may_be_blocked(test):
+    assert test.too_short
+
+
+def test_evidence_of_one_source_adds_up_and_fades():
+    test = trained()
+    assert total(test, evidence(2.0, 100), evidence(3.0, 100)) == pytest.approx(5.0)
+    later = 100 + int(HALF_LIFE_S)
+    assert total(test, evidence(0.0, later)) == pytest.approx(2.5)
+
+
+def test_sources_that_saw_the_same_packets_are_not_added_in_full():
+    assert total(trained(), evidence(6.0), evidence(4.0, source="contacts")) == pytest.approx(7.0)
+
+
+def test_what_only_supports_never_decides():
+    """However unlike training it looks: a new and harmless thing looks so, too."""
+    test = trained()
+    assert total(test, *[evidence(50.0, source="scores", supporting=True)] * 9) < test.bound / 2
+    assert total(test, evidence(6.0)) == pytest.approx(6.0 + 0.3 * test.bound)
+
+
+def test_victims_of_forged_senders_have_a_sum_of_their_own():
+    test = trained()
+    flood = structs.replace(evidence(8.0), sender=None, victims=("10.0.0.1",), service="tcp/80")
+    assert total(test, evidence(5.0)) == pytest.approx(5.0)
+    assert total(test, flood) == pytest.approx(8.0)
+
+
+def test_apps_may_use_the_same_name_for_a_source():
+    test = trained()
+    test.hear(evidence(4.0), "kitsune")
+    tally = test.hear(evidence(4.0), "other")
+    assert tally.total(100 * SECOND, test.bound) == pytest.approx(5.0)
+
+
+def test_subjects_are_bounded():
+    test = trained()
+    for number in range(20_000):
+        sender = structs.replace(CAMERA, ip=f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}")
+        test.hear(evidence(sender=sender), "kitsune")
+    assert len(test) == 16_384

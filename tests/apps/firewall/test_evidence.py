@@ -1,0 +1,109 @@
+"""Evidence leads to a block, a guard, or to a word why not."""
+
+import pytest
+from msgspec import structs
+
+from apps.evidence import TrainingState
+from apps.firewall.policy.rules import Rules
+from tests.apps.firewall.alerts import CAMERA
+from tests.apps.firewall.desk import NOW, Desk
+from tests.apps.firewall.policy.test_sequential_test import evidence
+
+SECOND = 1_000_000_000
+AT = NOW // SECOND
+PATTERN = "network.evidence.*.*"
+
+
+def desk(rule="sequential", seconds=3_600.0, **settings):
+    made = Desk(rule=rule, **settings)
+    state = TrainingState(packets=9, wanted=9, done=True, seconds=seconds, senders=20, event_time=NOW)
+    made.hand("network.training.kitsune", state.to_value(), pattern="network.training.*")
+    return made
+
+
+def hear(on, *heard, app="kitsune"):
+    for each in heard:
+        on.hand(f"network.evidence.{app}.{each.source}", each.to_value(), pattern=PATTERN)
+
+
+def test_a_strong_piece_of_evidence_blocks_the_sender_by_mac_and_port():
+    on = desk()
+    hear(on, evidence(20.0, AT))
+    assert on.blocked == [CAMERA.mac]
+    (decision,) = on.decisions
+    assert decision.reason.startswith("evidence of 20.0 nats")
+    assert decision.evidence[0].summary == "ports of a camera"
+
+
+def test_weak_evidence_blocks_when_it_persists():
+    on = desk()
+    hear(on, *[evidence(3.0, AT + n) for n in range(2)])
+    assert not on.blocked
+    hear(on, evidence(3.0, AT + 2))
+    assert on.blocked == [CAMERA.mac]
+
+
+def test_a_foreign_app_can_speak_and_nobody_in_its_name():
+    on = desk()
+    hear(on, evidence(20.0, AT), app="honeypot")
+    assert on.blocked == [CAMERA.mac]
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"role": "gateway"}, "is a gateway"),
+        ({"mac_addresses": 9, "training_rate": 5.0}, "anybody could have forged it"),
+    ],
+)
+def test_who_is_not_blocked_is_named(changes, why):
+    on = desk()
+    hear(on, evidence(20.0, AT, **changes))
+    assert not on.blocked
+    assert any(why in value["text"] for key, value in on.engine.written if key.startswith("network.event."))
+
+
+def test_training_that_is_too_short_blocks_nobody():
+    on = desk(seconds=2.0)
+    hear(on, evidence(40.0, AT))
+    assert not on.blocked
+
+
+def test_the_forger_of_an_address_is_blocked_and_its_owner_is_not():
+    on = desk()
+    hear(on, evidence(20.0, AT, mac_addresses=9, forged=True))
+    assert on.blocked == [CAMERA.mac]
+
+
+def test_a_handshake_proves_an_address_behind_a_router():
+    on = desk()
+    hear(on, evidence(20.0, AT, mac_addresses=9, training_rate=5.0, forgeable=False))
+    assert on.blocked == [CAMERA.ip]
+
+
+def test_a_flood_with_forged_sources_has_the_service_guarded():
+    on = desk()
+    hear(on, structs.replace(evidence(20.0, AT), sender=None, victims=("10.0.0.1",), service="tcp/80"))
+    assert not on.blocked
+    assert any(key.startswith("network.protect.firewall") for key, _ in on.engine.written)
+
+
+def test_a_flood_without_a_remedy_is_reported_once():
+    on = desk()
+    flood = structs.replace(evidence(20.0, AT), sender=None, victims=("10.0.0.1",), service="from-udp/53")
+    hear(on, flood, flood, flood)
+    told = [value for key, value in on.engine.written if key.startswith("network.event.")]
+    assert len(told) == 1
+    assert "no remedy" in told[0]["text"]
+
+
+def test_the_rule_of_the_paper_blocks_at_the_first_packet_over_the_threshold():
+    on = desk("paper")
+    hear(on, evidence(20.0, AT), evidence(0.0, AT, "threshold", supporting=True))
+    assert on.blocked == [CAMERA.mac]
+    assert on.decisions[0].reason.startswith("first packet over the threshold")
+
+
+def test_a_budget_has_to_be_possible():
+    with pytest.raises(ValueError, match="false_blocks_per_day"):
+        Rules(false_blocks_per_day=0)

@@ -1,0 +1,156 @@
+"""What senders do: scans, guessing, floods and claims are found, and what both sides want is not."""
+
+import json
+
+import numpy as np
+import pytest
+
+from apps.kitsune.behaviour.behaviour import Behaviour
+from due import RecordBatch
+from sdnator.testing.packet_rows import blank
+
+HOST, SERVER, STRANGER = 0x0A000005, 0x0A000001, 0x0A0000C8
+SYN, SYN_ACK, ACK, RST = 0x02, 0x12, 0x10, 0x04
+BASE_US = 1_600_000_000_000_000
+
+
+def packet(at_s, source, target, sport=40_000, dport=80, flags=0, **columns):
+    """One packet; TCP unless other columns are named."""
+    row = {
+        "time_us": BASE_US + round(at_s * 1e6),
+        "port": source & 0xFF,
+        "eth_src": source,
+        "eth_dst": target,
+    }
+    if "arp_op" in columns:
+        return {**row, "arp_src_ip": source, "arp_dst_ip": target, **columns}
+    row |= {"ip_version": 4, "ip_src_lo": source, "ip_dst_lo": target}
+    if columns:
+        return {**row, **columns}
+    return {**row, "tcp_sport": sport, "tcp_dport": dport, "tcp_flags": flags}
+
+
+def handshake(at_s, source, target, sport, dport):
+    return [
+        packet(at_s, source, target, sport, dport, SYN),
+        packet(at_s + 0.001, target, source, dport, sport, SYN_ACK),
+        packet(at_s + 0.002, source, target, sport, dport, ACK),
+    ]
+
+
+def batch(rows):
+    names = {name for row in rows for name in row}
+    empty = blank(1)
+    columns = {name: np.array([row.get(name, empty[name][0]) for row in rows]) for name in names}
+    return blank(len(rows), **columns)
+
+
+def quiet_network():
+    """Ten minutes in which a host talks to a server, and nothing fails."""
+    rows = [row for at in range(0, 600, 10) for row in handshake(at, HOST, SERVER, 30_000 + at, 80)]
+    rows += [packet(at + 0.5, HOST, SERVER, arp_op=1) for at in range(0, 600, 60)]
+    rows += [packet(at + 0.501, SERVER, HOST, arp_op=2) for at in range(0, 600, 60)]
+    rows.sort(key=lambda row: row["time_us"])
+    behaviour = Behaviour(len(rows))
+    assert feed(behaviour, rows, trained=len(rows)) == []
+    return behaviour
+
+
+def feed(behaviour, rows, trained=0, **more):
+    traffic = batch(rows) if rows else RecordBatch({})
+    return behaviour.add(traffic, "s1", np.zeros(len(rows)), trained, lambda: np.zeros(0), **more)
+
+
+def total(found, statistic):
+    return sum(each.nats for each in found if each.statistic == statistic)
+
+
+def test_a_scan_is_found_by_its_failed_contacts_within_a_second():
+    behaviour = quiet_network()
+    rows = [packet(700 + n / 50, STRANGER, SERVER, 50_000, 1_000 + n, SYN) for n in range(50)]
+    found = feed(behaviour, rows)
+    assert total(found, "ports") > 12
+    assert {each.sender[3] for each in found} == {STRANGER}
+    assert found[0].time < BASE_US / 1e6 + 701
+
+
+def test_connections_that_come_about_are_no_scan():
+    """A newcomer may talk to as many as it likes, if they answer."""
+    behaviour = quiet_network()
+    rows = [
+        row for n in range(60) for row in handshake(700 + n / 10, STRANGER, 0x08000000 + n, 50_000 + n, 443)
+    ]
+    assert feed(behaviour, [*rows, packet(720, HOST, SERVER, 1, 80, ACK)]) == []
+
+
+def test_answers_of_a_scanned_host_do_not_speak_against_it():
+    behaviour = quiet_network()
+    rows = []
+    for n in range(50):
+        rows.append(packet(700 + n / 50, STRANGER, SERVER, 50_000, 1_000 + n, SYN))
+        rows.append(packet(700 + n / 50 + 0.001, SERVER, STRANGER, 1_000 + n, 50_000, RST | ACK))
+    assert {each.sender[3] for each in feed(behaviour, rows) if each.sender} == {STRANGER}
+
+
+def test_many_connections_to_a_login_service_are_guessing():
+    behaviour = quiet_network()
+    rows = [row for n in range(15) for row in handshake(700 + n / 2, STRANGER, SERVER, 50_000 + n, 22)]
+    assert total(feed(behaviour, rows), "logins") > 12
+
+
+def test_a_flood_is_found_and_a_transfer_is_not():
+    """What the other side acknowledges is wanted."""
+    udp = [packet(700 + n / 1000, HOST, STRANGER, udp_sport=5, udp_dport=9) for n in range(300)]
+    assert total(feed(quiet_network(), udp), "one_way") > 12
+    transfer = handshake(700, HOST, STRANGER, 50_000, 9_000)
+    for n in range(300):
+        transfer.append(packet(700.01 + n / 1000, HOST, STRANGER, 50_000, 9_000, ACK))
+        if n % 4 == 0:
+            transfer.append(packet(700.01 + n / 1000, STRANGER, HOST, 9_000, 50_000, ACK))
+    assert feed(quiet_network(), transfer) == []
+
+
+def test_forged_sources_are_counted_for_their_victim():
+    behaviour = quiet_network()
+    rows = [packet(700 + n / 100, 0x20000000 + n, SERVER, 50_000, 80, SYN) for n in range(100)]
+    found = [each for each in feed(behaviour, rows) if each.statistic == "strangers"]
+    assert found
+    assert all(each.sender is None and each.victim == SERVER for each in found)
+
+
+def test_claims_of_the_address_of_a_present_host_are_theft():
+    behaviour = quiet_network()
+    claim = packet(700.5, STRANGER, HOST, arp_op=2) | {"arp_src_ip": SERVER}
+    there = packet(700, SERVER, HOST, 80, 30_000, ACK)
+    found = feed(behaviour, [there, claim, packet(702, SERVER, HOST, 80, 30_000, ACK)])
+    assert {(each.statistic, each.sender[2], each.victim) for each in found} >= {("thefts", STRANGER, SERVER)}
+    assert behaviour.forged(("s1", 200, STRANGER, SERVER))
+    absent = quiet_network()
+    late = packet(9_000, STRANGER, HOST, arp_op=2) | {"arp_src_ip": SERVER}
+    assert not total(feed(absent, [late]), "thefts")
+
+
+def test_packets_to_a_blocked_host_prove_nothing():
+    """Its answers are dropped, so everything towards it fails."""
+    behaviour = quiet_network()
+    rows = [packet(700 + n / 50, HOST, STRANGER, 50_000, 1_000 + n, SYN) for n in range(60)]
+    assert feed(behaviour, rows, cut_off=lambda row: row.target == STRANGER) == []
+
+
+def test_only_what_is_new_is_said_again():
+    """Findings add up to the weight, which has an upper end."""
+    behaviour = quiet_network()
+    rows = [packet(700 + n / 200, STRANGER, SERVER, 50_000, 1_000 + n, SYN) for n in range(2_000)]
+    found = [each for each in feed(behaviour, rows) if each.statistic == "ports"]
+    assert sum(each.nats for each in found) == pytest.approx(found[-1].total, rel=0.05)
+    assert len(found) < 40
+
+
+def test_what_was_learnt_survives_the_model_file():
+    behaviour = quiet_network()
+    feed(behaviour, [packet(650, HOST, SERVER, 1, 80, ACK)])
+    again = Behaviour.from_state(json.loads(json.dumps(behaviour.to_state())))
+    rows = [packet(700 + n / 50, HOST, SERVER, 50_000, 1_000 + n, SYN) for n in range(50)]
+    assert feed(again, rows) == feed(behaviour, rows) != []
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        Behaviour.from_state({"seconds": -1, "line": 1})
