@@ -241,7 +241,7 @@ class _Sessions:
 
     def _put(self, flow: Ints, time: Ints, direction: int, flags: Column, payload: Column = 0) -> None:
         full = [np.broadcast_to(value, len(flow)) for value in (direction, flags, payload)]
-        self._rows.append((flow, time, *full))
+        self._rows.append((flow, time, full[0], full[1], full[2]))
 
     def _handshake(self) -> Ints:
         c = self._connections
@@ -293,8 +293,9 @@ class _Sessions:
     ) -> None:
         """One acknowledgement for each two segments, and one for the last."""
         rows = np.repeat(np.arange(len(flow)), acks)
-        at = np.minimum(2 * within(acks) + 1, segments[rows] - 1)
-        self._put(flow[rows], begin[rows] + at * gap[rows], direction, ACK)
+        place: Ints = np.minimum(2 * within(acks) + 1, segments[rows] - 1)
+        at = begin[rows] + place * gap[rows]
+        self._put(flow[rows], at, direction, ACK)
 
     def _segments(
         self, flow: Ints, begin: Ints, direction: int, sizes: Ints, counts: Ints, gap: Ints

@@ -50,6 +50,15 @@ TYPED: Final = Talk(
 CRON_SSH: Final = Talk(
     exchanges=6, request=(300, 0.7), response=(500, 0.8), think_s=(0.01, 0.8), server_first=True
 )
+MISTYPED: Final = Talk(
+    exchanges=5,
+    fixed_exchanges=True,
+    request=(190, 0.9),
+    response=(220, 0.9),
+    think_s=(0.6, 0.9),
+    server_first=True,
+    most_bytes=1_400,
+)
 SITE: Final = Talk(exchanges=3, response=(6_000, 1.3), think_s=(0.3, 1.2), linger_s=(5, 1.0))
 PROBE: Final = Talk(
     exchanges=1, fixed_exchanges=True, request=(60, 0.1), response=(220, 0.3), linger_s=(0.01, 0.3)
@@ -131,78 +140,97 @@ def _snmp(now: Slice, time: Ints, asking: Ends, asked: Ends) -> None:
 
 def of_servers(network: Network, popular: Popularity, random: Random) -> dict[str, Habit]:
     """What servers do by themselves, what is done with them, and who comes from outside."""
-    server, update = network.of_kind("server")[0], network.of_kind("update server")[0]
-    build, files_ = network.of_kind("build server")[0], network.of_kind("file server")[0]
-    pcs = network.of_kind("pc")
-    admins = pcs[: int(random.integers(1, 4))]
-    cron_minutes = float(random.choice([10, 15, 30]))
-    published = random.uniform(12, 45)
-    mails = random.uniform(6, 25)
-    rows = ends([server, build, files_, update])
-    rows_pc = ends(pcs)
+    return _Servers(network, popular, random).habits()
 
-    def typed(now: Slice) -> None:
+
+class _Servers:
+    """The habits around the servers of one office."""
+
+    def __init__(self, network: Network, popular: Popularity, random: Random) -> None:
+        self._popular = popular
+        self._names = network.gateway.ends
+        self._server, self._update = network.of_kind("server")[0], network.of_kind("update server")[0]
+        self._build, self._files = network.of_kind("build server")[0], network.of_kind("file server")[0]
+        pcs = network.of_kind("pc")
+        self._count = len(pcs)
+        self._pcs = ends(pcs)
+        self._admins = pcs[: int(random.integers(1, 4))]
+        self._cron_minutes = float(random.choice([10, 15, 30]))
+        self._visitors = random.uniform(12, 45)
+        self._mails = random.uniform(6, 25)
+
+    def habits(self) -> dict[str, Habit]:
+        return {
+            "typed": self._typed,
+            "cron": self._cron,
+            "visitors": self._come,
+            "mail out": self._mail_out,
+            "updates": self._updates,
+            "intranet": self._intranet,
+        }
+
+    def _typed(self, now: Slice) -> None:
+        """Administrators log in by SSH; one login in six follows a password that was mistyped."""
         busy = 1.0 if 8 <= hour_of_day(now.start) < 19 else 0.08
-        for host in admins:
+        rows = ends([self._server, self._build, self._files, self._update])
+        for host in self._admins:
             time = poisson(now.random, now.start, now.end, 0.8 * busy)
             target = rows.at(now.random.integers(0, 4, len(time)))
             connections = connect(now.random, time, host.ends, target, 22)
             talk(now.tape, now.random, connections, TYPED, Fate(refused=0.01))
+            wrong = np.flatnonzero(now.random.random(len(time)) < 1 / 6)
+            for before_s in (14, 6):
+                at = time[wrong] - before_s * SECOND
+                failed = connect(now.random, at, host.ends, target.at(wrong), 22)
+                talk(now.tape, now.random, failed, MISTYPED, SOUND)
 
-    def cron(now: Slice) -> None:
-        time = every(now.random, now.start, now.end, cron_minutes * 60, spread_s=2, phase=0.0)
-        for number, target in enumerate((server, files_, update)):
-            connections = connect(now.random, time + number * 1_500_000, build.ends, target.ends, 22)
+    def _cron(self, now: Slice) -> None:
+        """Short SSH connections from server to server, on the minute."""
+        time = every(now.random, now.start, now.end, self._cron_minutes * 60, spread_s=2, phase=0.0)
+        for number, target in enumerate((self._server, self._files, self._update)):
+            connections = connect(now.random, time + number * 1_500_000, self._build.ends, target.ends, 22)
             talk(now.tape, now.random, connections, CRON_SSH, Fate(dead=0.01))
 
-    def visitors(now: Slice) -> None:
+    def _come(self, now: Slice) -> None:
+        """Visitors of the published site and mail, from anywhere."""
         busy = 1.0 if 7 <= hour_of_day(now.start) < 22 else 0.4
-        for port, what, rate in ((443, SITE, published), (25, SMTP_IN, mails)):
+        for port, what, rate in ((443, SITE, self._visitors), (25, SMTP_IN, self._mails)):
             time = poisson(now.random, now.start, now.end, rate * busy)
+            time = time[~self._popular.is_down(time)]
             counts = now.random.geometric(0.6, len(time)) if port == 443 else np.ones(len(time), np.int64)
-            visitor, far = popular.choose(now.random, len(time), 0.6)
+            visitor, far = self._popular.choose(now.random, len(time), 0.6)
             who = np.repeat(np.arange(len(time)), counts)
             begin = time[who] + within(counts) * 90_000
-            connections = connect(now.random, begin, visitor.at(who), server.ends, port, inbound=True)
+            connections = connect(now.random, begin, visitor.at(who), self._server.ends, port, inbound=True)
             connections.near[:] = far[who]
             talk(now.tape, now.random, connections, what, Fate(lost=0.004))
 
-    def mail_out(now: Slice) -> None:
-        time = poisson(now.random, now.start, now.end, mails / 2)
-        target, far = popular.choose(now.random, len(time), 0.4)
-        ask_names(now.tape, now.random, time - 60_000, server.ends, network.gateway.ends)
-        connections = connect(now.random, time, server.ends, target, 25)
+    def _mail_out(self, now: Slice) -> None:
+        time = poisson(now.random, now.start, now.end, self._mails / 2)
+        target, far = self._popular.choose(now.random, len(time), 0.4)
+        ask_names(now.tape, now.random, time, self._server.ends, self._names)
+        connections = connect(now.random, time + 60_000, self._server.ends, target, 25)
         connections.far[:] = far
         talk(now.tape, now.random, connections, SMTP_IN, Fate(dead=0.05, refused=0.02, slow=0.02))
 
-    def updates(now: Slice) -> None:
-        time = poisson(now.random, now.start, now.end, 0.35 * len(pcs))
-        who = rows_pc.at(now.random.integers(0, len(pcs), len(time)))
-        talk(now.tape, now.random, connect(now.random, time, who, update.ends, 8_530), UPDATE, SOUND)
+    def _updates(self, now: Slice) -> None:
+        time = poisson(now.random, now.start, now.end, 0.35 * self._count)
+        who = self._pcs.at(now.random.integers(0, self._count, len(time)))
+        talk(now.tape, now.random, connect(now.random, time, who, self._update.ends, 8_530), UPDATE, SOUND)
         fetched = poisson(now.random, now.start, now.end, 1.5)
-        source, far = popular.choose(now.random, len(fetched), 0.0)
-        connections = connect(now.random, fetched, update.ends, source, 443)
+        source, far = self._popular.choose(now.random, len(fetched), 0.0)
+        connections = connect(now.random, fetched, self._update.ends, source, 443)
         connections.far[:] = far
         talk(now.tape, now.random, connections, UPDATE, INTERNET)
 
-    def intranet(now: Slice) -> None:
+    def _intranet(self, now: Slice) -> None:
         busy = 1.0 if 8 <= hour_of_day(now.start) < 18 else 0.05
-        time = poisson(now.random, now.start, now.end, 2.0 * len(pcs) * busy)
-        who = rows_pc.at(now.random.integers(0, len(pcs), len(time)))
-        for port in (80, 8_080):
+        time = poisson(now.random, now.start, now.end, 2.0 * self._count * busy)
+        who = self._pcs.at(now.random.integers(0, self._count, len(time)))
+        for port, target in ((80, self._server), (8_080, self._build)):
             mine = np.flatnonzero(now.random.random(len(time)) < 0.5)
-            target = server if port == 80 else build
             connections = connect(now.random, time[mine], who.at(mine), target.ends, port)
             talk(now.tape, now.random, connections, SITE, Fate(refused=0.003, lost=0.0005))
-
-    return {
-        "typed": typed,
-        "cron": cron,
-        "visitors": visitors,
-        "mail out": mail_out,
-        "updates": updates,
-        "intranet": intranet,
-    }
 
 
 def of_monitor(network: Network, random: Random) -> dict[str, Habit]:
@@ -211,7 +239,9 @@ def of_monitor(network: Network, random: Random) -> dict[str, Habit]:
     hosts = [host for host in network.hosts if host is not monitor]
     shut = [host for host in network.of_kind("pc") if not host.always_on]
     absent = network.prefix | int(random.integers(201, 219))
-    services = [(host, port) for host in hosts if host.kind.endswith("server") for port in host.open_ports]
+    services = [
+        (host, port) for host in hosts if host.kind.endswith("server") for port in sorted(host.open_ports)
+    ]
     servers, ports = ends([host for host, _ in services]), np.array([port for _, port in services])
     rows = ends(hosts)
     away = np.array([host in shut for host in hosts])
@@ -260,6 +290,56 @@ def of_monitor(network: Network, random: Random) -> dict[str, Habit]:
         "away server": away_server,
         "absent": arp_for_absent(monitor, absent, 60, random),
     }
+
+
+def misfits(network: Network, random: Random) -> dict[str, Habit]:
+    """What is wrong in every office: drives of machines that are gone, forgotten addresses, late answers."""
+    pcs, gateway = network.of_kind("pc"), network.gateway
+    chosen = random.permutation(len(pcs))
+    gone, old = network.prefix | int(random.integers(221, 250)), int(random.integers(60 << 24, 90 << 24))
+    found: dict[str, Habit] = {}
+    for place in range(int(random.integers(1, 4))):
+        host = pcs[int(chosen[place])]
+        found[f"gone drive {place}"] = arp_for_absent(host, gone, random.uniform(40, 400), random)
+    forgetful, period = pcs[int(chosen[-1])], random.uniform(25, 180)
+    port = int(random.choice([443, 1_433, 5_222, 8_883]))
+
+    def forgotten(now: Slice) -> None:
+        time = every(now.random, now.start, now.end, period, spread_s=4)
+        connections = connect(now.random, time, forgetful.ends, network.outside(np.array([old])), port)
+        sent = unanswered(now.tape, now.random, connections, tries=3)
+        told = np.sort(sent)[:: int(now.random.integers(2, 5))]
+        packets.unreachable(
+            now.tape,
+            told + 3_000,
+            gateway.ends,
+            forgetful.ends,
+            code=packets.HOST,
+            proto=packets.TCP,
+            sport=now.random.integers(32_768, 61_000, len(told)),
+            dport=port,
+            length=74,
+        )
+
+    def late(now: Slice) -> None:
+        """Answers that come when the asking program has gone: the host tells the name server."""
+        time = poisson(now.random, now.start, now.end, 9)
+        who = ends(pcs).at(now.random.integers(0, len(pcs), len(time)))
+        sport = now.random.integers(49_152, 65_535, len(time))
+        packets.udp(now.tape, time, gateway.ends, who, sport=53, dport=sport, payload=120)
+        packets.unreachable(
+            now.tape,
+            time + 400,
+            who,
+            gateway.ends,
+            code=packets.PORT,
+            proto=packets.UDP,
+            sport=53,
+            dport=sport,
+            length=162,
+        )
+
+    return found | {"forgotten": forgotten, "late answers": late}
 
 
 def _outages(now: Slice, hosts: int) -> Ints:

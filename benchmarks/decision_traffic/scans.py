@@ -186,8 +186,9 @@ def planted_names(scene: Scene, *, count: int, rate: float) -> None:
 
 
 def _lan(scene: Scene, attacker: Ends) -> Ints:
-    addresses: Ints = scene.network.prefix | np.arange(1, 255)
-    return addresses[addresses != attacker.ip[0]]
+    addresses = scene.network.prefix | np.arange(1, 255)
+    others: Ints = addresses[addresses != attacker.ip[0]]
+    return others
 
 
 def _host(scene: Scene, address: int) -> Host:

@@ -31,15 +31,16 @@ def every(
     times = (np.arange(first, last) + phase) * period
     if spread_s:
         times = times + random.uniform(0, spread_s * SECOND, len(times))
-    return times.astype(np.int64)
+    found: Ints = times.astype(np.int64)
+    return found
 
 
 def poisson(random: Random, start: int, end: int, per_hour: float) -> Ints:
     """Times of a Poisson process, in order."""
     expected = per_hour * (end - start) / (3_600 * SECOND)
     count = int(random.poisson(max(expected, 0.0)))
-    times = np.sort(random.uniform(start, end, count))
-    return times.astype(np.int64)
+    times: Ints = np.sort(random.uniform(start, end, count)).astype(np.int64)
+    return times
 
 
 def hour_of_day(time: int) -> float:
@@ -54,7 +55,8 @@ def is_weekend(time: int) -> bool:
 
 def lognormal(random: Random, median: float, sigma: float, count: int, most: float) -> Ints:
     """Whole numbers from 1 to `most`, half of them below `median`."""
-    return np.clip(median * np.exp(random.normal(0, sigma, count)), 1, most).astype(np.int64)
+    found: Ints = np.clip(median * np.exp(random.normal(0, sigma, count)), 1, most).astype(np.int64)
+    return found
 
 
 def within(counts: Ints) -> Ints:
@@ -67,7 +69,8 @@ def before(values: Ints, counts: Ints) -> Ints:
     sums = np.cumsum(values) - values
     firsts = np.cumsum(counts) - counts
     starts = sums[np.minimum(firsts, max(len(sums) - 1, 0))] if len(sums) else np.zeros(len(counts), np.int64)
-    return sums - np.repeat(starts, counts)
+    found: Ints = sums - np.repeat(starts, counts)
+    return found
 
 
 def spread_ms(random: Random, count: int, low_ms: float, high_ms: float) -> Ints:

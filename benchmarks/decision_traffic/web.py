@@ -7,24 +7,25 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from benchmarks.decision_traffic import packets
-from benchmarks.decision_traffic.flows import Fate, Talk, connect, talk
+from benchmarks.decision_traffic.flows import Fate, Talk, connect, talk, unanswered
 from benchmarks.decision_traffic.habits import ask_names
 from benchmarks.decision_traffic.hosts import Ends, Host
 from benchmarks.decision_traffic.network import Habit, Network, Slice, public_addresses
-from benchmarks.decision_traffic.packets import ACK, PSH, UDP
+from benchmarks.decision_traffic.packets import ACK, PSH
 from benchmarks.decision_traffic.schedule import (
     Random,
+    chance,
     every,
     hour_of_day,
     is_weekend,
     lognormal,
     poisson,
-    spread_ms,
     within,
 )
-from benchmarks.decision_traffic.traffic import SECOND, Ints, Tape
+from benchmarks.decision_traffic.traffic import HOUR, SECOND, Ints, Tape
 
 PAGE: Final = Talk(
     exchanges=2.2,
@@ -36,6 +37,12 @@ PAGE: Final = Talk(
 )
 REQUEST: Final = Talk(exchanges=1.6, response=(1_500, 1.0), think_s=(0.03, 1.0), most_bytes=200_000)
 INTERNET: Final = Fate(dead=0.008, refused=0.004, slow=0.008, lost=0.003)
+DOWNLOAD: Final = Talk(
+    exchanges=1, fixed_exchanges=True, response=(35_000_000, 0.6), gap_us=300, most_bytes=120_000_000
+)
+_DAY: Final = 24 * HOUR
+_OUTAGES: Final = 0.25
+"""Share of days on which the uplink fails for minutes."""
 _NAMES_KEPT: Final = 0.55
 """Share of connections whose name is still in the client's cache."""
 
@@ -50,6 +57,21 @@ class Popularity:
         weights = 1 / np.arange(1, pool + 1) ** float(random.uniform(0.8, 1.05))
         self._sums = np.cumsum(weights) / weights.sum()
         self._rtt = np.clip(np.exp(random.normal(np.log(22), 0.7, pool)), 3, 260)
+        self._outages: dict[int, tuple[int, int]] = {}
+
+    def is_down(self, times: Ints) -> npt.NDArray[np.bool_]:
+        """Whether the uplink is dead at these times: on one day of four for one to eight minutes."""
+        days = times // _DAY
+        down = np.zeros(len(times), np.bool_)
+        for day in np.unique(days).tolist():
+            if day not in self._outages:
+                random = chance(self._network.seed, "outage", max(day, 0))
+                begin = day * _DAY + int(random.integers(0, _DAY))
+                lasting = int(random.integers(60, 480)) * SECOND if random.random() < _OUTAGES else 0
+                self._outages[day] = begin, begin + lasting
+            begin, end = self._outages[day]
+            down |= (times >= begin) & (times < end)
+        return down
 
     def choose(self, random: Random, count: int, share_once: float | None = None) -> tuple[Ends, Ints]:
         """Hosts for `count` connections, and the µs that each takes to answer."""
@@ -108,6 +130,19 @@ def browsing(network: Network, host: Host, popular: Popularity, taste: Browsing)
     return habit
 
 
+def downloads(host: Host, popular: Popularity, taste: Browsing) -> Habit:
+    """Tens of megabytes at once, about once a week."""
+
+    def habit(now: Slice) -> None:
+        time = presence(taste, now.random, poisson(now.random, now.start, now.end, 0.025))
+        server, far = popular.choose(now.random, len(time), 0.0)
+        connections = connect(now.random, time, host.ends, server, 443)
+        connections.far[:] = far
+        talk(now.tape, now.random, connections, DOWNLOAD, Fate(lost=0.003))
+
+    return habit
+
+
 def visit(
     tape: Tape,
     random: Random,
@@ -142,6 +177,7 @@ def contact(
     share_once: float | None = None,
 ) -> None:
     """Connections to hosts of the Internet, after their names were asked for where they are not known."""
+    time = _refused_by_outage(tape, random, time, client, names, popular)
     server, far = popular.choose(random, len(time), share_once)
     asked = np.flatnonzero(random.random(len(time)) > kept)
     ask_names(tape, random, time[asked] - 15_000 - far[asked] // 2, client.ends, names)
@@ -154,24 +190,32 @@ def contact(
     talk(tape, random, connections, what, INTERNET)
 
 
+def _refused_by_outage(
+    tape: Tape, random: Random, time: Ints, client: Host, names: Ends, popular: Popularity
+) -> Ints:
+    """Write what is tried in vain while the uplink is dead; returns the times of the rest."""
+    down = popular.is_down(time)
+    if not down.any():
+        return time
+    vain = time[down]
+    server, _ = popular.choose(random, len(vain))
+    unanswered(tape, random, connect(random, vain, client.ends, server, 443))
+    asked = vain[random.random(len(vain)) < 0.5]
+    ask_names(tape, random, asked, client.ends, names, unanswered=1.0)
+    return time[~down]
+
+
 def quic_talk(tape: Tape, random: Random, time: Ints, client: Ends, server: Ends, far: Ints) -> None:
     """QUIC: two full datagrams each way, then some bursts; one in a hundred is not answered."""
     sport = random.integers(49_152, 65_535, len(time))
     answered = random.random(len(time)) > 0.01
     bursts = random.geometric(0.3, len(time)) * answered
-    for number in range(2):
-        at = time + number * 1_200
-        packets.udp(tape, at, client, server, sport=sport, dport=443, payload=1_250)
-        good = np.flatnonzero(answered)
-        packets.udp(
-            tape,
-            (at + far)[good],
-            server.at(good),
-            client.at(good),
-            sport=443,
-            dport=sport[good],
-            payload=1_250,
-        )
+    good = np.flatnonzero(answered)
+    back = server.at(good), client.at(good)
+    for delay in (0, 1_200):
+        packets.udp(tape, time + delay, client, server, sport=sport, dport=443, payload=1_250)
+        later = (time + far)[good] + delay
+        packets.udp(tape, later, *back, sport=443, dport=sport[good], payload=1_250)
     flow = np.repeat(np.arange(len(time)), bursts)
     begin = (
         time[flow] + 2 * far[flow] + within(bursts) * lognormal(random, 300_000, 1.0, len(flow), 20 * SECOND)
@@ -187,7 +231,8 @@ def quic_talk(tape: Tape, random: Random, time: Ints, client: Ends, server: Ends
         payload=random.integers(33, 700, len(flow)),
     )
     row = np.repeat(np.arange(len(flow)), size)
-    number, which = within(size), flow[row]
+    number = within(size)
+    which = flow[row]
     at = begin[row] + far[which] + number * 220
     packets.udp(tape, at, server.at(which), client.at(which), sport=443, dport=sport[which], payload=1_250)
     third = np.flatnonzero(number % 3 == 2)
@@ -226,7 +271,7 @@ def background(network: Network, host: Host, popular: Popularity, random: Random
     return habit
 
 
-def push(network: Network, host: Host, popular: Popularity, random: Random) -> Habit:
+def push(host: Host, popular: Popularity, random: Random) -> Habit:
     """A connection that stays open all day; every minute or few a small segment each way."""
     server, sport = popular.favourite(random), int(random.integers(49_152, 65_535))
     period, phase, far = random.uniform(28, 280), random.random(), int(random.uniform(9_000, 40_000))
@@ -252,20 +297,4 @@ def keep_open(
     )
     packets.tcp(
         tape, time + far + 300, host.ends, server, flags=ACK, seq=seq + 41, ack=ack + 39, length=66, **out
-    )
-
-
-def complaints(tape: Tape, random: Random, time: Ints, router: Ends, client: Ends, *, share: float) -> None:
-    """ICMP errors of the router about a share of what a client sent to port 443 by UDP."""
-    chosen = time[random.random(len(time)) < share]
-    packets.unreachable(
-        tape,
-        chosen + spread_ms(random, len(chosen), 1, 30),
-        router,
-        client,
-        code=packets.HOST,
-        proto=UDP,
-        sport=random.integers(49_152, 65_535, len(chosen)),
-        dport=443,
-        length=120,
     )
