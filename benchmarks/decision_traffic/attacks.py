@@ -1,4 +1,4 @@
-"""All generated attacks: 30 to tune on and a second list, held back, with other numbers.
+"""All generated attacks: 31 to tune on and a second list, held back, with other numbers.
 
 Whoever tunes decisions must not look at results of those with `held_back`.
 """
@@ -112,6 +112,7 @@ ATTACKS: Final[Sequence[AttackSpec]] = (
     _spec(28, "ack flood, forged, outside", "flood", "outside forging", floods.ack_flood, "meter", count=10_000, rate=1_000),
     _spec(29, "dns amplification", "flood", "outside forging", floods.dns_amplification, "meter", count=14_000, rate=7_000, servers=1_000),
     _spec(30, "slow infection", "scan", "known", intrusions.slow_infection, count=1_000, rate=0.14),
+    _spec(31, "telnet guessing, known host", "guessing", "known", intrusions.guessing, port=23, count=150, rate=2),
     # held back
     _spec(101, "syn scan, 400/s, newcomer", "scan", "new", scans.syn_scan, count=2_500, rate=400),
     _spec(102, "syn scan, 25/s, known host", "scan", "known", scans.syn_scan, count=1_000, rate=25),
@@ -134,4 +135,4 @@ ATTACKS: Final[Sequence[AttackSpec]] = (
     _spec(119, "ack flood, forged by an infected host", "flood", "inside forging", floods.ack_flood, "meter", count=6_000, rate=500),
     _spec(120, "dns amplification, 2,000/s", "flood", "outside forging", floods.dns_amplification, "meter", count=8_000, rate=2_000, servers=300),
 )  # fmt: skip
-"""Numbers 1 to 30 to tune on, 101 to 120 held back."""
+"""Numbers 1 to 31 to tune on, 101 to 120 held back."""

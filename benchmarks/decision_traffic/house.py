@@ -5,7 +5,7 @@ unreachable 14.5 %, ICMP echo 8 %, ARP 5 %): cameras with rounds of UDP keep-ali
 SYNs and their retries, name questions that the gateway mostly answers, its ICMP errors that quote
 what it cannot forward (at most one a second for each host), pings between devices, spanning tree, SSDP,
 mDNS, NTP without answers, smart plugs; and people: a PC that looks at cameras, copies to a network drive and logs in
-there by SSH, a telephone that comes and goes, devices that restart, the web pages of devices.
+there by SSH, a telephone that comes and goes, attempts to go online in vain, devices that restart, the web pages of devices.
 
 Not imitated: an uplink that comes back.
 """
@@ -249,6 +249,8 @@ class _House:
             "seek": habits.ssdp_seeker(pcs[0], [network.gateway], random.uniform(120, 600), random),
             "absent": habits.arp_for_absent(pcs[0], network.prefix | 99, random.uniform(90, 400), random),
         }
+        for host in pcs + phones:
+            found[f"{host.name} tries"] = self.tries(host)
         for name, clients, servers, port, what, per_hour in (
             ("watch", pcs, cameras, 80, WATCHING, 1.6),
             ("stream", phones + pcs, cameras, 80, WATCHING, 0.8),
@@ -262,6 +264,26 @@ class _House:
         ):
             found[name] = self.visits(clients, servers, port, what, per_hour * random.uniform(0.6, 1.5))
         return found
+
+    def tries(self, host: Host) -> Habit:
+        """Somebody, or a program, tries to go online: a dozen hosts within seconds, in vain."""
+        per_hour = float(self.random.uniform(0.6, 2.5))
+        hosts = self.network.outside(public_addresses(self.random, 120))
+
+        def habit(now: Slice) -> None:
+            random = now.random
+            hour = hour_of_day(now.start)
+            level = 2.0 if 17 <= hour < 23 else 0.2 if hour < 7 else 1.0
+            begun = poisson(random, now.start, now.end, per_hour * level)
+            counts = random.geometric(1 / 9, len(begun))
+            time = np.repeat(begun, counts) + random.integers(0, 12 * SECOND, int(counts.sum()))
+            habits.ask_names(now.tape, random, time, host.ends, self.gateway, wait_ms=(0.3, 4))
+            server = hosts.at(random.integers(0, 120, len(time)))
+            connections = connect(random, time + 8_000, host.ends, server, 443)
+            unanswered(now.tape, random, connections, tries=3)
+            self.complain(now, connections.time, host, TCP, connections.sport, 443, 74)
+
+        return habit
 
     @staticmethod
     def visits(clients: list[Host], servers: list[Host], port: int, what: Talk, per_hour: float) -> Habit:

@@ -63,7 +63,7 @@ def _hosts(random: Random, prefix: int) -> list[Host]:
     for kind, ports in _SERVER_PORTS.items():
         add(kind, kind, 0x0050B6, *ports)
     for number in range(int(random.integers(2, 4))):
-        add(f"printer {number + 1}", "printer", 0x00206B, 80, 515, 631, 9_100)
+        add(f"printer {number + 1}", "printer", 0x00206B, 21, 23, 80, 515, 631, 9_100)
     for number in range(int(random.integers(3, 7))):
         add(f"telephone {number + 1}", "telephone", 0x805EC0, 80)
     for number in range(int(random.integers(20, 33))):
