@@ -1,6 +1,7 @@
 """Real traffic: the benign part of the Mirai capture as a network, and captured attacks, mapped into a LAN.
 
-Packets are read with the product's own capture reader, as `sdnator detect` reads them.  Times are moved, MACs and
+Packets are read with the product's own capture reader, as `sdnator detect` reads them; those of the Mirai table are
+rebuilt first, as for `sdnator replay` (the table has no TCP flags, so they are guessed from lengths).  Times are moved, MACs and
 addresses are replaced: the attacker becomes a host of the wanted kind, those it attacked become hosts of the network,
 its router the network's.  Lengths, ports, flags, gaps and answers are the capture's.
 
@@ -22,7 +23,7 @@ from benchmarks.data_folder import data_file
 from benchmarks.decision_traffic.hosts import BROADCAST_MAC, Host, ip_number
 from benchmarks.decision_traffic.network import Network, Slice
 from benchmarks.decision_traffic.scene import Scene
-from benchmarks.decision_traffic.traffic import BASE_US, SECOND, Array, Ints, Tape, Traffic
+from benchmarks.decision_traffic.traffic import Array, Ints, Tape, Traffic
 from benchmarks.decision_traffic.truth import (
     AttackerIs,
     AttackSpec,
@@ -32,7 +33,9 @@ from benchmarks.decision_traffic.truth import (
     Remedy,
     told,
 )
-from sdnator.capture.packet_sources import CaptureSource
+from sdnator.capture.packet_sources import Batch, CaptureSource, frame_batch
+from sdnator.capture.tshark_tsv import read_rows
+from sdnator.datasets.rebuild import frame
 
 BENIGN: Final = "kitsune/mirai_38k.tsv.gz"
 BENIGN_SECONDS: Final = 1_404.6
@@ -327,12 +330,16 @@ def _columns(path: Path) -> dict[str, Array]:
 
 @lru_cache(maxsize=16)
 def _read(path: Path) -> dict[str, Array]:
-    batches = list(CaptureSource(path))
+    source = CaptureSource(path)
+    batches = [_rebuilt(path)] if source.is_table else list(source)
     columns = {name: np.concatenate([batch[name] for batch in batches]) for name in PACKET_COLUMNS}
     order = np.argsort(columns["time_us"], kind="stable")
     return {name: column[order] for name, column in columns.items()}
 
 
-def second_of(time_us: int) -> float:
-    """Seconds of the network of an absolute time."""
-    return (time_us - BASE_US) / SECOND
+def _rebuilt(path: Path) -> Batch:
+    """Frames of a table as `sdnator dataset rebuild` makes them: the table itself has no TCP flags."""
+    rows = list(read_rows(path))
+    whole = tuple(frame(row) for row in rows)
+    times = np.array([row.time_ns for row in rows], np.int64)
+    return frame_batch(whole, tuple(map(len, whole)), times, 0)
