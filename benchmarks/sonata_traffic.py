@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.sonata_adapter.query.catalogue import CATALOGUE
+from apps.sonata_adapter.query.catalogue import PAPER
 from sdnator.testing.query_traffic import (
     ACK,
     BASE_US,
@@ -29,7 +29,7 @@ MINUTE_PACKETS = 320_000
 """Frames in a minute, at least."""
 ROUND_US = 20_000_000
 """From an attack to the next of its kind."""
-ATTACKS = len(CATALOGUE)
+ATTACKS = len(PAPER)
 """In a round."""
 _MINUTE_S = 60
 _CONNECTIONS = 6
@@ -83,7 +83,7 @@ def traffic(minutes: int, seed: int = 5) -> tuple[Traffic, Traffic]:
     made.add(frame for frame in office(seconds, rng) if _is_small_talk(frame))
     made.add((*_ipv6(seconds), *_telnet(seconds, rng)))
     for number in range(minutes):
-        for place, name in enumerate(CATALOGUE):
+        for place, name in enumerate(PAPER):
             made.add(attack(name, BASE_US + number * ROUND_US + 500_000 + place * 1_500_000, rng))
     whole, edge = made.traffic(), BASE_US + minutes * ROUND_US
     return whole.between(BASE_US, edge), whole.between(edge, BASE_US + seconds * 10**6)

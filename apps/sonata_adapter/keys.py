@@ -17,7 +17,7 @@ import msgspec
 from apps.sonata_adapter.errors import InvalidRequest
 from apps.sonata_adapter.query.catalogue import Template
 from apps.sonata_adapter.query.expressions import ACK, FIN, RST, SYN_ACK, Flags, Term
-from apps.sonata_adapter.query.language import Query, field, ip, tcp, udp
+from apps.sonata_adapter.query.language import ETHERTYPE_ARP, Query, arp, eth, ip, tcp, udp
 from apps.sonata_adapter.query.parameters import ANY_PREFIX, Parameter, Value, prefix
 from due import Key
 
@@ -53,7 +53,8 @@ PROTOCOLS: Final[dict[str, Protocol]] = {
     "tcp": Protocol("TCP segments", (ip.proto == 6,), (tcp.sport, tcp.dport), flags=True),
     "udp": Protocol("UDP datagrams", (ip.proto == 17,), (udp.sport, udp.dport)),
     "icmp": Protocol("ICMP and ICMPv6", ((ip.proto == 1) | (ip.proto == 58),)),
-    "arp": Protocol("ARP", (field("arp.op") >= 0,)),
+    # the classifier knows the EtherType, so that only ARP is copied
+    "arp": Protocol("ARP", (eth.type == ETHERTYPE_ARP, arp.op >= 0)),
     "dns": Protocol("DNS over UDP", (_DNS,), (udp.sport, udp.dport)),
     "ip": Protocol("IPv4 and IPv6", (ip.version != 0,)),
 }

@@ -247,6 +247,25 @@ def _dns_reflection(start: int, _rng: random.Random) -> Iterator[TimedFrame]:
         )
 
 
+def arp_request(mac: bytes, source: str, asked: str) -> bytes:
+    """A frame with an ARP request, to all.
+
+    Args:
+        mac: of the sender, six bytes.
+        source: IPv4 address of the sender.
+        asked: IPv4 address that it asks for.
+    """
+    head = struct.pack("!HHBBH", 1, 0x0800, 6, 4, 1)
+    body = head + mac + ip_address(source).packed + bytes(6) + ip_address(asked).packed
+    return b"\xff" * 6 + mac + b"\x08\x06" + body
+
+
+def _arp_scan(start: int, _rng: random.Random) -> Iterator[TimedFrame]:
+    mac = bytes.fromhex(HOSTS["arp_scan"].replace(":", ""))
+    for place, at in enumerate(_spread(start, 2, 150)):
+        yield _whole(at, arp_request(mac, "10.2.0.1", f"10.2.0.{place % 100 + 2}"))
+
+
 HOSTS: Final = {
     "new_tcp": "198.51.100.1",
     "ssh_brute_force": "198.51.100.2",
@@ -259,8 +278,9 @@ HOSTS: Final = {
     "dns_tunnel": "198.51.100.9",
     "zorro": "198.51.100.10",
     "dns_reflection": "198.51.100.11",
+    "arp_scan": "02:00:00:00:00:12",
 }
-"""Query to the address that it has to report."""
+"""Query to the address that it has to report; to the MAC for arp_scan."""
 _ATTACKS: Final[dict[str, Callable[[int, random.Random], Iterator[TimedFrame]]]] = {
     "new_tcp": _new_tcp,
     "ssh_brute_force": _ssh,
@@ -273,6 +293,7 @@ _ATTACKS: Final[dict[str, Callable[[int, random.Random], Iterator[TimedFrame]]]]
     "dns_tunnel": _dns_tunnel,
     "zorro": _zorro,
     "dns_reflection": _dns_reflection,
+    "arp_scan": _arp_scan,
 }
 
 

@@ -54,6 +54,7 @@ _PORTS: Final = {
     "udp.dport": ("udp_dport", 17),
 }
 _ADDRESSES: Final = {"ip.src": ("ip_src_hi", "ip_src_lo"), "ip.dst": ("ip_dst_hi", "ip_dst_lo")}
+_ARP_ADDRESSES: Final = {"arp.src": "arp_src_ip", "arp.dst": "arp_dst_ip"}
 _DNS: Final = ("dns.response", "dns.qtype", "dns.name")
 _DNS_PORT: Final = 53
 _NO_PORT: Final = -1
@@ -237,6 +238,8 @@ class PacketColumns:
         if name in _DNS:
             self._read_dns()
             return self._columns[name]
+        if name in _ARP_ADDRESSES:
+            return zeros(self._size), self._raw(_ARP_ADDRESSES[name]).astype(np.uint64)
         return self._address(*_ADDRESSES[name])
 
     def _port(self, name: str, protocol: int) -> NDArray[np.int64]:

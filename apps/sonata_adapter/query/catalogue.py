@@ -1,4 +1,4 @@
-"""The queries of the Sonata paper (Gupta et al., SIGCOMM 2018, table 3) with their parameters.
+"""The queries of the Sonata paper (Gupta et al., SIGCOMM 2018, table 3) and our own, with their parameters.
 
 A key is reported when its value *reaches* the threshold (>=), as in the queries that the authors
 published.  Differences to those: a SYN-ACK is flags 0x12 (18, not 17), ssh_brute_force looks at port
@@ -13,16 +13,20 @@ import msgspec
 
 from apps.sonata_adapter.query.language import (
     ACK,
+    ETHERTYPE_ARP,
     FIN,
     SYN,
     SYN_ACK,
     Query,
+    arp,
     count,
     dns,
+    eth,
     field,
     ip,
     length,
     payload_contains,
+    port,
     tcp,
     total,
     udp,
@@ -175,6 +179,12 @@ def _dns_reflection(values: Values) -> Query:
     return unasked.reduce("dst", count=count()).filter(field("count") >= int(values["threshold"]))
 
 
+def _arp_scan(values: Values) -> Query:
+    asked = _begin("arp_scan", values).filter((eth.type == ETHERTYPE_ARP) & (arp.op == 1))
+    pairs = _towards(asked, values, at="arp.dst").map(port=port, mac=eth.src, target=arp.dst).distinct()
+    return pairs.reduce("port", "mac", count=count()).filter(field("count") >= int(values["threshold"]))
+
+
 _DST: Final = prefix("dst", "only hosts in this prefix")
 _SRC: Final = prefix("src", "only senders in this prefix")
 _W: Final = window(3_000)
@@ -302,6 +312,21 @@ CATALOGUE: Final[dict[str, Template]] = {
             parameters=(_W, number("threshold", 40, "report at this many servers", unit="servers"), _DST),
             build=_dns_reflection,
         ),
+        Template(
+            name="arp_scan",
+            meaning="senders that ask for many addresses by ARP",
+            result="port: the switch's; mac: the sender's; count: addresses asked for",
+            parameters=(
+                _W,
+                number("threshold", 40, "report at this many addresses", unit="addresses"),
+                prefix("dst", "only addresses in this prefix"),
+            ),
+            build=_arp_scan,
+        ),
     )
 }
-"""Name to template, in the order of the paper."""
+"""Name to template: those of the paper in its order, then our own."""
+OUR_OWN: Final = frozenset({"arp_scan"})
+"""Queries that the paper does not have."""
+PAPER: Final = tuple(name for name in CATALOGUE if name not in OUR_OWN)
+"""The paper's eleven, in its order."""

@@ -82,6 +82,8 @@ PACKET_FIELDS: Final[dict[str, tuple[Kind, str]]] = {
     "icmp6.type": ("number", "ICMPv6 type, -1 = not ICMPv6"),
     "icmp6.code": ("number", "ICMPv6 code, -1 = not ICMPv6"),
     "arp.op": ("number", "ARP operation, -1 = not ARP"),
+    "arp.src": ("address", "address of the sender of an ARP message, 0.0.0.0 = not ARP"),
+    "arp.dst": ("address", "address that an ARP message asks for or answers to, 0.0.0.0 = not ARP"),
     "eth.src": ("mac", "source MAC address"),
     "eth.dst": ("mac", "destination MAC address"),
     "eth.type": ("number", "EtherType behind VLAN tags"),

@@ -34,7 +34,7 @@ from apps.sonata_adapter.query.expressions import (
     text_of,
 )
 
-__all__ = ["ACK", "FIN", "RST", "SYN", "SYN_ACK", "Query", "arp", "count", "dns", "eth", "field", "icmp", "ip", "largest", "length", "payload_contains", "port", "tcp", "total", "udp", "vlan"]  # fmt: skip
+__all__ = ["ACK", "ETHERTYPE_ARP", "FIN", "RST", "SYN", "SYN_ACK", "Query", "arp", "count", "dns", "eth", "field", "icmp", "ip", "largest", "length", "payload_contains", "port", "tcp", "total", "udp", "vlan"]  # fmt: skip
 
 JoinKind = Literal["inner", "left", "outer", "anti"]
 Function = Literal["sum", "max"]
@@ -81,6 +81,7 @@ class Join(msgspec.Struct, frozen=True, tag=True):
 Step: TypeAlias = Filter | Map | Distinct | Reduce | Join
 Pipeline: TypeAlias = tuple[Step, ...]
 
+ETHERTYPE_ARP: Final = 0x0806
 PACKET_KINDS: Final[dict[str, Kind]] = {name: kind for name, (kind, _) in PACKET_FIELDS.items()}
 MIN_WINDOW_MS: Final = 10
 MAX_WINDOW_MS: Final = 3_600_000
@@ -436,6 +437,8 @@ class _Arp:
     """Fields of ARP messages."""
 
     op = field("arp.op")
+    src = field("arp.src")
+    dst = field("arp.dst")
 
 
 class _Dns:

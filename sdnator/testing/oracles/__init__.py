@@ -2,7 +2,7 @@
 
     afterimage.NaiveAfterImage   Kitsune's features, packet by packet, as published
     kitnet.NaiveKitNet           its autoencoders, one numpy call per step, as published
-    sonata                       the eleven queries over a whole capture
+    sonata                       the queries of the catalogue over a whole capture
 
 Nothing here imports what it is compared with.
 """

@@ -1,4 +1,4 @@
-"""The eleven queries of the Sonata paper, one packet at a time over a whole capture: slow and obvious.
+"""The queries of the catalogue, one packet at a time over a whole capture: slow and obvious.
 
 Nothing of the product is used: frames are taken apart here, addresses are compared as text.  A result
 is a `Found`.
@@ -31,6 +31,9 @@ class NaivePacket(NamedTuple):
     dport: int = -1
     flags: int = 0
     payload: bytes = b""
+    mac: str = ""
+    """Source MAC of an ARP request; `asked` is the address that it asks for."""
+    asked: str = ""
 
 
 class Found(NamedTuple):
@@ -64,6 +67,8 @@ def read(time_us: int, length: int, frame: bytes) -> NaivePacket:
         return _ipv4(bare, body)
     if kind == b"\x86\xdd":
         return _ipv6(bare, body)
+    if kind == b"\x08\x06" and len(body) >= 28 and body[:8] == b"\0\1\x08\0\6\4\0\1":
+        return bare._replace(mac=frame[6:12].hex(":"), asked=str(ip_address(body[24:28])))
     return bare
 
 
@@ -329,6 +334,12 @@ def _dns_reflection(window: Window, p: Parameters) -> Reported:
     ]
 
 
+def _arp_scan(window: Window, p: Parameters) -> Reported:
+    requests = [k for k in window if k.asked and inside(k.asked, p["dst"])]
+    first = _distinct(requests, lambda k: (k.mac, k.asked))
+    return _growing((({"port": 1, "mac": k.mac}, k.time_us) for k in first), p["threshold"])
+
+
 _QUERIES: dict[str, Callable[[Window, Parameters], Reported]] = {
     "new_tcp": _new_tcp,
     "ssh_brute_force": _ssh_brute_force,
@@ -341,4 +352,5 @@ _QUERIES: dict[str, Callable[[Window, Parameters], Reported]] = {
     "dns_tunnel": _dns_tunnel,
     "zorro": _zorro,
     "dns_reflection": _dns_reflection,
+    "arp_scan": _arp_scan,
 }

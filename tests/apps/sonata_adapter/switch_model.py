@@ -247,7 +247,7 @@ def matches(conditions, packet):
         "l4_valid": int(
             max(packet["tcp_dport"], packet["udp_dport"], packet["icmp_type"], packet["icmp6_type"]) >= 0
         ),
-        "ethertype": int(packet["eth_type"]) if packet["ip_version"] else 0,
+        "ethertype": int(packet["eth_type"]) if packet["ip_version"] or packet["arp_op"] >= 0 else 0,
         "tcp_flags": int(packet["tcp_flags"]),
         "sport": max(int(packet["tcp_sport"]), int(packet["udp_sport"]), 0),
         "dport": dport,

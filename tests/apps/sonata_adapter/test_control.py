@@ -93,7 +93,7 @@ def test_split_equals_naive(name, everything):
 
 
 def test_all_together_equal_naive(everything):
-    """All eleven at once share bits, stages and copies."""
+    """All at once share bits, stages and copies."""
     found, _ = play([f"{PREFIX}.{name}" for name in CATALOGUE], everything)
     for key, results in found.items():
         name = key.split(":")[0].rpartition(".")[2]

@@ -31,7 +31,7 @@ def telemetry(states):
 
 
 def test_keys_become_queries_and_leave_with_them(stage):
-    """Eleven keys: results equal the naive evaluator's; without interest the switch has no request.
+    """All keys of the catalogue: results equal the naive evaluator's; without interest the switch has no request.
 
     Frames come much faster than they were captured, so no cell could be read in time.
     """

@@ -61,7 +61,7 @@ def test_counts_are_taken_in_the_switch():
 
 
 def test_what_does_not_fit_says_so():
-    """All eleven need more stages than there are: those that save most go in, the plan names the reason."""
+    """All together need more stages than there are: those that save most go in, the plan names the reason."""
     found = plan(requests(*EVERY))
     inside = {one.identity.split(":")[0].rpartition(".")[2] for one in found.queries if one.in_switch}
     assert {"superspreader", "port_scan", "ddos"} <= inside < COUNTED

@@ -53,10 +53,10 @@ def test_attack_is_found(name):
     """The query reports the host under attack, and the quiet office alone is not reported as that host."""
     rng = random.Random(3)
     frames = sorted(office(8, rng) + attack(name, BASE_US + 10_000, rng))
-    hosts = {
-        dict(found.fields).get("dst", dict(found.fields).get("src")) for found in run([name], frames)[name]
+    found = [dict(each.fields) for each in run([name], frames)[name]]
+    assert HOSTS[name] in {
+        fields[part] for fields in found for part in ("src", "dst", "mac") if part in fields
     }
-    assert HOSTS[name] in hosts
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -67,7 +67,7 @@ def test_equals_naive_on_all_attacks_at_once(name, everything):
 
 @pytest.mark.parametrize("size", [1, 7, 100_000])
 def test_results_do_not_depend_on_batches_or_company(size, everything):
-    """Eleven queries share operators; each still finds what it finds alone."""
+    """All queries share operators; each still finds what it finds alone."""
     frames = everything[:3000] if size == 1 else everything
     found = run(CATALOGUE, frames, size=size)
     for name in CATALOGUE:
@@ -76,7 +76,7 @@ def test_results_do_not_depend_on_batches_or_company(size, everything):
 
 @pytest.mark.parametrize("capture", CAPTURES)
 def test_equals_naive_on_real_captures(capture):
-    """Real captures, all eleven queries at once."""
+    """Real captures, all queries at once."""
     with Capture(shared_data(f"captures/{capture}.pcap")) as file:
         frames = [TimedFrame(time_ns // 1000, length, data) for time_ns, length, data in file]
     found = run(CATALOGUE, frames)
