@@ -44,6 +44,8 @@ class Evidence(Message, frozen=True, kw_only=True):
     """What found it, the last segment of its key: a statistic, a query."""
     sender: Sender | None = None
     """Who did it; None if the senders' addresses are forged or too many to name."""
+    address: Name = ""
+    """IP address of the sender where its switch, port and MAC are not known; empty if `sender` says who it is."""
     forgeable: bool = True
     """Whether a third party could have sent this under the sender's address; False after a handshake."""
     forged: bool = False
@@ -79,13 +81,17 @@ class Evidence(Message, frozen=True, kw_only=True):
         """Check sender, victims and times.
 
         Raises:
-            MessageError: an address is invalid, or nobody is accused and nobody is a victim.
+            MessageError: an address is invalid, two senders are accused, or nobody is and nobody is a victim.
         """
         if self.sender is not None:
             self.sender.check()
+        if self.address:
+            address_in(self.address, "evidence")
+        if self.sender is not None and self.address:
+            raise MessageError("fields", "evidence: it names both a sender and a plain address")
         for victim in self.victims:
             address_in(victim, "evidence")
-        if self.sender is None and not self.victims:
+        if self.sender is None and not self.address and not self.victims:
             raise MessageError("fields", "evidence: it names neither a sender nor a victim")
         if self.since > self.event_time:
             raise MessageError("time", "evidence: it ends before it begins")

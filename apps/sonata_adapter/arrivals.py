@@ -8,8 +8,10 @@ from typing import Annotated, Any, Final
 import numpy as np
 from msgspec import Meta
 
+from apps.evidence import TrainingState
 from apps.messages import LATEST_NS, Message, MessageError, Name, TableCommand, Time, sender_of
 from apps.packets import PACKET_COLUMNS, as_column, read_columns, read_frames
+from apps.sonata_adapter.evidence.count_baseline import CountBaseline
 from due import Item, RecordBatch
 
 MOST_FRAMES: Final = 65_536
@@ -52,6 +54,18 @@ def command_in(item: Item) -> TableCommand:
     """An archived command of this app."""
     sender_of(item)
     return TableCommand.from_value(item.value)
+
+
+def training_in(item: Item) -> TrainingState:
+    """`network.training.<app>`."""
+    sender_of(item)
+    return TrainingState.from_value(item.value)
+
+
+def baseline_in(item: Item) -> CountBaseline:
+    """An archived baseline of this app."""
+    sender_of(item)
+    return CountBaseline.from_value(item.value)
 
 
 def data_in(item: Item) -> RecordBatch:

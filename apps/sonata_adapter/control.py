@@ -59,6 +59,8 @@ class Written(msgspec.Struct, frozen=True):
 
     keys: tuple[str, ...]
     output: Output
+    switch: str
+    """Whose packets it is made of."""
 
 
 MOST_KEYS: Final = 1_024
@@ -81,7 +83,8 @@ class _Lane:
 class _Station:
     """The state kept for one switch."""
 
-    def __init__(self, engine: Callable[[], WindowEngine], base_us: int) -> None:
+    def __init__(self, name: str, engine: Callable[[], WindowEngine], base_us: int) -> None:
+        self.name = name
         self.headers = _Lane(engine())
         self.frames = _Lane(engine())
         self.handshakes = Handshakes()
@@ -158,9 +161,19 @@ class Control:
         """Replace the known queries; running ones continue unchanged."""
         self._templates = templates
 
-    def want(self, keys: Iterable[str]) -> ControllerUpdates:
-        """Replace the set of wanted keys."""
+    @property
+    def now_us(self) -> int | None:
+        """Capture time: how far the switches' clocks and packets have come."""
+        heard = [station.clock.heard_us for station in self._stations.values()]
+        heard += [lane.host.watermark_us for station in self._stations.values() for lane in station.lanes]
+        return max((each for each in heard if each is not None), default=None)
+
+    def want(self, keys: Iterable[str], own: Iterable[QueryRequest] = ()) -> ControllerUpdates:
+        """Replace the set of wanted keys, and of requests that the adapter has itself."""
         requests, outputs, refused = self._read(keys)
+        for request in own:
+            requests[request.identity] = request
+            outputs[request.identity] = {request.output}
         new_refusals = tuple((key, why) for key, why in refused.items() if key not in self._refused)
         self._refused = refused
         self._asked = requests
@@ -367,7 +380,7 @@ class Control:
     def _station(self, name: str, base_us: int = 0) -> _Station:
         station = self._stations.get(name)
         if station is None:
-            station = self._stations[name] = _Station(self._engine, base_us)
+            station = self._stations[name] = _Station(name, self._engine, base_us)
             self._refit(station, {})
         return station
 
@@ -439,9 +452,11 @@ class Control:
         for output in outputs:
             keys = self._outputs.get(output.query, ())
             if output.query == HANDSHAKE and isinstance(output, Captured):
-                written += [Written(keys, found) for found in station.handshakes.process(output.batch)]
+                written += [
+                    Written(keys, found, station.name) for found in station.handshakes.process(output.batch)
+                ]
             elif isinstance(output, Captured) or self._refinement.is_first(id(station), output):
-                written.append(Written(keys, output))
+                written.append(Written(keys, output, station.name))
         return written
 
     def _withdrawn(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:

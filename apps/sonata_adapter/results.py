@@ -1,10 +1,13 @@
 """Results of queries."""
 
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
 from due import RecordBatch
+
+TOO_LARGE: Final = "counts too large by up to"
+"""In `QueryResult.error` of those that may be."""
 
 
 class QueryResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -23,6 +26,11 @@ class QueryResult(msgspec.Struct, frozen=True, kw_only=True):
     """The query came into force within the window and has not seen all of it."""
     error: str = ""
     """Why it is an estimate, and its error; empty if it is exact."""
+
+    @property
+    def may_be_too_large(self) -> bool:
+        """Whether the count is an estimate that may lie above the truth; others lie below."""
+        return TOO_LARGE in self.error
 
     def to_value(self) -> dict[str, Any]:
         """The result as a DUE value; times in ns."""

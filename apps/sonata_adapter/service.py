@@ -2,6 +2,7 @@
 
     network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata.*, network.p4_command.sonata_adapter.*
     network.packets|frames|digests|counts.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
+    network.evidence.sonata_adapter.<query> ─ wanted ─► the query runs, and what goes beyond training is written
 
 While nobody wants a result, nothing is observed and nothing is requested: without an interest the switch
 has no entry and sends nothing.
@@ -21,17 +22,35 @@ import msgspec
 import numpy as np
 
 import due.service
+from apps.evidence import TRAINING, Evidence, TrainingState
 from apps.messages import Intake, MessageError, TableCommand, TableUpdate, one_line, youngest
 from apps.packets import SteadyTime
-from apps.sonata_adapter.arrivals import SwitchPrograms, cells_in, command_in, data_in, state_in
+from apps.sonata_adapter.arrivals import (
+    SwitchPrograms,
+    baseline_in,
+    cells_in,
+    command_in,
+    data_in,
+    state_in,
+    training_in,
+)
 from apps.sonata_adapter.control import Control, ControllerUpdates, Source, Written, leftovers
 from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.evidence.count_baseline import CountBaseline
+from apps.sonata_adapter.evidence.evidence_queries import EVIDENCE_PREFIX, EvidenceQueries
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
-from apps.sonata_adapter.keys import CAPTURE_PREFIX, HANDSHAKE, PROTOCOLS, QUERY_PREFIX, capture_parameters
+from apps.sonata_adapter.keys import (
+    CAPTURE_PREFIX,
+    HANDSHAKE,
+    PROTOCOLS,
+    QUERY_PREFIX,
+    QueryRequest,
+    capture_parameters,
+)
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.query.catalogue import CATALOGUE, Template
 from apps.sonata_adapter.query.templates import QueryFolder, own_queries
-from apps.sonata_adapter.results import Captured
+from apps.sonata_adapter.results import Captured, QueryResult
 from apps.sonata_adapter.switch.cell_read import CellRead
 from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
@@ -41,6 +60,8 @@ COMMAND: Final = "network.p4_command.sonata_adapter"
 CELL_REQUEST: Final = "network.cell_request.sonata_adapter"
 CELLS: Final = "network.cell.p4runtime_ctrl.*"
 INCOMPATIBLE: Final = "network.incompatible.sonata_adapter"
+BASELINE: Final = "network.baseline.sonata_adapter"
+TRAININGS: Final = f"{TRAINING}.*"
 _OWN_PARAMETERS: Final = sorted(
     {each.name for template in CATALOGUE.values() for each in template.parameters}
 )
@@ -50,7 +71,7 @@ def _offering(path: str, names: Iterable[str]) -> str:
     return f"{path}:{','.join(f'{name}=*' for name in sorted(names))}"
 
 
-INTERESTS = (Interest(SWITCHES),)
+INTERESTS = (Interest(SWITCHES), Interest(TRAININGS))
 CAPABILITIES = (
     *(
         Capability(
@@ -70,6 +91,8 @@ CAPABILITIES = (
     Capability(f"{COMMAND}.*", delivery="reliable", archive="always"),
     Capability(f"{CELL_REQUEST}.*", delivery="reliable"),
     Capability(f"{INCOMPATIBLE}.*", archive="always"),
+    Capability(f"{EVIDENCE_PREFIX}.*", delivery="reliable", archive="always"),
+    Capability(f"{BASELINE}.*", delivery="reliable", archive="always"),
 )
 
 _LOG = logging.getLogger(__name__)
@@ -77,6 +100,7 @@ MOST_SWITCHES: Final = 256
 _STATES_READ: Final = 2_000
 _COMMANDS_READ: Final = 20_000
 """Most archived items that are read at start, the youngest."""
+_TRAININGS_READ: Final = 100
 _STEP_US: Final = 3_600_000_000
 """A longer step of a switch's clock is accepted only after several items agree."""
 _LAST_ANSWERS_S: Final = 1.0
@@ -125,6 +149,10 @@ class SonataAdapterService:
         self._cells: Any = None
         self._switches: dict[str, Any] = {}
         self._wanted: frozenset[str] = frozenset()
+        self._evidence = EvidenceQueries(self._stored)
+        self._evidence_wanted: frozenset[str] = frozenset()
+        self._running: tuple[QueryRequest, ...] = ()
+        """What runs for evidence."""
         self._swept: set[str] = set()
         self._active = False
         self._heard: frozenset[str] = frozenset()
@@ -137,14 +165,21 @@ class SonataAdapterService:
         for item in youngest(self._find, {"dataKey": SWITCHES}, 0, _STATES_READ):
             on_switch(item)
         self._engine.observe(SWITCHES).subscribe(on_switch)
+        on_training = self._intake.reading("training", training_in, self._on_training)
+        for item in youngest(self._find, {"dataKey": TRAININGS}, 0, _TRAININGS_READ):
+            on_training(item)
+        self._engine.observe(TRAININGS).subscribe(on_training)
         self._engine.on_assignments(self._on_assignments)
 
     def tick(self) -> None:
-        """Process packets that waited for other streams."""
+        """Process packets that waited for other streams; end the training of queries whose time has come."""
         with self._lock:
             self._write(self._control.tick(time.monotonic()))
             self._read_cells()
             self._refine()
+            now_us = self._control.now_us
+            if now_us is not None:
+                self._say(self._evidence.hear(now_us))
 
     def stop(self) -> None:
         """Report open results, and remove all entries from the switch."""
@@ -168,6 +203,8 @@ class SonataAdapterService:
                 "results": self._written,
                 "switches": sorted(self._switches),
                 "times_doubted": sum(each.doubted for each in self._times.values()),
+                "evidence": self._evidence.written,
+                "evidence_queries": self._evidence.health(),
                 **self._intake.health(),
             }
 
@@ -192,15 +229,23 @@ class SonataAdapterService:
             return dict(CATALOGUE)
 
     def _on_assignments(self, assignments: tuple[Assignment, ...]) -> None:
-        wanted = frozenset(each.key for each in assignments if each.key.startswith(_MY_KEYS))
-        heard = frozenset(each.key for each in assignments) - wanted
+        keys = frozenset(each.key for each in assignments)
+        wanted = frozenset(key for key in keys if key.startswith(_MY_KEYS))
+        evidence = frozenset(key for key in keys if key.startswith(f"{EVIDENCE_PREFIX}."))
+        heard = keys - wanted - evidence
         with self._lock:
             self._active = bool(assignments)
             self._sweep()
-            if wanted != self._wanted:
+            if (wanted, evidence) != (self._wanted, self._evidence_wanted):
                 self._wanted = wanted
-                self._control.know(self._templates())
-                self._apply(self._control.want(wanted))
+                templates = self._templates()
+                self._control.know(templates)
+                if evidence != self._evidence_wanted:
+                    self._evidence_wanted = evidence
+                    for key, reason in self._evidence.want(evidence, templates).items():
+                        self._refuse(key, reason)
+                self._running = self._evidence.requests
+                self._apply(self._control.want(wanted, self._running))
             if heard - self._heard:
                 # a new controller does not know earlier requests
                 self._apply(self._control.everything())
@@ -244,9 +289,7 @@ class SonataAdapterService:
         for offer in changes.offer:
             self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
         for key, reason in changes.refused:
-            _LOG.warning("%s", one_line(reason))
-            name = key.split(":")[0].rpartition(".")[2]
-            self._engine.write(f"{INCOMPATIBLE}.{name}", {"key": key, "reason": reason}, [NO_WAIT])
+            self._refuse(key, reason)
         self._observe(self._control.sources)
         if self._control.needs_cells and self._cells is None:
             on_cells = self._intake.reading("cell", cells_in, self._on_cells)
@@ -254,6 +297,32 @@ class SonataAdapterService:
         elif not self._control.needs_cells and self._cells is not None:
             self._cells.dispose()
             self._cells = None
+
+    def _refuse(self, key: str, reason: str) -> None:
+        _LOG.warning("%s", one_line(reason))
+        name = key.split(":", maxsplit=1)[0].rpartition(".")[2]
+        self._engine.write(f"{INCOMPATIBLE}.{name}", {"key": key, "reason": reason}, [NO_WAIT])
+
+    def _stored(self, query: str) -> CountBaseline | None:
+        """The newest baseline of a query in the archive."""
+        items = youngest(self._find, {"dataKey": f"{BASELINE}.{query}"}, 0, 1)
+        return self._intake.read("baseline", baseline_in, items[-1]) if items else None
+
+    def _on_training(self, item: Item, state: TrainingState) -> None:
+        with self._lock:
+            self._say(self._evidence.train(item.app_id, state))
+
+    def _say(self, found: Iterable[tuple[str, Evidence]]) -> None:
+        """Write evidence and baselines; follow the thresholds, which change when training ends."""
+        for key, evidence in found:
+            self._engine.write(key, evidence.to_value(), [NO_WAIT], event_time=evidence.event_time)
+        for query, baseline in self._evidence.learnt():
+            self._engine.write(
+                f"{BASELINE}.{query}", baseline.to_value(), [NO_WAIT], event_time=baseline.event_time
+            )
+        if self._evidence.requests != self._running:
+            self._running = self._evidence.requests
+            self._apply(self._control.want(self._wanted, self._running))
 
     def _observe(self, sources: set[Source]) -> None:
         for source in self._observed.keys() - sources:
@@ -304,13 +373,20 @@ class SonataAdapterService:
             self._engine.write(f"{CELL_REQUEST}.{switch}", cell_request(reads), [NO_WAIT])
 
     def _write(self, written: Iterable[Written]) -> None:
+        weighed: list[tuple[str, str, QueryResult]] = []
         for one in written:
             output = one.output
             value: Any = output.batch if isinstance(output, Captured) else output.to_value()
             at_us = output.last_us if isinstance(output, Captured) else output.at_us
             for key in one.keys:
+                if self._evidence.owns(key):
+                    if isinstance(output, QueryResult):
+                        weighed.append((key, one.switch, output))
+                    continue
                 self._written += 1
                 self._engine.write(key, value, [NO_WAIT], event_time=at_us * 1000)
+        if weighed:
+            self._say(self._evidence.take(weighed))
 
 
 def _engine(settings: Settings) -> Callable[..., WindowEngine]:

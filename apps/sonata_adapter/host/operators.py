@@ -16,6 +16,7 @@ from apps.sonata_adapter.host.key_tables import Growing, Hashes, KeyTable, Numbe
 from apps.sonata_adapter.host.sketches import Bloom, CountMin
 from apps.sonata_adapter.query.dataflow import VALUE, DistinctNode, ReduceNode, kinds_of
 from apps.sonata_adapter.query.expressions import Expression, Number
+from apps.sonata_adapter.results import TOO_LARGE
 
 _NO_ROWS: Final = np.empty(0, dtype=np.int64)
 _BUSY: Final = 8
@@ -191,7 +192,7 @@ class ReduceOperator:
             return ""
         return (
             f"reduce: {self.beyond} tuples of keys beyond the bound of {self._limit}, "
-            f"their counts too large by up to {self._sketch.excess}"
+            f"their {TOO_LARGE} {self._sketch.excess}"
         )
 
 

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as examples
 
 from apps.packets import PACKET_COLUMNS
-from apps.sonata_adapter.service import CELLS, INTERESTS, SWITCHES, Settings, SonataAdapterService
+from apps.sonata_adapter.service import CELLS, INTERESTS, SWITCHES, TRAININGS, Settings, SonataAdapterService
 from due import Assignment, Item, RecordBatch
 from sdnator.testing.controller_run import frame
 from tests.apps.hostile import NOW, Hands, mutations, values
@@ -15,7 +15,7 @@ PREFIX = "network.traffic_query.sonata"
 WANTED = (
     f"{PREFIX}.port_scan", f"{PREFIX}.syn_flood:window=200ms", f"{PREFIX}.slowloris", f"{PREFIX}.dns_tunnel",
     f"{PREFIX}.zorro", f"{PREFIX}.new_tcp", f"{PREFIX}.incomplete_flows", "network.traffic_capture.sonata.tcp",
-    "network.handshake.sonata.tcp",
+    "network.handshake.sonata.tcp", "network.evidence.sonata_adapter.arp_scan",
 )  # fmt: skip
 ROWS = 5
 TIMES = np.arange(NOW // 1000, NOW // 1000 + ROWS)
@@ -34,6 +34,9 @@ COUNTS = ("window", "count", "src_hi", "src_lo", "dst_hi", "dst_lo", "port", "le
 ONES = np.ones(ROWS, "u1")
 GENUINE = {
     "switch": STATE[1],
+    "training": {
+        "packets": 5, "wanted": 10, "done": False, "seconds": 60.0, "senders": 2, "event_time": NOW,
+    },
     "packets": packets(),
     "digests": packets(crossed=ONES, overflow=ONES),
     "counts": RecordBatch({**{name: np.ones(ROWS, "i8") for name in COUNTS}, "time_us": TIMES}),
@@ -74,7 +77,7 @@ def test_all_interests_are_tried():
     """What is observed for these queries is of every kind that there is."""
     engine, _ = started()
     assert {pattern.split(".")[1] for pattern in engine.subjects} <= GENUINE.keys()
-    assert {interest.key for interest in INTERESTS} == {SWITCHES}
+    assert {interest.key for interest in INTERESTS} == {SWITCHES, TRAININGS}
     assert CELLS in engine.subjects or not places(engine, "cell")
 
 

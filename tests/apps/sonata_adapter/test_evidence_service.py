@@ -1,0 +1,96 @@
+"""Evidence among real processes: somebody wants it, the query learns, runs in the switch, and accuses."""
+
+import random
+
+import pytest
+
+from apps.evidence import Evidence, TrainingState
+from due import Capability
+from sdnator.testing.controller_run import BASE_US, ControllerRun, Heard
+from sdnator.testing.query_traffic import BASE_US as TRAFFIC_US
+from sdnator.testing.query_traffic import HOSTS, attack, office
+from sdnator.testing.waiting import wait_for
+
+PREFIX = "network.evidence.sonata_adapter"
+QUERIES = ("port_scan", "syn_flood", "arp_scan")
+TRAINED_S = 70
+SETTINGS = {"limits": {"reads": False}}  # frames come much faster than they were captured
+
+
+@pytest.fixture
+def stage(tmp_path):
+    with ControllerRun(tmp_path) as stage:
+        yield stage
+
+
+def send(feed, frames):
+    """All at once; they are through when the switch has answered for each."""
+    for begin in range(0, len(frames), 256):
+        part = frames[begin : begin + 256]
+        feed.send([f.time_us - TRAFFIC_US for f in part], [f.length for f in part], [f.data for f in part])
+    verdicts = b""
+    while len(verdicts) < len(frames):
+        verdicts += feed.verdicts()
+
+
+def quiet(seconds, start_s=0.0):
+    return office(seconds, random.Random(4), TRAFFIC_US + int(start_s * 1e6))
+
+
+def learning(health):
+    """What each query says of itself in the adapter's newest health."""
+    found = [value["app"]["evidence_queries"] for value in health.values("health")]
+    return found[-1] if found else {}
+
+
+def test_queries_learn_and_then_accuse(stage):
+    """The benign office says nothing; each attack does; another adapter goes on with what this one learnt."""
+    adapter = stage.run("apps.sonata_adapter.service", SETTINGS)
+    engine = stage.engine("observer")
+    trainer = stage.engine("kitsune", capabilities=[Capability("network.training.*", archive="always")])
+    states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
+    health = Heard(engine, "due.health.sonata_adapter")
+    stage.controller()
+    heard = Heard(engine, *(f"{PREFIX}.{name}" for name in QUERIES))
+    wait_for(lambda: set(learning(health)) == set(QUERIES), why=stage.log)
+    wait_for(lambda: states.values("network.switch")[-1]["telemetry"], why=stage.log)
+    feed = stage.feed()
+    send(feed, quiet(TRAINED_S))
+    state = TrainingState(
+        packets=1, wanted=1, done=True, seconds=TRAINED_S, senders=12, event_time=(BASE_US + TRAINED_S * 10**6) * 1000
+    )  # fmt: skip
+    trainer.write("network.training.kitsune", state.to_value())
+    send(feed, quiet(10, TRAINED_S))
+    wait_for(lambda: "learning" not in learning(health).values(), why=lambda: learning(health))
+    wait_for(lambda: len(engine.get("network.baseline.sonata_adapter.*")) == len(QUERIES), why=stage.log)
+    send(feed, quiet(5, TRAINED_S + 10))
+    assert not heard.items
+    rng = random.Random(5)
+    for place, name in enumerate(QUERIES):
+        start = TRAFFIC_US + (TRAINED_S + 20 + 5 * place) * 10**6
+        send(feed, sorted(attack(name, start, rng)))
+    send(feed, quiet(5, TRAINED_S + 40))
+    wait_for(
+        lambda: {item.key for item in heard.items} >= {f"{PREFIX}.{name}" for name in QUERIES}, why=stage.log
+    )
+    found = {item.key.rpartition(".")[2]: Evidence.from_value(item.value) for item in heard.items}
+    assert found["port_scan"].address == HOSTS["port_scan"]
+    assert found["syn_flood"].victims == (HOSTS["syn_flood"],)
+    sender = found["arp_scan"].sender
+    assert sender is not None
+    assert (sender.switch, sender.port, sender.mac) == ("s1", 1, HOSTS["arp_scan"])
+    feed.close()
+    stage.kill(adapter)
+    health.items.clear()
+    stage.run("apps.sonata_adapter.service", SETTINGS)
+    wait_for(lambda: "learning" not in (learning(health) or {"": "learning"}).values(), why=stage.log)
+
+
+def test_a_query_that_cannot_be_evidence_is_answered(stage):
+    """With the reason, like a wrong parameter."""
+    stage.run("apps.sonata_adapter.service", {})
+    engine = stage.engine("observer")
+    answers = Heard(engine, "network.incompatible.sonata_adapter.*")
+    Heard(engine, f"{PREFIX}.nonsense")
+    wait_for(lambda: answers.items)
+    assert "there is no such evidence" in answers.items[0].value["reason"]
