@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = {"due", "coordinator", "apps", "dataplane", "sdnator", "p4rt", "sdnator_due", "tests", "benchmarks"}
-CONTRACT = {"apps", "apps.evidence", "apps.messages", "apps.packets"}
+CONTRACT = {"apps", "apps.evidence", "apps.incidents", "apps.messages", "apps.packets"}
 APPS = ("p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall")
 IO_MODULES = {"socket", "threading", "asyncio", "subprocess", "time", "redis", "pymongo", "grpc"}
 
