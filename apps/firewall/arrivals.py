@@ -12,6 +12,7 @@ from apps.evidence import Evidence, TrainingState
 from apps.firewall.syn.recent_syns import SYN_COLUMNS
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_ack_buffer import ANSWER_COLUMNS
+from apps.incidents import Incident
 from apps.messages import (
     LATEST_NS,
     Alert,
@@ -103,6 +104,12 @@ def decision_in(item: Item) -> Decision:
     """An archived decision of this app."""
     sender_of(item)
     return Decision.from_value(item.value)
+
+
+def incident_in(item: Item) -> Incident:
+    """An archived incident of this app."""
+    sender_of(item)
+    return Incident.from_value(item.value)
 
 
 def command_in(item: Item) -> TableCommand:

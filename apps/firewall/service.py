@@ -21,7 +21,6 @@ from apps.firewall import arrivals
 from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
-from apps.firewall.enforcement.eve import alert_line, decision_line
 from apps.firewall.enforcement.event_sink import event_sinks
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
@@ -29,6 +28,7 @@ from apps.firewall.evidence.archive import Archive
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
 from apps.firewall.evidence.past import ArchivedPast
 from apps.firewall.evidence.recent_rows import AGED_S
+from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
 from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider, Proposal
@@ -82,6 +82,7 @@ CAPABILITIES = (
     Capability("network.protect.firewall.ipv4", delivery="reliable", archive="always"),
     Capability("network.protect.firewall.ipv6", delivery="reliable", archive="always"),
     Capability(f"{EVENTS}.*", delivery="reliable", archive="always"),
+    INCIDENT_CAPABILITY,
     Capability("network.p4_command.firewall.*", delivery="reliable"),
     Capability(f"{KEPT}.*", delivery="reliable", archive="always"),
     Capability("network.packet_out.firewall.*", delivery="reliable"),
@@ -150,7 +151,8 @@ class FirewallService:
         )
         self._archive = Archive(engine, settings.archive_patience_s)
         self._past = ArchivedPast(self._archive, self._intake, settings)
-        self._announcer = Announcer(engine, *event_sinks(settings))
+        self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
+        self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._lock = threading.RLock()
         self._stopped = False
         self._carried_out: deque[str] = deque(maxlen=1000)
@@ -215,6 +217,7 @@ class FirewallService:
         standing = self._past.standing()
         self._ledger.restore(standing)
         self._syn.restore(standing)
+        self._incidents.restore(self._past.incidents())
         if standing:
             log.info("decisions in force from the archive: %d", len(standing))
 
@@ -266,6 +269,7 @@ class FirewallService:
             "archive_away": self._archive.unanswered,
             "archive_items_read": self._archive.items_read,
             "times_doubted": self._time.doubted + self._row_time.doubted,
+            **self._incidents.health(),
             **self._intake.health(),
             **self._announcer.health(),
         }
@@ -446,12 +450,11 @@ class FirewallService:
 
     def _on_alert(self, item: Item, alert: Alert) -> None:
         with self._lock:
-            at = self._time.fit(alert.event_time)
-            self._judge(item, alert if at == alert.event_time else structs.replace(alert, event_time=at))
+            self._judge(item, structs.replace(alert, event_time=self._time.fit(alert.event_time)))
 
     def _judge(self, item: Item, alert: Alert) -> None:
         self._counts["alerts"] += 1
-        self._announcer.event(alert_line(alert))
+        self._incidents.alert(alert)
         self._lapse(alert.event_time)
         self._remember(alert.sender, evidence_of(item, alert.reason))
         if self._ledger.covering(alert.sender) is not None:
@@ -570,6 +573,7 @@ class FirewallService:
     def _on_confirmation(self, _: Item, confirmation: Confirmation) -> None:
         with self._lock:
             self._ledger.confirm(confirmation)
+            self._incidents.confirmed(confirmation)
             self._resets.confirm(confirmation.id, confirmation.state, time.monotonic())
         if confirmation.state == "failed":
             cause = one_line(confirmation.cause)
@@ -580,6 +584,7 @@ class FirewallService:
             believed = state.event_time > 0 and self._time.hear(state.event_time)
             for reading in state.blocks if believed else ():
                 self._ledger.count_drops(reading.id, reading.packets, state.event_time)
+                self._incidents.count(reading.id, reading.packets, state.event_time)
             self._arm(item, state)
             if believed:
                 self._lapse(state.event_time)
@@ -587,6 +592,7 @@ class FirewallService:
     def _lapse(self, now: int) -> None:
         for decision in [*self._ledger.due(now), *self._syn.due(now)]:
             self._publish(decision)
+        self._incidents.lapse(now)
 
     # -- output ------------------------------------------------------------------------
 
@@ -594,7 +600,7 @@ class FirewallService:
         target = decision.target
         kind = ("ipv6" if ":" in target.address else "ipv4") if target.kind == "ip" else "mac"
         log.warning("%s %s: %s", decision.action, target.address, one_line(decision.reason))
-        self._announcer.event(decision_line(decision), important=True)
+        self._incidents.decided(decision)
         family = "protect" if decision.action in ("protect", "unprotect") else "block"
         if is_prefix(target):
             family = "block_prefix"

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import due
-from apps.firewall.enforcement.eve import notice_line
+from apps.firewall.enforcement.eve import EveFormat, line_of, notice_event
 from apps.firewall.policy.block_lifecycle import OperatorNotice
 from due import Engine
 
@@ -31,8 +31,15 @@ class Taker(Protocol):
 class Announcer:
     """Sinks for every event, sinks for important events only, and notices as DUE items."""
 
-    def __init__(self, engine: Engine, every: Sequence[Taker], important: Sequence[Taker]) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        every: Sequence[Taker],
+        important: Sequence[Taker],
+        form: EveFormat = "eve",
+    ) -> None:
         self._engine = engine
+        self._form: EveFormat = form
         self._every = every
         self._important = important
 
@@ -45,7 +52,7 @@ class Announcer:
         """Publish a notice for operators; below a warning it is no event."""
         log.log(level, "%s", notice.text)
         if level > logging.INFO:
-            self.event(notice_line(notice), important=True)
+            self.event(line_of(notice_event(notice), self._form), important=True)
         value = {"kind": notice.kind, "text": notice.text, "event_time": notice.event_time}
         at = notice.event_time or None
         self._engine.write(f"{EVENTS}.{notice.kind}", value, [due.NO_WAIT], event_time=at)

@@ -6,12 +6,20 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any, Final, TypeVar
 
-from apps.firewall.arrivals import answer_in, command_in, decision_in, handshake_in, instruction_in
+from apps.firewall.arrivals import (
+    answer_in,
+    command_in,
+    decision_in,
+    handshake_in,
+    incident_in,
+    instruction_in,
+)
 from apps.firewall.enforcement.switch_entries import KEPT, leftovers
 from apps.firewall.evidence.archive import MOST, Archive
 from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, in_force
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
 from apps.firewall.settings import Settings
+from apps.incidents import INCIDENTS, Incident
 from apps.messages import LONGEST_BLOCK_S, Decision, Instruction, Intake, MessageError, TableUpdate
 from due import Item
 
@@ -21,6 +29,7 @@ _LONGEST_NS: Final = LONGEST_BLOCK_S * 1_000_000_000 + _DAY_NS
 """Longest block plus a day for clock changes: older decisions are no longer in force."""
 _INSTRUCTIONS: Final = 20_000
 _ANSWERS: Final = 1_000
+_INCIDENTS: Final = 20_000
 _SOURCE_SHARE: Final = 10
 """Archived handshakes read per known source."""
 
@@ -55,6 +64,11 @@ class ArchivedPast:
         since = time.time_ns() - _LONGEST_NS
         found = [each for key in DECISIONS for each in self._read(key, "decision", decision_in, since=since)]
         return in_force(each for each in found if not each.dry_run)
+
+    def incidents(self) -> list[Incident]:
+        """Reports of incidents that may still be open, oldest first."""
+        since = time.time_ns() - _LONGEST_NS
+        return self._read(INCIDENTS, "incident", incident_in, since=since, most=_INCIDENTS)
 
     def teach(self, known: KnownSources) -> None:
         """Known sources, from the handshakes of the last `known_days`."""

@@ -82,6 +82,10 @@ class IncidentBook:
     def __len__(self) -> int:
         return len(self._open)
 
+    def has(self, decision: str) -> bool:
+        """Whether a decision belongs to an incident that is not over."""
+        return decision in self._by_decision
+
     # -- what happens --------------------------------------------------------------------------------
 
     def hear_evidence(self, evidence: Evidence, total_nats: float, bound: float) -> list[Incident]:

@@ -244,13 +244,14 @@ def test_one_direction_is_told_once():
 
 
 def test_events_go_to_the_file_and_health_is_numbers(tmp_path):
-    """Alerts, decisions, notices; the file is whole when the service has stopped."""
+    """Incidents and notices; the file is whole when the service has stopped."""
     eve = tmp_path / "eve.json"
     desk = Desk(eve_file=str(eve), detect=False)
     desk.hand(ALERT, alert(anomalous_seconds=5).to_value())
     desk.service.stop()
     events = [json.loads(line) for line in eve.read_text().splitlines()]
-    assert [event["alert"]["category"] for event in events] == ["anomaly", "block"]
+    assert [event["alert"]["metadata"]["event"] for event in events] == [["opened"], ["decided"]]
+    assert len({event["flow_id"] for event in events}) == 1
     health = desk.service.health()
     assert health["outlets"] == [{"name": "eve_file", "delivered": 2, "lost": 0}]
     assert health["events_lost"] == 0
