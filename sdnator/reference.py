@@ -247,14 +247,16 @@ def keys() -> str:
         lines += [f"- {_code(one.key)}{when}" for one, when in _interests(service)]
         lines.append("")
     times = (
-        "Values of alerts, decisions, confirmations and commands are maps with these fields. Times are "
+        "Values of alerts, evidence, decisions, incidents, confirmations and commands are maps with these fields. Times are "
         "capture time, integer nanoseconds since the epoch (UTC)."
     )
     lines += ["## Packets", "", *_packets(), "## Messages", "", times, ""]
-    messages = import_module("apps.messages")
-    for kind in vars(messages).values():
-        if inspect.isclass(kind) and issubclass(kind, messages.Message) and kind is not messages.Message:
-            lines += [f"### {kind.__name__}", "", _first_line(kind), "", _fields(kind), ""]
+    base = import_module("apps.messages").Message
+    for module in ("apps.messages", "apps.evidence", "apps.incidents"):
+        for kind in vars(import_module(module)).values():
+            own = inspect.isclass(kind) and kind.__module__ == module
+            if own and issubclass(kind, base) and kind is not base:
+                lines += [f"### {kind.__name__}", "", _first_line(kind), "", _fields(kind), ""]
     return _page("Keys and messages", "![Data flow between the apps](../images/flow.svg)", lines)
 
 

@@ -8,8 +8,10 @@ from apps.firewall.evidence.history import DECISIONS, count_offences, instructio
 from apps.messages import Decision, Exhibit
 from due import Item
 from sdnator.blocks.blocks_archive import find
+from sdnator.blocks.five_lines import five_lines
 from sdnator.counted import counted
 from sdnator.errors import BadInput
+from sdnator.incidents.incidents_archive import incident_of
 
 _SHOWN = 200
 
@@ -25,8 +27,11 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
     confirmations = find(
         archive, {"dataKey": "network.confirmation.p4runtime_ctrl.*", "value.id": decision_id}
     )
+    incident = incident_of(archive, decision_id)
     return {
         "id": decision_id,
+        "why": list(five_lines(first, steps[-1], incident)),
+        "incident": incident.to_value() if incident is not None else None,
         "target": first.target.address,
         "steps": [
             {"written": item.timestamp} | made.to_value() for item, made in zip(found, steps, strict=True)
@@ -73,7 +78,11 @@ def _readings(item: Item, decision_id: str) -> Iterator[dict[str, int]]:
 
 
 def as_text(life: dict[str, Any]) -> Iterator[str]:
-    """The life in lines, in the order of what happened."""
+    """Five lines that explain it, then its life in the order of what happened."""
+    yield from life["why"]
+    yield ""
+    if life["incident"] is not None:
+        yield f"part of incident {life['incident']['id']}: `sdnator incidents show {life['incident']['id']}`"
     events: list[tuple[int, str]] = []
     for step in life["steps"]:
         made = Decision.from_value(step)

@@ -85,7 +85,7 @@ def why(
     archive: ArchiveOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """History of a decision: reasons, evidence, earlier offences, switch confirmations, drops.
+    """Why a decision was made, in five lines; then its history, earlier offences, confirmations, drops.
 
     Example: sdnator blocks why 1f0c2a9be771
     """

@@ -65,6 +65,7 @@ COMMANDS = {
         "sdnator.cli.due_commands:get",
         "Show archived items, oldest first; works without a running pipeline.",
     ),
+    "incidents": ("sdnator.cli.incidents_commands:incidents", "Incidents: list them, show one."),
     "keys": (
         "sdnator.cli.coordinator_commands:keys",
         "List all keys with producers, consumers and delivery.",

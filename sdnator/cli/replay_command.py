@@ -209,6 +209,7 @@ def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "not copied", f"{found['packets_not_copied']:,}"
     yield "lost", f"{found['packets_lost']:,}"
     yield "alerts", f"{found['alerts']:,}"
+    yield "incidents", f"{len(found['incidents']):,}, {found['incidents_mitigated']:,} mitigated within 5 s"
     if found.get("time_to_block_s") and found["time_to_block_s"]["capture"] is not None:
         yield (
             "time to block",

@@ -42,7 +42,9 @@ def status(*, as_json: Json = False) -> None:
         for name, pid in found.parts.items()
     }
     apps = _states(found.coordinator)
-    control = _control(found.coordinator) if apps is not None else None
+    health = _health(found.coordinator) if apps is not None else None
+    control = controlled(health) if health is not None else None
+    incidents = open_incidents(health) if health is not None else None
     away = [name for name, one in found.health.items() if one["state"] != "running"]
     well = all(part["alive"] for part in parts.values()) and apps is not None and not away
     if as_json:
@@ -55,6 +57,7 @@ def status(*, as_json: Json = False) -> None:
                     "parts": parts,
                     "apps": apps,
                     "control": control,
+                    "incidents_open": incidents,
                 }
             )
         )
@@ -63,6 +66,9 @@ def status(*, as_json: Json = False) -> None:
         wired = {str(one["name"]) for one in found.switches if one.get("forward")}
         for line in control_lines(control, wired):
             print(line)
+        if incidents is not None:
+            more = "; see `sdnator incidents list --open`" if incidents else ""
+            print(f"{counted(incidents, 'incident')} open{more}")
     raise typer.Exit(0 if well else 1)
 
 
@@ -138,14 +144,22 @@ def _states(coordinator: str) -> dict[str, str] | None:
         return None
 
 
-def _control(coordinator: str) -> dict[str, Any] | None:
-    """The controller's state of its switches; None if there is none."""
+def _health(coordinator: str) -> Mapping[str, Any] | None:
+    """What the Coordinator says of all apps; None if it does not answer."""
     from sdnator.northbound import ask
 
     try:
-        return controlled(ask(coordinator, "/health"))
+        found: Mapping[str, Any] = ask(coordinator, "/health")
     except PipelineError:
         return None
+    return found
+
+
+def open_incidents(health: Mapping[str, Any]) -> int | None:
+    """From the Coordinator's /health: how many incidents are open; None if no firewall says."""
+    told = health.get("apps", {}).get("firewall", {}).get("health", {}).get("app", {})
+    count = told.get("incidents_open")
+    return count if isinstance(count, int) else None
 
 
 def controlled(health: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -10,10 +10,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from apps.incidents import Incident
 from apps.messages import Alert, Confirmation, Decision
 
 ALERTS_KEPT: Final = 200
 DECISIONS_KEPT: Final = 500
+INCIDENTS_KEPT: Final = 200
 NAMES_KEPT: Final = 64
 BINS: Final = 240
 PARTS: Final = ("coordinator", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "dashboard")
@@ -70,6 +72,8 @@ class Board:
         self.decisions: OrderedDict[tuple[str, str, str, int | None], Decision] = OrderedDict()
         self.answers: OrderedDict[str, str] = OrderedDict()
         """What switches said of decisions, by decision and switch."""
+        self.incidents: OrderedDict[str, Incident] = OrderedDict()
+        """By id, as last reported, the one heard of last at the end."""
         self.switches: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
         self.health: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
         self.apps: list[dict[str, Any]] = []
@@ -129,6 +133,17 @@ class Board:
                 self.answers.popitem(last=False)
             self._changed("decisions")
 
+    def incident(self, incident: Incident) -> None:
+        """A report of an incident."""
+        with self.lock:
+            self.incidents.pop(incident.id, None)
+            if not incident.joined:
+                self.incidents[incident.id] = incident
+            while len(self.incidents) > INCIDENTS_KEPT:
+                over = (name for name, one in self.incidents.items() if one.state == "over")
+                del self.incidents[next(over, next(iter(self.incidents)))]
+            self._changed("incidents")
+
     def switch(self, value: Mapping[str, Any]) -> None:
         """The state of a switch."""
         with self.lock:
@@ -181,6 +196,10 @@ class Board:
     def standing(self) -> list[Decision]:
         """Blocks and guards in force, the newest first."""
         return [each for each in reversed(self.decisions.values()) if each.action in STANDING]
+
+    def open_incidents(self) -> int:
+        """How many incidents are not over, as far as they are kept."""
+        return sum(one.state == "open" for one in self.incidents.values())
 
     def present(self) -> list[dict[str, Any]]:
         """Apps that are here, and parts of the product that ought to be."""

@@ -1,4 +1,4 @@
-"""Live: figures, the plot of scores, what is blocked and why, alerts."""
+"""Live: figures, the plot of scores, incidents, what is blocked and why, alerts."""
 
 import time
 from typing import TYPE_CHECKING, Any
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from sdnator.dashboard.charts import score_chart, score_points, threshold, top
-from sdnator.dashboard.texts import alert_row, decision_row, number
+from sdnator.dashboard.texts import alert_row, decision_row, incident_row, number
 
 if TYPE_CHECKING:
     from nicegui.events import GenericEventArguments
@@ -53,6 +53,7 @@ class LivePanel:
             for name in (
                 "packets scored/s",
                 "above the threshold",
+                "open incidents",
                 "alerts",
                 "blocks and guards",
                 "apps active",
@@ -65,6 +66,9 @@ class LivePanel:
             with ui.element("div").classes("panel wide"):
                 ui.label("Anomaly scores").classes("panel-title")
                 self._chart = ui.echart(score_chart()).style("height: 260px; width: 100%").classes("scores")
+            with ui.element("div").classes("panel wide"):
+                ui.label("Incidents").classes("panel-title")
+                self._incidents = self._feed("incidents", "", "no incidents")
             with ui.element("div").classes("panel"):
                 ui.label("Blocks and guards").classes("panel-title")
                 undo = _button("undo", ':label="props.row.undo"', "undo", 'v-if="props.row.undo"')
@@ -105,7 +109,8 @@ class LivePanel:
             figures = self._figures(now)
         if points is not None:
             self._draw(points, line)
-        for name, table in (("decisions", self._decisions), ("alerts", self._alerts)):
+        tables = {"incidents": self._incidents, "decisions": self._decisions, "alerts": self._alerts}
+        for name, table in tables.items():
             if name in rows:
                 table.rows = rows[name]
         for name, text in figures.items():
@@ -122,12 +127,15 @@ class LivePanel:
     def _rows(self) -> dict[str, list[dict[str, Any]]]:
         board = self._board
         rows = {}
+        if self._new("incidents"):
+            newest = sorted(board.incidents.values(), key=lambda one: -one.begun)[:_SHOWN]
+            rows["incidents"] = [incident_row(each) for each in newest]
         if self._new("decisions"):
             rows["decisions"] = self._decision_rows()
         if self._new("alerts"):
             first = board.counts["alerts"]
-            newest = list(board.alerts)[: -_SHOWN - 1 : -1]
-            rows["alerts"] = [alert_row(each, first - place) for place, each in enumerate(newest)]
+            last = list(board.alerts)[: -_SHOWN - 1 : -1]
+            rows["alerts"] = [alert_row(each, first - place) for place, each in enumerate(last)]
         return rows
 
     def _decision_rows(self) -> list[dict[str, Any]]:
@@ -146,6 +154,7 @@ class LivePanel:
         return {
             "packets scored/s": number(board.scores.rate(now)),
             "above the threshold": number(over),
+            "open incidents": number(board.open_incidents()),
             "alerts": number(board.counts["alerts"]),
             "blocks and guards": number(len(board.standing())),
             "apps active": f"{active} of {len(here)}" if here else "-",

@@ -16,6 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 import due.service
+from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Answer, Confirmation, Decision, Instruction
 from due import NO_WAIT, Capability, Engine, Interest, Item
 from due.errors import DueError, InvalidOption
@@ -34,6 +35,7 @@ INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
     *(Interest(key) for key in DECISIONS),
     Interest("network.confirmation.p4runtime_ctrl.*"),
+    Interest(INCIDENTS),
     Interest(f"{_STATE}.*"),
     Interest("due.health.*"),
     Interest(ANSWERS),
@@ -43,6 +45,8 @@ CAPABILITIES = (Capability(INSTRUCTION, delivery="reliable", archive="always"),)
 _POLL_SECONDS = 2.0
 _ANSWER_SECONDS = 10.0
 _WAITING = 64
+_REPORTS = 5_000
+"""Archived reports of incidents that are read at the start, the newest."""
 _DAY_NS = 86_400 * 10**9
 
 log = logging.getLogger(__name__)
@@ -119,6 +123,7 @@ class DashboardService:
             "network.confirmation.p4runtime_ctrl.*": lambda item: board.confirm(
                 Confirmation.from_value(item.value)
             ),
+            INCIDENTS: lambda item: board.incident(Incident.from_value(item.value)),
             f"{_STATE}.*": lambda item: board.switch(item.value),
             "due.health.*": lambda item: board.healthy(item.app_id, item.value, time.monotonic()),
             ANSWERS: self._on_answer,
@@ -151,6 +156,8 @@ class DashboardService:
         query = {"dataKey": "network.anomaly.kitsune.alert", "timestamp": {"$gte": since}}
         for item in self._engine.get(query)[-200:]:
             self.board.alert(Alert.from_value(item.value))
+        for item in self._engine.get({"dataKey": INCIDENTS, "timestamp": {"$gte": since}})[-_REPORTS:]:
+            self.board.incident(Incident.from_value(item.value))
 
     def _take_up_switches(self) -> None:
         """What switches said before anybody knew of our interest: then it went to the archive alone."""

@@ -27,6 +27,7 @@ body { font-variant-numeric: tabular-nums; }
 .entry .side { flex: 0 0 auto; display: flex; gap: 4px; flex-wrap: wrap; justify-content: flex-end; }
 .mark { flex: 0 0 auto; width: 4px; align-self: stretch; border-radius: 2px; background: #8884; }
 .mark.block { background: #d32f2f; } .mark.protect { background: #1976d2; } .mark.alert { background: #f9a825; }
+.mark.incident { background: #6a4fb3; }
 .plain { width: 100%; }
 .plain td { white-space: normal !important; overflow-wrap: break-word; }
 .found td:last-child { overflow-wrap: anywhere; }

@@ -3,7 +3,9 @@
 from datetime import UTC, datetime
 from typing import Any
 
+from apps.incidents import Incident
 from apps.messages import Alert, Decision, Target
+from sdnator.incidents.incident_rows import row
 
 
 def clock(time_ns: int) -> str:
@@ -56,4 +58,19 @@ def alert_row(one: Alert, number: int) -> dict[str, Any]:
         "where": f"{clock(one.event_time)} · {sender.switch} port {sender.port} · score {one.peak_score:.1f} "
         f"· {one.over} of {one.packets} packets above the threshold",
         "reason": one.reason,
+    }
+
+
+def incident_row(one: Incident) -> dict[str, Any]:
+    """An incident for the list."""
+    texts = row(one)
+    over = "" if one.state == "open" else " · over"
+    return {
+        "id": one.id,
+        "action": "incident",
+        "target": f"{texts['kind']}: {texts['attacker']}",
+        "address": "",
+        "where": f"{clock(one.begun)} · against {texts['victims']}{over}",
+        "reason": texts["done"],
+        "said": f"{texts['stopped']} packets stopped" if one.cost.stopped else "",
     }

@@ -19,12 +19,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Confirmation, Decision
 from dataplane.ports.capture_port import CapturePortError
 from due import CONSUMER, Engine, Interest, Item
 from sdnator.capture.captures import Capture
 from sdnator.capture.interfaces import Feed
 from sdnator.errors import PipelineError
+from sdnator.incidents.incident_rows import newest_of_each, with_counters
 from sdnator.replay.drop_counters import DropCounters
 from sdnator.replay.packet_accounting import PacketAccounting, PacketState
 from sdnator.replay.pipeline import SWITCH_NAME, PipelinePlan, ReplayPipeline
@@ -56,6 +58,7 @@ INTERESTS = (
     Interest("network.block.firewall.*"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
+    Interest(INCIDENTS),
 )
 
 
@@ -109,10 +112,16 @@ class PassResult:
     alerts: list[Alert] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     confirmations: list[Confirmation] = field(default_factory=list)
+    incidents: list[Incident] = field(default_factory=list)
+    """Reports of the firewall, in the order of writing: the last of an id holds."""
     sent_at: dict[int, float] = field(default_factory=dict)
     """Wall time (monotonic) at which watched packets were sent."""
     confirmed_at: list[float] = field(default_factory=list)
     """Wall time of each confirmation."""
+
+    def last_incidents(self) -> list[Incident]:
+        """Incidents as last reported, with the last counters of the switch, in the order of their begin."""
+        return [with_counters(each, self.drops_counted) for each in newest_of_each(self.incidents)]
 
 
 Progress = Callable[[PacketAccounting, int], None]
@@ -134,6 +143,7 @@ class _Observer:
         engine.observe("network.block.firewall.*").subscribe(self._on_decision)
         engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
         engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
+        engine.observe(INCIDENTS).subscribe(self._on_incident)
 
     def _on_score(self, item: Item) -> None:
         value = item.value
@@ -148,6 +158,10 @@ class _Observer:
     def _on_decision(self, item: Item) -> None:
         with self.moved:
             self._result.decisions.append(Decision.from_value(item.value))
+
+    def _on_incident(self, item: Item) -> None:
+        with self.moved:
+            self._result.incidents.append(Incident.from_value(item.value))
 
     def _on_confirmation(self, item: Item) -> None:
         confirmation = Confirmation.from_value(item.value)

@@ -11,6 +11,7 @@ import numpy as np
 from sdnator.capture.captures import CaptureError
 from sdnator.capture.labels import Labels, LabelsError, read_labels
 from sdnator.errors import BadInput
+from sdnator.incidents.incident_rows import as_json
 from sdnator.replay.loop import PassResult, Progress, ReplayOptions, ReplayPass, wall_seconds_to_block
 from sdnator.replay.packet_accounting import PacketState
 from sdnator.replay.summary import attack_figures, auc, block_rows
@@ -101,6 +102,7 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
     flight = result.flight
     trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
     blocks = block_rows(outcome.survey, result.decisions, result.confirmations)
+    incidents = result.last_incidents()
     first_attack = None
     attack: dict[str, Any] = {}
     if outcome.labels is not None:
@@ -123,6 +125,8 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "training_packets": trained,
         "alerts": len(result.alerts),
         "blocks": blocks,
+        "incidents": [as_json(each) for each in incidents],
+        "incidents_mitigated": sum(each.mitigated for each in incidents),
         "first_alert_packet": min((alert.first_packet for alert in result.alerts), default=None),
         "first_block_packet": blocks[0]["packet"] if blocks else None,
         "time_to_block_s": time_to_block,

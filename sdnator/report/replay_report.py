@@ -32,5 +32,12 @@ def write_replay_report(folder: Path, outcome: ReplayOutcome, figures: Mapping[s
 
 def _pass_data(title: str, result: PassResult) -> PassData:
     return PassData(
-        title, result.flight.score, result.flight.state, result.alerts, result.decisions, result.confirmations
+        title,
+        result.flight.score,
+        result.flight.state,
+        result.alerts,
+        result.decisions,
+        result.confirmations,
+        result.incidents,
+        result.last_incidents(),
     )

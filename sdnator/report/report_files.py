@@ -1,21 +1,25 @@
-"""The machine-readable files of a report: scores.csv, decisions.csv and eve.json.
-
-Source of the event format: Suricata's EVE JSON (event types `alert` and `drop`).
-"""
+"""The machine-readable files of a report: scores.csv, decisions.csv and eve.json."""
 
 import csv
 import ipaddress
-import json
 import math
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.messages import Alert, Confirmation, Decision
+from apps.firewall.enforcement.eve import (
+    Event,
+    decision_event,
+    drop_event,
+    incident_event,
+    line_of,
+    time_text,
+)
+from apps.incidents import Incident
+from apps.messages import Confirmation, Decision
 from sdnator.replay.packet_accounting import PacketState
 
 SCORED: Final = int(PacketState.SCORED)
@@ -30,12 +34,6 @@ _DECISION_COLUMNS: Final = (
     *("time", "id", "action", "kind", "address", "port", "switch", "reason", "evidence", "expires", "level"),
     *("dry_run", "first_packet", "state", "handle", "cause", "packet"),
 )
-_SIGNATURES: Final = {"anomaly": 9_100_001, "block": 9_100_002}
-
-
-def time_text(time_ns: int) -> str:
-    """Capture time as text: ISO 8601 in UTC with microseconds."""
-    return f"{datetime.fromtimestamp(time_ns // 1_000_000_000, UTC):%Y-%m-%dT%H:%M:%S}.{time_ns // 1_000 % 1_000_000:06d}+0000"
 
 
 def write_scores(
@@ -123,47 +121,20 @@ def write_decisions(path: Path, decisions: Sequence[Decision], confirmations: Se
         writer.writerows(decision_rows(decisions, confirmations))
 
 
-def write_eve(path: Path, events: Iterable[dict[str, Any]]) -> None:
+def write_eve(path: Path, events: Iterable[Event]) -> None:
     """One JSON object a line."""
     with path.open("w", encoding="utf-8") as file:
-        file.writelines(f"{json.dumps(event)}\n" for event in events)
+        file.writelines(f"{line_of(event)}\n" for event in events)
 
 
-def alert_events(alerts: Sequence[Alert]) -> list[dict[str, Any]]:
-    """An EVE alert for each anomalous second of a sender."""
+def incident_events(reports: Iterable[Incident], decisions: Iterable[Decision]) -> list[Event]:
+    """What the firewall's own EVE file would hold: reports of incidents, and decisions outside of them."""
+    told = [each for each in reports if each.change != "more"]
+    within = {action.decision for each in told for action in each.actions}
     return [
-        {
-            **_head("alert", alert.event_time, alert.sender.ip, alert.sender.mac),
-            "in_iface": f"{alert.sender.switch}:{alert.sender.port}",
-            "alert": _alert("anomaly", "allowed", alert.reason, 2),
-            "sdnator": {
-                "id": alert.id,
-                "peak_score": alert.peak_score,
-                "packets": alert.packets,
-                "over": alert.over,
-                "rate": alert.rate,
-                "role": alert.role,
-                "first_packet": alert.first_packet,
-            },
-        }
-        for alert in alerts
+        *(incident_event(each) for each in told),
+        *(decision_event(each) for each in decisions if each.id not in within),
     ]
-
-
-def block_events(blocks: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """An EVE alert with action `blocked` for each block."""
-    events = []
-    for block in blocks:
-        is_mac = block["kind"] == "mac"
-        head = _head(
-            "alert",
-            block["event_time"],
-            "" if is_mac else block["address"],
-            block["address"] if is_mac else "",
-        )
-        about = {name: block[name] for name in ("id", "handle", "packet")}
-        events.append({**head, "alert": _alert("block", "blocked", block["reason"], 1), "sdnator": about})
-    return events
 
 
 def drop_events(
@@ -171,7 +142,7 @@ def drop_events(
     state: NDArray[np.uint8],
     eth_src: NDArray[np.uint64],
     ipv4_src: NDArray[np.uint32],
-) -> list[dict[str, Any]]:
+) -> list[Event]:
     """An EVE drop for each second in which packets of a sender were dropped, with their number."""
     dropped = np.flatnonzero(state == PacketState.DROPPED)
     if not len(dropped):
@@ -190,29 +161,5 @@ def drop_events(
         index = int(dropped[position])
         mac = int(eth_src[index]).to_bytes(6, "big").hex(":")
         ip = str(ipaddress.IPv4Address(int(ipv4_src[index]))) if ipv4_src[index] else ""
-        head = _head("drop", int(time_ns[index]), ip, mac)
-        events.append(
-            {**head, "drop": {"reason": "rules"}, "sdnator": {"packets": count, "first_packet": index}}
-        )
+        events.append(drop_event(int(time_ns[index]), ip, mac, count, index))
     return events
-
-
-def _head(kind: str, time_ns: int, ip: str, mac: str) -> dict[str, Any]:
-    event: dict[str, Any] = {"timestamp": time_text(time_ns), "event_type": kind}
-    if ip:
-        event["src_ip"] = ip
-    if mac:
-        event["ether"] = {"src_mac": mac}
-    return event
-
-
-def _alert(kind: str, action: str, reason: str, severity: int) -> dict[str, Any]:
-    return {
-        "action": action,
-        "gid": 1,
-        "signature_id": _SIGNATURES[kind],
-        "rev": 1,
-        "signature": f"SDNATOR {kind}: {reason}",
-        "category": "Anomalous network traffic",
-        "severity": severity,
-    }

@@ -30,12 +30,15 @@ code{font-size:13px;overflow-wrap:anywhere}
 .note{background:#fff7e0;border-left:5px solid #e0a800;padding:8px 14px;margin:6px 0}
 """
 
+_MOST_ROWS = 200
+
 
 def render(
     *,
     title: str,
     summary: Mapping[str, Any],
     decisions: Sequence[Mapping[str, Any]],
+    incidents: Sequence[Mapping[str, str]],
     notes: Sequence[str],
     extra: Mapping[str, str],
     png: bytes,
@@ -52,6 +55,7 @@ def render(
         *(f"<p class='note'>{escape(note)}</p>" for note in notes),
         f"<img alt='Anomaly score of each packet over time' src='data:image/png;base64,{picture}'>",
         _explanation(summary),
+        _incidents(incidents),
         _blocks(summary),
         _decisions(decisions),
         _figures(summary, extra, passes),
@@ -142,6 +146,20 @@ def _explanation(summary: Mapping[str, Any]) -> str:
     )
 
 
+def _incidents(rows: Sequence[Mapping[str, str]]) -> str:
+    if not rows:
+        return ""
+    names = ("time", "kind", "attacker", "victims", "done", "stopped")
+    heads = ("Begun", "Kind", "Attacker", "Victims", "What was done", "Packets stopped")
+    head = "".join(f"<th>{name}</th>" for name in heads)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(each[name])}</td>" for name in names) + "</tr>"
+        for each in rows[:_MOST_ROWS]
+    )
+    more = f"<p>… and {len(rows) - _MOST_ROWS:,} more in eve.json</p>" if len(rows) > _MOST_ROWS else ""
+    return f"<h2>Incidents</h2><div class='wide'><table><tr>{head}</tr>{body}</table></div>{more}"
+
+
 def _blocks(summary: Mapping[str, Any]) -> str:
     blocks = summary.get("blocks") or []
     if not blocks:
@@ -163,9 +181,9 @@ def _decisions(rows: Sequence[Mapping[str, Any]]) -> str:
     head = "".join(f"<th>{name}</th>" for name in names)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(str(row[name]))}</td>" for name in names) + "</tr>"
-        for row in rows[:200]
+        for row in rows[:_MOST_ROWS]
     )
-    more = f"<p>… and {len(rows) - 200:,} more in decisions.csv</p>" if len(rows) > 200 else ""
+    more = f"<p>… and {len(rows) - _MOST_ROWS:,} more in decisions.csv</p>" if len(rows) > _MOST_ROWS else ""
     return f"<h2>Decisions</h2><div class='wide'><table><tr>{head}</tr>{body}</table></div>{more}"
 
 

@@ -4,7 +4,7 @@
     scores.png      the picture alone
     scores.csv      index,time,score,state      (state: train, scored, dropped, not copied, lost)
     decisions.csv   what the firewall decided and what the switch did
-    eve.json        alerts, blocks and drops in Suricata's EVE format, one JSON object a line
+    eve.json        incidents, decisions by hand and drops in Suricata's EVE format, one JSON object a line
 
 It is written to a temporary folder beside its place and renamed when it is complete.
 
@@ -22,8 +22,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.incidents import Incident
 from apps.messages import Alert, Confirmation, Decision
 from sdnator.errors import BadInput
+from sdnator.incidents.incident_rows import row
 from sdnator.report import report_files, report_page
 from sdnator.report.plots import Curve, draw
 
@@ -46,6 +48,10 @@ class PassData:
     alerts: Sequence[Alert] = ()
     decisions: Sequence[Decision] = ()
     confirmations: Sequence[Confirmation] = ()
+    reports: Sequence[Incident] = ()
+    """Reports of incidents, in the order of writing."""
+    incidents: Sequence[Incident] = ()
+    """Incidents as they were in the end."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -150,6 +156,7 @@ def _write_files(data: ReportData, folder: Path) -> None:
         title=data.title,
         summary={**data.summary, "blocks": _blocks(data)},
         decisions=report_files.decision_rows(shown.decisions, shown.confirmations),
+        incidents=[row(each) for each in shown.incidents],
         notes=data.notes,
         extra=data.extra,
         png=png,
@@ -192,8 +199,7 @@ def _facts(data: ReportData, each: PassData) -> dict[str, float]:
 
 def _events(data: ReportData) -> list[dict[str, Any]]:
     shown = data.reported
-    events = report_files.alert_events(shown.alerts)
-    events += report_files.block_events(_blocks(data))
+    events = report_files.incident_events(shown.reports, shown.decisions)
     if data.eth_src is not None and data.ipv4_src is not None:
         events += report_files.drop_events(data.time_ns, shown.state, data.eth_src, data.ipv4_src)
     return sorted(events, key=lambda event: str(event["timestamp"]))

@@ -175,7 +175,13 @@ def test_why_tells_what_switches_did(tmp_path):
     driver = open_archive(url)
     driver.insert([Item(key, value, n, n, "a", "i", n) for n, (key, value) in enumerate(values, 10)])
     driver.close()
-    lines = run(blocks, "why", "d1", "--archive", url).splitlines()
+    five, life = run(blocks, "why", "d1", "--archive", url).split("\n\n")
+    assert [line.partition(":")[0] for line in five.splitlines()] == [
+        *("sum", "largest contributions", "remedy", "until", "undo")
+    ]
+    assert "hot" in five
+    assert "nothing to undo" in five
+    lines = life.splitlines()
     words = [
         "d1 block 192.0.2.1",
         "switch s1: installed",

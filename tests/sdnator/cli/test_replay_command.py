@@ -20,6 +20,8 @@ FOUND = {
     "alerts": 7,
     "auc": None,
     "blocks": [],
+    "incidents": [{}, {}],
+    "incidents_mitigated": 1,
 }
 
 

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from apps.p4runtime_ctrl.state.mac_learning import LearnSettings
-from sdnator.cli.status_command import control_lines, controlled
+from sdnator.cli.status_command import control_lines, controlled, open_incidents
 from sdnator.config.planned_switches import parse_ports, parse_wires, planned
 from sdnator.config.up_settings import LearnPlan, SwitchPlan
 from sdnator.errors import BadInput
@@ -193,3 +193,10 @@ def test_an_engine_that_cannot_run_is_said_before_anything_starts(options, word,
     monkeypatch.setattr("apps.sonata_adapter.host.spark.find_spec", lambda _: None)
     with pytest.raises(BadInput, match=word):
         run("up", *options)
+
+
+def test_open_incidents_are_the_firewalls_word():
+    """None without a firewall that says so."""
+    told = {"apps": {"firewall": {"health": {"app": {"incidents_open": 2}, "engine": {}}}}}
+    assert open_incidents(told) == 2
+    assert open_incidents({"apps": {}}) is None

@@ -1,9 +1,18 @@
 """Whatever comes in, the board keeps the newest, bounded, and counts what it saw."""
 
 import numpy as np
+from msgspec import structs
 
 from apps.messages import Alert, Confirmation, Decision, Sender, Target
-from sdnator.dashboard.board import ALERTS_KEPT, BINS, DECISIONS_KEPT, NAMES_KEPT, Board
+from sdnator.dashboard.board import (
+    ALERTS_KEPT,
+    BINS,
+    DECISIONS_KEPT,
+    INCIDENTS_KEPT,
+    NAMES_KEPT,
+    Board,
+)
+from tests.sdnator.incidents.samples import life
 
 
 def scored(*scores):
@@ -158,3 +167,19 @@ def test_parts_that_keep_dying_are_told_and_those_that_run_are_not():
     assert board.degraded == "kitsune is degraded: kitsune was killed by SIGKILL"
     board.supervised({})
     assert board.degraded == ""
+
+
+def test_an_incident_is_one_row_as_last_reported():
+    """Parts of another disappear, and open ones stay when there are too many."""
+    board, (opened, *_, over) = Board(), life()
+    board.incident(opened)
+    assert board.open_incidents() == 1
+    board.incident(over)
+    assert (list(board.incidents), board.open_incidents()) == ([over.id], 0)
+    board.incident(structs.replace(over, joined="another"))
+    assert not board.incidents
+    board.incident(opened)
+    for number in range(2 * INCIDENTS_KEPT):
+        board.incident(structs.replace(over, id=str(number)))
+    assert len(board.incidents) == INCIDENTS_KEPT
+    assert opened.id in board.incidents

@@ -3,7 +3,8 @@
 import pytest
 
 from apps.messages import Decision, Target
-from sdnator.dashboard.texts import decision_row
+from sdnator.dashboard.texts import decision_row, incident_row
+from tests.sdnator.incidents.samples import life
 
 
 @pytest.mark.parametrize(
@@ -17,3 +18,11 @@ def test_blocks_are_undone_and_guards_released_but_those_of_the_settings_stay(ac
     row = decision_row(one, {"s1": "installed"})
     assert (row["undo"], row["said"]) == (button, "s1: installed")
     assert row["where"].startswith("all switches")
+
+
+def test_an_incident_says_who_whom_and_what_was_done():
+    *_, over = life()
+    row = incident_row(over)
+    assert row["target"] == "scan: 192.168.2.108"
+    assert row["where"].endswith("against 192.168.2.50 tcp/22 · over")
+    assert (row["reason"], row["said"]) == ("blocked 5c:cf:7f:05:f2:c6 port 1, over", "70 packets stopped")

@@ -4,11 +4,12 @@ import csv
 import json
 
 import numpy as np
+from msgspec import structs
 
 from apps.messages import Target
 from sdnator.replay.packet_accounting import PacketState
 from sdnator.report import report_files
-from tests.sdnator.report.test_writer import BLOCKED_AT, MAC, T0, alert, confirmation, decision
+from tests.sdnator.report.test_writer import BLOCKED_AT, T0, confirmation, decision, incidents
 
 
 def test_scores_are_exact(tmp_path):
@@ -83,20 +84,15 @@ def test_answers_of_an_extended_block_stand_in_their_own_rows(tmp_path):
     ]
 
 
-def test_alert_and_block_events():
-    (event,) = report_files.alert_events([alert()])
-    assert event["timestamp"] == "2024-03-05T08:04:55.000000+0000"
-    assert (event["event_type"], event["src_ip"], event["ether"]) == (
-        "alert",
-        "192.168.2.113",
-        {"src_mac": MAC},
-    )
-    assert event["alert"]["action"] == "allowed"
-    by_ip = decision(target=Target(kind="ip", address="10.0.0.9"))
-    blocks = report_files.block_rows([by_ip], [confirmation()])
-    (event,) = report_files.block_events(blocks)
-    assert (event["alert"]["action"], event["src_ip"]) == ("blocked", "10.0.0.9")
-    assert "ether" not in event
+def test_events_are_those_of_the_firewalls_own_file():
+    """Reports of incidents without mere updates, and decisions that belong to none."""
+    by_hand = decision(id="d9", target=Target(kind="ip", address="10.0.0.9"))
+    *told, last = incidents()
+    update = structs.replace(last, change="more")
+    events = report_files.incident_events([*told, update], [decision(), by_hand])
+    signatures = [event["alert"]["signature"] for event in events]
+    assert signatures == ["SDNATOR traffic unlike training"] * 3 + ["SDNATOR block"]
+    assert (events[-1]["src_ip"], events[-1]["alert"]["action"]) == ("10.0.0.9", "blocked")
 
 
 def test_drops_are_counted_by_second_and_sender():
@@ -106,7 +102,7 @@ def test_drops_are_counted_by_second_and_sender():
     mac = np.array([1, 1, 2, 1, 1, 1], np.uint64)
     ip = np.array([9, 9, 0, 9, 9, 9], np.uint32)
     events = report_files.drop_events(time, state, mac, ip)
-    assert [(e["ether"]["src_mac"][-2:], e.get("src_ip"), e["sdnator"]["packets"]) for e in events] == [
+    assert [(e["ether"]["src_mac"][-2:], e.get("src_ip"), e["flow"]["pkts_toserver"]) for e in events] == [
         ("01", "0.0.0.9", 3),
         ("02", None, 1),
         ("01", "0.0.0.9", 1),

@@ -45,6 +45,7 @@ def _page(**changes) -> str:
         "title": "t",
         "summary": {},
         "decisions": [],
+        "incidents": [],
         "notes": [],
         "extra": {},
         "png": b"x",

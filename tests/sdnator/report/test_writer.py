@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from apps.firewall.incidents.incident_book import IncidentBook
+from apps.incidents import Incident
 from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
 from sdnator.replay.packet_accounting import PacketState
 from sdnator.report import report_files
@@ -61,6 +63,13 @@ def alert() -> Alert:
     )
 
 
+def incidents() -> list[Incident]:
+    """What the firewall reports of the alert, the decision and its confirmation."""
+    book = IncidentBook()
+    told = book.hear_alert(alert()) + book.decided(decision()) + book.confirmed(confirmation())
+    return told + book.count("d1", 100, T0 + 399 * 10**9)
+
+
 def data(**changes: Any) -> ReportData:
     """400 packets, one a second: 100 for training, blocked from 300 on."""
     state = np.full(400, PacketState.SCORED, np.uint8)
@@ -80,6 +89,8 @@ def data(**changes: Any) -> ReportData:
                 [alert()],
                 [decision()],
                 [confirmation()],
+                incidents(),
+                incidents()[-1:],
             ),
         ],
         "summary": {
@@ -109,8 +120,9 @@ def test_all_files_are_there_and_agree(tmp_path):
     (decided,) = csv.DictReader((index.parent / "decisions.csv").open())
     assert (decided["address"], decided["state"], decided["packet"]) == (MAC, "installed", "300")
     events = [json.loads(line) for line in (index.parent / "eve.json").read_text().splitlines()]
-    assert [event["event_type"] for event in events] == ["alert", "alert"] + ["drop"] * 100
-    assert events[1]["alert"]["action"] == "blocked"
+    assert [event["event_type"] for event in events] == ["alert"] * 3 + ["drop"] * 100
+    assert [event["alert"]["action"] for event in events[:3]] == ["allowed", "allowed", "blocked"]
+    assert len({event["flow_id"] for event in events[:3]}) == 1
 
 
 def test_the_page_is_self_contained_and_escapes(tmp_path):
@@ -120,6 +132,8 @@ def test_the_page_is_self_contained_and_escapes(tmp_path):
     assert "data:image/png;base64," in page
     assert "http://" not in page
     assert "https://" not in page
+    assert "<td>192.168.2.113</td>" in page
+    assert f"<td>blocked {MAC} port 1</td><td>100</td>" in page
     assert "1 sender blocked; 99.0 % of the attack stopped from then on" in page
 
 

@@ -1,0 +1,63 @@
+"""`sdnator incidents …`: what happened, one row each, from Data Archives."""
+
+import json
+import time
+from typing import Annotated
+
+import typer
+
+from sdnator.cli.plain_table import plain_table
+from sdnator.errors import BadInput
+from sdnator.incidents.incident_rows import as_json, as_text, row
+from sdnator.incidents.incidents_archive import archived_incidents, incident_of
+from sdnator.notation import instant_ns
+
+incidents = typer.Typer(help="Incidents: list them, show one.", no_args_is_help=True)
+
+ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard output.")]
+
+
+@incidents.command("list")
+def list_incidents(
+    *,
+    since: Annotated[
+        str,
+        typer.Option(help="Reported on since: 1h or 7d ago, or a UTC time such as 2024-05-01T12:00."),
+    ] = "",
+    only_open: Annotated[bool, typer.Option("--open", help="Only those that are not over.")] = False,
+    archive: ArchiveOption = "",
+    as_json_list: JsonOption = False,
+) -> None:
+    """Incidents, oldest first: when, what, who, whom, what was done, packets stopped.
+
+    Example: sdnator incidents list --since 24h
+    """
+    start = instant_ns(since, time.time_ns(), "--since") if since else 0
+    found = archived_incidents(archive, start)
+    found = [each for each in found if each.state == "open"] if only_open else found
+    if as_json_list:
+        typer.echo(json.dumps([as_json(each) for each in found]))
+    elif not found:
+        typer.echo("no incident is open" if only_open else "no incidents")
+    else:
+        names = ("id", "time", "kind", "attacker", "victims", "state", "stopped", "done")
+        rows = (row(each) for each in found)
+        typer.echo(plain_table(names, [[one[name] for name in names] for one in rows]))
+
+
+@incidents.command("show")
+def show_incident(
+    name: Annotated[str, typer.Argument(metavar="ID", help="Of an incident, or of a decision made in one.")],
+    *,
+    archive: ArchiveOption = "",
+    as_json_object: JsonOption = False,
+) -> None:
+    """All about one incident: evidence, decisions, packets stopped.
+
+    Example: sdnator incidents show 1f0c2a9be771
+    """
+    found = incident_of(archive, name)
+    if found is None:
+        raise BadInput(f"no incident has the id {name}, or a decision with it; see `sdnator incidents list`")
+    typer.echo(json.dumps(as_json(found)) if as_json_object else "\n".join(as_text(found)))

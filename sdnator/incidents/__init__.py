@@ -1,0 +1,1 @@
+"""Incidents for people and programs: from the archive, as rows, as text, as JSON."""
