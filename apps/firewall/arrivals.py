@@ -50,6 +50,8 @@ class SwitchReport(Message, frozen=True, kw_only=True):
     switch: Name
     primary: bool = False
     event_time: Time = 0
+    clock: Name = ""
+    """What moves its clock; "packets": nothing else does."""
     blocks: Annotated[tuple[DropReading, ...], Meta(max_length=100_000)] = ()
 
 

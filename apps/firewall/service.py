@@ -9,7 +9,6 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -36,6 +35,7 @@ from apps.firewall.policy.instructions import Desk, refused_as_late
 from apps.firewall.policy.prefix_aggregation import gather_blocks
 from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
+from apps.firewall.syn.examinations import Examination, Examinations
 from apps.firewall.syn.recent_syns import Surges
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_ack_buffer import Answers, SynAckBuffer, Wanted, packet_outs
@@ -92,7 +92,6 @@ CAPABILITIES = (
 COMMAND = "network.p4_command.firewall"
 EVIDENCE_KEPT = 10
 SENDERS_KEPT = 10_000
-HOSTS_WATCHED = 64
 MOST_SWITCHES = 256
 STEP_S = 3600
 """Seconds; a larger jump of capture time is not accepted at once."""
@@ -136,11 +135,9 @@ class FirewallService:
         self._switches: dict[str, str] = {}
         """Connected switches, and the controller instance that reported each."""
         self._surges = Surges(settings.syn.threshold, settings.syn.window_ms)
-        self._suspected: dict[str, tuple[float, Suspicion]] = {}
-        """By host: monotonic time of the examination, and its subject."""
-        self._undecided: dict[str, tuple[float, Suspicion]] = {}
-        """The same for the second examination, after which sources are blocked."""
-        self._resets = SynAckBuffer(self._answers, after_s=after_s, limit=settings.syn.resets)
+        self._examinations = Examinations(settings.syn.grace_ms, settings.syn.patience_ms)
+        resets = settings.syn.resets if settings.syn.challenge else 0
+        self._resets = SynAckBuffer(self._answers, after_s=after_s, limit=resets)
         self._bindings = ArpBindings(
             training_s=settings.arp_training_s,
             settle_s=settings.arp_settle_s,
@@ -159,8 +156,6 @@ class FirewallService:
         self._panics: deque[str] = deque(maxlen=1000)
         """Ids of archived panics that were carried out."""
         self._words_since = time.time_ns()
-        self._syns_until = 0
-        """Capture time of the newest SYN, ns."""
         self._time = SteadyTime(STEP_S * 1_000_000_000)
         """Capture time last reported by the switches, ns."""
         self._row_time = SteadyTime(STEP_S * 1_000_000)
@@ -323,23 +318,24 @@ class FirewallService:
         summary = f"{flood.count} new half-open connections to {flood.dst} within a window"
         with self._lock:
             now = self._time.fit(item.event_time)
-            self._look(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
+            self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
 
     def _on_syns(self, item: Item, batch: RecordBatch) -> None:
         rules = self._settings.syn
         with self._lock:
-            batch = self._believed(batch)
-            now = self._time.fit(item.event_time)
-            self._counts["syns"] += len(batch)
-            self._syns_until = max(self._syns_until, now)
-            self._syn.recent.add(batch)
-            for host, since in self._surges.add(batch):
-                summary = f"{rules.threshold} SYNs went to {host} within {rules.window_ms} ms"
-                due_at = time.monotonic() + rules.grace_ms / 1000
-                if len(self._suspected) < HOSTS_WATCHED and host not in self._suspected:
-                    self._suspected[host] = due_at, Suspicion(host, evidence_of(item, summary), now, since)
-                    self._look_later(rules.grace_ms / 1000)
+            # by what came before: handshakes and SYNs come under keys of their own, in no order between the two
             self._look_at_what_is_due()
+            batch = self._believed(batch)
+            if not len(batch):
+                return
+            self._counts["syns"] += len(batch)
+            self._syn.recent.add(batch)
+            self._examinations.hear(int(batch["time_us"].max()) * 1000, time.monotonic())
+            for surge in self._surges.add(batch):
+                summary = f"{rules.threshold} SYNs went to {surge.host} within {rules.window_ms} ms"
+                self._suspect(Suspicion(surge.host, evidence_of(item, summary), surge.at, surge.window))
+            if self._examinations.live:
+                self._look_at_what_is_due()
 
     def _believed(self, batch: RecordBatch) -> RecordBatch:
         """The packets with a plausible time."""
@@ -362,33 +358,29 @@ class FirewallService:
             if not self._stopped:
                 self._look_at_what_is_due()
 
-    def _look_at_what_is_due(self) -> None:
-        now = time.monotonic()
-        # late packets arrive in bursts, so the grace period is also measured in capture time
-        seen = self._syns_until - self._settings.syn.grace_ms * 1_000_000
-        for host, (due_at, suspicion) in list(self._suspected.items()):
-            if due_at <= now or suspicion.now < seen:
-                self._look(self._suspected.pop(host)[1])
-        for host in [host for host, (due_at, _) in self._undecided.items() if due_at <= now]:
-            suspicion = self._undecided.pop(host)[1]
-            self._look(replace(suspicion, now=max(self._now, suspicion.now)), sure=True)
+    def _suspect(self, suspicion: Suspicion) -> None:
+        if not len(self._syn.recent):  # SYNs do not come: there is nothing to wait for
+            self._look(Examination(suspicion, suspicion.now, sure=False))
+        elif (wait := self._examinations.suspect(suspicion, time.monotonic())) is not None:
+            self._look_later(wait)
 
-    def _look(self, suspicion: Suspicion, *, sure: bool = False) -> None:
+    def _look_at_what_is_due(self) -> None:
+        for examination in self._examinations.due(time.monotonic()):
+            self._look(examination)
+
+    def _look(self, due: Examination) -> None:
         """Examine the SYNs of a suspected flood, and decide."""
-        watch = self._syn.suspect(suspicion)
-        decisions = self._syn.conclude(
-            watch, self._offences(watch.often(self._settings.syn), watch.now) if sure else {}, sure=sure
-        )
-        for decision in decisions:
+        watch = self._syn.suspect(due.suspicion, due.at)
+        offences = self._offences(watch.often(self._settings.syn), watch.now) if due.sure else {}
+        for decision in self._syn.conclude(watch, offences, sure=due.sure):
             # the guard before the block has had the source's connections reset
             self._publish(decision, resets=False)
             if decision.action == "protect" and not decision.dry_run:
                 target = decision.target
-                wanted = Wanted(TcpService(target.address, target.port or 0), since=suspicion.since)
+                wanted = Wanted(TcpService(target.address, target.port or 0), since=due.suspicion.since)
                 self._resets.plan(decision.id, wanted, time.monotonic())
-        if watch.unsure and len(self._undecided) < HOSTS_WATCHED:
-            due_at = time.monotonic() + self._settings.syn.patience_ms / 1000
-            self._undecided.setdefault(suspicion.host, (due_at, suspicion))
+        if watch.unsure:
+            self._examinations.doubt(due, time.monotonic())
 
     def _offences(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
         """Earlier blocks by address; None if the archive does not answer."""
@@ -586,7 +578,9 @@ class FirewallService:
                 self._ledger.count_drops(reading.id, reading.packets, state.event_time)
                 self._incidents.count(reading.id, reading.packets, state.event_time)
             self._arm(item, state)
+            self._examinations.live = state.clock != "packets"
             if believed:
+                self._examinations.tick(state.event_time)
                 self._lapse(state.event_time)
 
     def _lapse(self, now: int) -> None:

@@ -18,18 +18,19 @@ from apps.evidence import EVIDENCE, TRAINING, TrainingState
 from apps.kitsune.detector import Detector, DetectorSettings, Scored
 from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
-from apps.messages import Alert, Decision, Intake, sender_of
+from apps.messages import Alert, Decision, Intake, Message, Name, Number, Time, sender_of
 from apps.packets import PACKET_COLUMNS, SteadyTime, read_columns
 from due import NO_WAIT, Capability, Engine, Interest, Item, RecordBatch
 
 PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
 BLOCKS: Final = "network.block.firewall.*"
+SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
 SCORE: Final = "network.anomaly.kitsune.score"
 ALERT: Final = "network.anomaly.kitsune.alert"
 EVIDENCE_KEY: Final = f"{EVIDENCE}.kitsune"
 TRAINING_KEY: Final = f"{TRAINING}.kitsune"
 
-INTERESTS = (Interest(PACKETS), Interest(BLOCKS))
+INTERESTS = (Interest(PACKETS), Interest(BLOCKS), Interest(SWITCHES))
 CAPABILITIES = (
     Capability(SCORE, delivery="reliable", archive="always"),
     Capability(ALERT, delivery="reliable", archive="always"),
@@ -45,6 +46,9 @@ _USED: Final = {
     )
 }
 """The columns of packets that Kitsune reads."""
+_MOST_SWITCHES: Final = 256
+_SECOND: Final = 1_000_000_000
+_SECOND_US: Final = 1_000_000
 _STEP_US: Final = 86_400_000_000
 """A longer step of capture time is accepted only after several packets agree."""
 
@@ -61,6 +65,20 @@ def decision_in(item: Item) -> Decision:
     """A block or its end; raises `MessageError`."""
     sender_of(item)
     return Decision.from_value(item.value)
+
+
+class ClockTick(Message, frozen=True, kw_only=True):
+    """The fields that Kitsune needs of a switch's state: its time, and the newest packet that it has sent."""
+
+    switch: Name
+    event_time: Time = 0
+    arrival: Number = 0
+
+
+def tick_in(item: Item) -> ClockTick:
+    """The state of a switch; raises `MessageError`."""
+    sender_of(item)
+    return ClockTick.from_value(item.value)
 
 
 class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -83,6 +101,11 @@ class KitsuneService:
         self._intake = Intake(_log)
         self._time = SteadyTime(_STEP_US)
         self._lock = threading.Lock()
+        self._arrived: dict[str, int] = {}
+        """Arrival number of the newest packet scored, by switch."""
+        self._ticks: dict[str, ClockTick] = {}
+        self._is_open = False
+        """Packets of the newest second may raise alerts when it is over."""
         self._packets = 0
         self._alerts = 0
         self._found = 0
@@ -95,6 +118,7 @@ class KitsuneService:
         self._subscriptions = [
             observe(BLOCKS).subscribe(reading(BLOCKS, decision_in, self._on_decision)),
             observe(PACKETS).subscribe(reading(PACKETS, packets_in, self._score)),
+            observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self._on_tick)),
         ]
 
     def tick(self) -> None:
@@ -138,6 +162,8 @@ class KitsuneService:
             batch = self._steady(batch)
             scored, alerts = self._detector.process(batch, switch)
             self._packets += len(batch)
+            self._is_open = True
+            self._note_arrival(switch, int(batch["arrival"][-1]))
             event_time = int(batch["time_us"][-1]) * 1_000
             self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
             self._write_evidence()
@@ -145,6 +171,24 @@ class KitsuneService:
             self._tell_training(event_time)
             if self._detector.model.is_trained and not self._told:
                 self._end_of_training()
+
+    def _on_tick(self, _: Item, tick: ClockTick) -> None:
+        """Close the open second where capture time has left it, and no packet of it is under way."""
+        with self._lock:
+            if tick.switch in self._arrived:
+                self._ticks[tick.switch] = tick
+            newest_us = self._time.now
+            if not self._is_open or newest_us is None:
+                return
+            ticks = self._ticks
+            settled = all(
+                switch in ticks and ticks[switch].arrival == arrival
+                for switch, arrival in self._arrived.items()
+            )
+            left = all(each.event_time // _SECOND > newest_us // _SECOND_US for each in ticks.values())
+            if settled and left:
+                self._is_open = False
+                self._write_alerts(self._detector.finish())
 
     def _steady(self, batch: RecordBatch) -> RecordBatch:
         """The batch with impossible times replaced by the newest valid one, since every packet is scored."""
@@ -154,6 +198,10 @@ class KitsuneService:
             return batch
         newest = np.maximum.accumulate(np.where(believed, times, before))
         return RecordBatch({**batch, "time_us": np.where(believed, times, newest)})
+
+    def _note_arrival(self, switch: str, arrival: int) -> None:
+        if switch in self._arrived or len(self._arrived) < _MOST_SWITCHES:
+            self._arrived[switch] = arrival
 
     def _end_of_training(self) -> None:
         self._told = True

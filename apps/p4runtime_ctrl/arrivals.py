@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from apps.messages import Decision, MessageError, TableCommand, as_map, sender_of
+from apps.messages import Decision, Message, MessageError, TableCommand, Time, as_map, sender_of
 from apps.p4runtime_ctrl.telemetry.demand import Offer
 from apps.packets import as_column, read_columns
 from due import Item, RecordBatch
@@ -25,6 +25,12 @@ QUESTION: Final = {
 """Columns of a request for cells."""
 OPTIONAL: Final = {"source_port": "u2", "sweep": "u1"}
 """Optional columns; 0 if missing."""
+
+
+class ClockReached(Message, frozen=True, kw_only=True):
+    """`network.clock.<app>.<switch>`: the capture time, ns, that a program which feeds a switch has reached."""
+
+    event_time: Time
 
 
 class FramesToSend(msgspec.Struct, frozen=True):
@@ -55,6 +61,12 @@ def offer_in(item: Item) -> tuple[str, Offer]:
     if item.key.rpartition(".")[2] != offer.name:
         raise MessageError("fields", f"{item.key}: offers {offer.name!r}, which is not the name in the key")
     return app, offer
+
+
+def clock_in(item: Item) -> ClockReached:
+    """`network.clock.<app>.<switch>`."""
+    sender_of(item)
+    return ClockReached.from_value(item.value)
 
 
 def questions_in(item: Item) -> RecordBatch:

@@ -14,7 +14,9 @@ from typing import Any, Final
 import due.service
 from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
 from apps.p4runtime_ctrl.arrivals import (
+    ClockReached,
     FramesToSend,
+    clock_in,
     command_in,
     decision_in,
     frames_in,
@@ -40,6 +42,7 @@ INTERESTS = (
     Interest("network.telemetry.*.*"),
     Interest("network.cell_request.*.*"),
     Interest("network.packet_out.*.*"),
+    Interest("network.clock.*.*"),
 )
 CAPABILITIES = (
     Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
@@ -100,6 +103,7 @@ class P4RuntimeCtrlService:
             reading("cell_request", questions_in, self._on_questions)
         )
         observe("network.packet_out.*.*").subscribe(reading("packet_out", frames_in, self._on_frames))
+        observe("network.clock.*.*").subscribe(reading("clock", clock_in, self._on_clock))
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
@@ -170,6 +174,11 @@ class P4RuntimeCtrlService:
         agent = self._agents.get(item.key.rpartition(".")[2])
         if agent is not None:
             agent.send(frames)
+
+    def _on_clock(self, item: Item, reached: ClockReached) -> None:
+        agent = self._agents.get(item.key.rpartition(".")[2])
+        if agent is not None:
+            agent.clock_reached(reached.event_time)
 
     def _on_offer(self, item: Item, offered: tuple[str, Offer]) -> None:
         self._take_offer(item, offered)

@@ -24,6 +24,9 @@ class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """MAC learning on ports without port forwarding; None: off."""
     fail: Literal["open", "closed"] = "open"
     """Without a controller: open keeps port forwarding, closed removes it, and restores it last."""
+    clock: Literal["packets", "heard", "own"] = "heard"
+    """What moves its time: its packets alone, as in a replay; heard: between packets the controller's clock carries
+    it on, once a second; own: also before the first packet, because `base_us` is known."""
     target: str = ""
     """Kind of switch, for display."""
 

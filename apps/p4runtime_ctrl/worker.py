@@ -29,6 +29,7 @@ from apps.p4runtime_ctrl.southbound.session import P4RuntimeSession
 from apps.p4runtime_ctrl.state.desired_state import check_entry
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
+from apps.p4runtime_ctrl.state.live_clock import LiveClock
 from apps.p4runtime_ctrl.state.mac_learning import DIGEST
 from apps.p4runtime_ctrl.state.readings import Readings
 from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
@@ -100,6 +101,7 @@ class SwitchWorker:
         self._recent: deque[Decision] = deque(maxlen=_JOBS)
         self._urgent: deque[Decision] = deque()
         """Decisions to carry out, before any other work."""
+        self._clock = LiveClock(mine.clock, time.time_ns() // 1000 if mine.clock == "own" else 0)
         self._readings = Readings()
         self._publishing = threading.Lock()
         self._counting = threading.Event()
@@ -153,6 +155,11 @@ class SwitchWorker:
         """Queue frames for the switch to send."""
         self._put(partial(self._send, frames))
 
+    def clock_reached(self, event_time: int) -> None:
+        """The program that feeds a switch whose packets alone move its time says how far that is, ns."""
+        if self._mine.clock == "packets":
+            self._put(partial(self._pass_time, event_time // 1000))
+
     def say_again(self) -> None:
         """Publish the state again for a new consumer: it is best effort and published on change only."""
         self._put(self._write_state)
@@ -168,6 +175,11 @@ class SwitchWorker:
         if now - self._counted_at > (_CALM_S if self._uncounted else 1):
             self._count_soon()
         self._settle(now)
+        time_us = self._clock.look(
+            self._progress.time_us, self._progress.received + self._progress.reported, now
+        )
+        if time_us is not None:
+            self._put(partial(self._pass_time, time_us))
         if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
             self._secret_at = now
             self._put(self._change_secret)
@@ -342,6 +354,10 @@ class SwitchWorker:
             return
         self._send_out(packets, "frames_sent")
 
+    def _pass_time(self, time_us: int) -> None:
+        self._progress.time_us = max(self._progress.time_us, time_us)
+        self._write_state()
+
     def _send_out(self, packets: Sequence[Any], what: str) -> None:
         """Best effort, like frames; what cannot be sent is counted."""
         if self._session is None:
@@ -441,6 +457,7 @@ class SwitchWorker:
             "target": self._mine.target or self._mine.address,
             "program": self._program_name,
             "base_us": self._mine.base_us,
+            "clock": self._mine.clock,
             "fail": self._mine.fail,
             "telemetry": [each.name for each in self._switch.requests or () if each not in FALLBACK],
             "packet_in": self._progress.received,

@@ -156,6 +156,12 @@ def replay(
         ),
     ] = None,
     no_mitigate: Annotated[bool, typer.Option("--no-mitigate", help="Decide, but block nothing.")] = False,
+    no_queries: Annotated[
+        bool,
+        typer.Option(
+            "--no-queries", help="Kitsune alone: no Sonata adapter, and no defence against SYN floods."
+        ),
+    ] = False,
     train: Annotated[
         int | None,
         typer.Option(
@@ -179,7 +185,7 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Replay a capture through switch, controller, Kitsune and firewall.
+    """Replay a capture through switch, controller, Kitsune, Sonata adapter and firewall.
 
     With labels or a report there are two passes: Kitsune alone, then with blocking.
     Exit codes: 0 replayed, 1 a part of the pipeline failed, 2 bad input or misuse.
@@ -195,6 +201,7 @@ def replay(
             switch=switch,
             inject=inject,
             mitigate=not no_mitigate,
+            queries=not no_queries,
             train=train,
             fm_grace=fm_grace,
             ad_grace=ad_grace,

@@ -47,6 +47,7 @@ class ReplayRequest:
     pace: str
     window: int
     telemetry: str = "packet-in"
+    queries: bool = True
     report: Path | None
     keep: Path | None
     as_json: bool
@@ -70,6 +71,7 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
         pace=_pace(request.pace),
         window=request.window,
         telemetry=_telemetry(request.telemetry),
+        queries=request.queries,
         keep=request.keep,
     )
 
@@ -195,6 +197,11 @@ def show(found: dict[str, Any]) -> None:
             f"[bold red]blocked[/] {block['address']} at packet {block['packet']:,} ({escape(block['handle'])})"
         )
         out.print(f"        {escape(block['reason'])}")
+    for guard in found["guards"]:
+        out.print(
+            f"[bold yellow]would guard[/] {guard['address']}:{guard['port']} from packet {guard['packet']:,} on"
+        )
+        out.print(f"        {escape(guard['reason'])}")
     if "report" in found:
         out.print(f"report: {found['report']}")
 
@@ -207,6 +214,8 @@ def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "scored", f"{found['packets_scored']:,}, {found['training_packets']:,} of them for training"
     yield "dropped", f"{found['packets_dropped']:,}"
     yield "not copied", f"{found['packets_not_copied']:,}"
+    if found["guards"]:
+        yield "would challenge", f"{found['packets_would_be_challenged']:,} SYNs, which passed"
     yield "lost", f"{found['packets_lost']:,}"
     yield "alerts", f"{found['alerts']:,}"
     yield "incidents", f"{len(found['incidents']):,}, {found['incidents_mitigated']:,} mitigated within 5 s"

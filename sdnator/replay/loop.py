@@ -21,8 +21,9 @@ from typing import Any, Literal
 
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Confirmation, Decision
+from apps.sonata_adapter.keys import HANDSHAKE
 from dataplane.ports.capture_port import CapturePortError
-from due import CONSUMER, Engine, Interest, Item
+from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
 from sdnator.capture.captures import Capture
 from sdnator.capture.interfaces import Feed
 from sdnator.errors import PipelineError
@@ -30,6 +31,7 @@ from sdnator.incidents.incident_rows import newest_of_each, with_counters
 from sdnator.replay.drop_counters import DropCounters
 from sdnator.replay.packet_accounting import PacketAccounting, PacketState
 from sdnator.replay.pipeline import SWITCH_NAME, PipelinePlan, ReplayPipeline
+from sdnator.replay.readiness import QueriesReady
 from sdnator.replay.survey import Survey
 
 CONFIRM_SECONDS = 5.0
@@ -50,16 +52,26 @@ DEATH_SECONDS = 5.0
 """Seconds from a part's closed sockets to the end of its process."""
 COORDINATED = "coordinated"
 """Phase of an engine whose declarations the Coordinator knows."""
+_DECIDED = ("block", "unblock", "protect", "unprotect")
+"""Actions of confirmed decisions; prefixes are blocked by commands that carry the decision's id."""
 PACKETS = "packets"
 """The controller's name for the request of every packet."""
 INTERESTS = (
     Interest("network.anomaly.kitsune.score"),
     Interest("network.anomaly.kitsune.alert"),
     Interest("network.block.firewall.*"),
+    Interest("network.block_prefix.firewall.*"),
+    Interest("network.protect.firewall.*"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
     Interest(INCIDENTS),
 )
+QUERY_INTERESTS = (Interest(HANDSHAKE),)
+CAPABILITIES = (Capability("network.clock.replay.*", delivery="reliable"),)
+AFTER_END_NS = 2_000_000_000
+"""Capture time that passes in silence after the last packet: seconds and windows end, and what waits is decided."""
+QUIET_SECONDS = 0.5
+"""Seconds without a decision, an alert or a confirmation after which nothing more is expected of a capture's end."""
 
 
 Telemetry = Literal["packet-in", "digest"]
@@ -82,6 +94,8 @@ class ReplayOptions:
     """Most packets in flight."""
     telemetry: Telemetry = "packet-in"
     """How headers come from the switch."""
+    queries: bool = True
+    """Run the Sonata adapter, and the parts of the firewall that need it; False: Kitsune alone."""
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
 
@@ -111,6 +125,9 @@ class PassResult:
     """Last drop counter of each block, by its id."""
     alerts: list[Alert] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
+    """Blocks and guards, and their ends, in the order of deciding."""
+    handshakes: list[tuple[int, str]] = field(default_factory=list)
+    """Capture time (ns) and source of each completed handshake that a query has found."""
     confirmations: list[Confirmation] = field(default_factory=list)
     incidents: list[Incident] = field(default_factory=list)
     """Reports of the firewall, in the order of writing: the last of an id holds."""
@@ -136,14 +153,21 @@ class _Observer:
         self.moved = threading.Condition()
         self.switch: dict[str, Any] = {}
         self.blocks = 0
+        self.last = time.monotonic()
+        """When the last alert, decision or confirmation came."""
+        self._decided: set[str] = set()
 
     def subscribe(self, engine: Engine) -> None:
         engine.observe("network.anomaly.kitsune.score").subscribe(self._on_score)
         engine.observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
-        engine.observe("network.block.firewall.*").subscribe(self._on_decision)
+        for kind in ("block", "block_prefix", "protect"):
+            engine.observe(f"network.{kind}.firewall.*").subscribe(self._on_decision)
         engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
         engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
         engine.observe(INCIDENTS).subscribe(self._on_incident)
+
+    def subscribe_queries(self, engine: Engine) -> None:
+        engine.observe(HANDSHAKE).subscribe(self._on_handshake)
 
     def _on_score(self, item: Item) -> None:
         value = item.value
@@ -154,10 +178,18 @@ class _Observer:
     def _on_alert(self, item: Item) -> None:
         with self.moved:
             self._result.alerts.append(Alert.from_value(item.value))
+            self.last = time.monotonic()
 
     def _on_decision(self, item: Item) -> None:
         with self.moved:
-            self._result.decisions.append(Decision.from_value(item.value))
+            decision = Decision.from_value(item.value)
+            self._result.decisions.append(decision)
+            self._decided.add(decision.id)
+            self.last = time.monotonic()
+
+    def _on_handshake(self, item: Item) -> None:
+        with self.moved:
+            self._result.handshakes.append((int(item.value["at"]), str(item.value["source"])))
 
     def _on_incident(self, item: Item) -> None:
         with self.moved:
@@ -166,6 +198,9 @@ class _Observer:
     def _on_confirmation(self, item: Item) -> None:
         confirmation = Confirmation.from_value(item.value)
         with self.moved:
+            if confirmation.action not in _DECIDED and confirmation.id not in self._decided:
+                return  # of a command: an entry of a query, or a known source
+            self.last = time.monotonic()
             self._result.confirmations.append(confirmation)
             self._result.confirmed_at.append(time.monotonic())
             if confirmation.state == "installed":
@@ -222,7 +257,8 @@ class ReplayPass:
                 telemetry=options.telemetry,
                 first=partial(self._join, engine),
                 kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},
-                firewall={"rules": {"dry_run": not self._result.mitigate}},
+                queries=options.queries,
+                firewall=_firewall(mitigate=self._result.mitigate, queries=options.queries),
             )
             with ReplayPipeline(plan) as pipeline:
                 self._run(pipeline, engine, progress)
@@ -233,8 +269,11 @@ class ReplayPass:
         pipeline.before_stop(engine.close)
         engine.set_pubsub(pipeline.updates)
         engine.set_db(pipeline.archive)
-        engine.init("replay", CONSUMER, interests=INTERESTS)
+        interests = (*INTERESTS, *(QUERY_INTERESTS if self._options.queries else ()))
+        engine.init("replay", PRODUCER | CONSUMER, interests=interests, capabilities=CAPABILITIES)
         self._observer.subscribe(engine)
+        if self._options.queries:
+            self._observer.subscribe_queries(engine)
         deadline = time.monotonic() + STALL_SECONDS
         while engine.health()["phase"] != COORDINATED:
             pipeline.check()
@@ -252,24 +291,32 @@ class ReplayPass:
                 if not pipeline.gives_verdicts:
                     self._drops = stack.enter_context(pipeline.drop_counters())
                 self._feed(pipeline, feed, progress)
+                self._result.seconds = time.monotonic() - started
+                self._end(pipeline, engine)
+                if not pipeline.gives_verdicts:
+                    self._await_drop_counters(pipeline)
             except CapturePortError as error:
                 _name_the_dead(pipeline)
                 raise PipelineError(str(error)) from error
-        self._result.seconds = time.monotonic() - started
 
     def _wait_for_packets(self, pipeline: ReplayPipeline, engine: Engine) -> None:
-        """Wait until the controller has told the switch to send packets, because Kitsune wants them.
+        """Wait until the controller has told the switch to send packets, because Kitsune and queries want them.
 
         Its state item may be older than our subscription, so the archive is read as well.
         """
         deadline = time.monotonic() + STALL_SECONDS
+        queries = QueriesReady(pipeline.coordinator) if self._options.queries else None
         while True:
             states = [item.value for item in engine.get(f"network.switch.p4runtime_ctrl.{SWITCH_NAME}")]
             with self._observer.moved:
                 latest = self._observer.switch or (states[-1] if states else {})
-            if latest.get("primary") and PACKETS in latest.get("telemetry", ()):
+            telemetry = latest.get("telemetry", ())
+            sends = latest.get("primary") and PACKETS in telemetry
+            if sends and (queries is None or queries.look(telemetry)):
                 return
             pipeline.check()
+            if sends and queries is not None and time.monotonic() > deadline:
+                raise PipelineError(f"queries do not run after {STALL_SECONDS:.0f} s: {queries.missing}")
             if time.monotonic() > deadline:
                 raise PipelineError(
                     f"switch {SWITCH_NAME} did not begin to send packets within {STALL_SECONDS:.0f} s; "
@@ -300,9 +347,27 @@ class ReplayPass:
         self._drain(pipeline, feed, progress)
         self._looked = 0.0
         self._look(pipeline, progress)
+
+    def _end(self, pipeline: ReplayPipeline, engine: Engine) -> None:
+        """Let capture time pass after the last packet, and wait for what is decided by it."""
+        self._await_quiet(pipeline)  # what the last packets lead to comes first
+        end = int(self._survey.time_ns.max()) + AFTER_END_NS
+        engine.write(f"network.clock.replay.{SWITCH_NAME}", {"event_time": end}, [NO_WAIT])
+        deadline = time.monotonic() + CONFIRM_SECONDS
+        with self._observer.moved:
+            while self._observer.switch.get("event_time", 0) < end and time.monotonic() < deadline:
+                pipeline.check()
+                self._observer.moved.wait(0.05)
+        self._await_quiet(pipeline)
         self._await_confirmations(pipeline)
-        if not pipeline.gives_verdicts:
-            self._await_drop_counters(pipeline)
+
+    def _await_quiet(self, pipeline: ReplayPipeline) -> None:
+        began = time.monotonic()
+        while (now := time.monotonic()) < began + CONFIRM_SECONDS:
+            if now - max(began, self._observer.last) >= QUIET_SECONDS:
+                return
+            pipeline.check()
+            time.sleep(0.02)
 
     def _await_confirmations(self, pipeline: ReplayPipeline) -> None:
         """Wait until the firewall's decisions are confirmed by the switch."""
@@ -400,6 +465,12 @@ class ReplayPass:
         if silence > SETTLE_SECONDS:
             with self._observer.moved:
                 flight.settle()
+
+
+def _firewall(*, mitigate: bool, queries: bool) -> dict[str, Any]:
+    """Settings of the firewall: nobody in a capture can answer a challenge, and no server there takes a reset."""
+    without = {} if queries else {"detect": False, "learn": False}
+    return {"rules": {"dry_run": not mitigate}, "syn": {"challenge": False}, **without}
 
 
 def _name_the_dead(pipeline: ReplayPipeline) -> None:

@@ -2,7 +2,10 @@
 
 Valkey (Data Updates) ─ coordinator ─┬─ switch ◄─ P4Runtime ─ p4runtime_ctrl
 SQLite (Data Archives)               ├─ kitsune
+                                     ├─ sonata_adapter
                                      └─ firewall
+
+These are the apps of `sdnator up`; without queries there is no Sonata adapter.
 
 No part is restarted: the results of a disturbed replay are not valid.
 """
@@ -21,6 +24,7 @@ from typing import Any, Self
 from dataplane.ports.capture_port import CaptureFeed
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
+from sdnator.app_catalogue import OURS
 from sdnator.capture.interfaces import Feed, VethPair, WireFeed
 from sdnator.errors import PipelineError
 from sdnator.replay.drop_counters import DropCounters
@@ -33,7 +37,7 @@ from sdnator.supervisor.updates_server import UpdatesProcess
 SWITCH_NAME = "s1"
 INGRESS_PORT = 1
 EGRESS_PORT = 2
-_APPS = ("p4runtime_ctrl", "kitsune", "firewall")
+_ADAPTER = "sonata_adapter"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +58,8 @@ class PipelinePlan:
     so a consumer that must not miss any registers its interests here."""
     telemetry: str = "packet-in"
     """How headers come from the switch: packet-in, or digest."""
+    queries: bool = True
+    """Run the Sonata adapter."""
     kitsune: Mapping[str, Any] = field(default_factory=dict)
     firewall: Mapping[str, Any] = field(default_factory=dict)
 
@@ -82,6 +88,7 @@ class ReplayPipeline:
         # Sockets live in a folder of their own: their paths must be short, the plan's may be long.
         self._run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-run-")))
         self._capture_socket = str(self._run / "capture.sock")
+        self._coordinator_file = self._run / "coordinator.url"
 
     def __enter__(self) -> Self:
         try:
@@ -102,7 +109,11 @@ class ReplayPipeline:
         self._stack.callback(server.stop)
         self.updates = server.url
         self._add("updates", partial(UpdatesProcess, server))
-        self._add("coordinator", partial(self._app, "coordinator", {}), after=("updates",))
+        self._add(
+            "coordinator",
+            partial(self._app, "coordinator", {"address_file": str(self._coordinator_file)}),
+            after=("updates",),
+        )
         self._add_switch()
         self._supervisor.start()
         if self._plan.first is not None:
@@ -110,10 +121,12 @@ class ReplayPipeline:
         settings = {
             "p4runtime_ctrl": self._controller_settings(),
             "kitsune": self._plan.kitsune,
+            _ADAPTER: self._adapter_settings(),
             "firewall": self._plan.firewall,
         }
-        for name in _APPS:
-            self._add(name, partial(self._app, name, settings[name]))
+        for name in OURS:
+            if self._plan.queries or name != _ADAPTER:
+                self._add(name, partial(self._app, name, settings[name]))
         self._supervisor.start()
 
     def _add(self, name: str, start: Callable[[], PartProcess], after: tuple[str, ...] = ()) -> None:
@@ -148,6 +161,11 @@ class ReplayPipeline:
         return self._switch.address if self._switch is not None else self._plan.switch
 
     @property
+    def coordinator(self) -> str:
+        """URL of the Coordinator's HTTP API."""
+        return self._coordinator_file.read_text(encoding="utf-8").strip()
+
+    @property
     def gives_verdicts(self) -> bool:
         """Whether the switch gives a verdict on each frame."""
         return self._inject is None
@@ -177,10 +195,19 @@ class ReplayPipeline:
                     "device_id": self._plan.device_id,
                     "base_us": self._switch.base_us if self._switch and own_clock else self._base_us,
                     "target": self._plan.switch,
+                    "clock": "packets",
                     "forward": {str(INGRESS_PORT): EGRESS_PORT},
                 }
             ],
         }
+
+    def _adapter_settings(self) -> dict[str, Any]:
+        """What the switch counts must not depend on the speed of the replay.
+
+        Cells would have to be read within a window of capture time, which may be over in a millisecond; and the
+        windows of a switch with a clock of its own are not the capture's, so there the host counts everything.
+        """
+        return {"limits": {"reads": False} if self._plan.switch == "embedded" else {"stages": 0}}
 
     def _app(self, name: str, settings: Mapping[str, Any]) -> Child:
         backends = Backends(updates=self.updates, archive=self.archive)

@@ -62,11 +62,12 @@ def replay_capture(
     mitigate: bool = True,
     pace: float | None = None,
     telemetry: Telemetry = "packet-in",
+    queries: bool = True,
     report: str | Path | None = None,
     keep: str | Path | None = None,
     progress: OnProgress | None = None,
 ) -> CaptureReplay:
-    """Replay a capture through the embedded switch, the controller, Kitsune and the firewall.
+    """Replay a capture through the embedded switch, the controller, Kitsune, the Sonata adapter and the firewall.
 
     The pipeline runs in processes of its own, which end before this returns. With labels or a report there are
     two passes, first without blocking and then with it, as with `sdnator replay`. Call it from the main thread:
@@ -80,6 +81,7 @@ def replay_capture(
         mitigate: False decides and archives, but blocks nothing.
         pace: capture seconds per wall second; None replays as fast as the pipeline goes.
         telemetry: "packet-in" or "digest", the way headers come from the switch.
+        queries: False runs Kitsune alone, without the Sonata adapter and the defence against SYN floods.
         report: folder for the HTML report; None writes none.
         keep: folder for the logs of all parts and the archive; None deletes them.
         progress: called now and then with the title of the pass, the packets done and the packets in the capture.
@@ -104,6 +106,7 @@ def replay_capture(
         ad_grace=ad_grace,
         pace=pace,
         telemetry=telemetry,
+        queries=queries,
         keep=Path(keep) if keep is not None else None,
     )
     surveyed, read = run.prepare(found.capture, found.labels, options)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from sdnator.capture.captures import CaptureError
 from sdnator.capture.labels import Labels, LabelsError, read_labels
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import as_json
+from sdnator.replay.guards import WouldChallenge, would_challenge
 from sdnator.replay.loop import PassResult, Progress, ReplayOptions, ReplayPass, wall_seconds_to_block
 from sdnator.replay.packet_accounting import PacketState
 from sdnator.replay.summary import attack_figures, auc, block_rows
@@ -30,6 +31,8 @@ class ReplayOutcome:
     """The pass with mitigation, if there was one."""
     notes: list[str]
     seconds: float
+    challenged: WouldChallenge
+    """What the guards of the reported pass would have done."""
 
     @property
     def reported(self) -> PassResult:
@@ -82,7 +85,9 @@ def run(
         watch = frozenset({int(np.argmax(labels.attack))})
 
     def one_pass(title: str, mitigating: bool) -> PassResult:
-        replay = ReplayPass(surveyed, options, mitigate=mitigating, watch=watch)
+        # scores alone are wanted of the first of two passes
+        chosen = replace(options, queries=options.queries and (mitigating or not both))
+        replay = ReplayPass(surveyed, chosen, mitigate=mitigating, watch=watch)
         return replay.run(progress(title) if progress is not None else None)
 
     alone = one_pass("Kitsune alone", False) if both or not mitigate else None
@@ -93,7 +98,14 @@ def run(
             f"switch {options.switch} stamps packets with its own clock, not with capture time: features and scores "
             "follow the speed of the replay (--pace 1x keeps them comparable), and block times are wall times"
         )
-    return ReplayOutcome(surveyed, labels, alone, blocking, notes, time.monotonic() - begun)
+    reported = blocking or alone
+    assert reported is not None  # noqa: S101 - there is at least one pass
+    challenged = would_challenge(surveyed.path, surveyed.packets, reported.decisions, reported.handshakes)
+    if challenged.by_guard:
+        notes.append(
+            "the clients of a capture cannot answer a challenge: guards were decided, not set, and their SYNs passed"
+        )
+    return ReplayOutcome(surveyed, labels, alone, blocking, notes, time.monotonic() - begun, challenged)
 
 
 def figures(outcome: ReplayOutcome) -> dict[str, Any]:
@@ -103,11 +115,13 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
     trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
     blocks = block_rows(outcome.survey, result.decisions, result.confirmations)
     incidents = result.last_incidents()
+    challenged = outcome.challenged.packets & (flight.state != PacketState.DROPPED)
     first_attack = None
     attack: dict[str, Any] = {}
     if outcome.labels is not None:
         attack = attack_figures(outcome.survey, outcome.labels, flight, blocks[0] if blocks else None)
         first_attack = attack["first_attack_packet"]
+        attack["attack_would_be_challenged"] = int((challenged & outcome.labels.attack).sum())
     capture_seconds = attack.pop("time_to_block_capture_s", None)
     time_to_block = (
         {"capture": capture_seconds, "wall": wall_seconds_to_block(result, first_attack)}
@@ -121,12 +135,14 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "packets_scored": trained + scored,
         "packets_dropped": flight.count(PacketState.DROPPED) - result.uncounted_drops,
         "packets_not_copied": flight.count(PacketState.NOT_COPIED),
+        "packets_would_be_challenged": int(challenged.sum()),
         "packets_lost": max(flight.in_flight + result.uncounted_drops, result.lost_on_the_way),
         "training_packets": trained,
         "alerts": len(result.alerts),
         "blocks": blocks,
         "incidents": [as_json(each) for each in incidents],
         "incidents_mitigated": sum(each.mitigated for each in incidents),
+        "guards": outcome.challenged.rows(outcome.survey.time_ns),
         "first_alert_packet": min((alert.first_packet for alert in result.alerts), default=None),
         "first_block_packet": blocks[0]["packet"] if blocks else None,
         "time_to_block_s": time_to_block,

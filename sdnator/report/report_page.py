@@ -57,6 +57,7 @@ def render(
         _explanation(summary),
         _incidents(incidents),
         _blocks(summary),
+        _guards(summary),
         _decisions(decisions),
         _figures(summary, extra, passes),
         "<p>Beside this page: <code>scores.csv</code>, <code>decisions.csv</code>, <code>eve.json</code>, ",
@@ -72,6 +73,9 @@ def verdict(summary: Mapping[str, Any]) -> str:
     if blocks:
         senders = len({block["address"] for block in blocks})
         return f"{_count(senders, 'sender')} blocked{_delay(summary)}{_stopped(summary)}"
+    if guards := summary.get("guards"):
+        syns = _count(int(summary.get("packets_would_be_challenged") or 0), "SYN")
+        return f"{_count(len(guards), 'service')} under a SYN flood: a guard would have challenged {syns}"
     if summary.get("mitigation") is False:
         return f"Kitsune alone, nothing blocked: {_count(alerts, 'alert')}"
     if attack:
@@ -172,6 +176,25 @@ def _blocks(summary: Mapping[str, Any]) -> str:
     )
     head = "<tr><th>Blocked</th><th>Capture time</th><th>At packet</th><th>Why</th><th>Entry in the switch</th></tr>"
     return f"<h2>Blocks</h2><div class='wide'><table>{head}{rows}</table></div>"
+
+
+def _guards(summary: Mapping[str, Any]) -> str:
+    guards = summary.get("guards") or []
+    if not guards:
+        return ""
+    rows = "".join(
+        f"<tr><td><b>{escape(str(guard['address']))}</b> port {guard['port']}</td>"
+        f"<td class='n'>{escape(str(guard['decided']))}</td><td class='n'>{escape(_number(guard['packet']))}</td>"
+        f"<td>{escape(str(guard['reason']))}</td>"
+        f"<td class='n'>{guard['packets_would_be_challenged']:,}</td></tr>"
+        for guard in guards
+    )
+    head = (
+        "<tr><th>Would be guarded</th><th>Capture time</th><th>From packet</th><th>Why</th>"
+        "<th>SYNs that it would have challenged</th></tr>"
+    )
+    why = "<p>Clients in a capture cannot answer a challenge, so guards are decided but not set, and SYNs pass.</p>"
+    return f"<h2>Guards</h2>{why}<div class='wide'><table>{head}{rows}</table></div>"
 
 
 def _decisions(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -192,6 +192,8 @@ class UpParts:
                     "address": self.switch_address(switch),
                     "device_id": switch.device_id,
                     "base_us": self._base_us(switch),
+                    # the clock zero of an external switch is unknown until its first packet
+                    "clock": "own" if _is_ours(switch) else "heard",
                     "target": switch.kind,
                     "forward": {str(number): egress for number, egress in switch.forward.items()},
                     "fail": switch.fail,

@@ -5,11 +5,13 @@ import json
 import subprocess
 import sys
 from contextlib import ExitStack
+from itertools import islice
 
 import numpy as np
 import pytest
 
 from due.drivers.sqlite import SqliteArchive
+from sdnator.capture.captures import Capture, CaptureWriter
 from sdnator.capture.interfaces import VethPair
 from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from sdnator.datasets.rebuild import rebuild
@@ -103,6 +105,34 @@ def test_attackers_are_blocked_and_nobody_else(attacked_capture, tmp_path):
         assert (report / name).stat().st_size > 0
     events = [json.loads(line) for line in (report / "eve.json").read_text().splitlines()]
     assert {"alert", "drop"} <= {event["event_type"] for event in events}
+
+
+@pytest.fixture(scope="module")
+def flood_capture(tmp_path_factory):
+    """The first four seconds of the real SYN flood."""
+    path = tmp_path_factory.mktemp("flood") / "flood.pcap"
+    with Capture(shared_data("captures/synflood_spoofed.pcap")) as frames, CaptureWriter(path) as short:
+        for frame in islice(frames, 6_000):
+            short.write(frame.time_ns, frame.data, frame.length)
+    return path
+
+
+def test_flood_from_forged_sources_ends_with_a_guard_at_any_speed(flood_capture):
+    """What the queries tell is decided at a capture time; nobody in a capture can be challenged, and none is lost."""
+    fast = figures("replay", flood_capture, "--train", "500")
+    (guard,) = fast["guards"]
+    assert (guard["address"], guard["port"], guard["effect"]) == ("10.10.10.10", 25565, "would challenge")
+    assert guard["packet"] < 1_000
+    assert fast["packets_would_be_challenged"] == 6_000 - guard["packet"]
+    assert (fast["blocks"], fast["packets_dropped"], fast["packets_lost"]) == ([], 0, 0)
+    assert fast["packets_scored"] == fast["packets_in"] == 6_000
+    slow = figures("replay", flood_capture, "--train", "500", "--pace", "1x")
+    assert slow["guards"] == fast["guards"]
+
+
+def test_kitsune_alone_knows_of_no_flood(flood_capture):
+    found = figures("replay", flood_capture, "--train", "500", "--no-queries")
+    assert (found["guards"], found["packets_scored"], found["packets_lost"]) == ([], 6_000, 0)
 
 
 def test_flood_answered_by_its_victim_blocks_the_flooder_only(tmp_path):

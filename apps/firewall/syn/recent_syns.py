@@ -6,6 +6,7 @@ Their sources are examined only when a flood is suspected.
 import ipaddress
 from collections import Counter
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,17 +34,29 @@ class RecentSyns:
         """Add SYNs that arrived at `now`, s; raises KeyError for a missing column."""
         self._recent.add(batch, now)
 
-    def towards(self, host: str, since: int) -> Iterator[tuple[int, str]]:
-        """Destination port and source address of SYNs to a host since a capture time in ns."""
+    def towards(self, host: str, since: int, until: int | None = None) -> Iterator[tuple[int, str]]:
+        """Destination port and source address of SYNs to a host, `since` and `until` in capture time, ns."""
         address = ipaddress.ip_address(host)
         high, low = int(address) >> _HALF, int(address) & ((1 << _HALF) - 1)
         make = ipaddress.IPv4Address if address.version == 4 else ipaddress.IPv6Address
         for _, block in self._recent.blocks():
             wanted = (block["ip_version"] == address.version) & (block["time_us"] >= since // 1000)
+            if until is not None:
+                wanted &= block["time_us"] <= until // 1000
             wanted &= (block["ip_dst_hi"] == np.uint64(high)) & (block["ip_dst_lo"] == np.uint64(low))
             columns = (block[name][wanted].tolist() for name in ("ip_src_hi", "ip_src_lo", "tcp_dport"))
             for source_high, source_low, port in zip(*columns, strict=True):
                 yield port, str(make(source_high << _HALF | source_low))
+
+
+class Surge(NamedTuple):
+    """A host to which the threshold of SYNs went within a window; times are capture time, ns."""
+
+    host: str
+    window: int
+    """Begin of the window."""
+    at: int
+    """When the threshold was reached."""
 
 
 class Surges:
@@ -60,23 +73,35 @@ class Surges:
         """Destinations counted in the current window."""
         return len(self._counts)
 
-    def add(self, batch: RecordBatch) -> list[tuple[str, int]]:
-        """Hosts that reach the threshold with this batch, each with the begin of the window, ns."""
+    def add(self, batch: RecordBatch) -> list[Surge]:
+        """Hosts that reach the threshold with this batch; how SYNs are divided into batches does not matter."""
         if not len(batch):
             return []
-        window = int(batch["time_us"].max()) // self._window_us
-        if window > self._window or self._window - window > _SET_BACK:
-            self._window = window
-            self._counts.clear()
+        numbers = batch["time_us"] // self._window_us
+        surging: list[Surge] = []
+        for window in np.unique(numbers).tolist():
+            if window > self._window or self._window - window > _SET_BACK:
+                self._window = window
+                self._counts.clear()
+            if window == self._window:
+                surging += self._count(batch.take(np.flatnonzero(numbers == window)))
+        return surging
+
+    def _count(self, batch: RecordBatch) -> list[Surge]:
         if len(self._counts) > HOSTS:
             self._counts.clear()
-        now = batch["time_us"] // self._window_us == self._window
-        columns = (batch[name][now].tolist() for name in ("ip_version", "ip_dst_hi", "ip_dst_lo"))
+        times, fields = batch["time_us"], ("ip_version", "ip_dst_hi", "ip_dst_lo")
         surging = []
-        for (version, high, low), count in Counter(zip(*columns, strict=True)).items():
-            before = self._counts[version, high, low]
-            self._counts[version, high, low] = before + count
+        for host, count in Counter(zip(*(batch[name].tolist() for name in fields), strict=True)).items():
+            before = self._counts[host]
+            self._counts[host] = before + count
+            version, high, low = host
             if before < self._threshold <= before + count and version:
+                theirs = np.logical_and.reduce(
+                    [batch[name] == value for name, value in zip(fields, host, strict=True)]
+                )
+                reached_us = int(times[np.flatnonzero(theirs)[self._threshold - before - 1]])
                 make = ipaddress.IPv4Address if version == 4 else ipaddress.IPv6Address
-                surging.append((str(make(high << _HALF | low)), window * self._window_us * 1000))
-        return surging
+                begin = self._window * self._window_us * 1000
+                surging.append(Surge(str(make(high << _HALF | low)), begin, reached_us * 1000))
+        return sorted(surging, key=lambda surge: surge.at)

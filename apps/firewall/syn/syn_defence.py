@@ -111,18 +111,19 @@ class SynDefence:
         ]
         return beforehand + [_on(switch, decision) for decision in self._guarded.values()]
 
-    def suspect(self, suspicion: Suspicion) -> Watch:
-        """Collect the SYNs of a suspected flood."""
-        host, now, since = suspicion.host, suspicion.now, suspicion.since
+    def suspect(self, suspicion: Suspicion, until: int | None = None) -> Watch:
+        """Collect the SYNs of a suspected flood up to a capture time, ns; None: all that have come."""
+        host, since = suspicion.host, suspicion.since
+        now = suspicion.now if until is None else until
         for service, decision in self._guarded.items():
             if service.address == host:
                 expires = now + self.rules.protect_s * SECOND
                 self._guarded[service] = _changed(decision, expires=expires)
         watch = Watch(host, suspicion.evidence, now)
-        for port, source in self.recent.towards(host, since):
+        for port, source in self.recent.towards(host, since, until):
             watch.add(port, source)
         for at, source, service in self._finished:
-            if at >= since and service.address == host:
+            if since <= at and (until is None or at <= until) and service.address == host:
                 watch.finished(service.port, source)
         return watch
 
@@ -289,7 +290,7 @@ class SynDefence:
             evidence=evidence,
             event_time=now,
             expires=expires,
-            dry_run=self._ledger.rules.dry_run,
+            dry_run=self._ledger.rules.dry_run or not self.rules.challenge,
         )
 
 

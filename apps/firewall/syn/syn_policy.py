@@ -26,9 +26,9 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     window_ms: int = 200
     """Length of that window."""
     grace_ms: int = 100
-    """Wall time that handshakes get to complete before the service is guarded."""
+    """Capture time that handshakes get to complete before the service is guarded."""
     patience_ms: int = 1000
-    """Wall time that a source gets to complete its handshakes before it is blocked."""
+    """Capture time that a source gets to complete its handshakes before it is blocked."""
     reset_after_ms: int = 1000
     """Age at which half-open connections that a flood left at a server are reset, once a rule stops the flood."""
     resets: int = 4096
@@ -47,6 +47,9 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """... and there are at most this many of them."""
     protect_s: int = 3600
     """Seconds for which a service is guarded after a flood; services in `guard` always are."""
+    challenge: bool = True
+    """False: guards are decided and reported, but nobody is challenged and no connection is reset, as in replays,
+    whose clients cannot answer."""
 
 
 @dataclass(frozen=True)

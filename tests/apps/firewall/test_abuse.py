@@ -137,7 +137,7 @@ def test_a_million_forged_sources():
             size, WEB.address, 80, first=1 + number * size, start_us=number * size * step, step_us=step
         )
         made.recent.add(rows)
-        for host, since in surges.add(rows) if number % 5 == 0 else ():
+        for host, since, _ in surges.add(rows) if number % 5 == 0 else ():
             watch = made.suspect(Suspicion(host, ANY, NOW, since))
             assert len(watch.syns) <= SOURCES_SAMPLED
             decisions += made.conclude(watch, {}, sure=True)
@@ -159,7 +159,7 @@ def test_a_million_forged_victims():
         assert surges.add(RecordBatch(columns)) == []
         assert surges.hosts <= HOSTS + 100_000
     crowd = spoofed_syns(100, WEB.address, 80, first=0, start_us=200_000, step_us=0)
-    assert [host for host, _ in surges.add(crowd)] == [WEB.address]
+    assert [surge.host for surge in surges.add(crowd)] == [WEB.address]
 
 
 def test_flash_crowd_is_no_flood():
@@ -179,7 +179,7 @@ def test_flash_crowd_is_no_flood():
     assert suspected
     decisions = [
         each
-        for host, since in suspected
+        for host, since, _ in suspected
         for each in made.conclude(made.suspect(Suspicion(host, ANY, NOW, since)), {})
     ]
     assert decisions == []
@@ -202,7 +202,7 @@ class Watchman:
         assert not any(theft.certain for theft in self.bindings.add(packets.take(packets["arp_op"] > 0)))
         self.syns += len(syns)
         self.defence.recent.add(syns)
-        for host, since in self.surges.add(syns):
+        for host, since, _ in self.surges.add(syns):
             watch = self.defence.suspect(Suspicion(host, ANY, since + SECOND, since))
             self.decisions += self.defence.conclude(watch, {})
 

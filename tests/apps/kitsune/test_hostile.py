@@ -7,17 +7,19 @@ from hypothesis import settings as examples
 
 from apps.kitsune.afterimage import AfterImage
 from apps.kitsune.kernel import ColumnError, load_kernel
-from apps.kitsune.service import BLOCKS, INTERESTS, PACKETS, SCORE, KitsuneService, Settings
+from apps.kitsune.service import BLOCKS, INTERESTS, PACKETS, SCORE, SWITCHES, KitsuneService, Settings
 from sdnator.testing.packet_rows import blank, part
 from tests.apps.firewall.enforcement.test_eve import decision
 from tests.apps.hostile import NOW, Hands, mutations, values
 
 KEY = "network.packets.p4runtime_ctrl.s1.all"
+SWITCH = "network.switch.p4runtime_ctrl.s1"
 BLOCK = "network.block.firewall.ipv4"
 ROWS = 20
 GENUINE = {
     PACKETS: (KEY, blank(ROWS, time_us=np.full(ROWS, NOW // 1000))),
     BLOCKS: (BLOCK, decision().to_value()),
+    SWITCHES: (SWITCH, {"switch": "s1", "event_time": NOW, "arrival": 3}),
 }
 
 

@@ -13,7 +13,7 @@ from apps.p4runtime_ctrl.settings import Settings
 from due import RecordBatch
 from sdnator.testing.controller_run import block
 from sdnator.testing.product_program import P4INFO, PROGRAM
-from tests.apps.hostile import Hands, mutations, values
+from tests.apps.hostile import NOW, Hands, mutations, values
 from tests.apps.p4runtime_ctrl.fake_switch import FakeSwitch
 
 UPDATE = TableUpdate(
@@ -39,6 +39,7 @@ GENUINE = {
         "network.packet_out.firewall.s1",
         {"port": np.array([1], "u2"), "length": np.array([3], "u2"), "frames": b"abc"},
     ),
+    "network.clock.*.*": ("network.clock.replay.s1", {"event_time": NOW}),
 }
 
 

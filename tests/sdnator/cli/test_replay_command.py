@@ -22,6 +22,7 @@ FOUND = {
     "blocks": [],
     "incidents": [{}, {}],
     "incidents_mitigated": 1,
+    "guards": [],
 }
 
 

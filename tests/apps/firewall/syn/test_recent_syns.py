@@ -3,6 +3,7 @@
 import ipaddress
 
 import numpy as np
+import pytest
 
 from apps.firewall.syn.recent_syns import RecentSyns, Surges
 from due import RecordBatch
@@ -55,10 +56,21 @@ def test_a_surge_is_said_once_a_window():
     row = (1_000_000, "10.0.0.5", "10.0.0.1", 80)
     other = (1_000_000, "2001:db8::5", "2001:db8::1", 80)
     assert surges.add(batch(*[row] * 9, other)) == []
-    assert surges.add(batch(row)) == [("10.0.0.1", 1_000_000_000)]
+    assert surges.add(batch(row)) == [("10.0.0.1", 1_000_000_000, 1_000_000_000)]
     assert surges.add(batch(*[row] * 30)) == []
-    assert surges.add(batch(*[other] * 9)) == [("2001:db8::1", 1_000_000_000)]
-    assert surges.add(batch(*[(1_200_000, *row[1:])] * 10)) == [("10.0.0.1", 1_200_000_000)]
+    assert surges.add(batch(*[other] * 9)) == [("2001:db8::1", 1_000_000_000, 1_000_000_000)]
+    assert surges.add(batch(*[(1_200_000, *row[1:])] * 10)) == [("10.0.0.1", 1_200_000_000, 1_200_000_000)]
+
+
+@pytest.mark.parametrize("rows", [1, 7, 64])
+def test_surges_do_not_depend_on_how_syns_are_divided_into_batches(rows):
+    """A replay at full speed brings many windows in a batch, a live switch a part of one."""
+    syns = [(1_000_000 + 1_500 * number, "10.0.0.5", f"10.0.0.{number % 2}", 80) for number in range(400)]
+    apart, whole = Surges(40, 200), Surges(40, 200)
+    found = [each for first in range(0, 400, rows) for each in apart.add(batch(*syns[first : first + rows]))]
+    assert found == whole.add(batch(*syns))
+    assert found[0] == ("10.0.0.0", 1_000_000_000, (1_000_000 + 1_500 * 78) * 1_000)
+    assert len(found) == 6
 
 
 def test_slow_syns_are_no_surge():
