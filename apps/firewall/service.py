@@ -7,7 +7,7 @@ import logging
 import sys
 import threading
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -27,29 +27,27 @@ from apps.firewall.evidence.archive import Archive
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
 from apps.firewall.evidence.past import ArchivedPast
 from apps.firewall.evidence.recent_rows import AGED_S
+from apps.firewall.evidence_handler import OFFENCES_READ, EvidenceHandler
 from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
 from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
-from apps.firewall.policy.decider import Decider, Proposal
+from apps.firewall.policy.decider import Decider
 from apps.firewall.policy.instructions import Desk, refused_as_late
-from apps.firewall.policy.prefix_aggregation import gather_blocks
 from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
 from apps.firewall.syn.examinations import Examination, Examinations
 from apps.firewall.syn.recent_syns import Surges
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_ack_buffer import Answers, SynAckBuffer, Wanted, packet_outs
-from apps.firewall.syn.syn_defence import EVERY_SWITCH, UNKNOWN_HISTORY, Suspicion, SynDefence
+from apps.firewall.syn.syn_defence import EVERY_SWITCH, Suspicion, SynDefence
 from apps.messages import (
     Alert,
     Answer,
     Confirmation,
     Decision,
-    Exhibit,
     Instruction,
     Intake,
     MessageError,
-    Sender,
     TableCommand,
     TableUpdate,
     Target,
@@ -90,13 +88,9 @@ CAPABILITIES = (
 )
 
 COMMAND = "network.p4_command.firewall"
-EVIDENCE_KEPT = 10
-SENDERS_KEPT = 10_000
 MOST_SWITCHES = 256
 STEP_S = 3600
 """Seconds; a larger jump of capture time is not accepted at once."""
-OFFENCES_READ = 1_000
-"""Most archived blocks read per address, the newest."""
 START_PATIENCE_S = 30.0
 ARCHIVED_WORD_S = 2.0
 CLOCKS_DIFFER_NS = 2 * 3600 * 1_000_000_000
@@ -119,7 +113,6 @@ class FirewallService:
         self._rules = settings.rules
         self._known = KnownSources(settings.known_limit)
         self._ledger = BlockLifecycle(settings.rules, known=self._known)
-        self._evidence: defaultdict[Sender, deque[Exhibit]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
         self._counts = dict.fromkeys(
             ("alerts", "evidence", "handshakes", "syns", "syn_acks", "arp_thefts"), 0
         )
@@ -143,13 +136,19 @@ class FirewallService:
             settle_s=settings.arp_settle_s,
             contest_s=settings.arp_contest_s,
         )
-        self._decider = Decider(
-            settings.rules, self._ledger, self._bindings, self._known, lambda: self._desk.allow
-        )
         self._archive = Archive(engine, settings.archive_patience_s)
         self._past = ArchivedPast(self._archive, self._intake, settings)
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
+        self._handler = EvidenceHandler(
+            Decider(settings.rules, self._ledger, self._bindings, self._known, lambda: self._desk.allow),
+            self._ledger,
+            self._syn,
+            self._archive,
+            self._announcer,
+            self._incidents,
+            self._publish,
+        )
         self._lock = threading.RLock()
         self._stopped = False
         self._carried_out: deque[str] = deque(maxlen=1000)
@@ -438,94 +437,28 @@ class FirewallService:
             self._ledger.refuse(cap, target.address, theft.at)
         return cap or ""
 
-    # -- anomalies ----------------------------------------------------------------------------
+    # -- anomalies and evidence ---------------------------------------------------------------
 
     def _on_alert(self, item: Item, alert: Alert) -> None:
         with self._lock:
-            self._judge(item, structs.replace(alert, event_time=self._time.fit(alert.event_time)))
-
-    def _judge(self, item: Item, alert: Alert) -> None:
-        self._counts["alerts"] += 1
-        self._incidents.alert(alert)
-        self._lapse(alert.event_time)
-        self._remember(alert.sender, evidence_of(item, alert.reason))
-        if self._ledger.covering(alert.sender) is not None:
-            return
-        verdict = self._decider.alert(alert)
-        if verdict.target is None:
-            log.info("no block of %s: %s", alert.sender, verdict.reason)
-            return
-        earlier = self._offences_of(verdict.target, alert.event_time)
-        reason = verdict.reason if earlier is not None else f"{verdict.reason} ({UNKNOWN_HISTORY})"
-        self._block(alert, verdict.target, reason, earlier or 0)
+            self._counts["alerts"] += 1
+            alert = structs.replace(alert, event_time=self._time.fit(alert.event_time))
+            self._lapse(alert.event_time)
+            self._handler.alert(item, alert)
+            self._say_notices()
 
     def _on_training(self, _: Item, state: TrainingState) -> None:
         with self._lock:
-            self._decider.trained(state)
+            self._handler.decider.trained(state)
 
     def _on_evidence(self, item: Item, evidence: Evidence) -> None:
         with self._lock:
             self._counts["evidence"] += 1
             at = self._time.fit(evidence.event_time)
-            if at != evidence.event_time:
-                evidence = structs.replace(evidence, event_time=at, since=min(evidence.since, at))
             self._lapse(at)
-            if evidence.sender is not None:
-                self._remember(evidence.sender, evidence_of(item, evidence.text))
-            proposal = self._decider.evidence(
-                evidence, item.app_id, lambda target: self._offences_of(target, at)
-            )
-            if proposal is not None:
-                self._follow(proposal, item)
-
-    def _follow(self, proposal: Proposal, item: Item) -> None:
-        """Carry a proposal out, or report why it is not."""
-        evidence = proposal.evidence
-        if proposal.service is not None:
-            exhibits = (evidence_of(item, evidence.text),)
-            for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
-                self._publish(decision)
-            self._decider.settled(proposal)
-        elif proposal.target is None or evidence.sender is None:
-            self._announcer.say(OperatorNotice("refused", proposal.reason, evidence.event_time))
-        else:
-            unknown = "" if proposal.offences is not None else f" ({UNKNOWN_HISTORY})"
-            self._block(evidence, proposal.target, proposal.reason + unknown, proposal.offences or 0)
-            self._decider.settled(proposal)
-
-    def _block(self, cause: Alert | Evidence, target: Target, reason: str, offences: int) -> None:
-        """Block a sender, unless a cap forbids it."""
-        sender = cause.sender
-        assert sender is not None  # noqa: S101 - callers have a sender
-        cap = self._ledger.cap_reached(cause.event_time, sender.ip)
-        if cap is not None:
-            self._ledger.refuse(cap, sender.ip or sender.mac, cause.event_time)
+            since = min(evidence.since, at)
+            self._handler.evidence(item, structs.replace(evidence, event_time=at, since=since))
             self._say_notices()
-            return
-        decision = self._ledger.open(
-            sender.switch,
-            target,
-            reason,
-            self._evidence[sender],
-            cause.event_time,
-            offences=offences,
-            first_packet=cause.first_packet,
-            training_rate=cause.training_rate,
-            host=sender.ip,
-        )
-        self._publish(decision)
-        for each in gather_blocks(self._ledger, self._syn.gather, cause.event_time):
-            self._publish(each)
-
-    def _offences_of(self, target: Target, now: int) -> int | None:
-        """Earlier blocks of a target; None if the archive does not answer."""
-        earlier = self._archive.find(history.offences_query(target), most=OFFENCES_READ)
-        return None if earlier is None else history.count_offences(earlier, target, now)
-
-    def _remember(self, sender: Sender, exhibit: Exhibit) -> None:
-        if len(self._evidence) >= SENDERS_KEPT and sender not in self._evidence:
-            self._evidence.pop(next(iter(self._evidence)))
-        self._evidence[sender].append(exhibit)
 
     # -- switches -----------------------------------------------------------------------------
 

@@ -112,6 +112,10 @@ class Decider:
             return self._towards(evidence, tally, total, bound) if total >= bound else None
         return self._against(evidence, evidence.sender, tally, bound, offences)
 
+    def sum_of(self, evidence: Evidence) -> tuple[float, float]:
+        """The sum in nats for the subject of evidence that was heard, and the bound."""
+        return self.test.sum_of(evidence), self.test.bound
+
     def settled(self, proposal: Proposal) -> None:
         """A decision was made: its evidence is spent."""
         if proposal.tally is not None:

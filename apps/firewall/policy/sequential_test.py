@@ -146,6 +146,11 @@ class SequentialTest:
         tally.contributions[source] = Contribution(nats, now, evidence)
         return tally
 
+    def sum_of(self, evidence: Evidence) -> float:
+        """The sum for the subject of a piece of evidence, at its time."""
+        tally = self._tallies.get(subject_of(evidence))
+        return 0.0 if tally is None else tally.total(evidence.event_time, self.bound)
+
     def forget(self, subject: Subject) -> None:
         """Start anew for a subject: after a decision, or a false alarm."""
         self._tallies.pop(subject, None)

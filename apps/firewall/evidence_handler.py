@@ -1,0 +1,129 @@
+"""Alerts and evidence → decisions: asks the decider, looks up history, carries out what is due, reports the rest."""
+
+from collections import defaultdict, deque
+from collections.abc import Callable
+from typing import Final
+
+from apps.evidence import Evidence
+from apps.firewall.arrivals import evidence_of
+from apps.firewall.enforcement.announcer import Announcer
+from apps.firewall.evidence import history
+from apps.firewall.evidence.archive import Archive
+from apps.firewall.incidents.incident_reports import IncidentReports
+from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
+from apps.firewall.policy.decider import Decider, Proposal
+from apps.firewall.policy.prefix_aggregation import gather_blocks
+from apps.firewall.syn.syn_defence import UNKNOWN_HISTORY, SynDefence
+from apps.messages import Alert, Decision, Exhibit, Sender, Target
+from due import Item
+
+EVIDENCE_KEPT: Final = 10
+SENDERS_KEPT: Final = 10_000
+OFFENCES_READ: Final = 1_000
+"""Most archived blocks read per address, the newest."""
+
+
+class EvidenceHandler:
+    """What the service does with alerts and evidence; it holds the lock meanwhile.
+
+    Args:
+        decider: the rule.
+        ledger: blocks in force.
+        syn: guards.
+        archive: earlier offences.
+        announcer: notices.
+        incidents: what belongs together.
+        publish: writes a decision.
+    """
+
+    def __init__(
+        self,
+        decider: Decider,
+        ledger: BlockLifecycle,
+        syn: SynDefence,
+        archive: Archive,
+        announcer: Announcer,
+        incidents: IncidentReports,
+        publish: Callable[[Decision], None],
+    ) -> None:
+        self.decider = decider
+        self._ledger = ledger
+        self._syn = syn
+        self._archive = archive
+        self._announcer = announcer
+        self._incidents = incidents
+        self._publish = publish
+        self._exhibits: defaultdict[Sender, deque[Exhibit]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
+
+    def alert(self, item: Item, alert: Alert) -> None:
+        """A sender had an anomalous second."""
+        self._incidents.alert(alert)
+        self._remember(alert.sender, evidence_of(item, alert.reason))
+        if self._ledger.covering(alert.sender) is not None:
+            return
+        verdict = self.decider.alert(alert)
+        if verdict.target is None:
+            return
+        earlier = self._offences_of(verdict.target, alert.event_time)
+        reason = verdict.reason if earlier is not None else f"{verdict.reason} ({UNKNOWN_HISTORY})"
+        self._block(alert, verdict.target, reason, earlier or 0)
+
+    def evidence(self, item: Item, evidence: Evidence) -> None:
+        """Something speaks against a sender, or for the protection of a victim."""
+        if evidence.sender is not None:
+            self._remember(evidence.sender, evidence_of(item, evidence.text))
+        at = evidence.event_time
+        proposal = self.decider.evidence(evidence, item.app_id, lambda target: self._offences_of(target, at))
+        if evidence.nats > 0:
+            self._incidents.evidence(evidence, *self.decider.sum_of(evidence))
+        if proposal is not None:
+            self._follow(proposal, item)
+
+    def _follow(self, proposal: Proposal, item: Item) -> None:
+        """Carry a proposal out, or report why it is not."""
+        evidence = proposal.evidence
+        if proposal.service is not None:
+            exhibits = (evidence_of(item, evidence.text),)
+            for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
+                self._publish(decision)
+            self.decider.settled(proposal)
+        elif proposal.target is None or evidence.sender is None:
+            self._announcer.say(OperatorNotice("refused", proposal.reason, evidence.event_time))
+            self._incidents.spared(evidence, proposal.nats, proposal.bound, proposal.refusal)
+        else:
+            unknown = "" if proposal.offences is not None else f" ({UNKNOWN_HISTORY})"
+            self._block(evidence, proposal.target, proposal.reason + unknown, proposal.offences or 0)
+            self.decider.settled(proposal)
+
+    def _block(self, cause: Alert | Evidence, target: Target, reason: str, offences: int) -> None:
+        """Block a sender, unless a cap forbids it."""
+        sender = cause.sender
+        assert sender is not None  # noqa: S101 - callers have a sender
+        cap = self._ledger.cap_reached(cause.event_time, sender.ip)
+        if cap is not None:
+            self._ledger.refuse(cap, sender.ip or sender.mac, cause.event_time)
+            return
+        decision = self._ledger.open(
+            sender.switch,
+            target,
+            reason,
+            self._exhibits[sender],
+            cause.event_time,
+            offences=offences,
+            first_packet=cause.first_packet,
+            training_rate=cause.training_rate,
+            host=sender.ip,
+        )
+        self._publish(decision)
+        for each in gather_blocks(self._ledger, self._syn.gather, cause.event_time):
+            self._publish(each)
+
+    def _offences_of(self, target: Target, now: int) -> int | None:
+        """Earlier blocks of a target; None if the archive does not answer."""
+        earlier = self._archive.find(history.offences_query(target), most=OFFENCES_READ)
+        return None if earlier is None else history.count_offences(earlier, target, now)
+
+    def _remember(self, sender: Sender, exhibit: Exhibit) -> None:
+        if len(self._exhibits) >= SENDERS_KEPT and sender not in self._exhibits:
+            self._exhibits.pop(next(iter(self._exhibits)))
+        self._exhibits[sender].append(exhibit)
