@@ -144,6 +144,8 @@ def talk(
 
     `attack` holds the attack ids of the client's and the server's packets.
     """
+    if not len(connections):
+        return np.zeros(0, np.int64)
     draw = random.random(len(connections))
     dead = draw < fate.dead
     refused = ~dead & (draw < fate.dead + fate.refused)
@@ -172,6 +174,8 @@ def unanswered(
     tape: Tape, random: Random, connections: Connections, *, tries: int = 4, attack: int = 0
 ) -> Ints:
     """SYNs that nobody answers, repeated; returns the times of all of them, in no order."""
+    if not len(connections):
+        return np.zeros(0, np.int64)
     times = []
     for delay in _RETRIES_US[:tries]:
         at = connections.time + delay
@@ -190,6 +194,8 @@ def _isn(connections: Connections, salt: int) -> Ints:
 
 
 def _syn(tape: Tape, connections: Connections, time: Ints, attack: int) -> None:
+    if not len(connections):
+        return
     packets.tcp(
         tape,
         time,
@@ -205,6 +211,8 @@ def _syn(tape: Tape, connections: Connections, time: Ints, attack: int) -> None:
 
 
 def _refused(tape: Tape, connections: Connections, attack: tuple[int, int]) -> None:
+    if not len(connections):
+        return
     _syn(tape, connections, connections.time, attack[0])
     packets.tcp(
         tape,
@@ -217,6 +225,10 @@ def _refused(tape: Tape, connections: Connections, attack: tuple[int, int]) -> N
         ack=_isn(connections, 1) + 1,
         attack=attack[1],
     )
+
+
+def _column(value: Column, count: int) -> Ints:
+    return np.full(count, value, np.int64) if isinstance(value, int) else value
 
 
 class _Sessions:
@@ -240,7 +252,9 @@ class _Sessions:
         return closed
 
     def _put(self, flow: Ints, time: Ints, direction: int, flags: Column, payload: Column = 0) -> None:
-        full = [np.broadcast_to(value, len(flow)) for value in (direction, flags, payload)]
+        if not len(flow):
+            return
+        full = [_column(value, len(flow)) for value in (direction, flags, payload)]
         self._rows.append((flow, time, full[0], full[1], full[2]))
 
     def _handshake(self) -> Ints:

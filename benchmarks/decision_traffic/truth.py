@@ -48,7 +48,8 @@ class AttackTruth:
     packets: int
     """Of the attacker; answers are not counted."""
     attackers: tuple[Identity, ...]
-    """The true senders; an `ip` of 0 where addresses are forged."""
+    """The true senders; an `ip` of 0 where addresses are forged, and a MAC of `innocents` where that is stolen (only
+    the port is the attacker's then)."""
     forged: bool
     """Source addresses are not the attacker's own."""
     victims: tuple[int, ...]
