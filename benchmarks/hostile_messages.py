@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from apps.evidence import TrainingState
 from apps.firewall import arrivals as firewall
 from apps.kitsune import service as kitsune
 from apps.messages import (
@@ -29,6 +30,7 @@ from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
 from apps.p4runtime_ctrl.telemetry.demand import Offer
 from apps.packets import read_frames
 from apps.sonata_adapter import arrivals as adapter
+from apps.sonata_adapter.evidence.count_baseline import CountBaseline
 from benchmarks.hostile_mutation import mutate_value
 from benchmarks.hostile_target import DecoderTarget
 from coordinator.admission import Admission
@@ -113,6 +115,10 @@ _STATE = {
     "blocks": [{"id": "d1", "packets": 5}], "change": "primary",
 }  # fmt: skip
 _OFFER = Offer(name="q1", bit=3, switch="s1", conditions={"ip.dst": "10.0.0.0/8", "tcp.flags": [2, 18]})
+_TRAINING = TrainingState(packets=9, wanted=10, done=False, seconds=60.0, senders=3, event_time=_NOW)
+_BASELINE = CountBaseline(
+    text="query ddos", low=11, newcomer=20.0, middle=12.0, highest={"10.0.0.1": 12.0}, event_time=_NOW
+)
 _QUESTIONS = RecordBatch({name: np.arange(4).astype(kind) for name, kind in controller.QUESTION.items()})
 _SEND = {"port": [1, 2], "length": [3, 4], "frames": b"abcdefg"}
 
@@ -224,6 +230,8 @@ TARGETS = (
     _target("sonata", "network.digests.p4runtime_ctrl.s1.q", adapter.data_in, _reported()),
     _target("sonata", "network.counts.p4runtime_ctrl.s1.q", adapter.data_in, _ones(**_COUNTED)),
     _target("sonata", "network.cell.p4runtime_ctrl.s1", adapter.cells_in, _ones(id="u8", count="u4")),
+    _target("sonata", "network.training.kitsune", adapter.training_in, _TRAINING.to_value()),
+    _target("sonata", "network.baseline.sonata_adapter.ddos", adapter.baseline_in, _BASELINE.to_value()),
     DecoderTarget(
         "coordinator checkpoint",
         _checkpoint,

@@ -13,9 +13,16 @@ from apps.evidence import Kind as AttackKind
 from apps.sonata_adapter.errors import InvalidRequest
 from apps.sonata_adapter.keys import QueryRequest
 from apps.sonata_adapter.query.catalogue import CATALOGUE, Template
-from apps.sonata_adapter.query.dataflow import Crossing, compile_query
+from apps.sonata_adapter.query.dataflow import (
+    Crossing,
+    Node,
+    PacketSource,
+    WindowTable,
+    compile_query,
+    sources,
+)
 from apps.sonata_adapter.query.expressions import BinaryOperation, Expression, Field, Kind, Number
-from apps.sonata_adapter.query.language import Filter, Map, Query, output_kinds
+from apps.sonata_adapter.query.language import SYN, Filter, Map, Query, arp, output_kinds, tcp
 
 _LOWER: Final = 4
 """While a query learns, its threshold is one in so many of the catalogue's, ..."""
@@ -24,6 +31,10 @@ _LOWEST: Final = 5
 _WINDOW_MS: Final = 3_000
 _SHORT_WINDOW_MS: Final = 1_000
 """For results that are known at the window's end only: the shortest whose counts the switch is asked for."""
+_SYN_RST_ACK: Final = 0x16
+_BEGINNING: Final = (tcp.flags & _SYN_RST_ACK == 0x02) | (tcp.flags & _SYN_RST_ACK == 0)
+"""Segments that begin a conversation or should: SYN, and those of FIN, NULL and Xmas scans."""
+_BEGINS: Final = frozenset({(tcp.flags == SYN).node, (arp.op == 1).node, _BEGINNING.node})
 _MEANT: Final[dict[str, tuple[AttackKind, str]]] = {
     "port_scan": ("scan", ""),
     "superspreader": ("scan", ""),
@@ -54,6 +65,8 @@ class EvidenceRecipe(msgspec.Struct, frozen=True, kw_only=True):
     """Threshold while the query learns: what is below it, training does not see."""
     crosses: bool
     """Whether a result is reported at the threshold, in the middle of a window."""
+    answered: bool
+    """Whether a count may consist of answers, which others can call forth with forged questions."""
     query: Query
 
     @property
@@ -107,6 +120,9 @@ def recipe_of(template: Template) -> EvidenceRecipe:
     crosses = isinstance(compile_query(query), Crossing)
     if template.name in CATALOGUE and not crosses and query.window_ms == _WINDOW_MS:
         query = template.query({"window": _SHORT_WINDOW_MS})
+    if template.name == "port_scan":
+        # a flooded server answers to as many ports as a scanner asks
+        query = msgspec.structs.replace(query, steps=(Filter(_BEGINNING.node), *query.steps))
     kind, service = _MEANT.get(template.name, ("other", ""))
     return EvidenceRecipe(
         name=template.name,
@@ -117,8 +133,20 @@ def recipe_of(template: Template) -> EvidenceRecipe:
         unit=_unit(template, measure),
         low=max(1, threshold // _LOWER, min(threshold, _LOWEST)),
         crosses=crosses,
+        answered=bool({"src", "mac"} & kinds.keys()) and not _begins(query),
         query=query,
     )
+
+
+def _begins(query: Query) -> bool:
+    """Whether all packets that are counted begin something."""
+    outcome = compile_query(query)
+    found = sources(outcome) if isinstance(outcome, WindowTable) else [outcome.node]
+    return all(_BEGINS.intersection(_packets(node).filters) for node in found)
+
+
+def _packets(node: Node) -> PacketSource:
+    return node if isinstance(node, PacketSource) else _packets(node.source)
 
 
 def _unit(template: Template, measure: str) -> str:

@@ -212,6 +212,7 @@ class WatchedQuery:
             source=recipe.name,
             sender=sender,
             address=str(fields["src"]) if sender is None and "src" in fields else "",
+            answered=recipe.answered,
             victims=victims,
             victim_count=len(victims),
             service=recipe.service,

@@ -4,9 +4,11 @@ import pytest
 
 from apps.evidence import Evidence, TrainingState
 from apps.sonata_adapter.evidence.evidence_queries import EVIDENCE_PREFIX, MOST_QUERIES, EvidenceQueries
+from apps.sonata_adapter.host.engine import HostEngine
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from apps.sonata_adapter.query.text import parse_queries
 from apps.sonata_adapter.results import QueryResult
+from sdnator.testing.query_traffic import ACK, BASE_US, SYN, TimedFrame, batches, tcp
 
 SECOND = 10**6
 BEGIN = 1_700_000_000 * SECOND
@@ -144,6 +146,25 @@ def test_a_frames_sender_is_named_with_its_port():
     (found,) = network.counts(60, {"mac": "02:00:00:00:00:12", "port": 3})
     assert (found.sender.switch, found.sender.port, found.sender.mac) == ("s1", 3, "02:00:00:00:00:12")
     assert (found.service, found.address) == ("arp", "")
+
+
+def test_answers_are_told_from_what_somebody_begins():
+    """Forged SYNs make a server answer to thousands of ports and hosts: that alone accuses nobody."""
+    (learning,) = Network("port_scan").queries.requests
+    engine = HostEngine()
+    engine.add(learning.query)
+    start = BASE_US + 1_000
+    forged = [f"172.16.{n >> 8}.{n & 255}" for n in range(200)]
+    frames = [
+        TimedFrame(start + n, 60, tcp("10.0.0.1", host, 80, 1024 + n, SYN | ACK))
+        for n, host in enumerate(forged)
+    ]
+    frames += [TimedFrame(start + 500 + n, 60, tcp("10.0.0.2", "10.0.0.1", 4444, n, SYN)) for n in range(200)]
+    found = [each for batch in batches(frames) for each in engine.process(batch)] + engine.finish()
+    assert [each.fields for each in found] == [{"src": "10.0.0.2", "count": 200}]
+    (scan,) = after_training().counts(200)
+    (spread,) = after_training("superspreader").counts(200)
+    assert (scan.answered, spread.answered) == (False, True)
 
 
 def test_own_queries_are_evidence():
