@@ -7,7 +7,9 @@
 
 One attacker is one incident: a MAC with few addresses, otherwise a MAC and an address.  Many attackers of one victim
 are one incident too, where the evidence says flood or guessing: other kinds name victims that have nothing else in
-common.  All times are capture time in ns.
+common.
+
+All times are capture time in ns, and believed: whoever calls has refused those that cannot be (`SteadyTime`).
 """
 
 from collections import OrderedDict
@@ -210,12 +212,13 @@ class IncidentBook:
         found = self._by_decision.get(confirmation.id)
         if found is None:
             return []
-        now = self._clock(confirmation.event_time)
+        now, said = self._now, confirmation.event_time
         action = found.actions.get(confirmation.id)
         if action is None:
             return self._due(now)
         if confirmation.state in ("installed", "exists"):
-            effective = action.effective or confirmation.event_time or now
+            # a switch's wrong clock must not move everybody's
+            effective = action.effective or (said if abs(said - now) < self._idle else now)
             after = structs.replace(action, state="in_force", effective=effective)
         elif confirmation.state == "failed":
             # one switch of several may refuse what others carry out
