@@ -2,6 +2,7 @@
 
 ControllerError
 ├── ProgramError      the P4 program lacks something that the controller needs
+├── CaptureTimesError the times of a capture cannot be used
 ├── EntryError        an entry that does not fit the program; never sent to the switch
 ├── TelemetryError    a packet request that the classifier cannot hold
 └── SwitchError       the switch: unreachable, refused, silent
@@ -17,6 +18,10 @@ class ControllerError(Exception):
 
 class P4InfoError(ControllerError):
     """The P4 program lacks a table, action or header that the controller needs."""
+
+
+class CaptureTimesError(ControllerError):
+    """The file with the times of a capture cannot be read, or holds something else."""
 
 
 class EntryError(ControllerError):

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from apps.p4runtime_ctrl.southbound.capture_times import CaptureTimes
 from apps.p4runtime_ctrl.southbound.counts_in import CountReader
 from apps.p4runtime_ctrl.southbound.digest_in import DigestReader
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker, Source
@@ -27,18 +28,26 @@ _SECOND_US: Final = 1_000_000
 class PacketPublisher:
     """Publishes packets and reports of the switch `name` through `write`.
 
-    `by_digest`: record batches come from digests, else from copied frames.
+    `by_digest`: record batches come from digests, else from copied frames.  `times`: of a capture, in place of the
+    switch's clock.
     """
 
     def __init__(
-        self, name: str, program: ProgramInfo, base_us: int, write: Write, *, by_digest: bool = False
+        self,
+        name: str,
+        program: ProgramInfo,
+        base_us: int,
+        write: Write,
+        *,
+        by_digest: bool = False,
+        times: CaptureTimes | None = None,
     ) -> None:
         self.progress = LossTracker()
         self._name = name
         self._write = write
         self._by_digest = by_digest
-        self._packets = PacketReader(program, base_us, self.progress)
-        self._digests = DigestReader(program, base_us, self.progress)
+        self._packets = PacketReader(program, base_us, self.progress, times)
+        self._digests = DigestReader(program, base_us, self.progress, times)
         self._counts = CountReader(program, base_us, self.progress)
         self.answers = 0
         """Answers about counting cells."""

@@ -27,6 +27,9 @@ class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clock: Literal["packets", "heard", "own"] = "heard"
     """What moves its time: its packets alone, as in a replay; heard: between packets the controller's clock carries
     it on, once a second; own: also before the first packet, because `base_us` is known."""
+    capture_times: str = ""
+    """File (.npy, int64) with the time of each frame of a capture, us since the epoch, by arrival number: for replays
+    on a switch with a clock of its own; empty: the switch's time stamps hold."""
     target: str = ""
     """Kind of switch, for display."""
 

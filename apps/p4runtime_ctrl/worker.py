@@ -22,6 +22,7 @@ from apps.p4runtime_ctrl.arrivals import FramesToSend
 from apps.p4runtime_ctrl.errors import ControllerError, EntryError, Malformed, SwitchError
 from apps.p4runtime_ctrl.packet_publisher import PacketPublisher
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.southbound.capture_times import CaptureTimes
 from apps.p4runtime_ctrl.southbound.connection import Connection, Listener
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
@@ -73,8 +74,9 @@ class SwitchWorker:
         self._settings = settings
         self._program = program
         by_digest = settings.telemetry == "digest"
+        times = CaptureTimes.load(Path(mine.capture_times)) if mine.capture_times else None
         self._outbound = PacketPublisher(
-            mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest
+            mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest, times=times
         )
         self._progress = self._outbound.progress
         self._packet_outs = PacketOuts(self._program, mine.base_us)

@@ -254,6 +254,7 @@ class ReplayPass:
                 switch=options.switch,
                 inject=options.inject,
                 base_us=self._survey.base_us,
+                times_us=self._survey.time_ns // 1_000,
                 telemetry=options.telemetry,
                 first=partial(self._join, engine),
                 kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},

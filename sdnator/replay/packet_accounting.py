@@ -53,6 +53,11 @@ class PacketAccounting:
         """Packets that are no longer in flight."""
 
     @property
+    def first_arrival(self) -> int:
+        """Arrival number of the capture's first packet at the switch."""
+        return self._first_arrival or 0
+
+    @property
     def in_flight(self) -> int:
         """Packets sent that are neither scored, dropped nor known to be not copied."""
         return self.sent - self.decided

@@ -21,6 +21,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dataplane.ports.capture_port import CaptureFeed
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator import p4_program
@@ -52,7 +55,9 @@ class PipelinePlan:
     """Interface through which frames enter an external switch."""
     device_id: int = 1
     base_us: int = 0
-    """Microseconds that the controller adds to the switch's time stamps."""
+    """Microseconds that the controller adds to the embedded switch's time stamps."""
+    times_us: NDArray[np.int64] | None = None
+    """Capture time of each frame, us since the epoch, for switches with a clock of their own."""
     first: "Callable[[ReplayPipeline], None] | None" = None
     """Called when Data Updates and the Coordinator run, before any app starts: data is made on demand,
     so a consumer that must not miss any registers its interests here."""
@@ -78,7 +83,6 @@ class ReplayPipeline:
         self._guests = ExitStack()
         self._supervisor = Supervisor((), _tell)
         self._begun_ns = time.time_ns()
-        self._base_us = plan.base_us
         self._inject = plan.inject
         self._switch: SwitchProgram | None = None
         self.updates = ""
@@ -152,7 +156,6 @@ class ReplayPipeline:
                 "bmv2", name="switch", logs=self._logs, ports=ports, device_id=self._plan.device_id
             )
         else:
-            self._base_us = time.time_ns() // 1_000
             return
         self._add("switch", self._switch.start)
 
@@ -180,8 +183,6 @@ class ReplayPipeline:
 
     def _controller_settings(self) -> dict[str, Any]:
         program = p4_program.find()
-        # the capture's times drive the embedded switch's clock
-        own_clock = self._switch is not None and self._plan.switch == "bmv2"
         return {
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
@@ -193,13 +194,22 @@ class ReplayPipeline:
                     "name": SWITCH_NAME,
                     "address": self._address,
                     "device_id": self._plan.device_id,
-                    "base_us": self._switch.base_us if self._switch and own_clock else self._base_us,
+                    "base_us": self._plan.base_us,
+                    "capture_times": self._capture_times(),
                     "target": self._plan.switch,
                     "clock": "packets",
                     "forward": {str(INGRESS_PORT): EGRESS_PORT},
                 }
             ],
         }
+
+    def _capture_times(self) -> str:
+        """The capture's times drive the embedded switch's clock; for others the controller knows them."""
+        if self._plan.switch == "embedded" or self._plan.times_us is None:
+            return ""
+        path = self._plan.folder.absolute() / "capture-times.npy"
+        np.save(path, self._plan.times_us)
+        return str(path)
 
     def _adapter_settings(self) -> dict[str, Any]:
         """What the switch counts must not depend on the speed of the replay.

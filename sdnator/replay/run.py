@@ -95,8 +95,8 @@ def run(
     notes = surveyed.notes()
     if options.switch != "embedded":
         notes.append(
-            f"switch {options.switch} stamps packets with its own clock, not with capture time: features and scores "
-            "follow the speed of the replay (--pace 1x keeps them comparable), and block times are wall times"
+            f"packets have the capture's times, but what switch {options.switch} measures itself runs on its own "
+            "clock: meters and idle time-outs of entries"
         )
     reported = blocking or alone
     assert reported is not None  # noqa: S101 - there is at least one pass
@@ -113,7 +113,7 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
     result = outcome.reported
     flight = result.flight
     trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
-    blocks = block_rows(outcome.survey, result.decisions, result.confirmations)
+    blocks = block_rows(outcome.survey, result.decisions, result.confirmations, flight.first_arrival)
     incidents = result.last_incidents()
     challenged = outcome.challenged.packets & (flight.state != PacketState.DROPPED)
     first_attack = None

@@ -45,7 +45,10 @@ def from_attackers(survey: Survey, labels: Labels) -> NDArray[np.bool_]:
 
 
 def block_rows(
-    survey: Survey, decisions: Sequence[Decision], confirmations: Sequence[Confirmation]
+    survey: Survey,
+    decisions: Sequence[Decision],
+    confirmations: Sequence[Confirmation],
+    first_arrival: int = 0,
 ) -> list[dict[str, Any]]:
     """One row for each block that the switch installed, in the order of installing.
 
@@ -58,14 +61,15 @@ def block_rows(
         decision = by_id.get(confirmation.id)
         if decision is None or confirmation.state != "installed":
             continue
+        packet = max(0, confirmation.arrival - first_arrival)
         rows.append(
             {
                 "id": decision.id,
                 "address": decision.target.address,
                 "reason": decision.reason,
-                "time": int(survey.time_ns[min(confirmation.arrival, survey.packets - 1)]) / 1e9,
+                "time": int(survey.time_ns[min(packet, survey.packets - 1)]) / 1e9,
                 "decided": decision.event_time / 1e9,
-                "packet": confirmation.arrival,
+                "packet": packet,
                 "handle": confirmation.handle,
             }
         )

@@ -169,13 +169,25 @@ def test_everything_decided_is_in_the_archive(tmp_path, monkeypatch):
         archive.close()
 
 
-def test_same_loop_on_bmv2(short_capture):
-    """The pipeline runs unchanged on BMv2: real packets on veth pairs, and nothing is lost."""
+def decided(folder):
+    with (folder / "decisions.csv").open(newline="") as file:
+        return [(row["time"], row["id"], row["action"], row["address"]) for row in csv.DictReader(file)]
+
+
+def test_same_scores_and_decisions_on_bmv2(short_capture, tmp_path):
+    """Real packets on veth pairs, scored at the capture's times: nothing is lost, and all is as on the embedded switch."""
     optional_program("simple_switch_grpc")
     require_netns()
-    found = figures("replay", short_capture, "--train", "1100", "--switch", "bmv2", "--no-mitigate")
-    assert (found["packets_lost"], found["packets_dropped"]) == (0, 0)
-    assert found["packets_scored"] == found["packets_in"]
+    for switch in ("bmv2", "embedded"):
+        how = ("--train", "1100", "--switch", switch, "--no-mitigate", "--report", tmp_path / switch)
+        found = figures("replay", short_capture, *how)
+        assert (found["packets_lost"], found["packets_dropped"]) == (0, 0)
+        assert found["packets_scored"] == found["packets_in"]
+    scores, states = scores_csv(tmp_path / "bmv2")
+    expected, expected_states = scores_csv(tmp_path / "embedded")
+    assert states == expected_states
+    np.testing.assert_allclose(scores, expected, rtol=1e-9)
+    assert decided(tmp_path / "bmv2") == decided(tmp_path / "embedded") != []
 
 
 def test_same_loop_on_a_switch_that_runs_already(short_capture):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.p4runtime_ctrl.errors import P4InfoError
+from apps.p4runtime_ctrl.southbound.capture_times import CaptureTimes
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.rows import RowLayout, has_bit, read_lists
@@ -62,12 +63,14 @@ class DigestReports:
 
 
 class DigestReader:
-    """Reads the digests of one switch and records them in `progress`.
+    """Reads the digests of one switch and records them in `progress`; `base_us` and `times` as in `PacketReader`.
 
     Raises `P4InfoError` where the program's digest lacks a field.
     """
 
-    def __init__(self, program: ProgramInfo, base_us: int, progress: LossTracker) -> None:
+    def __init__(
+        self, program: ProgramInfo, base_us: int, progress: LossTracker, times: CaptureTimes | None = None
+    ) -> None:
         fields = program.digest(_DIGEST)
         missing = sorted(_NEEDED - {name for name, _ in fields})
         if missing:
@@ -75,6 +78,7 @@ class DigestReader:
         self.digest_id = program.digest_id(_DIGEST)
         self._layout = RowLayout(fields)
         self._base_us = base_us
+        self._times = times
         self._progress = progress
 
     def read(self, lists: Sequence[Any]) -> DigestReports:
@@ -82,6 +86,8 @@ class DigestReader:
         found, malformed = read_lists(self._layout, lists)
         self._progress.malformed += malformed
         columns = _columns(found, self._base_us)
+        if self._times is not None:
+            columns["time_us"] = self._times.of(columns["arrival"])
         self._progress.digests(columns["sequence"], columns["arrival"], columns["time_us"])
         return DigestReports(
             columns, found["queries"], found["crossed"], found["overflow"], ~uncovered(found)

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.p4runtime_ctrl.southbound.capture_times import CaptureTimes
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.packet_out import question_of
@@ -94,16 +95,20 @@ class PacketInBatch:
 class PacketReader:
     """Reads the packet-in header of one switch and records sequence numbers in `progress`.
 
-    `base_us` is the absolute time of the switch's clock zero, integer microseconds since the epoch.
+    `base_us` is the absolute time of the switch's clock zero, integer microseconds since the epoch; `times` replaces
+    the switch's clock by the times of a capture.
     Raises `ProgramError` where the program's packet-in header lacks a field.
     """
 
-    def __init__(self, program: ProgramInfo, base_us: int, progress: LossTracker) -> None:
+    def __init__(
+        self, program: ProgramInfo, base_us: int, progress: LossTracker, times: CaptureTimes | None = None
+    ) -> None:
         program.header(_HEADER, _NEEDED)
         fields = program.headers[_HEADER]
         self._layout = RowLayout((field.name, field.width) for field in fields)
         self._ids = [field.id for field in fields]
         self._base_us = base_us
+        self._times = times
         self._progress = progress
 
     def read(self, messages: Sequence[Any]) -> PacketInBatch:
@@ -123,7 +128,7 @@ class PacketReader:
         packets = PacketInBatch(
             frames=frames,
             port=header["ingress_port"].astype(np.uint16),
-            time_us=header["timestamp"].astype(np.int64) + self._base_us,
+            time_us=self._time_us(header),
             length=header["length"].astype(np.uint32),
             sequence=header["sequence"].astype(np.uint64),
             arrival=header["arrival"].astype(np.uint64),
@@ -132,6 +137,12 @@ class PacketReader:
         )
         self._progress.packets(packets.sequence, packets.arrival, packets.time_us)
         return packets
+
+    def _time_us(self, header: NDArray[Any]) -> NDArray[np.int64]:
+        if self._times is not None:
+            return self._times.of(header["arrival"])
+        times_us: NDArray[np.int64] = header["timestamp"].astype(np.int64) + self._base_us
+        return times_us
 
     def _values(self, metadata: Any) -> list[bytes]:
         """Header values in the program's order; messages may carry them in any order."""
