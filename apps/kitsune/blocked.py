@@ -40,4 +40,5 @@ class Blocked:
 
     def covers(self, switch: str, mac: str, address: str) -> bool:
         """Whether a sender with this MAC or address is blocked on the switch."""
-        return (switch, mac) in self._targets or (switch, address) in self._targets
+        switches = (switch, "*")
+        return any((each, name) in self._targets for each in switches for name in (mac, address))

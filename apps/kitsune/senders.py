@@ -138,7 +138,7 @@ class Senders:
                 hot += self._turn(second)
             sender = self._sender(packet)
             responsible = self._responsible(packet, sender)
-            if responsible == sender and self.blocked and self._answers_blocked(packet):
+            if self.blocked and self._concerns_blocked(packet, sender, responsible):
                 continue
             tally = self._tallies.get(responsible)
             if tally is None:
@@ -273,6 +273,16 @@ class Senders:
         self._ids[record.identity] = number
         self.roles.see(record.identity[2], record.identity[3])
         return number
+
+    def _concerns_blocked(self, packet: Packet, sender: int, responsible: int) -> bool:
+        """Whether a packet answers a sender that is blocked, seen to begin the conversation or not."""
+        if responsible == sender:
+            return self._answers_blocked(packet)
+        record = self.records[responsible]
+        if record is None:
+            return False
+        switch, _, mac, address = record.identity
+        return self.blocked.covers(switch, mac_text(mac), ip_text(*address))
 
     def _answers_blocked(self, packet: Packet) -> bool:
         """Whether a packet answers a conversation that was not seen because its initiator is blocked."""

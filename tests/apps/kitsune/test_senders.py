@@ -3,8 +3,10 @@
 import numpy as np
 
 from apps.kitsune.senders import Senders
+from apps.messages import Target
 from due import RecordBatch
 from sdnator.testing.packet_rows import blank
+from tests.apps.firewall.enforcement.test_eve import decision
 
 HOST, OTHER = 0xC0A80205, 0xC0A80206
 BASE_S = 1_600_000_000
@@ -147,3 +149,35 @@ def test_spoofed_senders_are_forgotten(monkeypatch):
         feed(senders, [(second * 20, 1_000 + 10 * second + number, 0) for number in range(10)])
     assert len(senders.known()) <= 120
     assert any(record.training_rate for record in senders.known())
+
+
+def test_answers_to_a_blocked_sender_are_nobodys():
+    """Its victim goes on answering a conversation that it began before the block; it has no part in that any more."""
+    senders = trained_senders()
+    sides = {
+        "port": np.array([3, 4, 4, 4]),
+        "eth_src": np.array([HOST, OTHER, OTHER, OTHER]) & 0xFF,
+        "ip_version": np.full(4, 4),
+        "ip_src_lo": np.array([HOST, OTHER, OTHER, OTHER]),
+        "ip_dst_lo": np.array([OTHER, HOST, HOST, HOST]),
+        "udp_sport": np.array([5000, 53, 53, 53]),
+        "udp_dport": np.array([53, 5000, 5000, 5000]),
+    }
+
+    def second(at, scores):
+        batch = blank(4, time_us=np.full(4, (BASE_S + at) * 1_000_000), **sides)
+        how = {"trained": 0, "line": 1.0, "evidence": lambda row: row}
+        return senders.add(batch, "s1", scores=np.array(scores, float), **how) + senders.finish()
+
+    (hot,) = second(5, [0, 2, 2, 2])
+    assert hot.record.identity[3] == (4, 0, HOST)
+    address = ".".join(str(byte) for byte in HOST.to_bytes(4, "big"))
+    for number, switch in enumerate(("s1", "*")):
+        target = Target(kind="ip", address=address)
+        senders.blocked.decide(decision(id=f"d{number}", switch=switch, target=target))
+        batch = blank(4, time_us=np.full(4, (BASE_S + 6 + number) * 1_000_000), **sides).take(
+            np.array([1, 2, 3])
+        )
+        how = {"trained": 0, "line": 1.0, "evidence": lambda row: row}
+        assert senders.add(batch, "s1", scores=np.full(3, 2.0), **how) + senders.finish() == []
+        senders.blocked.decide(decision(id=f"d{number}", action="unblock", switch=switch, target=target))
