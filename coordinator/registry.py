@@ -224,7 +224,7 @@ class Registry:
         for name, app in list(self._apps.items()):
             for instance in list(app.instances.values()):
                 if paused > self._shortest_timeout_s:
-                    instance.seen += paused
+                    instance.seen = min(instance.seen + paused, now)
                 silent = now - instance.seen
                 if instance.alive and silent > self._patience(instance, now):
                     self._lost(name, instance, InstanceState.UNRESPONSIVE)
@@ -237,7 +237,10 @@ class Registry:
     def lead(self) -> None:
         """This Coordinator leads from now on; active instances stay active."""
         self.leading = True
-        for app in self._apps.values():
+        for name, app in self._apps.items():
+            if app.active:
+                # known from when this Coordinator led before; what a heartbeat says comes first
+                self._preferred[name] = app.active
             app.active = ""
         self._dirty = True
 

@@ -29,6 +29,7 @@ from coordinator.selection import find as find_strategy
 from due import NO_WAIT, PUB_ONLY, Capability, DueError, Engine, Interest, Item
 from due import service as due_service
 from due.backends import default_archive, open_archive
+from due.backoff import LONGEST_S
 from due.codec import encode_value
 from due.errors import InvalidOption
 from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
@@ -105,6 +106,7 @@ class CoordinatorService:
         self._leadership = Leadership(
             engine.instance_id, started, time.monotonic(), interval=settings.leader_interval_s
         )
+        self._judge_from = 0.0
         counts = ("registrations", "heartbeats", "misunderstood", "assignments_sent", "health_refused")
         self._counts = dict.fromkeys(counts, 0)
         self._apps_health: dict[str, Any] = {}
@@ -137,12 +139,20 @@ class CoordinatorService:
         return {"http": self._api.url} if self._api is not None else {}
 
     def tick(self) -> None:
-        """Announce this Coordinator, find silent instances, send changes."""
+        """Announce this Coordinator, find silent instances, send changes.
+
+        Without Data Updates it hears nobody and can tell nobody anything, so it judges nobody either, and not before
+        the instances have had time to come back.
+        """
         now = time.monotonic()
+        if not self._engine.connected:
+            self._judge_from = now + LONGEST_S
+            return
         with self._lock:
             led = self._leadership.leading
             claim = self._leadership.tick(now)
-            self._registry.expire(now)
+            if now >= self._judge_from:
+                self._registry.expire(now)
             self._obey(led)
             messages = self._registry.outgoing()
             leading = self._leadership.leading

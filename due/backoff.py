@@ -2,11 +2,14 @@
 
 import random
 
+LONGEST_S = 2.0
+"""Somebody who lost a server tries again at least so often."""
+
 
 class Backoff:
     """Delays of `first`, doubling up to `longest` seconds, each shortened by up to a half at random."""
 
-    def __init__(self, first: float = 0.05, longest: float = 2.0) -> None:
+    def __init__(self, first: float = 0.05, longest: float = LONGEST_S) -> None:
         self._first = first
         self._longest = longest
         self._delay = first

@@ -25,6 +25,7 @@ from uuid import uuid4
 import msgspec
 
 from due.backends import default_archive, default_updates
+from due.clock import awake_ns
 from due.codec import MAX_ID, checked_time, freeze, unpack
 from due.config import Options
 from due.errors import BackendError, DecodeError, InvalidKey, InvalidOption, NotAllowed, NotInitialised
@@ -209,7 +210,7 @@ class Engine:
         if event_time is not None:
             event_time = checked_time(event_time)
         session = self._session or self._require()
-        if now > session.keeper.alive_until:
+        if awake_ns() > session.keeper.alive_until:
             session.keeper.check_pause()
         with outlet.lock:
             if outlet.fast:
@@ -234,8 +235,14 @@ class Engine:
 
         Raises:
             Timeout: it took longer.
+            Superseded: another instance took this one's place before all of it was acknowledged.
         """
         self._require().flush(timeout)
+
+    @property
+    def connected(self) -> bool:
+        """Whether Data Updates have answered lately, and items of others can arrive."""
+        return self._require().connected
 
     def observe(
         self, key: str, *, frequency: Frequency = None, since: int | datetime | str | None = None

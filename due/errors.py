@@ -10,6 +10,7 @@
     ├── DecodeError           bytes from a backend are not a valid frame or value
     │   └── NewerVersion      ... because a newer DUE wrote them
     ├── RefusedFrame          a frame does not belong on its channel, or its numbers are impossible
+    ├── Superseded            another instance took this one's place before its writes were acknowledged
     ├── EngineFailed          a thread of the engine has died: nothing is sent or received any more
     └── BackendError          a backend refused a request or failed
         ├── UpdatesUnavailable    Data Updates cannot be reached (now)
@@ -70,6 +71,10 @@ class RefusedFrame(DueError):
     def __init__(self, cause: str, text: str) -> None:
         super().__init__(text)
         self.cause = cause
+
+
+class Superseded(DueError):
+    """Another instance took this one's place, and what this one wrote last may have been refused."""
 
 
 class EngineFailed(DueError):

@@ -1,4 +1,9 @@
-"""The thread for membership: heartbeats, assignments, leases, reconnects.  It never waits for data."""
+"""The thread for membership: heartbeats, assignments, leases, reconnects.  It never waits for data.
+
+An active standby instance may write for `pause` seconds after a heartbeat that Data Updates have answered for; a
+Coordinator waits longer before it replaces the instance.  Where that time ends, because the process was suspended or
+its connection is away, the instance asks before it writes on, so that two never write at once.
+"""
 
 import logging
 import threading
@@ -7,6 +12,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from due.clock import awake_ns
 from due.codec import decode_frame
 from due.dispatcher import Dispatcher
 from due.drivers.base import Publisher, Receiver
@@ -34,6 +40,8 @@ _LATE = 0.01
 """A wake-up delayed by more than this means that the CPU cores are overloaded."""
 _EASING = 0.8
 _RENEW_SECONDS = 1.0
+_ANSWER_SECONDS = 0.01
+"""An answer to a heartbeat is looked for after this time."""
 _SLOW_CALLBACK = 0.02
 
 Say = Callable[[str, object], None]
@@ -80,7 +88,9 @@ class HeartbeatThread:
         self.lock = threading.Lock()
         """Guards `member`."""
         self.alive_until = 0
-        """A write after this time (UTC, ns) shows that the process was suspended meanwhile."""
+        """A write after this time (`awake_ns`) comes from a process that was suspended or cut off meanwhile."""
+        self.superseded = 0
+        """How often another instance took this one's place while this one was active or asked whether it is."""
         self.turned = time.monotonic()
         """Start of the last loop iteration, monotonic seconds."""
         self.say: Say = lambda _path, _value: None
@@ -94,6 +104,8 @@ class HeartbeatThread:
         self._pause = pause
         self.misunderstood = 0
         """Assignments that were refused."""
+        self._probed = 0
+        self._unanswered = False
         self._seen = -1
         self._renew_at = 0.0
         self._poll_again = 0.0
@@ -105,7 +117,7 @@ class HeartbeatThread:
 
     def start(self) -> None:
         """Register and begin."""
-        self.alive_until = time.time_ns() + int(self._pause * 1e9)
+        self.alive_until = awake_ns() + int(self._pause * 1e9)
         self._control.subscribe(f"{ASSIGNMENT}.{self.member.registration.app_id}")
         self._turn()
         self._thread.start()
@@ -114,16 +126,24 @@ class HeartbeatThread:
         """Run the next iteration now."""
         self._control.wake()
 
+    @property
+    def connected(self) -> bool:
+        """Whether Data Updates have answered lately and can tell this instance of assignments."""
+        return self._control.connected and awake_ns() <= self._publisher.answered + int(self._pause * 1e9)
+
     def check_pause(self) -> None:
-        """Check for a suspension; called by writers after `alive_until` and by this thread."""
+        """Check for a suspension or a lost connection; called by writers after `alive_until` and by this thread."""
         with self.lock:
-            now = time.time_ns()
+            now = awake_ns()
             if now <= self.alive_until:
                 return
             late = (now - self.alive_until) / 1e9 + self._pause
             self.alive_until = now + int(self._pause * 1e9)
             if self.member.paused(time.monotonic()):
-                log.warning("suspended for %.1f s: asking which instance is active before writing more", late)
+                log.warning(
+                    "suspended or without Data Updates for %.1f s: asking which instance is active before writing more",
+                    late,
+                )
         self.changed()
 
     def close(self) -> None:
@@ -142,13 +162,22 @@ class HeartbeatThread:
         while not self._closed:
             try:
                 self._listen()
+                self._look_at_connection()
                 self.check_pause()
-                self.alive_until = time.time_ns() + int(self._pause * 1e9)
                 self._turn()
                 self.turned = time.monotonic()
             except DueError as error:
                 self._errors.error("membership", error=error)
                 time.sleep(_TICK)
+
+    def _look_at_connection(self) -> None:
+        """Renew the right to write, if Data Updates answer."""
+        self._poll_again = self._publisher.poll()
+        works = self.connected
+        if works:
+            self.alive_until = max(self.alive_until, self._publisher.answered + int(self._pause * 1e9))
+        with self.lock:
+            self.member.connection(time.monotonic(), works=works)
 
     def _listen(self) -> None:
         busy = self._dispatcher.busy_since
@@ -156,6 +185,8 @@ class HeartbeatThread:
         slow = busy is not None and began - busy > _SLOW_CALLBACK
         heard, self._heard = self._heard, self._dispatcher.best_effort
         rest = min(self._rhythm.rest(coming=self._heard != heard, slow=slow), self._poll_again)
+        if self._unanswered:
+            self._unanswered, rest = False, min(rest, _ANSWER_SECONDS)
         wait = min(rest, max(0.0, self.member.next_tick() - began))
         deliveries = self._control.receive(wait)
         self._rhythm.got_up(late=time.monotonic() - began - wait > _LATE)
@@ -171,21 +202,26 @@ class HeartbeatThread:
                     log.warning("an assignment was refused: %s; further ones are only counted", error)
                 continue
             with self.lock:
+                worked = self.member.active or self.member.asking
                 self.member.assigned(message, time.monotonic())
+                self.superseded += worked and not self.member.active
 
     def _turn(self) -> None:
         now = time.monotonic()
         with self.lock:
             messages = self.member.tick(now, written=self.written(), received=self._dispatcher.received)
             changes, active, reading = self.member.changes, self.member.active, self.member.reading
+        probed = awake_ns()
         for message in messages:
             self._send(message)
+        if messages or probed - self._probed > self.member.registration.heartbeat * 1e9:
+            self._probed, self._unanswered = probed, True
+            self._publisher.probe(probed)
         if changes != self._seen:
             take_over = self.member.phase is Phase.COORDINATED
             self._seen = changes
             self._dispatcher.activate(active, reading=reading, take_over=take_over)
             self.changed()
-        self._poll_again = self._publisher.poll()
         if now >= self._renew_at:
             self._renew_at = now + _RENEW_SECONDS
             self._dispatcher.receiver.renew()

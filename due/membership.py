@@ -194,6 +194,8 @@ class Member:
         self._beat_at = now
         self._fenced_until = 0.0
         self._fenced = False
+        self._unheard = False
+        """The question who is active could not be sent."""
 
     @property
     def active(self) -> bool:
@@ -204,7 +206,7 @@ class Member:
 
     @property
     def asking(self) -> bool:
-        """Whether it was suspended for long and does not know yet if it is still active."""
+        """Whether it was suspended or cut off for long and does not know yet if it is still active."""
         return self._fenced
 
     @property
@@ -301,7 +303,7 @@ class Member:
         return changed
 
     def paused(self, now: float) -> bool:
-        """This process was suspended for longer than a Coordinator waits: another may be active by now.
+        """This process was suspended or cut off for longer than a Coordinator waits: another may be active by now.
 
         Writes are buffered until the Coordinator says who is active, or stays silent for the handshake
         time-out.  Returns whether this applies (only the active instance of a standby app).
@@ -315,6 +317,15 @@ class Member:
         self._register_at = now
         self.changes += 1
         return True
+
+    def connection(self, now: float, *, works: bool) -> None:
+        """Whether Data Updates answers now: a question that nobody could hear is asked again, and waits anew."""
+        if not self._fenced or (works and not self._unheard):
+            return
+        self._fenced_until = now + self._handshake_timeout
+        self._unheard = not works
+        if works:
+            self._beat_at = self._register_at = now
 
     def permission(self, key: Key) -> Permission:
         """How to treat items written under the concrete `key`."""

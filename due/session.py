@@ -16,7 +16,7 @@ from due.config import Options
 from due.dispatcher import Dispatcher
 from due.drivers.base import ArchiveDriver
 from due.drivers.embedded_redis import EmbeddedServer, shared_server
-from due.errors import DueError, EngineFailed, Timeout, UpdatesUnavailable
+from due.errors import DueError, EngineFailed, Superseded, Timeout, UpdatesUnavailable
 from due.heartbeat_thread import HeartbeatThread
 from due.key_writer import ARCHIVE, PUBLISH, KeyWriter, Sent
 from due.keys import Key
@@ -90,6 +90,9 @@ class Session:
         self._archive: ArchiveDriver = open_archive(archive_url)
         self._lock = threading.RLock()
         self._unpublished = 0
+        self._acknowledged = 0
+        """Items written when `flush` last succeeded."""
+        self._superseded = 0
         self._told: tuple[Assignment, ...] | None = None
         self._callback: AssignmentCallback | None = None
 
@@ -177,6 +180,24 @@ class Session:
         self.publisher.settle(max(0.1, deadline - time.monotonic()))
         if self._archiver is not None:
             self._archiver.flush(max(0.1, deadline - time.monotonic()))
+        self._check_place()
+
+    def _check_place(self) -> None:
+        """Raise `Superseded` if readers may have refused what was written since the last successful flush."""
+        written = self._written() + self.gate.taken_back
+        since, self._acknowledged = written - self._acknowledged, written
+        superseded = self.keeper.superseded
+        lost_place, self._superseded = superseded > self._superseded, superseded
+        if lost_place and since:
+            raise Superseded(
+                f"another instance took over from this one: of the last {since} items written readers may have "
+                "refused some"
+            )
+
+    @property
+    def connected(self) -> bool:
+        """See `Engine.connected`."""
+        return self.keeper.connected and self.dispatcher.receiver.connected
 
     def flush_archive(self, timeout: float) -> None:
         """Wait until this engine's writes are in the archive."""
@@ -222,7 +243,7 @@ class Session:
             "asking": member.asking,
             "epoch": member.epoch,
             "written": self.keeper.written(),
-            "unpublished": self._unpublished,
+            "unpublished": self._unpublished + self.gate.lost,
             "outlets": len(self.outlets),
             "keys": self._busiest(),
             **self.gate.counts,

@@ -34,6 +34,10 @@ class WriteAdmission:
         self._held_bytes = 0
         self.failed: Callable[[], None] = lambda: None
         """Raises if no assignment can ever come; set by the session."""
+        self.taken_back = 0
+        """Items that `write` took, and that were refused when it was known which instance is active."""
+        self.lost = 0
+        """Best-effort items for which there was no room while Data Updates could not be reached."""
         self.counts = {"unwanted": 0, "refused": 0, "held_for_permission": 0, "replaced": 0}
 
     def changed(self) -> None:
@@ -65,6 +69,8 @@ class WriteAdmission:
             held, outlet.held = outlet.held, deque()
             self._held_bytes -= outlet.held_bytes
             outlet.held_bytes = 0
+            if permission.verdict is Verdict.REFUSED:
+                self.taken_back += len(held)
             for item in held:
                 self._place(outlet, item)
         if permission.verdict is not Verdict.OPEN or outlet.pacer is not None:
@@ -107,6 +113,9 @@ class WriteAdmission:
         """Hold an item until the assignments are known; wait if too much is held already."""
         self.counts["held_for_permission"] += 1
         while self._held_bytes > self._hold_bytes:
+            if not (outlet.reliable or self._keeper.connected):
+                self.lost += 1
+                return True
             with self._changed:
                 self._changed.wait(0.05)
             self.failed()

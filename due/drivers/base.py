@@ -145,6 +145,19 @@ class Publisher(Protocol):
         """
         ...
 
+    def probe(self, now: int) -> None:
+        """Ask the server for a sign of life; nothing while there is no connection.
+
+        Args:
+            now: of the caller's clock, for `answered`.
+        """
+        ...
+
+    @property
+    def answered(self) -> int:
+        """The `now` of the youngest `probe` that the server has answered, as far as replies were read; 0: none."""
+        ...
+
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
         ...
@@ -175,6 +188,11 @@ class Receiver(Protocol):
 
     def unfollow(self, pattern: str) -> None:
         """The inverse of `follow`."""
+        ...
+
+    @property
+    def connected(self) -> bool:
+        """Whether best-effort payloads of what was subscribed can arrive now."""
         ...
 
     def receive(self, timeout: float) -> list[Delivery]:

@@ -81,6 +81,8 @@ class MemoryPublisher:
         self._written: set[str] = set()
         self._held_back = 0
         self._closed = False
+        self.answered = 0
+        """See `Publisher.answered`."""
 
     def publish(self, path: str, *payloads: bytes) -> None:
         """See `Publisher.publish`."""
@@ -121,6 +123,10 @@ class MemoryPublisher:
             for path in self._written:
                 self._space.streams[path].trim(time.monotonic())
         return _POLL_SECONDS
+
+    def probe(self, now: int) -> None:
+        """See `Publisher.probe`: this process answers at once."""
+        self.answered = now
 
     def statistics(self) -> dict[str, int]:
         """See `Publisher.statistics`."""
@@ -173,6 +179,8 @@ class MemoryReceiver:
         self._take_over = False
         self._woken = False
         self._closed = False
+        self.connected = True
+        """See `Receiver.connected`."""
         with space.lock:
             space.receivers.append(self)
 

@@ -48,7 +48,8 @@ _MESSAGE = "message"
 """A best-effort message whose reply is pending; lost with the connection."""
 _COMMAND = "command"
 """A command of our own whose reply is pending."""
-_Awaited = StreamEntry | Question | str
+_Awaited = StreamEntry | Question | str | int
+"""What a reply belongs to; a number is the `now` of a probe."""
 
 
 class RedisUpdates:
@@ -99,6 +100,10 @@ class RedisPublisher:
         """Number of outstanding replies from which to collect them."""
         self._care_at = 0.0
         self._closed = False
+        self.answered = 0
+        """See `Publisher.answered`."""
+        self._probing = False
+        self._connecting = False
         self._counts = {"refused": 0, "lost_disconnected": 0, "reconnects": 0, "held_back": 0, "resent": 0}
         self._connect()
 
@@ -144,7 +149,7 @@ class RedisPublisher:
                 if self._wire is not None:
                     self._guarded_wait(0.05)
                     continue
-                self.poll()
+            self.poll()
             if deadline is not None and time.monotonic() > deadline:
                 raise Timeout(f"{self._url} did not acknowledge within {timeout} s")
             time.sleep(0.01)
@@ -152,9 +157,18 @@ class RedisPublisher:
     def poll(self) -> float:
         """See `Publisher.poll`."""
         with self._lock:
+            away = self._wire is None
+            connecting, self._connecting = self._connecting, self._connecting or away
+        if away:
+            if not connecting:
+                try:
+                    if self._backoff.due(time.monotonic()):
+                        self._connect()
+                finally:
+                    self._connecting = False
+            return _RECONNECT_SECONDS
+        with self._lock:
             if self._wire is None:
-                if self._backoff.due(time.monotonic()):
-                    self._connect()
                 return _RECONNECT_SECONDS
             try:
                 self._collect_at = 0
@@ -168,6 +182,19 @@ class RedisPublisher:
             if now >= self._care_at:
                 self._care(now)
         return _POLL_SECONDS
+
+    def probe(self, now: int) -> None:
+        """See `Publisher.probe`; one at a time is on its way."""
+        with self._lock:
+            if self._wire is None or self._probing:
+                return
+            try:
+                self._wire.send(b"PING")
+            except UpdatesUnavailable as error:
+                self._lose(error)
+                return
+            self._outstanding.append(now)
+            self._probing = True
 
     def statistics(self) -> dict[str, int]:
         """Counters, and bytes kept for readers that have not acknowledged."""
@@ -282,10 +309,11 @@ class RedisPublisher:
 
         Returns whether there is a connection.
         """
+        if self._wire is None:
+            self.poll()
         with self._lock:
             wire = self._wire
             if wire is None:
-                self.poll()
                 return False
             self._guarded_take(wire)  # a new question is more informative than the answer to an earlier one
             self._ask(ledger)
@@ -316,7 +344,7 @@ class RedisPublisher:
             ledger.asking(time.monotonic())
             self._outstanding.extend([question] * question.size)
 
-    def _answered(self, question: Question) -> None:
+    def _acknowledged(self, question: Question) -> None:
         """Forget what the readers have acknowledged, here and on the server."""
         ledger = question.ledger
         ledger.asked = False
@@ -356,7 +384,9 @@ class RedisPublisher:
             awaited = self._outstanding.popleft()
             if isinstance(awaited, Question):
                 if awaited.take(reply):
-                    self._answered(awaited)
+                    self._acknowledged(awaited)
+            elif isinstance(awaited, int):
+                self.answered, self._probing = awaited, False
             elif isinstance(reply, hiredis.ReplyError):
                 self._refused(reply, awaited)
             elif isinstance(awaited, StreamEntry):
@@ -376,18 +406,27 @@ class RedisPublisher:
         self._wire = None
         self._counts["lost_disconnected"] += self._outstanding.count(_MESSAGE)
         self._outstanding.clear()
+        self._probing = False
         for ledger in self._ledgers.values():
             ledger.asked = False
         delay = self._backoff.failed(time.monotonic())
         log.warning("lost Data Updates at %s: %s; retrying in %.2f s", self._url, error, delay)
 
     def _connect(self) -> None:
+        """Without the lock until the server has answered: nobody waits for one that does not."""
         try:
             wire = Wire(self._url)
             run_id = _run_id(wire)
         except UpdatesUnavailable as error:
             delay = self._backoff.failed(time.monotonic())
             log.warning("%s; retrying in %.2f s", error, delay)
+            return
+        with self._lock:
+            self._take_up(wire, run_id)
+
+    def _take_up(self, wire: Wire, run_id: bytes) -> None:
+        if self._closed:
+            wire.close()
             return
         self._backoff.succeeded()
         self._wire = wire

@@ -88,6 +88,11 @@ class RedisReceiver:
         self._reader.activate(active, take_over=take_over)
         self.wake()
 
+    @property
+    def connected(self) -> bool:
+        """See `Receiver.connected`."""
+        return self._bus is not None or not self._patterns
+
     def receive(self, timeout: float) -> list[Delivery]:
         """See `Receiver.receive`."""
         self._care()

@@ -7,6 +7,7 @@ parsing (RESP3, its default, formats each push into a log line).
 
 import socket
 import ssl
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, cast
@@ -22,6 +23,7 @@ _PARSER_KEEPS = 1 << 20
 _SEND_ROOM = 1 << 20
 """The default buffer of a Unix socket holds two frames, so a writer would wait at every third."""
 _JOIN_BELOW = 1 << 14
+_ANSWER_SECONDS = 5.0
 _MOST_PARTS = 512
 """Buffers per sendmsg; Linux allows at most 1,024."""
 
@@ -57,7 +59,11 @@ class Wire:
 
     def __init__(self, url: str) -> None:
         pool = redis.ConnectionPool.from_url(
-            _redis_url(url), protocol=2, socket_timeout=None, socket_connect_timeout=5, retry=None
+            _redis_url(url),
+            protocol=2,
+            socket_timeout=_ANSWER_SECONDS,
+            socket_connect_timeout=_ANSWER_SECONDS,
+            retry=None,
         )
         self._connection = cast("Any", pool.make_connection())
         try:
@@ -66,6 +72,7 @@ class Wire:
             raise UpdatesUnavailable(f"Data Updates at {url} cannot be reached: {error}") from None
         # redis-py has no public way to wait on several connections
         self._socket: socket.socket = self._connection._sock  # noqa: SLF001
+        self._socket.settimeout(None)  # the time-out was for opening the connection
         self._reader = cast("Any", hiredis.Reader())  # its stub knows no buffer but bytes
         self._reader.setmaxbuf(_PARSER_KEEPS)
         # reused: the allocator would map and unmap a new one for each read
@@ -145,11 +152,13 @@ class Wire:
         yield from self._parsed(size)
 
     def call(self, *arguments: bytes | str | int) -> Any:
-        """Send one command and wait for its reply; only while nothing else is outstanding."""
+        """Send one command and wait for its reply, at most 5 s; only while nothing else is outstanding."""
         self.send(*arguments)
-        while True:
-            for reply in self.wait():
+        deadline = time.monotonic() + _ANSWER_SECONDS
+        while (left := deadline - time.monotonic()) > 0:
+            for reply in self.wait(left):
                 return reply
+        raise UpdatesUnavailable(f"the server did not answer within {_ANSWER_SECONDS:g} s")
 
     def close(self) -> None:
         """Close the socket."""

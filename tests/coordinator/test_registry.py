@@ -237,6 +237,27 @@ def test_a_coordinator_that_was_stopped_blames_nobody() -> None:
     assert set(world.states().values()) == {"active", "idle"}
 
 
+def test_who_is_heard_after_a_stop_is_not_trusted_for_longer_than_others() -> None:
+    world = World()
+    world.join("a", "a1")
+    world.now += 60
+    world.registry.beat(Heartbeat(app_id="a", instance_id="a1", revision=1), world.now)
+    world.registry.expire(world.now)
+    world.run(2.0, [])
+    assert world.states() == {"a1": "unresponsive"}
+
+
+def test_who_leads_again_keeps_an_active_instance_that_asks_whether_it_still_is() -> None:
+    world = World()
+    world.join("a", "a2")
+    world.join("a", "a1")
+    world.registry.follow()
+    world.beat("a", "a1", active=False)
+    world.beat("a", "a2", active=False)
+    world.registry.lead()
+    assert {each.active for each in world.send()} == {"a2"}
+
+
 def test_the_only_instance_keeps_its_place_over_an_outage() -> None:
     world = World()
     world.join("app", "i1", interests=(Interest("a"),))

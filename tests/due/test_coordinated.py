@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
+from benchmarks.chaos_links import UnixLink
 from due import NO_WAIT, PUB_ONLY, Capability, Interest
+from due.errors import Superseded
 from due.membership import ASSIGNMENT, Assignments, Registration
 from due.messages import Assignment
 from tests.due.conftest import wait_for
@@ -130,6 +132,57 @@ def test_an_app_that_was_stopped_for_a_moment_is_not_told_that_nothing_is_wanted
     script.assign("stopped", assignments=_wants("t.other"))
     wait_for(lambda: changes[-1:] == [["t.other"]])
     assert changes == [["t.stopped"], ["t.other"]]
+
+
+@pytest.fixture
+def link(server, tmp_path):
+    made = UnixLink(tmp_path / "link.sock", server.socket)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def cut_off(make_engine, script, link):
+    """An active instance that lost its connection, and has noticed."""
+    init = {"capabilities": [Capability("t.cut.**", delivery="reliable")]}
+    engine = make_engine("cut", init=init, url=link.url, **FAST | {"pause_limit": 0.2})
+    script.assign("cut", active=engine.instance_id, assignments=_wants("t.cut.**"))
+    wait_for(lambda: engine.write("t.cut.x", 0) and engine.health()["phase"] == "coordinated")
+    engine.flush()
+    link.cut()
+    wait_for(lambda: engine.health()["asking"])
+    assert not engine.connected
+    return engine
+
+
+def test_an_instance_without_data_updates_keeps_its_items_until_it_is_told_that_it_is_active(
+    make_engine, script, cut_off, link
+):
+    got: list[Any] = []
+    make_engine("cut_reader").observe("t.cut.x").subscribe(lambda item: got.append(item.value))
+    assert cut_off.write("t.cut.x", 1)
+    link.mend()
+    wait_for(lambda: 1 in got)
+    assert not cut_off.health()["asking"]
+    assert cut_off.connected
+    cut_off.flush()
+
+
+def test_an_instance_that_was_replaced_while_it_was_cut_off_writes_nothing_and_flush_says_so(
+    make_engine, script, cut_off, link
+):
+    """Two instances never write at once, and nothing counts as acknowledged that readers refuse."""
+    got: list[Any] = []
+    make_engine("cut_reader").observe("t.cut.x").subscribe(lambda item: got.append(item.value))
+    script.assign("cut", active="another", epoch=2)
+    assert cut_off.write("t.cut.x", 1)
+    link.mend()
+    wait_for(lambda: not cut_off.health()["active"] and not cut_off.health()["asking"])
+    with pytest.raises(Superseded, match="another instance took over"):
+        cut_off.flush()
+    assert not cut_off.write("t.cut.x", 2)
+    cut_off.flush()
+    assert 1 not in got
 
 
 def test_interests_are_registered_and_withdrawn(make_engine, script):

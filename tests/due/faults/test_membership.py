@@ -94,3 +94,19 @@ def test_data_flows_while_the_coordinator_is_dead_and_it_learns_all_again(progra
     assert sorted([_states(process)[-1], _states(standby_process)[-1]]) == ["active", "standby"]
     said = _said(listener, active)  # once: the stream goes on
     assert said == list(range(len(said)))
+
+
+def test_data_updates_that_come_back_empty_replace_no_instance_and_lose_no_word(
+    programs, own_server, coordinator
+):
+    coordinator()
+    listener, (active, _), (standby, _) = _pair(programs, own_server.url)
+    for _ in range(2):
+        own_server.kill()
+        time.sleep(2.5)  # longer than the Coordinator waits for a heartbeat
+        own_server.start()
+        count = len(_said(listener, active))
+        _watch(lambda count=count: len(_said(listener, active)) > count + 100)
+    assert not _said(listener, standby)
+    said = _said(listener, active)
+    assert said == list(range(said[0], said[0] + len(said)))
