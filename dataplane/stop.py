@@ -6,6 +6,7 @@ does not wake it.  A pipe has neither problem: CPython writes to it when the sig
 """
 
 import os
+import select
 import signal
 from collections.abc import Iterable
 from contextlib import suppress
@@ -35,6 +36,11 @@ class Stop:
     def wait(self) -> None:
         """Return as soon as it was set."""
         os.read(self._read, 1)
+
+    def readable_first(self, descriptor: int) -> bool:
+        """Wait until a descriptor can be read, or this was set; whether the former, and not the latter."""
+        ready, _, _ = select.select([self._read, descriptor], [], [])
+        return self._read not in ready
 
 
 def _taken(_number: int, _frame: FrameType | None) -> None:

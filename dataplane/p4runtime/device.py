@@ -16,7 +16,7 @@ from typing import Any
 
 from dataplane.p4runtime import messages, pipeline_config
 from dataplane.p4runtime.arbitration import DEFAULT_ROLE, Arbitration, ArbitrationUpdate
-from dataplane.p4runtime.pipeline import ForwardingPipeline, Verified
+from dataplane.p4runtime.pipeline import ForwardingPipeline, verify
 from dataplane.p4runtime.reads import Reader
 from dataplane.p4runtime.status import (
     Aborted,
@@ -53,6 +53,7 @@ class Device:
     clock: the packets' clock, µs
     programs: those that may be loaded; None = the product's own
     roles: that controllers may claim beside the default role
+    prepared: a pipeline without entries, for the first configuration if that has the same program
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class Device:
         clock: Callable[[], int],
         programs: TrustedPrograms | None = None,
         roles: Iterable[str] = (),
+        prepared: ForwardingPipeline | None = None,
     ) -> None:
         self.device_id = device_id
         self.control = threading.RLock()
@@ -81,6 +83,7 @@ class Device:
         self._programs = TrustedPrograms() if programs is None else programs
         self._roles = {DEFAULT_ROLE, *roles}
         self._saved: ForwardingPipeline | None = None
+        self._prepared = prepared
         self._arbitration = Arbitration()
         self._streams: dict[int, ControllerStream] = {}
         self._next_stream = 0
@@ -209,10 +212,15 @@ class Device:
             if plan.active is not self.pipeline:
                 self._replace(plan.active)
 
-    def _make(self, verified: Verified) -> ForwardingPipeline:
-        pipeline = ForwardingPipeline(
-            verified, cpu_port=self._cpu_port, backend=self._backend, clock=self._clock
-        )
+    def _make(self, config: Any) -> ForwardingPipeline:
+        pipeline, self._prepared = self._prepared, None
+        if pipeline is not None and not pipeline.take(config):
+            pipeline.close()
+            pipeline = None
+        if pipeline is None:
+            pipeline = ForwardingPipeline(
+                verify(config), cpu_port=self._cpu_port, backend=self._backend, clock=self._clock
+            )
         pipeline.switch.set_ports(self._ports)
         return pipeline
 
@@ -228,10 +236,10 @@ class Device:
     def close(self) -> None:
         """Free the pipelines; no packets may come any more."""
         with self.control, self.running:
-            for pipeline in (self.pipeline, self._saved):
+            for pipeline in (self.pipeline, self._saved, self._prepared):
                 if pipeline is not None:
                     pipeline.close()
-            self.pipeline = self._saved = None
+            self.pipeline = self._saved = self._prepared = None
 
     def get_pipeline(self, request: Any) -> Any:
         """The response to a GetForwardingPipelineConfigRequest.  Raises Missing."""

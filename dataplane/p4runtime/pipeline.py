@@ -71,6 +71,15 @@ class ForwardingPipeline:
         self.packet_in = PacketInEncoder(self.schema.packet_in)
         self.packet_out = PacketOutDecoder(self.schema.packet_out)
 
+    def take(self, config: Any) -> bool:
+        """Take over a configuration with the same program, and its cookie; whether it has the same."""
+        same = bool(
+            config.p4_device_config == self.config.p4_device_config and config.p4info == self.config.p4info
+        )
+        if same:
+            self.config.CopyFrom(config)
+        return same
+
     def close(self) -> None:
         """Free the switch."""
         self.switch.close()

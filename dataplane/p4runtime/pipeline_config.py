@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dataplane.errors import DataplaneError
-from dataplane.p4runtime.pipeline import ForwardingPipeline, Verified, verify
+from dataplane.p4runtime.pipeline import ForwardingPipeline, verify
 from dataplane.p4runtime.reads import Reader
 from dataplane.p4runtime.status import InvalidArgument, MissingEntity
 from dataplane.p4runtime.writes import Writer
@@ -20,7 +20,8 @@ from p4rt import p4runtime
 
 _Set = p4runtime.SetForwardingPipelineConfigRequest
 _Get = p4runtime.GetForwardingPipelineConfigRequest
-Make = Callable[[Verified], ForwardingPipeline]
+Make = Callable[[Any], ForwardingPipeline]
+"""Makes a pipeline of a ForwardingPipelineConfig."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +52,15 @@ def plan(
         verify(request.config)
         return PipelineChange(active, saved)
     if action == _Set.VERIFY_AND_SAVE:
-        made = make(verify(request.config))
+        made = make(request.config)
         _close(saved)
         return PipelineChange(active, made)
     if action == _Set.VERIFY_AND_COMMIT:
-        made = make(verify(request.config))
+        made = make(request.config)
         _close(saved)
         return PipelineChange(made, None)
     if action == _Set.RECONCILE_AND_COMMIT:
-        made = make(verify(request.config))
+        made = make(request.config)
         _carry_over(active, made)
         _close(saved)
         return PipelineChange(made, None)

@@ -39,6 +39,7 @@ class Child:
         heartbeat: give it the writing end of a pipe as `--heartbeat-fd N`; it writes a byte about every second
             while it makes progress.
         environment: added to ours.
+        waits: it prepares itself, and goes on at `begin`.
     """
 
     def __init__(
@@ -49,9 +50,12 @@ class Child:
         *,
         heartbeat: bool = False,
         environment: Mapping[str, str] | None = None,
+        waits: bool = False,
     ) -> None:
         self.name = name
         self.log = logs / f"{name}.log"
+        self.waits = waits
+        """Whether it goes on, or went on, at `begin` only."""
         self._line = b""
         self._said: dict[str, Any] | None = None
         self._beats = -1
@@ -69,7 +73,7 @@ class Child:
                 # that mostly sleeps, such as Data Updates, waits 100 ms and more beside busy parts.
                 self._process = subprocess.Popen(
                     command,
-                    stdin=subprocess.DEVNULL,
+                    stdin=subprocess.PIPE if waits else subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=stderr,
                     process_group=0,
@@ -86,6 +90,14 @@ class Child:
     @property
     def pid(self) -> int:
         return self._process.pid
+
+    def begin(self) -> None:
+        """What was waiting goes on."""
+        if self._process.stdin is not None:
+            with suppress(OSError):  # it has ended: `ended` tells
+                self._process.stdin.write(b"\n")
+                self._process.stdin.close()
+            self._process.stdin = None
 
     def ready(self) -> Mapping[str, Any] | None:
         """The JSON object of its ready line; None before.  Raises PipelineError for a line that is none."""
@@ -181,6 +193,8 @@ class Child:
             self._process.kill()
             self._process.wait()
         self._close_output()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
         for name in ("_beats", "_exit"):
             if getattr(self, name) >= 0:
                 os.close(getattr(self, name))

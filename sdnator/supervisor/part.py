@@ -22,6 +22,10 @@ State = Literal["waiting", "starting", "running", "ending"]
 Shown = Literal["waiting", "starting", "running", "restarting", "degraded"]
 _LONGEST_LOOK_S = 1.0
 _END_SECONDS = 10.0
+_PREPARE_AFTER_S = 3.0
+"""A part that was restarted has the machine for itself for so long."""
+_PREPARE_EVERY_S = 1.0
+_PREPARE_AGAIN_S = 60.0
 _TOLD_DEATHS = 5
 _TOLD_SECONDS = 300.0
 
@@ -82,6 +86,7 @@ class Part:
         self._cause = ""
         self._start_at = 0.0
         self._since = 0.0
+        self._prepare_at = 0.0
         self._silence = Silence(spec.silence_s)
         self._reason = ""
         self._quiet_until = 0.0
@@ -139,6 +144,7 @@ class Part:
             return True
         if said is not None:
             self.state, self._since, self.said = "running", now, said
+            self._prepare_at = now + _PREPARE_AFTER_S
             self._silence = Silence(self.spec.silence_s)
             if self.deaths:
                 self._say(f"{self.spec.name} runs again", now)
@@ -158,6 +164,7 @@ class Part:
         if (ended := process.ended()) is not None:
             self._died(ended, now)
             return True
+        self._prepare(now)
         if self._silence.too_long(now, beaten=process.beaten()):
             self._end(
                 f"{self.spec.name} hung: no heartbeat for {self.spec.silence_s:g} s, so it was killed", now
@@ -169,6 +176,16 @@ class Part:
             self.deaths = 0
             return degraded
         return False
+
+    def _prepare(self, now: float) -> None:
+        if self.spec.reserve is None or now < self._prepare_at:
+            return
+        self._prepare_at = now + _PREPARE_EVERY_S
+        try:
+            with self.spec.inside(), deferred_signals():
+                self.spec.reserve.prepare()
+        except (SdnatorError, OSError):  # its next start takes longer, that is all
+            self._prepare_at = now + _PREPARE_AGAIN_S
 
     def _step_ending(self, process: PartProcess, now: float) -> bool:
         if process.ended() is None:
@@ -185,9 +202,14 @@ class Part:
 
     def renew(self, now: float) -> None:
         """Stop and restart it, for instance with new settings."""
+        self._discard()
         if self.process is not None and self.state in ("starting", "running"):
             self._end("", now)
             self.process.ask_to_end()
+
+    def _discard(self) -> None:
+        if self.spec.reserve is not None:
+            self.spec.reserve.discard()
 
     def _end(self, reason: str, now: float) -> None:
         self.state, self._reason, self._since = "ending", reason, now
@@ -200,6 +222,7 @@ class Part:
     def _died(self, how: str, now: float) -> None:
         self._close()
         policy, first = self.spec.restart, not self.was_ready and not self.restarts
+        ran = self.state == "running"
         self._cause, self._reason = first_line(how), ""
         if policy is None or (first and self.spec.vital):
             self.state, self._start_at, self._fatal = "waiting", float("inf"), how
@@ -208,7 +231,7 @@ class Part:
             self.failed = how
         self.deaths += 1
         self.restarts += 1
-        pause = policy.pause_s(self.deaths)
+        pause = policy.pause_s(self.deaths, now - self._since if ran else 0.0)
         self.state, self._start_at = "waiting", now + pause
         self._say(f"{self._cause}: restarting it {f'in {pause:g} s' if pause else 'at once'}", now)
 
@@ -223,6 +246,7 @@ class Part:
 
     def stop(self) -> None:
         """Stop it; it is not restarted."""
+        self._discard()
         if self.process is not None:
             stop(self.process)
             self.process = None

@@ -50,6 +50,18 @@ class PartProcess(Protocol):
         ...
 
 
+class Reserve(Protocol):
+    """Makes the next start of a part quick; no method waits."""
+
+    def prepare(self) -> None:
+        """Called about every second while the part runs."""
+        ...
+
+    def discard(self) -> None:
+        """The next start is to use nothing that was prepared."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class RestartPolicy:
     """A part that died is restarted after a pause that doubles with each death, without limit."""
@@ -58,16 +70,18 @@ class RestartPolicy:
     longest_s: float = 30.0
     at_once: bool = False
     """No pause after the first death: for the switch, which forwards nothing while it is down."""
+    quick_s: float = 5.0
+    """Nor, with `at_once`, after a death that comes later than this many seconds after it was ready."""
     well_s: float = 60.0
     """Seconds of running after which earlier deaths no longer count."""
     degraded_deaths: int = 3
     """Number of deaths from which the part is degraded, even while it runs."""
 
-    def pause_s(self, deaths: int) -> float:
-        """Seconds to wait after the death with this number, the first being 1."""
+    def pause_s(self, deaths: int, ran_s: float = 0.0) -> float:
+        """Seconds to wait after the death with this number, the first being 1, of a part that ran for `ran_s`."""
         doubled = deaths - 1
         if self.at_once:
-            if deaths == 1:
+            if deaths == 1 or ran_s >= self.quick_s:
                 return 0.0
             doubled -= 1
         # the exponent is bounded, for a part may die for years
@@ -100,7 +114,8 @@ class PartSpec:
         restart: None: its death is an error of the whole pipeline (`PipelineError`).
         vital: if it fails to start, the whole start fails.
         silence_s: seconds without a heartbeat after which it counts as hung; 0: it has none.
-        inside: entered around its start, such as a network namespace.
+        inside: entered around its start and what prepares it, such as a network namespace.
+        reserve: prepares its next start while it runs.
     """
 
     name: str
@@ -112,3 +127,4 @@ class PartSpec:
     vital: bool = True
     silence_s: float = 0.0
     inside: Callable[[], AbstractContextManager[object]] = nullcontext
+    reserve: Reserve | None = None

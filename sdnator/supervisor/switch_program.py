@@ -10,6 +10,8 @@ from sdnator.supervisor.child import Child
 
 _LONGEST_SOCKET = 100
 """Bytes; the kernel takes 107."""
+_AGAIN_S = 60.0
+"""A spare that died is replaced after this time."""
 
 
 class SwitchProgram:
@@ -24,7 +26,8 @@ class SwitchProgram:
         device_id: P4Runtime device id.
         options: more for `python -m dataplane`.
 
-    The embedded switch's clock continues after a restart; BMv2's starts at zero.
+    The embedded switch's clock continues after a restart; BMv2's starts at zero.  As a `Reserve` it keeps a spare
+    process of the embedded switch that has loaded everything and compiled the program.
     """
 
     def __init__(
@@ -48,6 +51,8 @@ class SwitchProgram:
         self._zero_us = 0
         """The same on the clock that runs since the machine's start."""
         self._child: Child | None = None
+        self._spare: Child | None = None
+        self._spare_from = 0.0
         self.base_us = 0
         """Absolute time of its clock's zero, µs; valid from the first start on."""
 
@@ -65,18 +70,43 @@ class SwitchProgram:
         return self._kind == "embedded"
 
     def start(self) -> Child:
-        """Start it, at the address of the previous start."""
-        address = self.address
+        """Start it, at the address of the previous start; the spare takes its place if there is one."""
+        spare, self._spare = self._spare, None
+        if spare is not None and spare.ended() is None:
+            spare.begin()
+            self._child = spare
+            return spare
+        if spare is not None:
+            spare.close()
         if not self.base_us or not self.clock_goes_on:
             self.base_us = time.time_ns() // 1_000
             self._zero_us = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1_000
+        self._child = self._process()
+        return self._child
+
+    def prepare(self) -> None:
+        """See `Reserve.prepare`."""
+        if self._kind != "embedded" or time.monotonic() < self._spare_from:
+            return
+        if self._spare is None:
+            self._spare = self._process("--spare")
+        elif self._spare.ended() is not None:
+            self.discard()
+            self._spare_from = time.monotonic() + _AGAIN_S
+
+    def discard(self) -> None:
+        """See `Reserve.discard`."""
+        if self._spare is not None:
+            self._spare.close()
+            self._spare = None
+
+    def _process(self, *more: str) -> Child:
         module = "dataplane" if self._kind == "embedded" else "sdnator.supervisor.bmv2_program"
-        places = ["--grpc", address, "--device-id", str(self._device_id)]
+        places = ["--grpc", self.address, "--device-id", str(self._device_id)]
         ports = [part for number, kind in self._ports.items() for part in ("--port", f"{number}={kind}")]
         clock = ["--base-us", str(self._zero_us)] if self.clock_goes_on else []
-        arguments = [module, *places, *ports, *clock, *self._options]
-        self._child = Child(self._name, arguments, self._logs, heartbeat=True)
-        return self._child
+        arguments = [module, *places, *ports, *clock, *self._options, *more]
+        return Child(self._name, arguments, self._logs, heartbeat=True, waits=bool(more))
 
 
 def socket_address(folder: Path, name: str, stack: ExitStack) -> str:

@@ -103,6 +103,7 @@ class UpParts:
                 start=self._programs[switch.name].start,
                 restart=self._restart(at_once=True),
                 silence_s=self.plan.supervisor.hung_s,
+                reserve=self._programs[switch.name],
             )
             for switch in self.plan.switches
             if _is_ours(switch)

@@ -12,7 +12,7 @@ from pathlib import Path
 import grpc
 import pytest
 
-from dataplane.p4runtime.trust import program_hash
+from dataplane.p4runtime.trust import own_program, program_hash, read_program
 from dataplane.ports.capture_port import CaptureFeed
 from dataplane.ports.pcap_port import PcapReader, PcapWriter
 from p4rt import P4RuntimeStub, p4runtime
@@ -319,3 +319,26 @@ def test_a_capture_file_goes_in_and_out(tmp_path):
     reader = PcapReader(tmp_path / "out.pcap")
     assert [reader.read()[1] for _ in frames] == frames
     reader.close()
+
+
+def test_a_spare_serves_when_a_byte_comes_and_a_first_push_finds_its_program_compiled(tmp_path):
+    process = start("--spare", "--port", "1=null", stdin=subprocess.PIPE)
+    assert not select.select([process.stdout], [], [], 0.2)[0]
+    process.stdin.write("\n")
+    process.stdin.flush()
+    ready = json.loads(process.stdout.readline())
+    with P4RuntimeClient(ready["grpc"]) as controller:
+        assert controller.arbitrate().status.code == 0
+        controller.set_pipeline(read_program(own_program()))
+        controller.set_pipeline(program_config(PROGRAM))
+    assert ended(process)[0] == 0
+
+
+@pytest.mark.parametrize("number", [0, signal.SIGTERM])
+def test_a_spare_that_is_not_needed_ends(number):
+    process = start("--spare", "--port", "1=null", stdin=subprocess.PIPE)
+    if number:
+        # once it has handlers; before that the signal ends it as well
+        process.send_signal(number)
+    assert process.communicate(timeout=TIMEOUT_S)[0] == ""
+    assert process.returncode in (0, -number)

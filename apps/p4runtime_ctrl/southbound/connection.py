@@ -129,23 +129,29 @@ class Connection:
 
     def _keep_streaming(self, stub: Any) -> None:
         pause = _FIRST_PAUSE
+        answered = True
         while not self._closing.is_set():
             opened = time.monotonic()
-            cause = self._one_stream(stub)
+            # Only a call that waits makes the channel try again as often as its options say; to calls that fail at
+            # once, a switch that is back shows itself two seconds later.
+            cause = self._one_stream(stub, waits=not answered)
             if self._closing.is_set():
                 return
+            answered = self._told is not None
             self._listener.lost(cause)
             if time.monotonic() - opened > self._longest_pause_s * 2:
                 pause = _FIRST_PAUSE
             self._closing.wait(pause)
             pause = min(pause * 2, self._longest_pause_s)
 
-    def _one_stream(self, stub: Any) -> str:
-        """Open the stream and read it to its end; returns why it ended."""
+    def _one_stream(self, stub: Any, *, waits: bool) -> str:
+        """Open the stream, waiting for the switch or not, and read it to its end; returns why it ended."""
         self._requests = Outgoing()
         self._told = None
         self._claim(self._usual_id())
-        self._call = stub.StreamChannel(iter(self._requests))
+        self._call = stub.StreamChannel(iter(self._requests), wait_for_ready=waits)
+        if self._closing.is_set():
+            self._call.cancel()
         try:
             for message in self._call:
                 self._take(message)

@@ -237,7 +237,8 @@ class P4RuntimeSession:
             response_type=p4runtime.GetForwardingPipelineConfigRequest.COOKIE_ONLY,
         )
         try:
-            reply = self._invoke(self._stub.GetForwardingPipelineConfig, request)
+            # the channel of the calls may not have noticed yet that the switch is back
+            reply = self._invoke(self._stub.GetForwardingPipelineConfig, request, wait_for_ready=True)
         except grpc.RpcError as error:
             if error.code() in (grpc.StatusCode.FAILED_PRECONDITION, grpc.StatusCode.NOT_FOUND):
                 return None
@@ -319,9 +320,11 @@ class P4RuntimeSession:
         self.broken |= isinstance(found, Unreachable)
         return found
 
-    def _invoke(self, method: Callable[..., Any], request: Any, *, patience: int = 1) -> Any:
+    def _invoke(
+        self, method: Callable[..., Any], request: Any, *, patience: int = 1, wait_for_ready: bool = False
+    ) -> Any:
         try:
-            return method(request, timeout=self._address.timeout_s * patience)
+            return method(request, timeout=self._address.timeout_s * patience, wait_for_ready=wait_for_ready)
         except ValueError as error:  # gRPC raises this if the channel was closed meanwhile
             raise Unreachable(f"switch at {self._address.target}: the connection was closed") from error
 

@@ -26,8 +26,8 @@ def reconcile(config):
 def make(request):
     made = []
 
-    def new(verified):
-        made.append(ForwardingPipeline(verified, cpu_port=510, backend=request.param, clock=lambda: 0))
+    def new(config):
+        made.append(ForwardingPipeline(verify(config), cpu_port=510, backend=request.param, clock=lambda: 0))
         return made[-1]
 
     yield new
@@ -41,7 +41,7 @@ def config():
 
 
 def test_registers_are_carried_over(make, config):
-    old = make(verify(config))
+    old = make(config)
     name, array = next((n, a) for n, a in old.switch.registers.items() if a.size > 1)
     array.write(array.size - 1, 5)
     new = plan(reconcile(config), old, None, make).active
@@ -52,7 +52,7 @@ def test_registers_are_carried_over(make, config):
 
 
 def test_a_register_that_the_new_program_lacks_is_refused(make, config):
-    old = make(verify(config))
+    old = make(config)
     name, array = next(iter(old.switch.registers.items()))
     array.write(0, 1)
     other = type(config)()

@@ -16,6 +16,8 @@ def test_pauses_double_up_to_the_longest():
 def test_the_switch_comes_back_at_once_but_not_for_ever():
     policy = RestartPolicy(at_once=True)
     assert [policy.pause_s(deaths) for deaths in (1, 2, 3)] == [0, 0.5, 1]
+    assert policy.pause_s(3, ran_s=policy.quick_s) == 0
+    assert RestartPolicy().pause_s(2, ran_s=3600) == 1
 
 
 @given(st.lists(st.floats(min_value=0.0, max_value=1.0), max_size=100))

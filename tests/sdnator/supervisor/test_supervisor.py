@@ -99,6 +99,30 @@ def test_a_part_that_beats_is_left_alone(stage):
     assert report(supervisor, "good").restarts == 0
 
 
+class Reserved:
+    """Notes what the supervisor asks of a reserve."""
+
+    def __init__(self):
+        self.asked = []
+
+    def prepare(self):
+        self.asked.append("prepare")
+        raise OSError("no process can be started now")
+
+    def discard(self):
+        self.asked.append("discard")
+
+
+def test_what_runs_is_prepared_for_and_what_ends_needs_no_reserve(stage, monkeypatch):
+    monkeypatch.setattr("sdnator.supervisor.part._PREPARE_AFTER_S", 0.0)
+    reserve = Reserved()
+    supervisor = stage.supervisor(stage.part("one", reserve=reserve))
+    supervisor.start()
+    watch_until(supervisor, lambda: reserve.asked)
+    supervisor.stop()
+    assert reserve.asked == ["prepare", "discard"]
+
+
 def test_the_slow_start_of_one_delays_no_other(stage):
     supervisor = stage.supervisor(stage.part("slow", "slow"), stage.part("quick"))
     supervisor.start()

@@ -180,13 +180,25 @@ def test_a_stream_that_the_switch_still_holds_does_not_lock_its_successor_out(sw
         old.sessions[0].write([block(1)])
 
 
-def test_no_switch_is_said_and_tried_again(connect, switch):
+def test_no_switch_is_said_once_and_waited_for(connect, switch):
+    """Calls that fail at once would find a switch that is back two seconds late."""
     switch.stop()
     _, listener = connect()
-    listener.until(lambda: len(listener.lost_causes) >= 2)
+    listener.until(lambda: listener.lost_causes)
     assert switch.address in listener.lost_causes[0]
+    time.sleep(1)
     switch.start()
     listener.until(lambda: listener.sessions)
+    assert len(listener.lost_causes) == 1
+
+
+def test_who_waits_for_a_switch_can_be_closed(connect, switch):
+    switch.stop()
+    connection, listener = connect()
+    listener.until(lambda: listener.lost_causes)
+    time.sleep(0.2)
+    connection.close()
+    assert not any(thread.is_alive() for thread in connection._threads)
 
 
 def test_calls_to_a_dead_switch_are_unreachable(switch, connect):
