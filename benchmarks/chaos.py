@@ -186,6 +186,7 @@ class ChaosRun:
             "instructions_unwanted": self._probes.unwanted_instructions,
             "numbers_unwanted": len(record.unwanted),
             "answers": len(record.answers),
+            "answers_refused": sum(not done for done in record.answers.values()),
             "decisions": len(record.decisions),
             "entries": len(record.entries or ()),
             "words": len(record.words),

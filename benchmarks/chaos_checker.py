@@ -5,6 +5,7 @@ The model.  The probes live through every fault, on a disk and with a clock of t
     taken by `write` ─► covered by `flush` ─► delivered once, in order      reliable key
                                        └─► in the archive at the end      archived key
     instruction taken and flushed ─► answered ─► done: a decision in the archive ─► an entry in the switch
+                                              └─► refused with its cause: no promise
     words of the standby pair, by the time of writing: turns of one instance, never both at once
 
 Delivery is at least once to an app and once to an instance that lives; the reading probe is never killed, so
@@ -144,10 +145,8 @@ def _instructions(record: RunRecord) -> Iterator[Violation]:
             yield Violation(
                 "acknowledged_not_answered", f"{asked.verb} {asked.address} at {asked.at:.1f} s: no answer"
             )
-        if (asked.verb, asked.address) not in decided:
-            done = record.answers.get(asked.id)
-            answer = "no answer" if done is None else "answered as done" if done else "refused"
-            yield Violation("acknowledged_not_decided", f"{asked.verb} {asked.address}: {answer}")
+        if record.answers.get(asked.id) and (asked.verb, asked.address) not in decided:
+            yield Violation("acknowledged_not_decided", f"{asked.verb} {asked.address} was answered as done")
 
 
 def in_force(decisions: Sequence[Decided]) -> frozenset[str]:

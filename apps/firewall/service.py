@@ -21,6 +21,7 @@ from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
 from apps.firewall.enforcement.event_sink import event_sinks
+from apps.firewall.enforcement.storing import StoredAnswers
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
@@ -149,6 +150,7 @@ class FirewallService:
             self._incidents,
             self._publish,
         )
+        self._stored = StoredAnswers(engine)
         self._lock = threading.RLock()
         self._stopped = False
         self._carried_out: deque[str] = deque(maxlen=1000)
@@ -261,6 +263,7 @@ class FirewallService:
             "resets_waited_out": self._resets.waited_out,
             "bindings": len(self._bindings),
             "archive_away": self._archive.unanswered,
+            "answers_unstored": self._stored.unstored,
             "archive_items_read": self._archive.items_read,
             "times_doubted": self._time.doubted + self._row_time.doubted,
             **self._incidents.health(),
@@ -275,6 +278,7 @@ class FirewallService:
             if instruction.id in self._carried_out:
                 return  # sent again after a restart of the firewall or of Data Updates
             answer = self._carry_out(instruction, item)
+        answer = self._stored.checked(answer)
         self._engine.write(f"{history.ANSWERS}.{item.key.split('.')[2]}", answer.to_value(), [due.NO_WAIT])
 
     def _carry_out(self, instruction: Instruction, item: Item) -> Answer:

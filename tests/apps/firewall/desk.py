@@ -13,7 +13,7 @@ from apps.firewall.service import FirewallService
 from apps.firewall.settings import Settings
 from apps.messages import Confirmation, Decision
 from due import Item, Key
-from due.errors import ArchiveUnavailable
+from due.errors import ArchiveUnavailable, Timeout
 
 NOW = 1_700_000_000_000_000_000
 SWITCH = "network.switch.p4runtime_ctrl.s1"
@@ -33,6 +33,7 @@ class FakeEngine:
         self.archived: list[Item] = []
         self.archive_hangs: threading.Event | None = None
         self.archive_away = False
+        self.disk_full = False
 
     def observe(self, key: str) -> Subject[Item]:
         return self.subjects[key]
@@ -40,6 +41,10 @@ class FakeEngine:
     def write(self, key: str, value: Any, *_: object, **__: object) -> bool:
         self.written.append((key, value))
         return True
+
+    def flush(self, timeout: float) -> None:
+        if self.disk_full:
+            raise Timeout(f"not stored within {timeout} s")
 
     def get(self, query: object, *, limit: int | None = None) -> list[Item]:
         if self.archive_hangs is not None:

@@ -195,6 +195,20 @@ def test_instruction_that_is_sent_again_is_not_carried_out_again():
     assert len(desk.written("network.answer.firewall.operator")) == 1
 
 
+def test_an_instruction_is_answered_as_done_when_its_decision_is_stored():
+    """A firewall that is killed while the disk is full forgets what is in its memory only."""
+    engine = FakeEngine()
+    desk = Desk(engine=engine)
+    for name, engine.disk_full in (("a", True), ("b", False)):
+        said = Instruction(id=name, verb="block", subject=f"192.0.2.{len(desk.blocked)}").to_value()
+        desk.hand(INSTRUCTION, said, pattern=INSTRUCTIONS)
+    answers = desk.written("network.answer.firewall.operator")
+    assert [(each["id"], each["done"]) for each in answers] == [("a", False), ("b", True)]
+    assert "in force, but not stored" in answers[0]["text"]
+    assert len(desk.blocked) == 2
+    assert desk.service.health()["answers_unstored"] == 1
+
+
 def test_refused_allow_entry_in_the_archive_does_not_stop_the_start():
     """Instructions are archived before anybody checks them."""
     engine = FakeEngine()
