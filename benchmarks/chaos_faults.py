@@ -84,6 +84,23 @@ class Slow(Cut):
         self.stage.links[self.fault.targets[0]].slow()
 
 
+class CutSwitch(FaultAction):
+    """No connection between controller and switch."""
+
+    def begin(self) -> None:
+        self.stage.switch_link.cut()
+
+    def end(self) -> None:
+        self.stage.switch_link.mend()
+
+
+class SlowSwitch(CutSwitch):
+    """A slow connection between controller and switch."""
+
+    def begin(self) -> None:
+        self.stage.switch_link.slow()
+
+
 class FullDisk(FaultAction):
     """The disk of state and archive takes no byte more."""
 
@@ -152,6 +169,8 @@ ACTIONS: Mapping[str, type[FaultAction]] = {
     "redis_empty": Kill,
     "cut": Cut,
     "slow": Slow,
+    "cut_switch": CutSwitch,
+    "slow_switch": SlowSwitch,
     "full_disk": FullDisk,
     "clock": ClockFault,
     "memory": Memory,
@@ -161,7 +180,6 @@ ACTIONS: Mapping[str, type[FaultAction]] = {
 NOT_DONE: Mapping[str, str] = {
     "controllers_split": "two controllers of one switch, split from each other, are not part of `sdnator up`",
     "corrupt_archive": "a damaged archive loses what stood in it: there is no promise to check",
-    "slow_switch": "the connection between controller and switch is a Unix socket of theirs and is not relayed",
 }
 """What this benchmark does not do anywhere, and why."""
 

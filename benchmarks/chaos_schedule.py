@@ -28,6 +28,8 @@ KINDS: Mapping[str, FaultKind] = {
     "redis_empty": FaultKind(("updates",), weight=2),
     "cut": FaultKind(APPS, weight=2, seconds=(1.0, 10.0)),
     "slow": FaultKind(APPS, seconds=(5.0, 15.0)),
+    "cut_switch": FaultKind(("p4runtime_ctrl",), seconds=(1.0, 10.0)),
+    "slow_switch": FaultKind(("p4runtime_ctrl",), seconds=(5.0, 15.0)),
     "full_disk": FaultKind(("disk",), weight=2, seconds=(2.0, 15.0)),
     "clock": FaultKind((*APPS, "updates"), weight=2),
     "memory": FaultKind(APPS, weight=2, seconds=(5.0, 10.0)),

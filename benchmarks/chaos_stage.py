@@ -4,12 +4,12 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from benchmarks.chaos_links import UnixLink
 from benchmarks.chaos_schedule import APPS
@@ -32,6 +32,19 @@ def may_mount() -> bool:
 def faketime_library() -> Path | None:
     """libfaketime, where the package is installed."""
     return next(iter(Path("/usr/lib").glob(_LIBRARY)), None)
+
+
+class _RelayedParts(UpParts):
+    """The controller reaches the switch through a relay."""
+
+    relay = ""
+
+    def settings(self, name: str) -> Mapping[str, Any]:
+        """See `UpParts.settings`."""
+        found = super().settings(name)
+        if name != "p4runtime_ctrl":
+            return found
+        return {**found, "switches": [{**each, "address": self.relay} for each in found["switches"]]}
 
 
 class ChaosStage:
@@ -58,8 +71,9 @@ class ChaosStage:
                     VethPair.make(self._stack, "ci"),
                     VethPair.make(self._stack, "co"),
                 )
-            self.parts = UpParts(self._plan(), self._stack)
+            self.parts = _RelayedParts(self._plan(), self._stack)
             self.links = {name: self._link(name) for name in APPS}
+            self.switch_link = self._link_to_switch()
             specs = tuple(self._prepared(spec) for spec in self.parts.specs())
             self.supervisor = Supervisor(specs, self._tell)
         except BaseException:
@@ -139,6 +153,13 @@ class ChaosStage:
         server = Path(self.parts.updates.removeprefix("unix://"))
         link = UnixLink(self.folder / f"{name}.sock", server)
         self._stack.callback(link.close)
+        return link
+
+    def _link_to_switch(self) -> UnixLink:
+        """The controller's way to the switch."""
+        link = UnixLink(self.folder / "switch.sock", Path(self.switch_address.removeprefix("unix:")))
+        self._stack.callback(link.close)
+        self.parts.relay = link.url
         return link
 
     def _prepared(self, spec: PartSpec) -> PartSpec:
