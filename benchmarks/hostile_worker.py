@@ -75,8 +75,12 @@ class _Worker:
 
     def _job(self, number: int, target: DecoderTarget, indices: range, limit: float) -> None:
         began, crashes, resident_at_first, done = time.monotonic(), 0, 0, 0
-        end = min(self._end, began + limit)
+        end = self._end
         for index in indices:
+            if done == 1:
+                # the first input waits for what is prepared once, such as a build under sanitizers
+                began = time.monotonic()
+                end = min(self._end, began + limit)
             if done == max(1, len(indices) // 10):
                 resident_at_first = resident()
             if done and time.monotonic() > end:
