@@ -177,9 +177,7 @@ class SonataAdapterService:
             self._write(self._control.tick(time.monotonic()))
             self._read_cells()
             self._refine()
-            now_us = self._control.now_us
-            if now_us is not None:
-                self._say(self._evidence.hear(now_us))
+            self._hear()
 
     def stop(self) -> None:
         """Report open results, and remove all entries from the switch."""
@@ -312,6 +310,11 @@ class SonataAdapterService:
         with self._lock:
             self._say(self._evidence.train(item.app_id, state))
 
+    def _hear(self) -> None:
+        now_us = self._control.now_us
+        if now_us is not None:
+            self._say(self._evidence.hear(now_us))
+
     def _say(self, found: Iterable[tuple[str, Evidence]]) -> None:
         """Write evidence and baselines; follow the thresholds, which change when training ends."""
         for key, evidence in found:
@@ -349,6 +352,7 @@ class SonataAdapterService:
                 self._write(self._control.packets(switch, name, batch, time.monotonic()))
                 self._control.busy(switch, time.monotonic())
             self._read_cells()
+            self._hear()
 
     def _on_cells(self, item: Item, answers: tuple[list[int], list[int]]) -> None:
         """Answers of a switch: `id` and `count` of each question."""

@@ -84,8 +84,6 @@ class WatchedQuery:
         """Training lasts until then at least."""
         self._end_us: int | None = None
         """When training ends, as soon as that is known."""
-        self._long_us: int | None = None
-        """For so long it trains on its own, because it has missed the network's training."""
 
     @property
     def learning(self) -> bool:
@@ -95,23 +93,16 @@ class WatchedQuery:
     def train(self, state: TrainingState) -> list[Evidence]:
         """Note how far the network's training is."""
         self._state = state
-        at_us = state.event_time // 1000
-        if self._now_us is not None and at_us > self._now_us + _AHEAD_US:
-            at_us = self._now_us
-        if not state.done:
-            if self._training is None:  # the network trains again; until it is done the old baseline holds
-                self._begin(at_us)
-            self._end_us = self._long_us = None
-            self._safe_us = max(self._safe_us, at_us)
-            self._learn_waiting()
-        elif self._training is not None and self._end_us is None and self._long_us is None:
-            covered = self._since_us is not None and at_us - self._since_us >= state.seconds * 1e6 / 2
-            if covered:
-                self._end_us = at_us
-            elif self.baseline is not None:
-                return self._judge_from_now()
-            else:
-                self._long_us = min(max(_SHORTEST_US, int(state.seconds * 1e6)), _LONGEST_US)
+        if state.done:
+            return self._decide()
+        at_us = self._time_of(state)
+        if self._training is None:  # the network trains again; until it is done the old baseline holds
+            self._begin(at_us)
+        if self._since_us is None:
+            self._since_us = at_us
+        self._end_us = None
+        self._safe_us = max(self._safe_us, at_us)
+        self._learn_waiting()
         return []
 
     def hear(self, now_us: int) -> list[Evidence]:
@@ -121,16 +112,41 @@ class WatchedQuery:
             return []
         if self._since_us is None:
             self._since_us = now_us
-        if self._end_us is None and self._long_us is not None:
-            self._end_us = self._since_us + self._long_us
-        elif self._end_us is None and self._state is None and now_us - self._since_us >= ALONE_US:
-            self._end_us = self._since_us + ALONE_US  # nobody trains here
-        if self._end_us is None:
-            return []
+        found = self._decide()
+        if self._training is None or self._end_us is None:
+            return found
         window_us = self.recipe.query.window_us
         if now_us < self._end_us + window_us + window_us // 4 + _SLACK_US:
+            return found
+        return found + self._close(self._training, self._end_us)
+
+    def _time_of(self, state: TrainingState) -> int:
+        """Capture time of a word about training."""
+        at_us = state.event_time // 1000
+        wrong = self._now_us is not None and at_us > self._now_us + _AHEAD_US
+        return self._now_us if wrong and self._now_us is not None else at_us
+
+    def _decide(self) -> list[Evidence]:
+        """Decide when training ends, once the network's is over and this query has come as far."""
+        state, since_us, now_us = self._state, self._since_us, self._now_us
+        decided = self._training is None or self._end_us is not None
+        if decided or since_us is None or now_us is None:
             return []
-        return self._close(self._training, self._end_us)
+        if state is None:
+            if now_us - since_us >= ALONE_US:
+                self._end_us = since_us + ALONE_US  # nobody trains here
+            return []
+        at_us = self._time_of(state)
+        if not state.done or now_us < at_us:
+            return []
+        self._safe_us = 0
+        if at_us - since_us >= state.seconds * 1e6 / 2:
+            self._end_us = at_us
+        elif self.baseline is not None:
+            return self._judge_from_now()
+        else:
+            self._end_us = since_us + min(max(_SHORTEST_US, int(state.seconds * 1e6)), _LONGEST_US)
+        return []
 
     def take(self, switch: str, result: QueryResult) -> list[Evidence]:
         """A result of one of its requests: learnt, or weighed."""

@@ -233,6 +233,20 @@ def test_a_kept_baseline_is_used_if_it_is_for_this_query():
         assert not later.queries.learnt()
 
 
+def test_training_may_be_over_before_a_query_has_come_as_far():
+    """Packets may wait on their way to the query; what they bring is training all the same."""
+    network = Network("port_scan")
+    network.goes_on(1)
+    now, network.now = network.now, network.now + 300 * SECOND
+    network.trained(seconds=300)
+    network.now = now
+    network.goes_on(200)
+    assert not network.counts(50)
+    network.goes_on(200)
+    assert network.queries.health()["port_scan"] != "learning"
+    assert not network.counts(50)
+
+
 def test_a_query_that_missed_training_learns_as_long_by_itself():
     """Somebody got interested when training was over."""
     network = Network("port_scan")
