@@ -57,9 +57,11 @@ from apps.messages import (
 from apps.packets import SteadyTime
 from due import Capability, Engine, Interest, Item, Key, RecordBatch
 
+KITSUNES_EVIDENCE = f"{EVIDENCE}.kitsune.*"
+
 INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
-    Interest(f"{EVIDENCE}.*.*"),
+    Interest(KITSUNES_EVIDENCE),
     Interest(f"{TRAINING}.*"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
@@ -178,7 +180,10 @@ class FirewallService:
             self._hear(HANDSHAKES, arrivals.handshake_in, self._on_handshake)
         self._hear("network.anomaly.kitsune.alert", arrivals.alert_in, self._on_alert)
         self._hear(f"{TRAINING}.*", arrivals.training_in, self._on_training)
-        self._hear(f"{EVIDENCE}.*.*", arrivals.spoken_in, self._on_evidence)
+        queries = (f"sonata_adapter.{query}" for query in self._settings.evidence_queries)
+        apps = (f"{app}.*" for app in self._settings.evidence_apps)
+        for key in (KITSUNES_EVIDENCE, *(f"{EVIDENCE}.{each}" for each in (*queries, *apps))):
+            self._hear(key, arrivals.spoken_in, self._on_evidence)
         self._hear("network.confirmation.p4runtime_ctrl.*", arrivals.confirmation_in, self._on_confirmation)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
         self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)

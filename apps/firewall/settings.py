@@ -1,11 +1,14 @@
 """Options of the firewall as a whole."""
 
-from typing import Literal
+import re
+from typing import Final, Literal
 
 import msgspec
 
 from apps.firewall.policy.rules import Rules
 from apps.firewall.syn.syn_policy import SynRules
+
+_SEGMENT: Final = re.compile(r"[a-z0-9_]{1,64}")
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -19,6 +22,10 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Ask the switch for SYN floods (needs the Sonata adapter)."""
     learn: bool = True
     """Learn known sources from completed handshakes (needs the Sonata adapter, and both directions)."""
+    evidence_queries: tuple[str, ...] = ()
+    """Queries whose results are evidence as well, the user's own among them (needs the Sonata adapter)."""
+    evidence_apps: tuple[str, ...] = ()
+    """Further apps whose evidence counts, by app id."""
     known_limit: int = 4000
     """Known sources in the switch, the most recent ones."""
     known_days: int = 30
@@ -49,3 +56,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Bearer token for the webhook."""
     archive_patience_s: float = 5.0
     """Seconds that a decision waits for the sender's history from Data Archives."""
+
+    def __post_init__(self) -> None:
+        for name in (*self.evidence_queries, *self.evidence_apps):
+            if not _SEGMENT.fullmatch(name):
+                raise ValueError(f"{name!r} is no name of a query or an app: letters, digits and _ only")

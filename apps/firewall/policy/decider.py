@@ -9,6 +9,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
+from msgspec import structs
+
 from apps.evidence import Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
@@ -108,9 +110,9 @@ class Decider:
         total = tally.total(now, bound)
         if self._rules.rule != "sequential" or total < min(LEAST_BOUND, PROBATION_SHARE * bound):
             return None
-        if evidence.sender is None:
-            return self._towards(evidence, tally, total, bound) if total >= bound else None
-        return self._against(evidence, evidence.sender, tally, bound, offences)
+        if isinstance(tally.subject, Sender):
+            return self._against(_latest(tally, evidence), tally.subject, tally, bound, offences)
+        return self._towards(evidence, tally, total, bound) if total >= bound else None
 
     def sum_of(self, evidence: Evidence) -> tuple[float, float]:
         """The sum in nats for the subject of evidence that was heard, and the bound."""
@@ -198,16 +200,26 @@ class Decider:
         """A victim of senders that cannot be told apart, or whose addresses are forged."""
         now = evidence.event_time
         reason = _reason(tally, now, bound, total, bound, 0)
+        if evidence.address:
+            refusal = (
+                f"on which port {evidence.address} is, and whether the address is its own, nobody has told"
+            )
+            return self._refused(evidence, reason, refusal, tally, total, bound)
         protocol, _, port = evidence.service.partition("/")
         if protocol == "tcp" and port.isdecimal():
             service = TcpService(evidence.victims[0], int(port))
             return Proposal(evidence, reason, service=service, nats=total, bound=bound, tally=tally)
-        if not self._news(tally.subject, now):
-            return None
         refusal = f"there is no remedy for floods of {evidence.service or 'this kind'} from forged addresses"
-        return Proposal(
-            evidence, f"{reason}; {refusal}", refusal=refusal, nats=total, bound=bound, tally=tally
-        )
+        return self._refused(evidence, reason, refusal, tally, total, bound)
+
+    def _refused(
+        self, evidence: Evidence, reason: str, refusal: str, tally: Tally, total: float, bound: float
+    ) -> Proposal | None:
+        """A proposal to do nothing; None if that was told lately."""
+        if not self._news(tally.subject, evidence.event_time):
+            return None
+        text = f"{reason}; {refusal}"
+        return Proposal(evidence, text, refusal=refusal, nats=total, bound=bound, tally=tally)
 
     def _news(self, subject: object, now: int) -> bool:
         """Whether a refusal about this subject was not told lately."""
@@ -218,6 +230,17 @@ class Decider:
             self._told.clear()
         self._told[subject] = now
         return True
+
+
+def _latest(tally: Tally, evidence: Evidence) -> Evidence:
+    """The evidence itself, or, if it names an address only, with what others know of the sender."""
+    if evidence.sender is not None:
+        return evidence
+    known = [each.latest for each in tally.contributions.values() if each.latest.sender is not None]
+    if not known:
+        return structs.replace(evidence, sender=tally.subject, address="")
+    newest = max(known, key=lambda each: each.event_time)
+    return structs.replace(newest, event_time=evidence.event_time, text=evidence.text)
 
 
 def _target_of(evidence: Evidence, sender: Sender) -> Target | None:

@@ -37,6 +37,9 @@ MOST_SOURCES: Final = 32
 """Sources remembered for one subject."""
 _SECOND: Final = 1_000_000_000
 
+UNPLACED: Final = "unplaced"
+"""In place of a service: the address of a sender whose port and MAC nobody has told."""
+
 Subject = Sender | tuple[str, str]
 """A sender; or a victim's address and service."""
 
@@ -82,13 +85,6 @@ class Tally:
         return sorted(shares, key=lambda pair: -pair[0])
 
 
-def subject_of(evidence: Evidence) -> Subject:
-    """Whom evidence is about."""
-    if evidence.sender is not None:
-        return evidence.sender
-    return evidence.victims[0], evidence.service
-
-
 class SequentialTest:
     """Sums of evidence, and the bound that they have to cross.
 
@@ -99,6 +95,8 @@ class SequentialTest:
     def __init__(self, false_blocks_per_day: float) -> None:
         self._budget = false_blocks_per_day
         self._tallies: OrderedDict[Subject, Tally] = OrderedDict()
+        self._placed: dict[str, Sender] = {}
+        """By address: the sender last seen with it."""
         self.training: TrainingState | None = None
         """The training that evidence rests on; None: none is done."""
 
@@ -125,7 +123,9 @@ class SequentialTest:
 
     def hear(self, evidence: Evidence, app: str) -> Tally:
         """Add evidence that an app wrote; returns all that there is about its subject."""
-        subject, source = subject_of(evidence), f"{app}.{evidence.source}"
+        if evidence.sender is not None and evidence.sender.ip:
+            self._place(evidence.sender)
+        subject, source = self._subject_of(evidence), f"{app}.{evidence.source}"
         now = evidence.event_time
         tally = self._tallies.get(subject)
         if tally is None:
@@ -148,8 +148,21 @@ class SequentialTest:
 
     def sum_of(self, evidence: Evidence) -> float:
         """The sum for the subject of a piece of evidence, at its time."""
-        tally = self._tallies.get(subject_of(evidence))
+        tally = self._tallies.get(self._subject_of(evidence))
         return 0.0 if tally is None else tally.total(evidence.event_time, self.bound)
+
+    def _place(self, sender: Sender) -> None:
+        self._placed[sender.ip] = sender
+        if len(self._placed) > MOST_SUBJECTS:
+            del self._placed[next(iter(self._placed))]
+
+    def _subject_of(self, evidence: Evidence) -> Subject:
+        """Whom evidence is about; a plain address is that of a sender who has been seen, if there is one."""
+        if evidence.sender is not None:
+            return evidence.sender
+        if evidence.address:
+            return self._placed.get(evidence.address) or (evidence.address, UNPLACED)
+        return evidence.victims[0], evidence.service
 
     def forget(self, subject: Subject) -> None:
         """Start anew for a subject: after a decision, or a false alarm."""

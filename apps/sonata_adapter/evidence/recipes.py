@@ -65,7 +65,7 @@ class EvidenceRecipe(msgspec.Struct, frozen=True, kw_only=True):
     """Threshold while the query learns: what is below it, training does not see."""
     crosses: bool
     """Whether a result is reported at the threshold, in the middle of a window."""
-    answered: bool
+    supporting: bool
     """Whether a count may consist of answers, which others can call forth with forged questions."""
     query: Query
 
@@ -133,7 +133,7 @@ def recipe_of(template: Template) -> EvidenceRecipe:
         unit=_unit(template, measure),
         low=max(1, threshold // _LOWER, min(threshold, _LOWEST)),
         crosses=crosses,
-        answered=bool({"src", "mac"} & kinds.keys()) and not _begins(query),
+        supporting=bool({"src", "mac"} & kinds.keys()) and not _begins(query),
         query=query,
     )
 

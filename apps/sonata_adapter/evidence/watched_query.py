@@ -228,7 +228,7 @@ class WatchedQuery:
             source=recipe.name,
             sender=sender,
             address=str(fields["src"]) if sender is None and "src" in fields else "",
-            answered=recipe.answered,
+            supporting=recipe.supporting,
             victims=victims,
             victim_count=len(victims),
             service=recipe.service,

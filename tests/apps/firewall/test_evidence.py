@@ -11,7 +11,6 @@ from tests.apps.firewall.policy.test_sequential_test import evidence
 
 SECOND = 1_000_000_000
 AT = NOW // SECOND
-PATTERN = "network.evidence.*.*"
 
 
 def desk(rule="sequential", seconds=3_600.0, **settings):
@@ -23,7 +22,11 @@ def desk(rule="sequential", seconds=3_600.0, **settings):
 
 def hear(on, *heard, app="kitsune"):
     for each in heard:
-        on.hand(f"network.evidence.{app}.{each.source}", each.to_value(), pattern=PATTERN)
+        key = f"network.evidence.{app}.{each.source}"
+        named = f"network.evidence.sonata_adapter.{each.source}"
+        on.hand(
+            key, each.to_value(), pattern=named if app == "sonata_adapter" else f"network.evidence.{app}.*"
+        )
 
 
 def test_a_strong_piece_of_evidence_blocks_the_sender_by_mac_and_port():
@@ -44,8 +47,20 @@ def test_weak_evidence_blocks_when_it_persists():
 
 
 def test_a_foreign_app_can_speak_and_nobody_in_its_name():
-    on = desk()
+    on = desk(evidence_apps=("honeypot",))
     hear(on, evidence(20.0, AT), app="honeypot")
+    assert on.blocked == [CAMERA.mac]
+
+
+def test_a_query_that_knows_only_an_address_counts_against_its_sender():
+    """Alone it blocks nobody: the address may be forged, and its port is unknown."""
+    query = structs.replace(evidence(20.0, AT, "port_scan"), sender=None, address=CAMERA.ip)
+    alone = desk(evidence_queries=("port_scan",))
+    hear(alone, query, app="sonata_adapter")
+    assert not alone.blocked
+    on = desk(evidence_queries=("port_scan",))
+    hear(on, evidence(1.0, AT))
+    hear(on, query, app="sonata_adapter")
     assert on.blocked == [CAMERA.mac]
 
 

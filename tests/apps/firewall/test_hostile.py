@@ -27,7 +27,7 @@ PATTERNS = {
     INSTRUCTION: "network.instruction.*.firewall",
     SWITCH: "network.switch.p4runtime_ctrl.*",
     CONFIRMATION: "network.confirmation.p4runtime_ctrl.*",
-    SPOKEN: "network.evidence.*.*",
+    SPOKEN: "network.evidence.kitsune.*",
     TRAINED: "network.training.*",
 }
 GENUINE = {

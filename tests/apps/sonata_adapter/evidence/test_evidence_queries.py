@@ -164,7 +164,7 @@ def test_answers_are_told_from_what_somebody_begins():
     assert [each.fields for each in found] == [{"src": "10.0.0.2", "count": 200}]
     (scan,) = after_training().counts(200)
     (spread,) = after_training("superspreader").counts(200)
-    assert (scan.answered, spread.answered) == (False, True)
+    assert (scan.supporting, spread.supporting) == (False, True)
 
 
 def test_own_queries_are_evidence():
