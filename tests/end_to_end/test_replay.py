@@ -105,6 +105,10 @@ def test_attackers_are_blocked_and_nobody_else(attacked_capture, tmp_path):
         assert (report / name).stat().st_size > 0
     events = [json.loads(line) for line in (report / "eve.json").read_text().splitlines()]
     assert {"alert", "drop"} <= {event["event_type"] for event in events}
+    acted = {action["decision"]: one for one in found["incidents"] for action in one["actions"]}
+    assert {block["id"] for block in found["blocks"]} <= acted.keys()
+    assert all(one["packets_stopped"] for one in acted.values())
+    assert found["incidents_mitigated"] == sum(one["mitigated"] for one in found["incidents"])
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +167,8 @@ def test_everything_decided_is_in_the_archive(tmp_path, monkeypatch):
         assert sum(item.value["count"] for item in scores) == found["packets_scored"]
         decided = {item.value["id"] for item in archive.find({"dataKey": "network.block.firewall.*"})}
         assert {block["id"] for block in found["blocks"]} <= decided
+        reported = {item.value["id"] for item in archive.find({"dataKey": "network.incident.firewall.*"})}
+        assert reported >= {one["id"] for one in found["incidents"]} != set()
         answers = archive.find({"dataKey": "network.confirmation.p4runtime_ctrl.*"})
         assert [item.value["state"] for item in answers].count("installed") == len(found["blocks"])
     finally:

@@ -111,7 +111,7 @@ class IncidentBook:
             self._forget(found)
             found = None
         found = found or self._begin((*mine, *theirs), evidence.since, evidence.event_time)
-        found.hear(evidence, (mine or theirs)[0], total_nats, bound)
+        found.hear(evidence, mine or theirs, total_nats, bound)
         self._know(found, (*mine, *theirs))
         return self._told(found, "more", now, may_open=suspect)
 
@@ -125,7 +125,7 @@ class IncidentBook:
         keys = keys_of(alert.sender, alert.mac_addresses, alert.role)
         begun = max(0, alert.event_time - SECOND)
         found = self._same(keys, ()) or self._begin(keys, begun, alert.event_time)
-        found.blame(keys[0], alert.sender)
+        found.blame(keys, alert.sender)
         found.last = max(found.last, alert.event_time)
         found.weigh("unlike_training", 0.0)
         found.count_packets("alert", alert.packets, alert.first_packet)
@@ -274,7 +274,7 @@ class IncidentBook:
         last = {each.id: each for each in incidents}
         for one in [each for each in last.values() if each.state == "open"][-self._most :]:
             found = OpenIncident(one.id, one.begun, one.last, one.attacker, one.attacker_text, shown=True)
-            found.attackers, found.published_at = one.attacker_count, one.event_time
+            found.attackers_before, found.published_at = one.attacker_count, one.event_time
             found.weigh(one.kind, 1.0)
             found.name_victims(one.victims, one.victim_count)
             found.services = {one.service} if one.service else set()

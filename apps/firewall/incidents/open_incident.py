@@ -5,6 +5,7 @@ The book (`incident_book.py`) decides what belongs to it; here is what it holds,
 
 import hashlib
 from collections import Counter, OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -80,7 +81,10 @@ class OpenIncident:
     keys: set[AttackerKey] = field(default_factory=set)
     sums: OrderedDict[AttackerKey, SumAgainst] = field(default_factory=OrderedDict)
     """By attacker; the one heard of last is the last."""
-    attackers: int = 0
+    names: set[AttackerKey] = field(default_factory=set)
+    """Attackers, counted once each: a MAC has several keys where it speaks ARP and IP."""
+    attackers_before: int = 0
+    """Attackers before a restart, whose names nobody has."""
     nameless: bool = False
     """Whether evidence came that accuses nobody: forged addresses, or too many."""
     kinds: dict[Kind, float] = field(default_factory=dict)
@@ -103,11 +107,18 @@ class OpenIncident:
 
     # -- what comes in ---------------------------------------------------------------------------------
 
-    def blame(self, key: AttackerKey, sender: Sender | None) -> SumAgainst:
-        """The sum of an attacker, who is counted if he is new."""
+    @property
+    def attackers(self) -> int:
+        """How many attackers are known."""
+        return max(self.attackers_before, len(self.names))
+
+    def blame(self, keys: Sequence[AttackerKey], sender: Sender | None) -> SumAgainst:
+        """The sum of an attacker, who is counted if he is new; `keys` with the narrowest first."""
+        key, name = keys[0], keys[-1]
+        if sender is not None and len(self.names) < MOST_KEYS:
+            self.names.add(name)
         found = self.sums.get(key)
         if found is None:
-            self.attackers += sender is not None
             found = self.sums[key] = SumAgainst()
             while len(self.sums) > MOST_ATTACKERS:
                 self.sums.popitem(last=False)
@@ -115,10 +126,10 @@ class OpenIncident:
         self.attacker = self.attacker or sender
         return found
 
-    def hear(self, evidence: Evidence, key: AttackerKey, total: float, bound: float) -> None:
+    def hear(self, evidence: Evidence, keys: Sequence[AttackerKey], total: float, bound: float) -> None:
         """Take a piece of evidence; `total` is the sum against its sender with it."""
         piece = piece_of(evidence)
-        self.blame(key, evidence.sender).add(piece, total, bound)
+        self.blame(keys, evidence.sender).add(piece, total, bound)
         self.nameless = self.nameless or evidence.sender is None
         self.peak = max(self.peak, total)
         self.weigh(evidence.kind, evidence.nats)
@@ -164,9 +175,10 @@ class OpenIncident:
             if key not in self.sums:
                 self.sums[key] = one
                 self.sums.move_to_end(key, last=False)
-                self.attackers += key[0] != "victim"
         while len(self.sums) > MOST_ATTACKERS:
             self.sums.popitem(last=False)
+        self.names |= other.names
+        self.attackers_before = max(self.attackers_before, other.attackers_before)
         self.attacker = self.attacker or other.attacker
         self.begun, self.last = min(self.begun, other.begun), max(self.last, other.last)
         self.nameless = self.nameless or other.nameless
@@ -224,7 +236,7 @@ class OpenIncident:
             service=next(iter(self.services)) if len(self.services) == 1 else "",
             begun=self.begun,
             last=self.last,
-            event_time=max(now, self.last),
+            event_time=max(now, self.last, *(action.effective for action in self.actions.values())),
             packets=max(self.packets.values(), default=0),
             first_packet=self.first_packet,
             nats=nats,

@@ -95,6 +95,17 @@ def test_scans_of_one_host_by_two_senders_are_two_incidents():
     assert opened(book).id != opened(book, sender=PHONE).id
 
 
+def test_a_host_that_speaks_arp_and_ip_is_one_attacker():
+    """An ARP frame has no address, and an IPv6 address is another one: the MAC tells."""
+    book = IncidentBook()
+    first = opened(book)
+    arp = structs.replace(CAMERA, ip="")
+    book.hear_evidence(evidence(100.2, arp, kind="spoofing", service="arp"), 6.0, BOUND)
+    book.hear_evidence(evidence(100.4, structs.replace(CAMERA, ip="fe80::1"), mac_addresses=2), 6.0, BOUND)
+    (last,) = book.decided(decision())
+    assert (last.id, last.attacker_count, last.service) == (first.id, 1, "")
+
+
 def test_forged_sources_have_no_name():
     """Evidence without a sender makes an incident of the victim, and a guard belongs to it."""
     book = IncidentBook()
