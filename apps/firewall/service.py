@@ -246,6 +246,7 @@ class FirewallService:
         """Deliver queued events; blocks stay in force, and in the archive."""
         with self._lock:
             self._stopped = True
+            self._incidents.flush()
         self._announcer.close()
 
     def health(self) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from apps.messages import Decision, one_line
 from sdnator.incidents.incident_rows import action_words, local_time
 
 _LARGEST = 3
+_WORDS = 100
+"""Characters of a text in a line; what follows a semicolon is detail, which the history below has."""
 
 
 def five_lines(first: Decision, last: Decision, incident: Incident | None) -> Iterator[str]:
@@ -36,14 +38,16 @@ def _action(decision: Decision, incident: Incident | None) -> IncidentAction | N
 def _sum(decision: Decision, action: IncidentAction | None) -> str:
     if action is not None and action.bound:
         return f"{action.nats:.1f} nats of evidence; the bound was {action.bound:.1f}"
-    return f"none, another rule decided: {one_line(decision.reason)}"
+    return f"none, another rule decided: {_short(decision.reason)}"
 
 
 def _contributions(decision: Decision, action: IncidentAction | None) -> str:
     shares = action.contributions if action is not None else ()
     if shares:
-        return "; ".join(f"{each.source} {each.nats:.1f} nats ({each.text})" for each in shares[:_LARGEST])
-    told = dict.fromkeys(one_line(each.summary) for each in reversed(decision.evidence))
+        return "; ".join(
+            f"{each.source} {each.nats:.1f} nats ({_short(each.text)})" for each in shares[:_LARGEST]
+        )
+    told = dict.fromkeys(_short(each.summary) for each in reversed(decision.evidence))
     return "; ".join(list(told)[:_LARGEST]) or "none, the settings name it"
 
 
@@ -73,6 +77,11 @@ def _undo(first: Decision, last: Decision) -> str:
         return "take the service out of `guard` in the firewall's settings"
     never = f"; never again: sdnator allow add {first.target.address}" if first.action == "block" else ""
     return f"sdnator blocks remove {first.id}{never}"
+
+
+def _short(text: str) -> str:
+    head = one_line(text.partition(";")[0])
+    return head if len(head) <= _WORDS else f"{head[:_WORDS]}…"
 
 
 def _is_lifted(decision: Decision) -> bool:

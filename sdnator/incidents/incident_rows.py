@@ -159,7 +159,8 @@ def as_text(incident: Incident) -> Iterator[str]:
         yield f"sum: {incident.nats:.1f} nats, bound {incident.bound:.1f}; the highest was {incident.peak_nats:.1f}"
     yield "evidence, the newest:"
     for piece in incident.evidence:
-        yield f"  {local_time(piece.event_time)} {piece.source}, {piece.nats:.1f} nats: {piece.text}"
+        weight = f", {piece.nats:.1f} nats" if piece.nats else ""
+        yield f"  {local_time(piece.event_time)} {piece.source}{weight}: {piece.text}"
     yield f"done: {done_words(incident)}"
     for action in incident.actions:
         end = f" until {local_time(action.until)}" if action.until else ""

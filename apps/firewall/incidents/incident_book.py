@@ -265,6 +265,16 @@ class IncidentBook:
             self._forget(one)
         return self._due(now)
 
+    def flush(self) -> list[Incident]:
+        """Tell news that would have had to wait, because nothing more will come.
+
+        Returns:
+            Incidents to publish.
+        """
+        waiting, self._changed = list(self._changed.values()), OrderedDict()
+        closed, self._closed = self._closed, []
+        return [*closed, *(one.report("more", self._now) for one in waiting)]
+
     def restore(self, incidents: Iterable[Incident]) -> None:
         """Take up what was open before a restart.
 

@@ -99,6 +99,10 @@ class IncidentReports:
         """Capture time has come to `now` (ns): end what is over, publish news that waited."""
         self._publish(self._book.lapse(now))
 
+    def flush(self) -> None:
+        """Publish news that waits, because the firewall ends; what is open stays open."""
+        self._publish(self._book.flush())
+
     def health(self) -> dict[str, int]:
         """Counters for the operator and for Prometheus."""
         return {

@@ -186,6 +186,9 @@ def test_news_waits_for_a_second_but_decisions_do_not():
     assert book.hear_evidence(evidence(100.8), 8.0, BOUND) == []
     (update,) = book.lapse(102 * SECOND)
     assert (update.change, update.packets) == ("more", 240)
+    assert book.hear_evidence(evidence(102.1), 8.0, BOUND) == []
+    assert [each.packets for each in book.flush()] == [260]
+    assert book.flush() == []
 
 
 def test_a_block_in_force_keeps_it_open_and_drops_are_signs_of_it():

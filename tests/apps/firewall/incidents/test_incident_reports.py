@@ -47,6 +47,7 @@ def test_evidence_and_decisions_become_items_and_lines():
         *("opened", "decided", "decided", "confirmed", "more", "over")
     ]
     assert [important for _, important in lines.taken] == [False, True, True, False, True]
+    told.flush()
     assert told.health() == {"incidents_open": 0, "incident_reports": 6, "incident_openings_put_off": 0}
 
 
