@@ -1,0 +1,158 @@
+"""Detector and decisions alone, without switch, DUE or archive: what a pipeline would decide about traffic.
+
+    Traffic ─► what blocks leave of it ─► Detector ─► Evidence, Alert ─► Decider ─► blocks, guards
+                      ▲──────────────────────────────────────────────────────┘
+
+A decision is in force for the next rows; within a batch it comes too late, as in a switch.
+"""
+
+import ipaddress
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.evidence import Evidence, TrainingState
+from apps.firewall.arp.arp_bindings import ArpBindings
+from apps.firewall.policy.block_lifecycle import BlockLifecycle
+from apps.firewall.policy.decider import Decider
+from apps.firewall.policy.rules import AllowList, Rules
+from apps.firewall.syn.services import TcpService
+from apps.kitsune.detector import Detector, DetectorSettings
+from apps.kitsune.kernel import load_kernel
+from apps.messages import Alert, Target
+from benchmarks.decision_traffic.traffic import Traffic
+from due import RecordBatch
+
+SWITCH: Final = "s1"
+ROWS: Final = 128
+"""Packets between two looks at decisions."""
+
+
+@dataclass(frozen=True)
+class Decided:
+    """One block or guard."""
+
+    time_ns: int
+    reason: str
+    target: Target | None = None
+    service: TcpService | None = None
+
+
+@dataclass
+class DecisionRun:
+    """One network under one rule; `feed` it in order of time.
+
+    Args:
+        training_packets: packets of training.
+        rules: the firewall's options.
+    """
+
+    training_packets: int
+    rules: Rules
+    decided: list[Decided] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    dropped: int = 0
+    challenged: int = 0
+
+    def __post_init__(self) -> None:
+        map_packets = max(self.training_packets // 11, 1)
+        settings = DetectorSettings(fm_grace=map_packets, ad_grace=self.training_packets - map_packets - 1)
+        self.detector = Detector(settings, kernel=load_kernel())
+        self._ledger = BlockLifecycle(self.rules)
+        # capture times of generated traffic: ARP claims are weighed by the detector
+        bindings = ArpBindings(training_s=0, settle_s=3_600, contest_s=60)
+        self.decider = Decider(self.rules, self._ledger, bindings, (), AllowList)
+        self._told = False
+        self._guarded: set[TcpService] = set()
+
+    def feed(self, traffic: Traffic) -> npt.NDArray[np.bool_]:
+        """Take traffic; returns which of its packets were stopped (dropped, or SYNs that were challenged)."""
+        stopped = np.zeros(len(traffic), bool)
+        for start in range(0, len(traffic), ROWS):
+            columns = {name: column[start : start + ROWS] for name, column in traffic.columns.items()}
+            drops = self._drops(columns)
+            challenges = self._challenges(columns) & ~drops
+            stopped[start : start + ROWS] = drops | challenges
+            self.dropped += int(drops.sum())
+            self.challenged += int(challenges.sum())
+            left = ~drops
+            if left.any():
+                rows = columns if left.all() else {name: column[left] for name, column in columns.items()}
+                self._look(rows)
+        return stopped
+
+    def _look(self, columns: Mapping[str, Any]) -> None:
+        _, alerts = self.detector.process(RecordBatch(dict(columns)), SWITCH)
+        if not self._told and self.detector.model.is_trained:
+            self._told = True
+            behaviour = self.detector.behaviour
+            self.decider.trained(
+                TrainingState(
+                    packets=self.training_packets,
+                    wanted=self.training_packets,
+                    done=True,
+                    seconds=behaviour.seconds,
+                    senders=len(behaviour.senders),
+                    event_time=0,
+                )
+            )
+        for decision in self._ledger.due(int(columns["time_us"][-1]) * 1_000):
+            self.detector.senders.blocked.decide(decision)
+        for alert in alerts:
+            if self._ledger.covering(alert.sender) is None:
+                verdict = self.decider.alert(alert)
+                if verdict.target is not None:
+                    self._block(alert, verdict.target, verdict.reason)
+        for evidence in self.detector.take_evidence():
+            self._hear(evidence)
+
+    def _hear(self, evidence: Evidence) -> None:
+        proposal = self.decider.evidence(evidence, "kitsune", lambda _: 0)
+        if proposal is None:
+            return
+        if proposal.service is not None:
+            if proposal.service not in self._guarded:
+                self._guarded.add(proposal.service)
+                self.decided.append(Decided(evidence.event_time, proposal.reason, service=proposal.service))
+            self.decider.settled(proposal)
+        elif proposal.target is not None:
+            self._block(evidence, proposal.target, proposal.reason)
+            self.decider.settled(proposal)
+        else:
+            self.refused.append(proposal.reason)
+
+    def _block(self, cause: Alert | Evidence, target: Target, reason: str) -> None:
+        host = "" if cause.sender is None else cause.sender.ip
+        decision = self._ledger.open(
+            SWITCH, target, reason, (), cause.event_time, training_rate=cause.training_rate, host=host
+        )
+        self.detector.senders.blocked.decide(decision)
+        self.decided.append(Decided(cause.event_time, reason, target=target))
+
+    def _drops(self, columns: Mapping[str, Any]) -> npt.NDArray[np.bool_]:
+        drops = np.zeros(len(columns["port"]), bool)
+        for block in self._ledger.blocks.values():
+            target = block.decision.target
+            if target.kind == "mac":
+                mine = columns["eth_src"] == int(target.address.replace(":", ""), 16)
+                drops |= mine if target.port is None else mine & (columns["port"] == target.port)
+            else:
+                address = ipaddress.ip_address(target.address)
+                if address.version == 4:
+                    drops |= (columns["ip_version"] == 4) & (columns["ip_src_lo"] == int(address))
+        return drops
+
+    def _challenges(self, columns: Mapping[str, Any]) -> npt.NDArray[np.bool_]:
+        challenges = np.zeros(len(columns["port"]), bool)
+        for service in self._guarded:
+            address = ipaddress.ip_address(service.address)
+            if address.version == 4:
+                challenges |= (
+                    (columns["ip_dst_lo"] == int(address))
+                    & (columns["tcp_dport"] == service.port)
+                    & (columns["tcp_flags"] & 0x12 == 0x02)
+                )
+        return challenges
