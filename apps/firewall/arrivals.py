@@ -52,6 +52,8 @@ class SwitchReport(Message, frozen=True, kw_only=True):
     event_time: Time = 0
     clock: Name = ""
     """What moves its clock; "packets": nothing else does."""
+    mirror: bool = False
+    """It sees copies only."""
     blocks: Annotated[tuple[DropReading, ...], Meta(max_length=100_000)] = ()
 
 

@@ -22,6 +22,7 @@ from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
 from apps.firewall.enforcement.event_sink import event_sinks
 from apps.firewall.enforcement.storing import StoredAnswers
+from apps.firewall.enforcement.mirrors import Mirrors
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
@@ -141,6 +142,7 @@ class FirewallService:
         )
         self._archive = Archive(engine, settings.archive_patience_s)
         self._past = ArchivedPast(self._archive, self._intake, settings)
+        self._mirrors = Mirrors()
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
@@ -253,7 +255,8 @@ class FirewallService:
         """Counters for the operator and for Prometheus."""
         return {
             **self._counts,
-            "blocks": len(self._ledger.blocks),
+            "blocks": sum(not each.decision.dry_run for each in self._ledger.blocks.values()),
+            "would_block": sum(each.decision.dry_run for each in self._ledger.blocks.values()),
             "guarded": [str(service) for service in self._syn.guarded],
             "guards": len(self._syn.guarded),
             "known_sources": len(self._known),
@@ -383,7 +386,7 @@ class FirewallService:
         offences = self._offences(watch.often(self._settings.syn), watch.now) if due.sure else {}
         for decision in self._syn.conclude(watch, offences, sure=due.sure):
             # the guard before the block has had the source's connections reset
-            self._publish(decision, resets=False)
+            decision = self._publish(decision, resets=False)  # noqa: PLW2901 - as it was published
             if decision.action == "protect" and not decision.dry_run:
                 target = decision.target
                 wanted = Wanted(TcpService(target.address, target.port or 0), since=due.suspicion.since)
@@ -520,6 +523,7 @@ class FirewallService:
             for reading in state.blocks if believed else ():
                 self._ledger.count_drops(reading.id, reading.packets, state.event_time)
                 self._incidents.count(reading.id, reading.packets, state.event_time)
+            self._mirrors.note(state.switch, mirror=state.mirror)
             self._arm(item, state)
             self._examinations.live = state.clock != "packets"
             if believed:
@@ -533,7 +537,11 @@ class FirewallService:
 
     # -- output ------------------------------------------------------------------------
 
-    def _publish(self, decision: Decision, *, resets: bool = True) -> None:
+    def _publish(self, decision: Decision, *, resets: bool = True) -> Decision:
+        """Returns the decision as it was published: where only copies are seen, as a dry run."""
+        decision = self._mirrors.marked(decision, self._switches)
+        if decision.id in self._ledger.blocks:
+            self._ledger.blocks[decision.id].decision = decision
         target = decision.target
         kind = ("ipv6" if ":" in target.address else "ipv4") if target.kind == "ip" else "mac"
         log.warning("%s %s: %s", decision.action, target.address, one_line(decision.reason))
@@ -550,13 +558,14 @@ class FirewallService:
             [due.NO_WAIT],
             event_time=decision.event_time,
         )
+        return decision
 
     def _carry_out_prefix(self, decision: Decision, switches: Iterable[str]) -> None:
         if decision.dry_run:
             return
         kind = "insert" if decision.action == "block" else "delete"
         for switch in switches:
-            if decision.switch in (EVERY_SWITCH, switch):
+            if decision.switch in (EVERY_SWITCH, switch) and switch not in self._mirrors:
                 self._keep(switch, [prefix_update(kind, decision.target.address)], decision.id)
 
     def _say_notices(self) -> None:

@@ -27,6 +27,8 @@ class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clock: Literal["packets", "heard", "own"] = "heard"
     """What moves its time: its packets alone, as in a replay; heard: between packets the controller's clock carries
     it on, once a second; own: also before the first packet, because `base_us` is known."""
+    mirror: bool = False
+    """It sees copies only, as behind a mirror port: decisions are not carried out."""
     capture_times: str = ""
     """File (.npy, int64) with the time of each frame of a capture, us since the epoch, by arrival number: for replays
     on a switch with a clock of its own; empty: the switch's time stamps hold."""

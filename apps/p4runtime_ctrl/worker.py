@@ -139,6 +139,9 @@ class SwitchWorker:
         self._connection.close()
 
     def decide(self, decision: Decision) -> None:
+        """Queue a decision; a switch that sees copies only carries none out: a counter would claim a stop."""
+        if self._mine.mirror:
+            return
         self._recent.append(decision)
         self._urgent.append(decision)
         self._put(self._decide)
@@ -460,6 +463,7 @@ class SwitchWorker:
             "program": self._program_name,
             "base_us": self._mine.base_us,
             "clock": self._mine.clock,
+            "mirror": self._mine.mirror,
             "fail": self._mine.fail,
             "telemetry": [each.name for each in self._switch.requests or () if each not in FALLBACK],
             "packet_in": self._progress.received,
@@ -504,6 +508,7 @@ class SwitchWorker:
         recently = max(since, time.time_ns() - LONGEST_S * 1_000_000_000)
         items = [item for key in DECISIONS for item in self._archived(key, recently)]
         decisions = decisions_for(self.name, items, list(self._recent), since, self._intake)
+        decisions = [] if self._mine.mirror else decisions
         archived = self._archived(f"network.p4_command.*.{self.name}", since)
         for problem in self._switch.restore(decisions, commands_of(archived, since, self._intake)):
             _LOG.warning("%s: not restored: %s", self.name, one_line(problem))

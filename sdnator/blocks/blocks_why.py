@@ -107,8 +107,8 @@ def decision_line(decision: Decision) -> str:
     until = f"until {time_text(decision.expires)}" if decision.expires else "without end"
     target = decision.target
     where = f"{target.address} port {target.port}" if target.port is not None else target.address
-    dry = " (dry run)" if decision.dry_run else ""
-    return f"{decision.id} {decision.action} {where} on {decision.switch} {until}{dry}: {decision.reason}"
+    action = f"would {decision.action}" if decision.dry_run else decision.action
+    return f"{decision.id} {action} {where} on {decision.switch} {until}: {decision.reason}"
 
 
 def time_text(time_ns: int) -> str:

@@ -26,6 +26,7 @@ class PlannedSwitch:
     """Ingress port to egress port."""
     learn: LearnPlan = field(default_factory=LearnPlan)
     fail: Literal["open", "closed"] = "open"
+    mirror: bool = False
     listen: str = ""
     """HOST:PORT on which a switch that `sdnator up` starts serves P4Runtime; empty: a private address."""
 
@@ -43,6 +44,7 @@ def planned(plan: SwitchPlan, *, look: bool = True) -> PlannedSwitch:
         forward=parse_wires(plan.wires or (("none",) if learns else ()), ports, plan.kind),
         learn=plan.learn,
         fail=plan.fail,
+        mirror=plan.mirror,
         listen=_checked_listen(plan),
     )
 

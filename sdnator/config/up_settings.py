@@ -56,6 +56,8 @@ class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     learn: LearnPlan = LearnPlan()
     fail: Literal["open", "closed"] = "open"
     """Without a controller: open keeps port forwarding, closed removes it."""
+    mirror: bool = False
+    """The switch sees copies only, as behind a mirror (SPAN) port or a tap: it decides, but claims to stop nothing."""
     listen: str = ""
     """HOST:PORT on which a switch that `sdnator up` starts serves P4Runtime; empty: a Unix socket that only its
     user can reach (embedded), or 127.0.0.1 (BMv2)."""

@@ -156,7 +156,7 @@ class LivePanel:
             "above the threshold": number(over),
             "open incidents": number(board.open_incidents()),
             "alerts": number(board.counts["alerts"]),
-            "blocks and guards": number(len(board.standing())),
+            "blocks and guards": number(sum(not each.dry_run for each in board.standing())),
             "apps active": f"{active} of {len(here)}" if here else "-",
             "switches": f"{connected} of {len(board.switches)}" if board.switches else "-",
         }

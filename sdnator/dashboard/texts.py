@@ -35,10 +35,10 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     where = "all switches" if one.switch in ("", "*") else one.switch
     return {
         "id": one.id,
-        "action": one.action,
+        "action": f"would {one.action}" if one.dry_run else one.action,
         "target": target(one.target),
         "address": one.target.address,
-        "where": f"{'dry run · ' if one.dry_run else ''}{where} · {until}",
+        "where": f"{where} · {until}",
         "reason": one.reason,
         "said": said,
         # a guard without end is one that the settings name: it stays

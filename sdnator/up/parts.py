@@ -198,6 +198,7 @@ class UpParts:
                     "target": switch.kind,
                     "forward": {str(number): egress for number, egress in switch.forward.items()},
                     "fail": switch.fail,
+                    "mirror": switch.mirror,
                     **({"learn": msgspec.to_builtins(switch.learn)} if switch.learn.ports else {}),
                 }
                 for switch in self.plan.switches

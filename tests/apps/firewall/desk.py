@@ -85,8 +85,16 @@ class Desk:
         item = Item(key, value, at, at, "sonata_adapter" if named == "sonata" else named, instance, 1)
         self.engine.subjects[pattern or key].on_next(item)
 
-    def switch(self, name: str = "s1", *, primary: bool = True, instance: str = "i1", at: int = NOW) -> None:
-        value = {"switch": name, "primary": primary, "event_time": at}
+    def switch(
+        self,
+        name: str = "s1",
+        *,
+        primary: bool = True,
+        instance: str = "i1",
+        at: int = NOW,
+        mirror: bool = False,
+    ) -> None:
+        value = {"switch": name, "primary": primary, "event_time": at, "mirror": mirror}
         key = f"network.switch.p4runtime_ctrl.{name}"
         self.hand(key, value, pattern="network.switch.p4runtime_ctrl.*", instance=instance, at=at)
 

@@ -78,3 +78,39 @@ def test_a_decision_does_not_wait_for_counters():
     switch.let.set()
     wait_for(lambda: set(engine.counted()) >= {"d1", "d2"}, 60)
     agent.stop()
+
+
+def test_a_switch_that_sees_copies_only_carries_no_decision_out():
+    """An entry's counter there would claim that something was stopped."""
+    engine = Written()
+    mine = SwitchSettings(name="s1", address="", device_id=1, mirror=True)
+    settings = Settings(switches=(mine,), program="", p4info="", restore=False)
+    agent = SwitchWorker(engine, settings, mine, program(), Connected)  # type: ignore[arg-type]
+    agent.start(active=True)
+    try:
+        agent.became_primary(Held())  # type: ignore[arg-type]
+        agent.decide(decision(1))
+        agent.say_again()
+        wait_for(lambda: [value for key, value in engine.items if ".switch." in key and value["primary"]])
+        assert agent.health()["mirror"] is True
+        assert (engine.confirmed(), agent.health()["blocks_total"]) == ([], 0)
+    finally:
+        agent.stop()
+
+
+def test_time_of_a_silent_live_switch_goes_on():
+    """So that blocks end though no packet comes."""
+    engine = Written()
+    mine = SwitchSettings(name="s1", address="", device_id=1, clock="own")
+    settings = Settings(switches=(mine,), program="", p4info="", restore=False)
+    agent = SwitchWorker(engine, settings, mine, program(), Connected)
+    agent.start(active=True)
+
+    def ticked():
+        agent.tick()
+        return len({value["event_time"] for key, value in engine.items if ".switch." in key}) >= 2
+
+    try:
+        wait_for(ticked, 60)
+    finally:
+        agent.stop()

@@ -1,0 +1,41 @@
+"""Switches that see copies only, as behind a mirror port: nothing that they drop stops anything.
+
+A decision about such a switch is a dry run, and says why.  One for all switches is, where all of them are mirrors.
+Pure.
+"""
+
+from collections.abc import Collection
+from typing import Final
+
+from msgspec import structs
+
+from apps.messages import Decision
+
+COPIES: Final = "; would only: the switch sees copies, so nothing can be stopped there"
+_EVERY_SWITCH: Final = ("", "*")
+
+
+class Mirrors:
+    """The mirrors among the connected switches."""
+
+    def __init__(self) -> None:
+        self._mirrors: set[str] = set()
+
+    def __contains__(self, switch: str) -> bool:
+        return switch in self._mirrors
+
+    def note(self, switch: str, *, mirror: bool) -> None:
+        """Remember whether a switch sees copies only."""
+        if mirror:
+            self._mirrors.add(switch)
+        else:
+            self._mirrors.discard(switch)
+
+    def marked(self, decision: Decision, connected: Collection[str]) -> Decision:
+        """The decision, as a dry run where no switch that could carry it out sees more than copies."""
+        all_copies = bool(connected) and self._mirrors.issuperset(connected)
+        if decision.switch not in self._mirrors and not (decision.switch in _EVERY_SWITCH and all_copies):
+            return decision
+        said = decision.reason.endswith(COPIES)
+        reason = decision.reason if said or decision.dry_run else decision.reason + COPIES
+        return structs.replace(decision, dry_run=True, reason=reason)
