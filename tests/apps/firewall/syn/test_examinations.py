@@ -2,7 +2,7 @@
 
 from apps.firewall.syn.examinations import Examinations
 from apps.firewall.syn.syn_defence import Suspicion
-from apps.messages import Exhibit
+from tests.apps.firewall.syn.test_syn_defence import FLOOD
 
 SECOND = 1_000_000_000
 NOW = 1_700_000_000 * SECOND
@@ -10,7 +10,7 @@ MS = 1_000_000
 
 
 def suspicion(host: str = "10.0.0.1", at: int = NOW) -> Suspicion:
-    return Suspicion(host, Exhibit(key="k", timestamp=0, summary="a flood"), at, at - SECOND)
+    return Suspicion(host, FLOOD, at, at - SECOND)
 
 
 def waiting(*, live: bool) -> Examinations:
