@@ -44,7 +44,7 @@ class EvidenceHandler:
         archive: Archive,
         announcer: Announcer,
         incidents: IncidentReports,
-        publish: Callable[[Decision], None],
+        publish: Callable[[Decision], Decision],
     ) -> None:
         self.decider = decider
         self._ledger = ledger

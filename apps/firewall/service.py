@@ -21,8 +21,8 @@ from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
 from apps.firewall.enforcement.event_sink import event_sinks
-from apps.firewall.enforcement.storing import StoredAnswers
 from apps.firewall.enforcement.mirrors import Mirrors
+from apps.firewall.enforcement.storing import StoredAnswers
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
