@@ -95,7 +95,13 @@ class Archiver:
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`; items, but the backlog in frames."""
-        return {**self._counts, "backlog": self.backlog(), "away": int(self._away)}
+        damaged = self._spool.damaged if self._spool is not None else 0
+        return {
+            **self._counts,
+            "backlog": self.backlog(),
+            "away": int(self._away),
+            "damaged_spools": damaged,
+        }
 
     def close(self, timeout: float = 10.0) -> None:
         """Flush, at most `timeout` seconds, and stop the thread."""

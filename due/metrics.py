@@ -84,6 +84,13 @@ _ENGINE: dict[str, _Family] = {
         ("archive.refused", "archive_refused_items", "counter", "Items the archive refused for good"),
         ("archive.held_back", "archive_held_back_writes", "counter", "Waits for the archive's queue"),
         ("archive.backlog", "archive_backlog_frames", "gauge", "Frames not yet archived"),
+        (
+            "damaged_rows",
+            "archive_damaged_rows",
+            "counter",
+            "Damaged rows left out of answers of the archive",
+        ),
+        ("archive.damaged_spools", "damaged_spools", "counter", "Damaged spools and records set aside"),
         ("archive.away", "archive_away", "gauge", "1 while the archive cannot be reached"),
     )
 }

@@ -251,6 +251,7 @@ class Session:
             "receiving": self.dispatcher.statistics(),
             "misunderstood_assignments": self.keeper.misunderstood,
             "liveness": self.liveness.state(),
+            "damaged_rows": self._archive.damaged,
         }
         if self._archiver is not None:
             health["archive"] = self._archiver.statistics()

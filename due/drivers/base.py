@@ -27,6 +27,9 @@ class ArchiveDriver(Protocol):
     file locked, disk full), otherwise `BackendError`; `find` also raises `InvalidQuery`.
     """
 
+    damaged: int
+    """Rows that were left out of answers so far because they are damaged."""
+
     def insert(self, items: Sequence[Item]) -> None:
         """Store items.  On return they are committed.  Idempotent on (instance_id, key, sequence)."""
         ...
@@ -72,6 +75,11 @@ class Spool(Protocol):
     Used by the archiver's thread only.  `take` does not remove: a crash between `take` and `done`
     delivers the frames again, and the archive recognises them.
     """
+
+    @property
+    def damaged(self) -> int:
+        """Damaged files that were set aside, and damaged records that were dropped, so far."""
+        ...
 
     def put(self, frames: Sequence[PackedFrame]) -> int:
         """Append; returns how many *items* did not fit (they are lost and the archiver counts them).

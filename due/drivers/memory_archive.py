@@ -77,6 +77,8 @@ class MemoryArchive:
         with _stores_lock:
             self._store = _stores.setdefault(memory_name(url), _Store())
         self._closed = False
+        self.damaged = 0
+        """See `ArchiveDriver.damaged`; memory has none."""
 
     def insert(self, items: Sequence[Item]) -> None:
         """Store items, one row each."""

@@ -39,6 +39,7 @@ class DiskSpool:
         self._count = self._bytes = 0
         self.set_aside = 0
         """Damaged files so far."""
+        self._dropped = 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
             try:
@@ -134,6 +135,11 @@ class DiskSpool:
     def __len__(self) -> int:
         return self._count
 
+    @property
+    def damaged(self) -> int:
+        """See `Spool.damaged`."""
+        return self.set_aside + self._dropped
+
     def close(self) -> None:
         """Close the file; what is in it stays for the next start."""
         if not self._closed:
@@ -145,6 +151,7 @@ class DiskSpool:
             return self._decode(data)
         except (msgspec.MsgspecError, ValueError, TypeError, RecursionError) as error:
             log.error("spool %s: record %d is damaged and dropped: %s", self.path, number, error)  # noqa: TRY400
+            self._dropped += 1
             self._remove("id = ?", number)
             return None
 

@@ -30,6 +30,8 @@ class SlottedSpool:
         self._limit = limit
         self._adopted: list[_Slot] = []
         self._taken_from: DiskSpool | None = None
+        self._damaged_before = 0
+        """Of spools that were adopted and are empty now."""
         self._own = self._first_free()
 
     def put(self, frames: Sequence[PackedFrame]) -> int:
@@ -46,7 +48,7 @@ class SlottedSpool:
         (self._taken_from or self._own.spool).done(frames)
         for slot in [slot for slot in self._adopted if not len(slot.spool)]:
             self._adopted.remove(slot)
-            slot.remove()
+            self._remove(slot)
 
     def adopt(self) -> None:
         """Take over the spools of instances that have ended."""
@@ -59,7 +61,16 @@ class SlottedSpool:
                 log.warning("archiving %d frames that another instance left in %s", len(slot.spool), name)
                 self._adopted.append(slot)
             else:
-                slot.remove()
+                self._remove(slot)
+
+    @property
+    def damaged(self) -> int:
+        """See `Spool.damaged`."""
+        return self._damaged_before + sum(slot.spool.damaged for slot in (self._own, *self._adopted))
+
+    def _remove(self, slot: "_Slot") -> None:
+        self._damaged_before += slot.spool.damaged
+        slot.remove()
 
     def __len__(self) -> int:
         return len(self._own.spool) + sum(len(slot.spool) for slot in self._adopted)

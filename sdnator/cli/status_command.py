@@ -45,6 +45,7 @@ def status(*, as_json: Json = False) -> None:
     health = _health(found.coordinator) if apps is not None else None
     control = controlled(health) if health is not None else None
     incidents = open_incidents(health) if health is not None else None
+    damaged = damaged_by_app(health or {})
     away = [name for name, one in found.health.items() if one["state"] != "running"]
     well = all(part["alive"] for part in parts.values()) and apps is not None and not away
     if as_json:
@@ -58,13 +59,14 @@ def status(*, as_json: Json = False) -> None:
                     "apps": apps,
                     "control": control,
                     "incidents_open": incidents,
+                    "damaged": damaged,
                 }
             )
         )
     else:
         _show_status(found, parts, apps)
         wired = {str(one["name"]) for one in found.switches if one.get("forward")}
-        for line in control_lines(control, wired):
+        for line in (*control_lines(control, wired), *damage_lines(damaged)):
             print(line)
         if incidents is not None:
             more = "; see `sdnator incidents list --open`" if incidents else ""
@@ -160,6 +162,29 @@ def open_incidents(health: Mapping[str, Any]) -> int | None:
     told = health.get("apps", {}).get("firewall", {}).get("health", {}).get("app", {})
     count = told.get("incidents_open")
     return count if isinstance(count, int) else None
+
+
+def damaged_by_app(health: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """From the Coordinator's /health: damaged rows that an app met in the archive, and its damaged spools."""
+    found = {}
+    for app, told in health.get("apps", {}).items():
+        engine = told.get("health", {}).get("engine", {})
+        counts = {
+            "rows": int(engine.get("damaged_rows", 0)),
+            "spools": int(engine.get("archive", {}).get("damaged_spools", 0)),
+        }
+        if any(counts.values()):
+            found[app] = counts
+    return found
+
+
+def damage_lines(damaged: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
+    """Text: a line for each app with damage."""
+    for app, counts in damaged.items():
+        if counts["rows"]:
+            yield f"{app} left {counted(counts['rows'], 'damaged row')} of the archive out of its answers"
+        if counts["spools"]:
+            yield f"{app} set {counted(counts['spools'], 'damaged piece')} of its spool aside"
 
 
 def controlled(health: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -8,7 +8,13 @@ import pytest
 from typer.testing import CliRunner
 
 from apps.p4runtime_ctrl.state.mac_learning import LearnSettings
-from sdnator.cli.status_command import control_lines, controlled, open_incidents
+from sdnator.cli.status_command import (
+    control_lines,
+    controlled,
+    damage_lines,
+    damaged_by_app,
+    open_incidents,
+)
 from sdnator.config.planned_switches import parse_ports, parse_wires, planned
 from sdnator.config.up_settings import LearnPlan, SwitchPlan
 from sdnator.errors import BadInput
@@ -167,6 +173,18 @@ def test_status_tells_who_closes_a_switch_that_nobody_controls():
     assert "closed, and has no port forwarding" in list(control_lines(control, ()))[1]
     assert controlled({"apps": {}}) is None, "the controller has said nothing yet"
     assert list(control_lines(None, ())) == []
+
+
+def test_status_tells_of_damage_on_disk():
+    engine = {"damaged_rows": 1, "archive": {"damaged_spools": 2}}
+    apps = {"kitsune": {"health": {"engine": engine}}, "firewall": {"health": {"engine": {}}}}
+    damaged = damaged_by_app({"apps": apps})
+    assert damaged == {"kitsune": {"rows": 1, "spools": 2}}
+    assert list(damage_lines(damaged)) == [
+        "kitsune left 1 damaged row of the archive out of its answers",
+        "kitsune set 2 damaged pieces of its spool aside",
+    ]
+    assert damaged_by_app({}) == {}
 
 
 def test_down_is_content_where_nothing_runs():
