@@ -44,6 +44,7 @@ _INT64 = struct.Struct("<q")
 _ATOMS = frozenset((type(None), bool, float, bytes))
 """Immutable types that always encode: buffered without a copy."""
 _PLAIN = _ATOMS | {int, str}
+_NESTING = frozenset((list, dict))
 
 
 MAX_PAYLOAD = 64 << 20
@@ -51,8 +52,7 @@ MAX_PAYLOAD = 64 << 20
 MAX_ITEMS = 1 << 20
 """Items of a frame."""
 MAX_DEPTH = 64
-"""Lists and maps within each other, in what is written.  A reader's limit is the interpreter's stack: to count would
-cost more than to decode."""
+"""Lists and maps within each other: more is neither written nor read."""
 MAX_NUMBER = 2**62 - 1
 """Limit of `sequence` and `before`, also after the last item of a frame."""
 MAX_EPOCH = 2**32 - 1
@@ -123,9 +123,12 @@ def decode_value(data: bytes | memoryview) -> Any:
     if len(data) > MAX_PAYLOAD:
         raise DecodeError(f"not a DUE value: {len(data)} bytes, at most {MAX_PAYLOAD} are read")
     try:
-        return _value_decoder.decode(data)
+        value = _value_decoder.decode(data)
     except _DAMAGED as error:
         raise DecodeError(f"not a DUE value: {error}") from None
+    if _too_deep([value]):
+        raise DecodeError(f"not a DUE value: nested over {MAX_DEPTH} levels deep")
+    return value
 
 
 def encode_frame(frame: Frame) -> bytes:
@@ -175,7 +178,26 @@ def decode_frame(payload: bytes) -> Frame:
     times = len(frame.timestamps) if frame.event_times is None else len(frame.event_times)
     if not len(frame.values) == len(frame.timestamps) == times:
         raise DecodeError("damaged DUE frame: values and times differ in number")
+    if _too_deep(frame.values):
+        raise DecodeError(f"damaged DUE frame: a value is nested over {MAX_DEPTH} levels deep")
     return frame
+
+
+def _too_deep(values: list[Any]) -> bool:
+    """Whether a value nests over `MAX_DEPTH` lists and maps."""
+    if _NESTING.isdisjoint(map(type, values)):
+        return False
+    found, levels = values, 0
+    while found := [
+        inner
+        for one in found
+        if type(one) in _NESTING
+        for inner in (one if type(one) is list else one.values())
+    ]:
+        levels += 1
+        if levels > MAX_DEPTH:
+            return True
+    return False
 
 
 def unpack(frame: PackedFrame | bytes) -> list[Item]:

@@ -131,7 +131,7 @@ def _header(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Any]:
     try:
         header = json.loads(bytes(arrays["header"]))
         found, version = header["format"], header["version"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise NotAModelError(
             f"{path}: not a Kitsune model (no header); use a file from --save-model"
         ) from error

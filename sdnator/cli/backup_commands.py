@@ -183,7 +183,7 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
             tar.extractall(folder, [tar.getmember(name) for name in names if _is_ours(name)], filter="data")
     except OSError as error:
         raise BadInput(f"{file}: {error.strerror or error}") from None
-    except (tarfile.TarError, EOFError, KeyError, ValueError) as error:
+    except (tarfile.TarError, EOFError, KeyError, ValueError, RecursionError) as error:
         raise BadInput(f"{file}: this is no backup of sdnator, or it is damaged ({error})") from None
     return manifest, {name: folder / name for name in names if _is_ours(name)}
 

@@ -121,7 +121,7 @@ def _print(part: str, line: str, *, alone: bool, as_json: bool) -> None:
 
 def _parsed(line: str) -> object:
     if line.startswith("{"):
-        with suppress(ValueError):
+        with suppress(ValueError, RecursionError):
             return json.loads(line)
     return line
 

@@ -232,7 +232,7 @@ def _health_of_parts(run_file: str) -> dict[str, Any]:
     """What `sdnator up` has written of its parts; empty where there is nothing to read."""
     try:
         found = json.loads(Path(run_file).read_bytes())["health"] if run_file else {}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -121,7 +121,7 @@ class Child:
     def _parsed(self) -> dict[str, Any]:
         try:
             said = json.loads(self._line.partition(b"\n")[0])
-        except ValueError:
+        except (ValueError, RecursionError):
             said = None
         if not isinstance(said, dict):
             raise PipelineError(f"{self.name} did not print its ready line first{self._log_tail()}")

@@ -154,7 +154,7 @@ def find(folder: Path | None = None) -> Running | None:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadInput(f"{path} cannot be read ({error}): restart the pipeline") from None
     if not isinstance(found, dict) or found.get("schema") != SCHEMA:
         raise BadInput(

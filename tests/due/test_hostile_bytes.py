@@ -165,6 +165,21 @@ def test_endless_nesting(opening):
         decode_value(opening * 200_000 + b"\xc0")
 
 
+@pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1a"])
+def test_readers_nest_no_deeper_than_writers(opening):
+    """What is decoded near the end of the stack would exceed it in whatever walks through it later."""
+    assert decode_value(opening * MAX_DEPTH + b"\xc0")
+    with pytest.raises(DecodeError, match=f"over {MAX_DEPTH} levels"):
+        decode_value(opening * (MAX_DEPTH + 1) + b"\xc0")
+    for levels in (MAX_DEPTH, MAX_DEPTH + 1):
+        frame = _frame([1, msgspec.Raw(opening * levels + b"\xc0")])
+        if levels == MAX_DEPTH:
+            assert decode_frame(encode_frame(frame)).values[0] == 1
+        else:
+            with pytest.raises(DecodeError, match=f"over {MAX_DEPTH} levels"):
+                decode_frame(encode_frame(frame))
+
+
 @pytest.mark.parametrize(
     "fields",
     [

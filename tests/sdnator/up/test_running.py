@@ -75,7 +75,7 @@ def test_run_file_is_its_owners(tmp_path):
         assert stat.S_IMODE((tmp_path / "state").stat().st_mode) == 0o700
 
 
-@pytest.mark.parametrize("text", [json.dumps({"schema": 99}), "[]", "no json"])
+@pytest.mark.parametrize("text", [json.dumps({"schema": 99}), "[]", "no json", "[" * 100_000])
 def test_another_versions_run_file_is_refused(tmp_path, text):
     with running.claimed(tmp_path):
         (tmp_path / "run.json").write_text(text)
