@@ -119,7 +119,7 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     try:
         address = arguments.grpc or default_address(f"switch-{arguments.device_id}-{os.getpid()}.sock")
         server = P4RuntimeServer(device, address, credentials)
-        heartbeat = _heartbeat(arguments.heartbeat_fd, server, loop)
+        heartbeat = _heartbeat(arguments.heartbeat_fd, device, server, loop)
     except DataplaneError:
         for port in ports.values():
             port.close()
@@ -162,8 +162,8 @@ def _prepared(
         return None
 
 
-def _heartbeat(descriptor: int | None, *loops: Turning) -> LivenessPipe | None:
-    return None if descriptor is None else LivenessPipe(descriptor, loops)
+def _heartbeat(descriptor: int | None, device: Device, *loops: Turning) -> LivenessPipe | None:
+    return None if descriptor is None else LivenessPipe(descriptor, loops, out_of_range=device.out_of_range)
 
 
 def state(device: Device, loop: PacketLoop, ports: Mapping[int, Port]) -> dict[str, Any]:

@@ -3,12 +3,13 @@
     Heartbeat ── ask ──► event loop of P4Runtime ── turns ─┐
               ── ask ──► packet loop ─────────────── turns ─┴─► all went on since the last byte? write one
 
-A thread that hangs, or a process that is stopped, sends no more; the supervisor's time-out does the rest.
+A thread that hangs, or a process that is stopped, sends no more; the supervisor's time-out does the rest.  Where the
+program has reached beyond the end of an array, the byte is followed by how often, as `N;`.
 """
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Protocol
 
@@ -38,17 +39,25 @@ class LivenessPipe:
 
     descriptor: of a pipe's end for writing; one that is full is left as it is
     loops: that all have to turn
+    out_of_range: accesses beyond the end of arrays so far
 
     Raises HeartbeatError.
     """
 
-    def __init__(self, descriptor: int, loops: Sequence[Turning], interval_s: float = INTERVAL_S) -> None:
+    def __init__(
+        self,
+        descriptor: int,
+        loops: Sequence[Turning],
+        interval_s: float = INTERVAL_S,
+        out_of_range: Callable[[], int] = int,
+    ) -> None:
         try:
             os.set_blocking(descriptor, False)
             os.set_inheritable(descriptor, False)
         except OSError as error:
             raise HeartbeatError(f"heartbeat descriptor {descriptor}: {error.strerror}") from error
         self._descriptor, self._loops, self._interval_s = descriptor, tuple(loops), interval_s
+        self._out_of_range = out_of_range
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
@@ -67,7 +76,8 @@ class LivenessPipe:
             if all(loop.turns != turns for loop, turns in zip(self._loops, before, strict=True)):
                 before = self._asked()
                 with suppress(BlockingIOError, BrokenPipeError):
-                    os.write(self._descriptor, b".")
+                    beyond = self._out_of_range()
+                    os.write(self._descriptor, b".%d;" % beyond if beyond else b".")
 
     def _asked(self) -> list[int]:
         turns = [loop.turns for loop in self._loops]

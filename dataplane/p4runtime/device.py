@@ -89,6 +89,7 @@ class Device:
         self._next_stream = 0
         self._queues: dict[str, PacketQueue] = {}
         self._idle_checked = 0
+        self._out_of_range = 0
 
     def check_id(self, device_id: int) -> None:
         """Raises Missing for another device's id."""
@@ -240,6 +241,16 @@ class Device:
                 if pipeline is not None:
                     pipeline.close()
             self.pipeline = self._saved = self._prepared = None
+
+    def out_of_range(self) -> int:
+        """Accesses beyond the end of arrays by the program in force; as known last while a control operation runs."""
+        if self.control.acquire(blocking=False):
+            try:
+                pipeline = self.pipeline
+                self._out_of_range = 0 if pipeline is None else sum(pipeline.switch.out_of_range().values())
+            finally:
+                self.control.release()
+        return self._out_of_range
 
     def get_pipeline(self, request: Any) -> Any:
         """The response to a GetForwardingPipelineConfigRequest.  Raises Missing."""

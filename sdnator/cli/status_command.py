@@ -115,6 +115,9 @@ def trouble_lines(health: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             yield f"{name} was restarted {times}{cause}"
         if one["suppressed_lines"]:
             yield f"{name} logged too much: {one['suppressed_lines']:,} lines were suppressed"
+        if one.get("out_of_range"):
+            times = counted(one["out_of_range"], "time")
+            yield f"the program of {name} reached beyond the end of an array {times}: it is damaged, or not ours"
 
 
 def _age(started: int) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import select
 import signal
 import subprocess
@@ -27,6 +28,8 @@ SECRET_VARIABLES = (
 _PARENT_VARIABLE = "DUE_PARENT"
 """`due.service.PARENT_VARIABLE`; importing that takes longer than `sdnator --help` may."""
 _LONGEST_LINE = 1 << 20
+_COUNT = re.compile(rb"\.([0-9]{1,18});")
+"""See `dataplane.heartbeat`."""
 
 
 class Child:
@@ -56,6 +59,8 @@ class Child:
         self.log = logs / f"{name}.log"
         self.waits = waits
         """Whether it goes on, or went on, at `begin` only."""
+        self.out_of_range = 0
+        """See `PartProcess.out_of_range`."""
         self._line = b""
         self._said: dict[str, Any] | None = None
         self._beats = -1
@@ -150,7 +155,10 @@ class Child:
         if self._beats < 0:
             return False
         with suppress(BlockingIOError):
-            return bool(os.read(self._beats, 65_536))
+            beats = os.read(self._beats, 65_536)
+            for told in _COUNT.findall(beats):
+                self.out_of_range = int(told)
+            return bool(beats)
         return False
 
     def check(self) -> None:

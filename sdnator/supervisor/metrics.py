@@ -34,6 +34,12 @@ def _lines(reports: list[PartReport], logs: Mapping[str, tuple[int, int]]) -> It
     for name, (_, lines) in logs.items():
         yield f'sdnator_part_suppressed_lines_total{{part="{name}"}} {lines}'
 
+    yield from _family(
+        "sdnator_part_out_of_range", "gauge", "Accesses beyond the end of an array by a switch's program"
+    )
+    for one in reports:
+        yield f'sdnator_part_out_of_range{{part="{one.name}"}} {one.out_of_range}'
+
 
 def _family(name: str, kind: str, text: str) -> Iterator[str]:
     yield f"# HELP {name} {text}"

@@ -63,6 +63,8 @@ class PartReport:
     """Restarts in this run, for any reason."""
     cause: str
     """Cause of the last death; empty: none."""
+    out_of_range: int = 0
+    """Accesses beyond the end of an array by a switch's program, since it was started."""
 
 
 class Part:
@@ -95,7 +97,12 @@ class Part:
     def report(self) -> PartReport:
         """Its present state."""
         return PartReport(
-            name=self.spec.name, pid=self._pid, state=self._shown(), restarts=self.restarts, cause=self._cause
+            name=self.spec.name,
+            pid=self._pid,
+            state=self._shown(),
+            restarts=self.restarts,
+            cause=self._cause,
+            out_of_range=self.process.out_of_range if self.process is not None else 0,
         )
 
     def _shown(self) -> Shown:

@@ -15,6 +15,8 @@ class PartProcess(Protocol):
 
     log: Path
     """Its log, which takes standard error."""
+    out_of_range: int
+    """Accesses beyond the end of an array by a switch's program, as its heartbeats tell."""
 
     @property
     def pid(self) -> int:

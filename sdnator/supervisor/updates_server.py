@@ -78,6 +78,8 @@ class UpdatesProcess:
         except UpdatesUnavailable as error:
             raise PipelineError(str(error)) from None
         self.log = server.log
+        self.out_of_range = 0
+        """A server runs no program of a switch."""
         self.pid = server.pid
         self._probe = PingProbe(server.socket)
         self._ready = False

@@ -64,6 +64,7 @@ class UpReport:
                     "cause": one.cause,
                     "log_bytes": logs.get(one.name, (0, 0))[0],
                     "suppressed_lines": logs.get(one.name, (0, 0))[1],
+                    "out_of_range": one.out_of_range,
                 }
                 for one in reports
             },

@@ -46,7 +46,8 @@ class Running:
     parts: Mapping[str, int] = field(default_factory=dict)
     """Process ids by name; the last one if a part does not run."""
     health: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """By part: state, restarts, cause of the last death, log_bytes, suppressed_lines."""
+    """By part: state, restarts, cause of the last death, log_bytes, suppressed_lines,
+    out_of_range."""
     logs: str = ""
     dashboard: str = ""
     """URL of the page; empty: there is none."""

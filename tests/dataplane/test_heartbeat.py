@@ -33,6 +33,19 @@ def comes(read):
     return bool(select.select([read], [], [], TIMEOUT_S)[0]) and os.read(read, 1) == b"."
 
 
+def test_the_beat_tells_how_often_an_array_was_left(pipe):
+    read, write = pipe
+    counts = iter([0, 17])
+    heart = LivenessPipe(write, [Loop()], FAST_S, lambda: next(counts, 17))
+    heart.start()
+    told = b""
+    while told.count(b";") < 2:
+        assert select.select([read], [], [], TIMEOUT_S)[0]
+        told += os.read(read, 100)
+    heart.stop()
+    assert told.startswith(b"..17;.17;")
+
+
 @pytest.mark.parametrize("which", [0, 1])
 def test_both_have_to_turn(pipe, which):
     read, write = pipe

@@ -14,6 +14,7 @@ from sdnator.cli.status_command import (
     damage_lines,
     damaged_by_app,
     open_incidents,
+    trouble_lines,
 )
 from sdnator.config.planned_switches import parse_ports, parse_wires, planned
 from sdnator.config.up_settings import LearnPlan, SwitchPlan
@@ -173,6 +174,12 @@ def test_status_tells_who_closes_a_switch_that_nobody_controls():
     assert "closed, and has no port forwarding" in list(control_lines(control, ()))[1]
     assert controlled({"apps": {}}) is None, "the controller has said nothing yet"
     assert list(control_lines(None, ())) == []
+
+
+def test_status_tells_of_a_program_that_leaves_its_arrays():
+    calm = {"restarts": 0, "cause": "", "suppressed_lines": 0}
+    (line,) = trouble_lines({"firewall": calm, "switch": calm | {"out_of_range": 2}})
+    assert line.startswith("the program of switch reached beyond the end of an array 2 times")
 
 
 def test_status_tells_of_damage_on_disk():

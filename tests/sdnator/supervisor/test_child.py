@@ -14,9 +14,9 @@ def program(tmp_path, monkeypatch):
     """Write a module that `python -m` finds."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
-    def write(source: str) -> Child:
+    def write(source: str, **options: bool) -> Child:
         (tmp_path / "child_program.py").write_text(source)
-        return Child("program", ["child_program"], tmp_path)
+        return Child("program", ["child_program"], tmp_path, **options)
 
     return write
 
@@ -73,5 +73,21 @@ def test_ready_line_may_come_in_pieces(program):
     )
     try:
         assert child.wait_ready() == {"ready": True}
+    finally:
+        child.stop()
+
+
+def test_what_the_beats_tell_is_kept(program):
+    child = program(
+        "import json, os, signal, sys\nos.write(int(sys.argv[2]), b'..3;.17;.')\n"
+        "print(json.dumps({'ready': True}), flush=True)\nsignal.pause()",
+        heartbeat=True,
+    )
+    try:
+        child.wait_ready()
+        assert child.out_of_range == 0
+        assert child.beaten()
+        assert child.out_of_range == 17
+        assert not child.beaten()
     finally:
         child.stop()
