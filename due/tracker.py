@@ -20,6 +20,7 @@ can write to the server and imitates an instance's numbers exactly can still rep
 """
 
 import logging
+from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -35,6 +36,44 @@ KEPT = 1 << 27
 """Items: over a gigabyte of the smallest."""
 CONFIRMED = 64
 _MOST_COUNTED = 1 << 62
+_MOST_RANGES = 4096
+"""Of one (instance, key), whose members take turns."""
+
+
+class NumberRanges:
+    """Disjoint ranges of numbers, ascending; the lowest are forgotten first.
+
+    A member of a shared app sees only some frames of a producer, and a producer sends again whatever its readers may
+    have missed, however long ago: a memory of single frames would have to hold them all.
+    """
+
+    __slots__ = ("_ends", "_starts")
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []
+        self._ends: list[int] = []
+
+    @property
+    def end(self) -> int:
+        """Behind the highest number; 0: none yet."""
+        return self._ends[-1] if self._ends else 0
+
+    def add(self, first: int, end: int) -> bool:
+        """Add `first` to `end`, not included; False if `first` was there already."""
+        at = bisect_right(self._starts, first)
+        if at and first < self._ends[at - 1]:
+            return False
+        if at and first == self._ends[at - 1]:
+            at -= 1
+            first = self._starts[at]
+        after = at
+        while after < len(self._starts) and self._starts[after] <= end:
+            end = max(end, self._ends[after])
+            after += 1
+        self._starts[at:after], self._ends[at:after] = [first], [end]
+        if len(self._starts) > _MOST_RANGES:
+            del self._starts[0], self._ends[0]
+        return True
 
 
 class Tracker:
@@ -47,7 +86,7 @@ class Tracker:
         self._left_off: OrderedDict[tuple[str, str], tuple[int, int]] = OrderedDict()
         """Where a jump started, and how many frames must still follow before it is accepted."""
         self._rested: set[tuple[str, str]] = set()
-        self._seen: OrderedDict[tuple[str, str, int], None] = OrderedDict()
+        self._seen: OrderedDict[tuple[str, str], NumberRanges] = OrderedDict()
         self._epochs: OrderedDict[tuple[str, str], tuple[int, str]] = OrderedDict()
         """The highest epoch, and the instance that wrote it."""
         self.gaps = 0
@@ -142,20 +181,26 @@ class Tracker:
         elif frame.epoch < known[0]:
             if frame.instance_id != known[1]:
                 return False
-            if frame.before < self._expected.get((frame.instance_id, frame.key), 0):
+            if frame.before < self._reached((frame.instance_id, frame.key)):
                 return True  # a resent older frame does not move the tracker
             self._refute(f"epoch {known[0]} of {frame.key}, its writer's is {frame.epoch}")
         self._epochs[path] = (frame.epoch, frame.instance_id)
         return True
 
     def _unseen(self, frame: Frame, count: int) -> bool:
-        name = (frame.instance_id, frame.key, frame.before)
-        if name in self._seen:
+        name = (frame.instance_id, frame.key)
+        seen = self._seen.get(name)
+        if seen is None:
+            self._make_space(self._seen)
+            seen = self._seen[name] = NumberRanges()
+        if not seen.add(frame.before, frame.before + count):
             self.repeats += count
             return False
-        self._make_space(self._seen)
-        self._seen[name] = None
         return True
+
+    def _reached(self, name: tuple[str, str]) -> int:
+        seen = self._seen.get(name)
+        return max(self._expected.get(name, 0), seen.end if seen is not None else 0)
 
     def _make_space(self, table: OrderedDict[Any, Any]) -> None:
         if len(table) >= self._remember:

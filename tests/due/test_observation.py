@@ -10,7 +10,7 @@ from due.errors import RefusedFrame
 from due.keys import Key
 from due.messages import Item
 from due.observation import Observation, deliver
-from due.tracker import CONFIRMED, FAR, KEPT, Tracker
+from due.tracker import CONFIRMED, FAR, KEPT, NumberRanges, Tracker
 
 
 def _frame(before, count=2, *, instance="i", epoch=0, key="a.b"):
@@ -85,6 +85,34 @@ def test_a_jump_that_no_outage_explains_is_refused_and_changes_nothing():
         assert refused.value.cause == "out_of_range"
     assert tracker.admit(_frame(2), reliable=True)
     assert (tracker.gaps, tracker.repeats) == (0, 0)
+
+
+def test_a_shared_member_knows_a_repeat_however_long_ago_the_frame_was():
+    """A server that comes back empty is given again all that producers still have."""
+    tracker = Tracker(shared=True, remember=4)
+    frames = [_frame(before=2 * n, count=2, epoch=1 + n // 50) for n in range(100)]
+    assert all(tracker.admit(frame, reliable=True) for frame in frames)
+    assert not any(tracker.admit(frame, reliable=True) for frame in frames)
+    assert tracker.repeats == 200
+    assert tracker.refuted == 0, "older epochs of older frames are true"
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 4)), max_size=60))
+def test_ranges_know_what_they_were_given(numbers):
+    ranges, known = NumberRanges(), set()
+    for first, count in numbers:
+        assert ranges.add(first, first + count) == (first not in known)
+        if first not in known:
+            known |= set(range(first, first + count))
+    assert ranges.end == max(known, default=-1) + 1
+
+
+def test_ranges_are_bounded():
+    ranges = NumberRanges()
+    for number in range(10_000):
+        ranges.add(3 * number, 3 * number + 1)
+    assert not ranges.add(29_997, 29_998)
+    assert ranges.add(0, 1), "the lowest were forgotten"
 
 
 def test_a_false_first_frame_is_seen_by_frames_from_before_all_that_could_be_kept():
