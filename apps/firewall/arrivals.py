@@ -16,6 +16,7 @@ from apps.incidents import Incident
 from apps.messages import (
     LATEST_NS,
     Alert,
+    Answer,
     Confirmation,
     Decision,
     Exhibit,
@@ -74,12 +75,6 @@ class FloodReported(Message, frozen=True, kw_only=True):
     window_start: Time
 
 
-class Answered(Message, frozen=True, kw_only=True):
-    """The id of an archived answer."""
-
-    id: Name
-
-
 def alert_in(item: Item) -> Alert:
     """`network.anomaly.kitsune.alert`."""
     sender_of(item)
@@ -128,9 +123,9 @@ def instruction_in(item: Item) -> Instruction:
     return Instruction.from_value(item.value)
 
 
-def answer_in(item: Item) -> str:
-    """The id of an instruction that was answered."""
-    return Answered.from_value(item.value).id
+def answer_in(item: Item) -> Answer:
+    """`network.answer.firewall.<app>`, as it was archived."""
+    return Answer.from_value(item.value)
 
 
 def state_in(item: Item) -> SwitchReport:

@@ -157,7 +157,6 @@ class FirewallService:
         self._stored = StoredAnswers(engine)
         self._lock = threading.RLock()
         self._stopped = False
-        self._carried_out: deque[str] = deque(maxlen=1000)
         self._panics: deque[str] = deque(maxlen=1000)
         """Ids of archived panics that were carried out."""
         self._words_since = time.time_ns()
@@ -213,9 +212,8 @@ class FirewallService:
 
     def _take_up_history(self) -> None:
         """Restore what was in force before a restart, as it still is in the switch."""
-        answered = self._past.answered()
-        self._desk.take_up(history.carried_out(self._past.instructions(), frozenset(answered)))
-        self._carried_out.extend(answered)
+        self._stored.take_up(self._past.answered())
+        self._desk.take_up(history.carried_out(self._past.instructions(), self._stored))
         self._panics.extend(self._past.panics())
         standing = self._past.standing()
         self._ledger.restore(standing)
@@ -284,16 +282,16 @@ class FirewallService:
 
     def _on_instruction(self, item: Item, instruction: Instruction) -> None:
         with self._lock:
-            if instruction.id in self._carried_out:
-                return  # sent again after a restart of the firewall or of Data Updates
-            answer = self._carry_out(instruction, item)
-        answer = self._stored.checked(answer)
-        self._engine.write(f"{history.ANSWERS}.{item.key.split('.')[2]}", answer.to_value(), [due.NO_WAIT])
+            again = instruction.id in self._stored
+            answer = self._stored.given(instruction.id) if again else self._carry_out(instruction, item)
+        if answer is not None:
+            answer, key = answer if again else self._stored.checked(answer), history.answer_key(item.key)
+            self._engine.write(key, answer.to_value(), [due.NO_WAIT])
 
     def _carry_out(self, instruction: Instruction, item: Item) -> Answer:
         summary = f"{instruction.verb} {instruction.subject}: {instruction.reason}"
         evidence = evidence_of(item, summary)
-        self._carried_out.append(instruction.id)
+        self._stored.began(instruction.id)
         if (late := refused_as_late(instruction, time.time_ns())) is not None:
             return late
         decisions, answer = self._desk.carry_out(instruction, evidence, self._now or evidence.timestamp)
@@ -315,7 +313,7 @@ class FirewallService:
                 if said is None or said.id in self._panics:
                     continue
                 self._panics.append(said.id)
-                if said.verb == "panic" and said.id not in self._carried_out:
+                if said.verb == "panic" and said.id not in self._stored:
                     self._carry_out(said, item)
 
     # -- SYN floods ---------------------------------------------------------------------------

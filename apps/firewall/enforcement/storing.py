@@ -1,5 +1,7 @@
-"""Whether what was decided is stored: an operator hears `done` of nothing that a restart would forget."""
+"""What operators' programs were answered: `done` of nothing that a restart would forget, and again if they ask again."""
 
+from collections import OrderedDict
+from collections.abc import Iterable
 from typing import Final
 
 from msgspec import structs
@@ -10,19 +12,51 @@ from due import DueError, Engine
 _PATIENCE_S: Final = 2.0
 _SHORT_S: Final = 0.1
 """While storing fails every instruction waits for this long only: alerts wait behind it."""
+_REMEMBERED: Final = 1000
 
 
 class StoredAnswers:
-    """Waits until decisions are in the archive or in its spool before they are answered as done."""
+    """Waits until decisions are in the archive or in its spool before they are answered as done.
+
+    An instruction may come again after a restart of the firewall or of Data Updates, which may have lost the answer.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
+        self._given: OrderedDict[str, Answer | None] = OrderedDict()
+        """By the id of the instruction; None: it is being carried out, or its answer cannot be read."""
         self.unstored = 0
         """Answers that said so."""
         self._patience_s = _PATIENCE_S
 
+    def __contains__(self, instruction: object) -> bool:
+        return instruction in self._given
+
+    def given(self, instruction: str) -> Answer | None:
+        """What was answered to this instruction."""
+        return self._given.get(instruction)
+
+    def take_up(self, answers: Iterable[Answer]) -> None:
+        """Answers of an earlier run."""
+        for each in answers:
+            self._note(each.id, each)
+
+    def began(self, instruction: str) -> None:
+        """It is being carried out, and not to be carried out again."""
+        self._note(instruction, None)
+
     def checked(self, answer: Answer) -> Answer:
         """The answer itself, or one that says that it is in force, but not stored."""
+        checked = self._checked(answer)
+        self._note(answer.id, checked)
+        return checked
+
+    def _note(self, instruction: str, answer: Answer | None) -> None:
+        self._given[instruction] = answer
+        if len(self._given) > _REMEMBERED:
+            self._given.popitem(last=False)
+
+    def _checked(self, answer: Answer) -> Answer:
         if not answer.done:
             return answer
         try:

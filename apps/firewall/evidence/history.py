@@ -1,6 +1,6 @@
 """A sender's history from archived items.  Pure."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 from apps.messages import Decision, Instruction, MessageError, Target
@@ -44,6 +44,11 @@ ANSWERS: Final = "network.answer.firewall"
 INSTRUCTIONS: Final = "network.instruction.*.firewall"
 
 
+def answer_key(instruction: str) -> str:
+    """The key of the answer to an instruction that came under this key."""
+    return f"{ANSWERS}.{instruction.split('.')[2]}"
+
+
 def instructions_in(items: Iterable[Item]) -> list[Instruction]:
     """Archived instructions in order, without malformed ones."""
     found = []
@@ -55,7 +60,7 @@ def instructions_in(items: Iterable[Item]) -> list[Instruction]:
     return found
 
 
-def carried_out(instructions: Iterable[Instruction], answered: Collection[str]) -> list[Instruction]:
+def carried_out(instructions: Iterable[Instruction], answered: Container[str]) -> list[Instruction]:
     """Without instructions with a deadline that no firewall answered: their sender was told that nothing was done."""
     return [each for each in instructions if not each.expires or each.id in answered]
 

@@ -20,7 +20,7 @@ from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, in_
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
 from apps.firewall.settings import Settings
 from apps.incidents import INCIDENTS, Incident
-from apps.messages import LONGEST_BLOCK_S, Decision, Instruction, Intake, MessageError, TableUpdate
+from apps.messages import LONGEST_BLOCK_S, Answer, Decision, Instruction, Intake, MessageError, TableUpdate
 from due import Item
 
 _PATIENCE_S: Final = 30.0
@@ -50,8 +50,8 @@ class ArchivedPast:
         query = {"dataKey": INSTRUCTIONS, "value.verb": {"$in": ["allow", "disallow"]}}
         return self._read(query, "instruction", instruction_in, most=_INSTRUCTIONS)
 
-    def answered(self) -> list[str]:
-        """Ids of the instructions carried out most recently."""
+    def answered(self) -> list[Answer]:
+        """What was answered most recently."""
         return self._read(f"{ANSWERS}.*", "answer", answer_in, most=_ANSWERS)
 
     def panics(self) -> list[str]:

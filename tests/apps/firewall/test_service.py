@@ -8,7 +8,7 @@ import pytest
 
 from apps.firewall.policy.rules import Rules
 from apps.firewall.syn.syn_policy import SynRules
-from apps.messages import Instruction, TableCommand
+from apps.messages import Answer, Instruction, TableCommand
 from due import Item
 from tests.apps.firewall.alerts import alert
 from tests.apps.firewall.desk import ALERT, NOW, SYN_ACKS, SYNS, Desk, FakeEngine
@@ -186,13 +186,17 @@ def test_panic_in_the_archive_is_carried_out(monkeypatch, clock_s):
 def test_instruction_that_is_sent_again_is_not_carried_out_again():
     """Data Updates send again what nobody has acknowledged; the archive has the answers of an earlier run."""
     engine = FakeEngine()
-    engine.archived.append(Item("network.answer.firewall.operator", {"id": "a"}, 1, 1, "firewall", "f1", 1))
+    first = Answer(id="a", done=True, text="blocked").to_value()
+    engine.archived.append(Item("network.answer.firewall.operator", first, 1, 1, "firewall", "f1", 1))
     desk = Desk(engine=engine)
     for name, address in (("a", "192.0.2.1"), ("b", "192.0.2.2"), ("b", "192.0.2.3")):
         said = Instruction(id=name, verb="block", subject=address).to_value()
         desk.hand(INSTRUCTION, said, pattern=INSTRUCTIONS)
     assert desk.blocked == ["192.0.2.2"]
-    assert len(desk.written("network.answer.firewall.operator")) == 1
+    answers = desk.written("network.answer.firewall.operator")
+    assert [each["id"] for each in answers] == ["a", "b", "b"], "the first answer may be lost"
+    assert answers[0] == first
+    assert answers[1] == answers[2]
 
 
 def test_an_instruction_is_answered_as_done_when_its_decision_is_stored():
