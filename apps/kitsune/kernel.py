@@ -102,10 +102,10 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
 
 
 def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:
-    """The array as the kernel reads it; copied only when type or layout differ.
+    """The array as the kernel reads it; copied only when type, layout or alignment differ.
 
     Raises `ColumnError` for what does not hold numbers.
     """
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufb":
         raise ColumnError(f"a column holds {getattr(array, 'dtype', type(array).__name__)}, not numbers")
-    return np.ascontiguousarray(array, dtype=kind)
+    return np.require(array, kind, ("C_CONTIGUOUS", "ALIGNED"))

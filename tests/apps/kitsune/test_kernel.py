@@ -4,9 +4,10 @@ import shutil
 import subprocess
 import warnings
 
+import numpy as np
 import pytest
 
-from apps.kitsune.kernel import load_kernel
+from apps.kitsune.kernel import contiguous, load_kernel
 from tests.requirements import require_program
 
 
@@ -32,3 +33,14 @@ def test_a_library_of_another_version_is_not_used(tmp_path, source):
     subprocess.run([compiler, "-shared", "-fPIC", "-o", library, tmp_path / "old.c"], check=True)
     with pytest.warns(RuntimeWarning):
         assert load_kernel(library) is None
+
+
+@pytest.mark.parametrize("shift", [0, 1, 4])
+def test_the_kernel_gets_aligned_numbers_wherever_they_stood(shift):
+    """Columns of a frame may begin anywhere in its bytes; C may read numbers at multiples of their size only."""
+    data = np.arange(5, dtype="u8").tobytes()
+    column = np.frombuffer(bytes(shift) + data, "u8", 5, shift)
+    given = contiguous(column, "u8")
+    assert given.flags.aligned
+    assert given.flags.c_contiguous
+    assert given.tolist() == [0, 1, 2, 3, 4]
