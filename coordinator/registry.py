@@ -108,9 +108,15 @@ class _App:
         )
 
     def claim(self) -> str:
-        """The live instance that an earlier Coordinator made active, or ""."""
+        """The live instance that a Coordinator made active in the newest epoch, or ""."""
         claims = [
-            one.beat for one in self.alive if one.beat is not None and one.beat.active and one.beat.version
+            one.beat
+            for one in self.alive
+            if one.beat is not None
+            and one.beat.active
+            and one.beat.version
+            # what an instance said before it was replaced is not its word now
+            and one.beat.epoch >= self.epoch
         ]
         return max(claims, key=lambda beat: beat.epoch).instance_id if claims else ""
 

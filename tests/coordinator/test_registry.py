@@ -258,6 +258,22 @@ def test_who_leads_again_keeps_an_active_instance_that_asks_whether_it_still_is(
     assert {each.active for each in world.send()} == {"a2"}
 
 
+def test_who_leads_again_does_not_bring_back_an_instance_that_was_replaced() -> None:
+    """After a silence of all the dead are not known to be dead, and what they said last is old."""
+    world = World()
+    world.join("a", "a1")
+    world.join("a", "a2")
+    world.beat("a", "a1")
+    world.run(0.6, [("a", "a2")])
+    assert world.told["a"].active == "a2"
+    world.registry.follow()
+    world.now += 1.0
+    world.beat("a", "a2", active=False)
+    world.registry.lead()
+    world.send()
+    assert world.told["a"].active == "a2"
+
+
 def test_the_only_instance_keeps_its_place_over_an_outage() -> None:
     world = World()
     world.join("app", "i1", interests=(Interest("a"),))
