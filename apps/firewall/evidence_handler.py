@@ -75,7 +75,7 @@ class EvidenceHandler:
         at = evidence.event_time
         proposal = self.decider.evidence(evidence, item.app_id, lambda target: self._offences_of(target, at))
         if evidence.nats > 0:
-            self._incidents.evidence(evidence, *self.decider.sum_of(evidence))
+            self._incidents.evidence(self.decider.test.placed(evidence), *self.decider.sum_of(evidence))
         if proposal is not None:
             self._follow(proposal, item)
 

@@ -103,8 +103,8 @@ class IncidentBook:
         """
         now = self._clock(evidence.event_time)
         suspect = total_nats >= SUSPECT_SHARE * bound
-        mine = keys_of(evidence.sender, evidence.mac_addresses, evidence.role) if evidence.sender else []
-        shared = evidence.sender is None or (suspect and evidence.kind in SHARED_VICTIM)
+        mine = _accused(evidence)
+        shared = not mine or (suspect and evidence.kind in SHARED_VICTIM)
         theirs: list[AttackerKey] = [("victim", victim) for victim in evidence.victims] if shared else []
         found = self._same(mine, theirs)
         if found is not None and not found.shown and total_nats - evidence.nats < FADED_SHARE * total_nats:
@@ -182,7 +182,7 @@ class IncidentBook:
             Incidents to publish.
         """
         now = self._clock(evidence.event_time)
-        mine = keys_of(evidence.sender, evidence.mac_addresses, evidence.role) if evidence.sender else []
+        mine = _accused(evidence)
         found = self._same([*mine, *(("victim", each) for each in evidence.victims)], ())
         if found is None:
             return self._due(now)
@@ -193,7 +193,9 @@ class IncidentBook:
             since=before.since if before else now,
             until=0,
             reason=one_line(why),
-            target=who(evidence.sender) if evidence.sender else ", ".join(evidence.victims),
+            target=who(evidence.sender)
+            if evidence.sender
+            else evidence.address or ", ".join(evidence.victims),
             nats=total_nats,
             bound=bound,
             contributions=sum_against.largest(),
@@ -494,6 +496,13 @@ class IncidentBook:
         for decision in one.actions:
             if self._by_decision.get(decision) is one:
                 del self._by_decision[decision]
+
+
+def _accused(evidence: Evidence) -> list[AttackerKey]:
+    """Keys of whom a piece of evidence accuses; none where it is about a victim."""
+    if evidence.sender is not None:
+        return keys_of(evidence.sender, evidence.mac_addresses, evidence.role)
+    return [("ip", evidence.address)] if evidence.address else []
 
 
 def keys_of(sender: Sender, mac_addresses: int, role: str) -> list[AttackerKey]:

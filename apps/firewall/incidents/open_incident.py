@@ -130,7 +130,7 @@ class OpenIncident:
         """Take a piece of evidence; `total` is the sum against its sender with it."""
         piece = piece_of(evidence)
         self.blame(keys, evidence.sender).add(piece, total, bound)
-        self.nameless = self.nameless or evidence.sender is None
+        self.nameless = self.nameless or not (evidence.sender or evidence.address)
         self.peak = max(self.peak, total)
         self.weigh(evidence.kind, evidence.nats)
         self.begun, self.last = min(self.begun, evidence.since), max(self.last, evidence.event_time)

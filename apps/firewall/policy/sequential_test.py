@@ -19,6 +19,8 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final
 
+from msgspec import structs
+
 from apps.evidence import Evidence, TrainingState
 from apps.messages import Sender
 
@@ -150,6 +152,11 @@ class SequentialTest:
         """The sum for the subject of a piece of evidence, at its time."""
         tally = self._tallies.get(self._subject_of(evidence))
         return 0.0 if tally is None else tally.total(evidence.event_time, self.bound)
+
+    def placed(self, evidence: Evidence) -> Evidence:
+        """Evidence about a plain address with the sender that was last seen with it, if there is one."""
+        sender = self._placed.get(evidence.address) if evidence.sender is None else None
+        return evidence if sender is None else structs.replace(evidence, sender=sender, address="")
 
     def _place(self, sender: Sender) -> None:
         self._placed[sender.ip] = sender
