@@ -175,7 +175,7 @@ def test_observing_ends_well_with_ctrl_c(standing):
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=SECONDS)
     assert process.returncode == 0
-    assert "items" in error
+    assert " item" in error
     assert "Traceback" not in error
 
 
