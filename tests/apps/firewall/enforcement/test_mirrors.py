@@ -1,10 +1,8 @@
 """Where only copies are seen, decisions say what they would do, and nothing claims that anything was stopped."""
 
-import json
-
 import pytest
 
-from apps.firewall.enforcement.eve import decision_line
+from apps.firewall.enforcement.eve import decision_event
 from apps.firewall.enforcement.mirrors import COPIES, Mirrors
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Instruction
@@ -25,8 +23,8 @@ def test_block_of_an_attacker_on_a_mirror_is_a_would_be_block():
     assert block.reason.endswith(COPIES)
     health = desk.service.health()
     assert (health["blocks"], health["would_block"]) == (0, 1)
-    event = json.loads(decision_line(block))["alert"]
-    assert (event["action"], event["category"]) == ("allowed", "would block")
+    event = decision_event(block)["alert"]
+    assert (event["action"], event["metadata"]["dry_run"]) == ("allowed", ["yes"])
 
 
 def test_guard_on_a_mirror_challenges_nobody_and_resets_nothing():
