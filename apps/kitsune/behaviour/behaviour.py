@@ -33,8 +33,9 @@ from apps.kitsune.behaviour.contacts import (
     FailedContact,
     PacketRow,
 )
-from apps.kitsune.behaviour.rows import SenderId, packet_rows
+from apps.kitsune.behaviour.rows import SenderId, packet_rows, parts_of
 from apps.kitsune.kernel import Columns
+from apps.kitsune.roles import is_inside
 
 Statistic = Literal[
     "contacts",
@@ -327,7 +328,7 @@ class Behaviour:
     def _failed(self, failed: FailedContact, block: int) -> list[Finding]:
         found: list[Finding | None] = []
         sender, target, service = failed.sender, failed.target, failed.service
-        if not failed.half_open:
+        if not failed.half_open and not _is_reflected(failed):
             for statistic, subject in (
                 ("contacts", sender),
                 ("ports", (sender, target)),
@@ -526,6 +527,11 @@ def _flooded(failed: FailedContact) -> int:
     if failed.service & ~0xFFFF == TCP and not failed.is_syn:
         return STRAY_TCP | failed.service - TCP
     return failed.service
+
+
+def _is_reflected(failed: FailedContact) -> bool:
+    """A datagram from a well-known port outside: who sends it may have been asked in the victim's name."""
+    return _flooded(failed) & ~0xFFFF == FROM_UDP and not is_inside(parts_of(failed.sender[3]))
 
 
 def _refuses(flags: int) -> bool:

@@ -118,6 +118,18 @@ def test_forged_sources_are_counted_for_their_victim():
     assert all(each.sender is None and each.victim == SERVER for each in found)
 
 
+def test_reflectors_are_not_accused():
+    """Somebody asked them in the victim's name; the flood is told for its victim."""
+    behaviour = quiet_network()
+    rows = [
+        packet(700 + n / 2_000, 0x08000000 + n % 20, SERVER, udp_sport=53, udp_dport=20_000 + n)
+        for n in range(2_000)
+    ]
+    found = feed(behaviour, rows)
+    assert not [each for each in found if each.statistic in ("ports", "contacts", "targets")]
+    assert total(found, "strangers") > 5
+
+
 def test_claims_of_the_address_of_a_present_host_are_theft():
     behaviour = quiet_network()
     claim = packet(700.5, STRANGER, HOST, arp_op=2) | {"arp_src_ip": SERVER}
