@@ -24,6 +24,8 @@ LEAST_SCALE: Final = 0.75
 """Events: the scale of the tail where training shows no variation at all."""
 _LEAST_SHARE: Final = 0.25
 """The scale is at least this share of the highest count of training."""
+_NEIGHBOURS_SHARE: Final = 0.1
+"""A subject may do at least this share of what the busiest of all does: a quiet hour of training proves little."""
 
 
 class SlidingSums:
@@ -154,7 +156,7 @@ class Baseline:
         Returns:
             The weight in nats, 0 if training saw as much; and the window that it comes from.
         """
-        most = self.highest.get(subject) or self.newcomer
+        most = self._most(subject)
         best, which = 0.0, 0
         for number, (count, usual) in enumerate(zip(counts, most, strict=True)):
             if count > usual:
@@ -166,7 +168,13 @@ class Baseline:
 
     def usual(self, subject: Any, window: int) -> float:
         """The highest count of training in a window."""
-        return (self.highest.get(subject) or self.newcomer)[window]
+        return self._most(subject)[window]
+
+    def _most(self, subject: Any) -> list[float]:
+        own = self.highest.get(subject)
+        if own is None:
+            return self.newcomer
+        return [max(count, _NEIGHBOURS_SHARE * most) for count, most in zip(own, self.newcomer, strict=True)]
 
     def to_state(self) -> dict[str, Any]:
         """Plain values for the model file."""

@@ -208,7 +208,7 @@ class Behaviour:
             "contacts": _Counter(),
             "ports": _Counter(),
             "targets": _Counter(),
-            "logins": _Counter(),
+            "logins": _Counter(0.9),
             "one_way": _Counter(8.0),
             "claims": _Counter(),
             "thefts": _Counter(),
