@@ -43,6 +43,7 @@ def learning(health):
     return found[-1] if found else {}
 
 
+@pytest.mark.timeout(400)  # three adapters' starts, and a minute and a half of traffic
 def test_queries_learn_and_then_accuse(stage):
     """The benign office says nothing; each attack does; another adapter goes on with what this one learnt."""
     adapter = stage.run("apps.sonata_adapter.service", SETTINGS)
