@@ -39,7 +39,7 @@ from benchmarks.decision_traffic.networks import NETWORKS
 from benchmarks.decision_traffic.novelty import NOVELTIES
 from benchmarks.decision_traffic.traffic import BASE_US, Traffic, merge, renumbered
 from benchmarks.decision_traffic.truth import AttackSpec, AttackTruth
-from benchmarks.decisions_core import Decided, DecisionRun
+from benchmarks.decisions_core import DecidedAction, DecisionRun
 
 RULES: Final = {"sequential": "", "paper": "paper_rule", "seconds": "seconds_rule"}
 """Rule of the firewall to the field of its figures; the default's stand at the top."""
@@ -206,7 +206,7 @@ def _attack(
     }
 
 
-def _helps(decided: Decided, truth: AttackTruth) -> bool:
+def _helps(decided: DecidedAction, truth: AttackTruth) -> bool:
     """Whether a decision stops the attacker, and nobody else."""
     if decided.service is not None:
         victims = {str(ipaddress.IPv4Address(victim)) for victim in truth.victims}

@@ -32,7 +32,7 @@ ROWS: Final = 128
 
 
 @dataclass(frozen=True)
-class Decided:
+class DecidedAction:
     """One block or guard."""
 
     time_ns: int
@@ -52,7 +52,7 @@ class DecisionRun:
 
     training_packets: int
     rules: Rules
-    decided: list[Decided] = field(default_factory=list)
+    decided: list[DecidedAction] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     dropped: int = 0
     challenged: int = 0
@@ -116,7 +116,9 @@ class DecisionRun:
         if proposal.service is not None:
             if proposal.service not in self._guarded:
                 self._guarded.add(proposal.service)
-                self.decided.append(Decided(evidence.event_time, proposal.reason, service=proposal.service))
+                self.decided.append(
+                    DecidedAction(evidence.event_time, proposal.reason, service=proposal.service)
+                )
             self.decider.settled(proposal)
         elif proposal.target is not None:
             self._block(evidence, proposal.target, proposal.reason)
@@ -130,7 +132,7 @@ class DecisionRun:
             SWITCH, target, reason, (), cause.event_time, training_rate=cause.training_rate, host=host
         )
         self.detector.senders.blocked.decide(decision)
-        self.decided.append(Decided(cause.event_time, reason, target=target))
+        self.decided.append(DecidedAction(cause.event_time, reason, target=target))
 
     def _drops(self, columns: Mapping[str, Any]) -> npt.NDArray[np.bool_]:
         drops = np.zeros(len(columns["port"]), bool)

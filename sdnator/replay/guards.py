@@ -29,7 +29,7 @@ _HALF: Final = 64
 
 
 @dataclass(frozen=True)
-class Guard:
+class ReplayedGuard:
     """A guard that was decided: in force from `since` until before `until`, capture time in ns."""
 
     decision: Decision
@@ -48,7 +48,7 @@ class WouldChallenge:
 
     packets: NDArray[np.bool_]
     """One entry for each packet of the capture."""
-    by_guard: list[tuple[Guard, int]] = field(default_factory=list)
+    by_guard: list[tuple[ReplayedGuard, int]] = field(default_factory=list)
     """Each guard, and how many SYNs it would have challenged."""
 
     def rows(self, time_ns: NDArray[np.int64]) -> list[dict[str, Any]]:
@@ -70,12 +70,12 @@ class WouldChallenge:
         ]
 
 
-def guards_of(decisions: Sequence[Decision]) -> list[Guard]:
+def guards_of(decisions: Sequence[Decision]) -> list[ReplayedGuard]:
     """Guards from decisions, in their order; one that is never lifted ends when it expires."""
     ends = {each.id: each.event_time for each in reversed(decisions) if each.action == "unprotect"}
     first = {each.id: each for each in reversed(decisions) if each.action == "protect"}
     return [
-        Guard(each, each.event_time, ends.get(each.id, each.expires or np.iinfo(np.int64).max))
+        ReplayedGuard(each, each.event_time, ends.get(each.id, each.expires or np.iinfo(np.int64).max))
         for each in sorted(first.values(), key=lambda each: (each.event_time, each.id))
     ]
 
@@ -128,7 +128,7 @@ def _syns(frames: Iterator[CapturedFrame]) -> Iterator[tuple[int, RecordBatch]]:
         first += count
 
 
-def _challenged(guard: Guard, batch: RecordBatch, known: dict[str, int]) -> NDArray[np.intp]:
+def _challenged(guard: ReplayedGuard, batch: RecordBatch, known: dict[str, int]) -> NDArray[np.intp]:
     """Rows of the SYNs that a guard would have challenged."""
     address = guard.service.address
     version, number = _number(address)

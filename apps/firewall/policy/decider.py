@@ -15,7 +15,7 @@ from apps.evidence import Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
-from apps.firewall.policy.sequential_test import LEAST_BOUND, SequentialTest, Tally
+from apps.firewall.policy.sequential_test import LEAST_BOUND, EvidenceSum, SequentialTest
 from apps.firewall.syn.services import TcpService
 from apps.messages import Alert, Sender, Target
 
@@ -48,7 +48,7 @@ class Proposal:
     nats: float = 0.0
     bound: float = 0.0
     offences: int | None = 0
-    tally: Tally | None = None
+    tally: EvidenceSum | None = None
 
 
 class Decider:
@@ -133,7 +133,7 @@ class Decider:
         return Proposal(evidence, f"first packet over the threshold: {evidence.text}", target)
 
     def _against(
-        self, evidence: Evidence, sender: Sender, tally: Tally, bound: float, offences: Offences
+        self, evidence: Evidence, sender: Sender, tally: EvidenceSum, bound: float, offences: Offences
     ) -> Proposal | None:
         now = evidence.event_time
         if self._ledger.covering(sender) is not None:
@@ -196,7 +196,7 @@ class Decider:
             return None, f"{target.address} is known from handshakes and may be forged"
         return target, ""
 
-    def _towards(self, evidence: Evidence, tally: Tally, total: float, bound: float) -> Proposal | None:
+    def _towards(self, evidence: Evidence, tally: EvidenceSum, total: float, bound: float) -> Proposal | None:
         """A victim of senders that cannot be told apart, or whose addresses are forged."""
         now = evidence.event_time
         reason = _reason(tally, now, bound, total, bound, 0)
@@ -213,7 +213,7 @@ class Decider:
         return self._refused(evidence, reason, refusal, tally, total, bound)
 
     def _refused(
-        self, evidence: Evidence, reason: str, refusal: str, tally: Tally, total: float, bound: float
+        self, evidence: Evidence, reason: str, refusal: str, tally: EvidenceSum, total: float, bound: float
     ) -> Proposal | None:
         """A proposal to do nothing; None if that was told lately."""
         if not self._news(tally.subject, evidence.event_time):
@@ -232,7 +232,7 @@ class Decider:
         return True
 
 
-def _latest(tally: Tally, evidence: Evidence) -> Evidence:
+def _latest(tally: EvidenceSum, evidence: Evidence) -> Evidence:
     """The evidence itself, or, if it names an address only, with what others know of the sender."""
     if evidence.sender is not None:
         return evidence
@@ -249,7 +249,7 @@ def _target_of(evidence: Evidence, sender: Sender) -> Target | None:
     return narrowest_target(sender, evidence.mac_addresses)
 
 
-def _reason(tally: Tally, now: int, bound: float, total: float, needed: float, earlier: int) -> str:
+def _reason(tally: EvidenceSum, now: int, bound: float, total: float, needed: float, earlier: int) -> str:
     shares = [(nats, each) for nats, each in tally.shares(now, bound) if nats > 0]
     parts = [f"{each.latest.text} ({nats:.1f})" for nats, each in shares[:_PARTS_SHOWN]]
     before = f", {earlier} earlier block{'s' if earlier > 1 else ''}" if earlier else ""

@@ -47,7 +47,7 @@ Subject = Sender | tuple[str, str]
 
 
 @dataclass(slots=True)
-class Contribution:
+class SourceNats:
     """The nats of one source, as of its last evidence."""
 
     nats: float
@@ -60,11 +60,11 @@ class Contribution:
 
 
 @dataclass
-class Tally:
+class EvidenceSum:
     """All evidence about one subject."""
 
     subject: Subject
-    contributions: dict[str, Contribution] = field(default_factory=dict)
+    contributions: dict[str, SourceNats] = field(default_factory=dict)
     first: Evidence | None = None
     """The first evidence since the sum was last near zero."""
 
@@ -72,7 +72,7 @@ class Tally:
         """The sum in nats at a capture time, ns."""
         return sum(nats for nats, _ in self.shares(now, bound))
 
-    def shares(self, now: int, bound: float) -> list[tuple[float, Contribution]]:
+    def shares(self, now: int, bound: float) -> list[tuple[float, SourceNats]]:
         """What each source adds to the sum, the largest first."""
         weights = [(each.at(now), each) for each in self.contributions.values()]
         alone = sorted((pair for pair in weights if not pair[1].latest.supporting), key=lambda pair: -pair[0])
@@ -96,7 +96,7 @@ class SequentialTest:
 
     def __init__(self, false_blocks_per_day: float) -> None:
         self._budget = false_blocks_per_day
-        self._tallies: OrderedDict[Subject, Tally] = OrderedDict()
+        self._tallies: OrderedDict[Subject, EvidenceSum] = OrderedDict()
         self._placed: dict[str, Sender] = {}
         """By address: the sender last seen with it."""
         self.training: TrainingState | None = None
@@ -123,7 +123,7 @@ class SequentialTest:
         """Whether training cannot bear out the budget, so that nobody may be blocked."""
         return self.extrapolation > MOST_EXTRAPOLATION
 
-    def hear(self, evidence: Evidence, app: str) -> Tally:
+    def hear(self, evidence: Evidence, app: str) -> EvidenceSum:
         """Add evidence that an app wrote; returns all that there is about its subject."""
         if evidence.sender is not None and evidence.sender.ip:
             self._place(evidence.sender)
@@ -133,7 +133,7 @@ class SequentialTest:
         if tally is None:
             if len(self._tallies) >= MOST_SUBJECTS:
                 self._tallies.popitem(last=False)
-            tally = self._tallies[subject] = Tally(subject)
+            tally = self._tallies[subject] = EvidenceSum(subject)
         self._tallies.move_to_end(subject)
         if tally.first is None or tally.total(now, self.bound) < 0.5:
             tally.first = evidence
@@ -145,7 +145,7 @@ class SequentialTest:
         elif len(tally.contributions) >= MOST_SOURCES:
             weakest = min(tally.contributions, key=lambda each: tally.contributions[each].at(now))
             del tally.contributions[weakest]
-        tally.contributions[source] = Contribution(nats, now, evidence)
+        tally.contributions[source] = SourceNats(nats, now, evidence)
         return tally
 
     def sum_of(self, evidence: Evidence) -> float:
