@@ -9,7 +9,7 @@ from due import Capability
 from sdnator.testing.controller_run import BASE_US, ControllerRun, Heard
 from sdnator.testing.query_traffic import BASE_US as TRAFFIC_US
 from sdnator.testing.query_traffic import HOSTS, attack, office
-from sdnator.testing.waiting import wait_for
+from sdnator.testing.waiting import TookTooLong, wait_for
 
 PREFIX = "network.evidence.sonata_adapter"
 QUERIES = ("port_scan", "syn_flood", "arp_scan")
@@ -43,6 +43,15 @@ def learning(health):
     return found[-1] if found else {}
 
 
+def came(condition):
+    """Whether something came about in half a minute."""
+    try:
+        wait_for(condition, seconds=30)
+    except TookTooLong:
+        return False
+    return True
+
+
 @pytest.mark.timeout(400)  # three adapters' starts, and a minute and a half of traffic
 def test_queries_learn_and_then_accuse(stage):
     """The benign office says nothing; each attack does; another adapter goes on with what this one learnt."""
@@ -54,7 +63,7 @@ def test_queries_learn_and_then_accuse(stage):
     stage.controller()
     heard = Heard(engine, *(f"{PREFIX}.{name}" for name in QUERIES))
     wait_for(lambda: set(learning(health)) == set(QUERIES), why=stage.log)
-    wait_for(lambda: states.values("network.switch")[-1]["telemetry"], why=stage.log)
+    wait_for(lambda: any(state["telemetry"] for state in states.values("network.switch")), why=stage.log)
     feed = stage.feed()
     send(feed, quiet(TRAINED_S))
     state = TrainingState(
@@ -67,19 +76,22 @@ def test_queries_learn_and_then_accuse(stage):
     send(feed, quiet(5, TRAINED_S + 10))
     assert not heard.items
     rng = random.Random(5)
-    for place, name in enumerate(QUERIES):
-        start = TRAFFIC_US + (TRAINED_S + 20 + 5 * place) * 10**6
-        send(feed, sorted(attack(name, start, rng)))
-    send(feed, quiet(5, TRAINED_S + 40))
-    wait_for(
-        lambda: {item.key for item in heard.items} >= {f"{PREFIX}.{name}" for name in QUERIES}, why=stage.log
-    )
-    found = {item.key.rpartition(".")[2]: Evidence.from_value(item.value) for item in heard.items}
-    assert found["port_scan"].address == HOSTS["port_scan"]
-    assert found["syn_flood"].victims == (HOSTS["syn_flood"],)
-    sender = found["arp_scan"].sender
-    assert sender is not None
-    assert (sender.switch, sender.port, sender.mac) == ("s1", 1, HOSTS["arp_scan"])
+    for attempt in range(4):  # a window that is read too late is lost, and counted; attacks go on
+        for place, name in enumerate(QUERIES):
+            start = TRAFFIC_US + (TRAINED_S + 20 + 30 * attempt + 5 * place) * 10**6
+            send(feed, sorted(attack(name, start, rng)))
+        send(feed, quiet(5, TRAINED_S + 40 + 30 * attempt))
+        if came(lambda: {item.key for item in heard.items} >= {f"{PREFIX}.{name}" for name in QUERIES}):
+            break
+    else:
+        pytest.fail(f"heard only of {sorted({item.key for item in heard.items})}: {stage.log()}")
+    found = {name: [] for name in QUERIES}
+    for item in heard.items:
+        found[item.key.rpartition(".")[2]].append(Evidence.from_value(item.value))
+    assert HOSTS["port_scan"] in {evidence.address for evidence in found["port_scan"]}
+    assert (HOSTS["syn_flood"],) in {evidence.victims for evidence in found["syn_flood"]}
+    senders = {evidence.sender for evidence in found["arp_scan"]} - {None}
+    assert {(s.switch, s.port, s.mac) for s in senders} == {("s1", 1, HOSTS["arp_scan"])}
     feed.close()
     stage.kill(adapter)
     health.items.clear()
