@@ -291,7 +291,7 @@ def _number(request: Request, name: str, default: int | None) -> int | None:
     text = request.query_params.get(name)
     if text is None:
         return default
-    if not (text.lstrip("-").isdecimal() and len(text) < _INT64_DIGITS):
+    if not (text.removeprefix("-").isdecimal() and len(text) < _INT64_DIGITS):
         raise InvalidQuery(f"{name} is a whole number, not {text[:40]!r}")
     return int(text)
 
@@ -359,4 +359,7 @@ def _of_key(request: Request) -> dict[str, Any]:
 def _same_site(socket: WebSocket) -> bool:
     """Whether the Origin is ours: browsers send the page's origin, programs send none."""
     origin = socket.headers.get("origin")
-    return origin is None or urlsplit(origin).netloc == socket.headers.get("host")
+    try:
+        return origin is None or urlsplit(origin).netloc == socket.headers.get("host")
+    except ValueError:  # half an IPv6 address
+        return False

@@ -25,7 +25,7 @@ def ask(url: str, path: str) -> Any:
     try:
         with opener.open(url.rstrip("/") + path, timeout=_SECONDS) as answer:
             return json.load(answer)
-    except (URLError, OSError, ValueError, http.client.HTTPException) as error:
+    except (URLError, OSError, ValueError, RecursionError, http.client.HTTPException) as error:
         cause = getattr(error, "reason", None) or error
         raise PipelineError(
             f"no Coordinator answers at {url}{path} ({cause}); see `sdnator status`"

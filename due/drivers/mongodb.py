@@ -225,7 +225,7 @@ class MongoArchive:
         for document in in_time(self._find(criteria)):
             try:
                 yield from _items(self._joined(document), query)
-            except (DecodeError, KeyError, TypeError, ValueError) as error:
+            except (DecodeError, KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
                 self.damaged += 1
                 if self.damaged == 1:
                     log.error(  # noqa: TRY400 - no trace needed

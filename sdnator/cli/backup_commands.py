@@ -158,7 +158,9 @@ def restore(
     shown = {str(name): str(place) for name, place in places.items()}
     if as_json:
         print(
-            json.dumps({"made": manifest["made"], "files": shown, "kept": [str(one) for one in kept if one]})
+            json.dumps(
+                {"made": manifest.get("made"), "files": shown, "kept": [str(one) for one in kept if one]}
+            )
         )
         return
     for name, place in shown.items():
@@ -178,7 +180,8 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
                 raise BadInput(
                     f"{file} was written by sdnator {manifest.get('version')}, which is newer: update this one"
                 )
-            names = [str(name) for name in manifest.get("files", ())]
+            listed = manifest.get("files", ())
+            names = [str(name) for name in listed] if isinstance(listed, list | tuple) else []
             # nothing but what a backup holds, whatever else the file says
             tar.extractall(folder, [tar.getmember(name) for name in names if _is_ours(name)], filter="data")
     except OSError as error:

@@ -24,7 +24,10 @@ _HEADERS = {
 
 def named_well(host: str, names: Iterable[str]) -> bool:
     """Whether a Host header may be answered: a foreign name that leads to us would be another site's trick."""
-    name = urlsplit(f"//{host}").hostname or ""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:  # half an IPv6 address
+        return False
     if name == "localhost" or name in names:
         return True
     try:
@@ -49,7 +52,7 @@ class Guard:
         headers = dict(scope["headers"])
         host = headers.get(b"host", b"").decode("latin-1")
         origin = headers.get(b"origin", b"").decode("latin-1")
-        if named_well(host, self._names) and (not origin or urlsplit(origin).netloc == host):
+        if named_well(host, self._names) and (not origin or _of_host(origin, host)):
             await self._app(scope, receive, _with_headers(send))
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
@@ -57,6 +60,13 @@ class Guard:
             text = b"refused: this name is not among dashboard.names\n"
             await send({"type": "http.response.start", "status": 403, "headers": []})
             await send({"type": "http.response.body", "body": text})
+
+
+def _of_host(origin: str, host: str) -> bool:
+    try:
+        return urlsplit(origin).netloc == host
+    except ValueError:  # half an IPv6 address
+        return False
 
 
 def _with_headers(send: Any) -> Any:

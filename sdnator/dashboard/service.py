@@ -137,7 +137,7 @@ class DashboardService:
         def handle(item: Item) -> None:
             try:
                 handler(item)
-            except (ValueError, TypeError, KeyError, AttributeError) as error:
+            except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
                 self._misunderstood += 1
                 log.warning("%s: not understood: %s", item.key, error)
 
@@ -151,13 +151,14 @@ class DashboardService:
             log.warning("Data Archives do not answer, showing no history: %s", error)
             return
         ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
-        self.board.decide(Decision.from_value(item.value) for item in ordered)
+        for item in ordered:
+            self._tolerant(lambda one: self.board.decide([Decision.from_value(one.value)]))(item)
         since = time.time_ns() - _DAY_NS
         query = {"dataKey": "network.anomaly.kitsune.alert", "timestamp": {"$gte": since}}
         for item in self._engine.get(query)[-200:]:
-            self.board.alert(Alert.from_value(item.value))
+            self._tolerant(lambda one: self.board.alert(Alert.from_value(one.value)))(item)
         for item in self._engine.get({"dataKey": INCIDENTS, "timestamp": {"$gte": since}})[-_REPORTS:]:
-            self.board.incident(Incident.from_value(item.value))
+            self._tolerant(lambda one: self.board.incident(Incident.from_value(one.value)))(item)
 
     def _take_up_switches(self) -> None:
         """What switches said before anybody knew of our interest: then it went to the archive alone."""
@@ -207,11 +208,14 @@ class DashboardService:
             try:
                 url = Path(self.settings.coordinator_file).read_text(encoding="utf-8").strip()
                 apps, instances, flow = (ask(url, path) for path in ("/apps", "/instances", "/flow"))
-            except (OSError, SdnatorError) as error:
+            except (OSError, ValueError, SdnatorError) as error:
                 self.board.uncoordinated(str(error))
-            else:
+                continue
+            try:
                 self.board.coordinated(apps, instances, flow, time.monotonic())
-                self._take_up_switches()
+            except (ValueError, TypeError, LookupError, AttributeError) as error:
+                self.board.uncoordinated(f"{url} answers what no Coordinator says: {error!r}")
+            self._take_up_switches()
 
     def _serve(self) -> None:
         from sdnator.dashboard.server import serve

@@ -96,7 +96,7 @@ class _Part:
     def _noted_version(self) -> str:
         try:
             known = json.loads(self.note.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # a note cut off by a crash: start again
+        except (OSError, ValueError, RecursionError):  # a note cut off by a crash: start again
             return ""
         if not isinstance(known, dict) or known.get("url") != self.url:
             return ""

@@ -100,7 +100,7 @@ def _read(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadInput(f"{path}: cannot be read ({error}); delete it and fetch the data sets again") from None
     if not isinstance(found, dict):
         raise BadInput(f"{path}: not a record of data sets; delete it and fetch the data sets again")

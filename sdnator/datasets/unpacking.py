@@ -7,6 +7,8 @@ that the catalogue expects and written under names of ours, so no path in an arc
 """
 
 import bz2
+import errno
+import lzma
 import re
 import shutil
 import zipfile
@@ -118,7 +120,7 @@ def extract(
                 if member is not None:
                     suffix = ".gz" if member.filename.lower().endswith(".gz") else ""
                     found.append(_extract(archive, file, member, folder / f"{name}{suffix}", progress))
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError, IndexError) as error:
         raise UnpackError(f"{archive}: not a whole zip file ({error}); fetch or copy it again") from None
     return found
 
@@ -153,7 +155,10 @@ def _extract(
             f"{archive}: {member.filename} cannot be unpacked here ({error}); unpack it with unzip or 7z, and give "
             "the file with --from"
         ) from None
-    except (zlib.error, EOFError) as error:
+    except (zlib.error, lzma.LZMAError, EOFError, OSError) as error:
+        # Python's bzip2 says the same of damaged data as the disk of itself, but without a number
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+            raise
         raise UnpackError(
             f"{archive}: {member.filename} is damaged ({error}); fetch the archive again"
         ) from None

@@ -159,6 +159,7 @@ def test_get_reads_the_archive(client: httpx.Client, engine: Engine) -> None:
         "query={",
         'query={"colour":1}',
         "key=a&limit=many",
+        "key=a&limit=--5",
         "query=" + "[" * 9000,
         "query=" + '{"$nor":[' * 900 + "1" + "]}" * 900,
         "key=a&since=" + "9" * 5000,

@@ -1,8 +1,10 @@
 """Captures, tables, labels and settings from anywhere: what they hold, or the one declared error; bounded memory."""
 
 import gzip
+import io
 import struct
 import tracemalloc
+import zipfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from sdnator.capture.packet_sources import CaptureSource
 from sdnator.capture.tshark_tsv import MalformedTsv, TsvError
 from sdnator.config import config_file
 from sdnator.config.config_file import WrongConfiguration
+from sdnator.datasets.unpacking import UnpackError, extract
 from sdnator.replay.survey import survey
 from sdnator.testing.capture_samples import CAPTURES, block, interface, packet, section
 from sdnator.testing.table_samples import LABELS, TSHARK_HEADER, TSHARK_UDP
@@ -27,7 +30,11 @@ MUTATIONS = st.lists(
 NUMBERS = st.sampled_from(
     [b"\xff\xff\xff\xff", b"\x80\0\0\0", b"\0\0\0\x80", b"\xff\xff\xff\x7f", b"\0\0\0\0"]
 )
-QUICK = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+QUICK = settings(
+    max_examples=120,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 
 
 def _mutated(content: bytes, mutations: list[tuple[float, int, bytes]]) -> bytes:
@@ -204,3 +211,45 @@ def test_lines_without_an_end(tmp_path, reader):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 << 20
+
+
+def _zip(method, name="in/capture.pcap"):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", method) as packed:
+        packed.writestr(name, b"abc" * 99)
+    return bytearray(file.getvalue())
+
+
+@pytest.mark.parametrize(
+    ("method", "at", "number"),
+    [
+        (zipfile.ZIP_LZMA, 49, b"\xff" * 4),  # properties of the stream
+        (zipfile.ZIP_BZIP2, 49, b"\xff" * 4),
+        (zipfile.ZIP_STORED, 6, b"\0\x08"),  # the local name in UTF-8, which it is not
+        (zipfile.ZIP_STORED, -59, b"\xff"),  # the version that is needed
+    ],
+)
+def test_zip_files_that_python_reads_in_its_own_way(tmp_path, method, at, number):
+    """Damage of each kind is UnpackError, and no half file stays."""
+    content = _zip(method)
+    if number == b"\xff":
+        at = content.index(b"PK\1\2") + 6
+    content[at : at + len(number)] = number
+    if at == 6:
+        content[30:45] = b"\xff" * 15
+    (tmp_path / "d.zip").write_bytes(content)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(UnpackError):
+        extract(tmp_path / "d.zip", ["capture.pcap"], tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
+
+
+@QUICK
+@given(
+    method=st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]),
+    mutations=MUTATIONS,
+)
+def test_mutated_zip_files(tmp_path, method, mutations):
+    (tmp_path / "d.zip").write_bytes(_mutated(bytes(_zip(method)), mutations))
+    with suppress(UnpackError):
+        extract(tmp_path / "d.zip", ["capture.pcap"], tmp_path)

@@ -4,6 +4,7 @@ Such a switch stamps frames with the time of the replay.  It numbers them, too, 
 which of the capture it is.
 """
 
+import tokenize
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,7 +39,7 @@ class CaptureTimes:
         """
         try:
             found = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError) as error:
             raise CaptureTimesError(f"times of the capture: {path} cannot be read: {error}") from None
         if not isinstance(found, np.ndarray) or found.dtype != np.int64 or found.ndim != 1:
             raise CaptureTimesError(f"times of the capture: {path} is no list of int64")

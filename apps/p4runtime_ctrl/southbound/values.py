@@ -106,7 +106,9 @@ def parse_masked(value: object, mask: object, width: int, *, where: str) -> tupl
 
 
 def shown(value: int, width: int) -> str:
-    """A value as text: MAC and IP addresses by their width, else decimal."""
+    """A value as text: MAC and IP addresses by their width, else decimal; too wide a one, of a switch, as it is."""
+    if value >> width:
+        return hex(value)
     if width == MAC_BITS:
         return ":".join(f"{byte:02x}" for byte in value.to_bytes(6, "big"))
     if width == ADDRESS_BITS:

@@ -137,3 +137,14 @@ def test_padding_and_canonical_values_are_still_read():
     for field in message.metadata:
         field.value = b"\0" * 40 + (field.value or canonical(0))
     assert PacketReader(program(), 0, LossTracker()).read([message]).port.tolist() == [3]
+
+
+@pytest.mark.parametrize("size", [7, 50, 4000])
+@pytest.mark.parametrize("name", ["ingress.smac", "ingress.block_src"])
+def test_an_entry_with_too_wide_a_value_can_be_named(name, size):
+    """What a switch says it holds is shown in answers and logs, whatever it is."""
+    table = program().table(name)
+    entry = p4runtime.TableEntry(table_id=table.id)
+    for field in table.fields:
+        entry.match.add(field_id=field.id).exact.value = b"\xff" * size
+    assert name in program().describe(entry)

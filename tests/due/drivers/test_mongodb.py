@@ -141,13 +141,14 @@ def test_names_that_bson_does_not_take_are_still_found(archive: MongoArchive) ->
 
 
 def test_a_damaged_document_costs_that_document_only(archive: MongoArchive) -> None:
-    archive.insert([Item("a.b", n, n, n, "app", "i", n) for n in range(1, 6)])
+    archive.insert([Item("a.b", n, n, n, "app", "i", n) for n in range(1, 7)])
     table = archive._table()
+    table.update_one({"sequence": {"$eq": 5}}, {"$set": {"payload": 7}})
     table.update_one({"sequence": {"$eq": 2}}, {"$set": {"payload": b"no frame"}})
     table.update_one({"sequence": {"$eq": 3}}, {"$unset": {"instanceId": ""}})
     table.update_one({"sequence": {"$eq": 4}}, {"$set": {"parts": "many"}})
-    assert [item.value for item in archive.find({"dataKey": "a.b"})] == [1, 5]
-    assert [item.value for item in archive.find({"dataKey": "a.b"}, limit=1)] == [5]
+    assert [item.value for item in archive.find({"dataKey": "a.b"})] == [1, 6]
+    assert [item.value for item in archive.find({"dataKey": "a.b"}, limit=1)] == [6]
 
 
 def test_keys_go_a_while_after_their_last_document_and_come_back(

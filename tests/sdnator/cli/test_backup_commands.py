@@ -126,6 +126,12 @@ def test_a_file_that_wants_out_of_its_folder_is_left_alone(home):
     assert not list(home.rglob("evil"))
 
 
+@pytest.mark.parametrize("files", [None, 5, "archive.db", {"a": 1}], ids=str)
+def test_a_manifest_that_names_no_files_restores_none(home, files):
+    packed(home / "b.tar.gz", {"schema": 1, "files": files})
+    assert json.loads(run("restore", home / "b.tar.gz", "--json").stdout)["files"] == {}
+
+
 def test_damaged_files_are_named(home):
     (home / "b.tar.gz").write_bytes(b"\x1f\x8b\x08garbage")
     with pytest.raises(BadInput, match=r"b\.tar\.gz"):

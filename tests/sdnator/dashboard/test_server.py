@@ -17,6 +17,8 @@ from sdnator.dashboard.server import Guard, named_well
         ("board.example.org", True),
         ("evil.example.org:8470", False),
         ("", False),
+        ("[::1", False),
+        ("[:%1]:80", False),
     ],
 )
 def test_names_that_may_be_asked(host, well):
@@ -41,6 +43,7 @@ def asked(kind="http", **headers):
 def test_a_page_of_another_site_reaches_nothing():
     assert asked(host="127.0.0.1:1", origin="http://127.0.0.1:1")[0]["status"] == 200
     assert asked(host="127.0.0.1:1", origin="http://evil.example")[0]["status"] == 403
+    assert asked(host="127.0.0.1:1", origin="http://[::1")[0]["status"] == 403
     assert asked(host="evil.example")[0]["status"] == 403
     assert asked("websocket", host="127.0.0.1:1", origin="http://evil.example")[0]["code"] == 1008
 

@@ -313,5 +313,7 @@ def test_damaged_records_say_what_to_do(tmp_path):
     local_sets.folder().mkdir(parents=True)
     (local_sets.folder() / "mirai.json").write_text("{")
     assert "delete it" in _fail_named("mirai")
+    (local_sets.folder() / "mirai.json").write_text("[" * 5000)
+    assert "delete it" in _fail_named("mirai")
     (local_sets.folder() / "mirai.json").write_text("[1]")
     assert "not a record" in _fail_named("mirai")

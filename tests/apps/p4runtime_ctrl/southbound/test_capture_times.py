@@ -47,6 +47,16 @@ def test_wrong_times_are_refused(tmp_path, held, text):
         CaptureTimes.load(tmp_path / "times.npy")
 
 
+@pytest.mark.parametrize(
+    "head", [b"{'descr': ',i8', 'fortran_order': False, 'shape': (5,), }", b"{'descr': '<i8', ((("]
+)
+def test_a_head_that_is_no_python_is_refused(tmp_path, head):
+    """numpy parses it, and lets the parser's own errors out."""
+    (tmp_path / "times.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head)
+    with pytest.raises(CaptureTimesError, match="cannot be read"):
+        CaptureTimes.load(tmp_path / "times.npy")
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=300))
 def test_any_bytes_are_read_or_refused(tmp_path, data):
