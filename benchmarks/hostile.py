@@ -1,24 +1,28 @@
 """Mutated inputs for every decoder that faces bytes from outside: `python -m benchmarks.hostile --json FILE`.
 
-    [--inputs N] [--seconds S] [--seed S] [--only TARGET …] [--hang S] [--workers N]
+    [--inputs N] [--seconds S] [--seed S] [--only TARGET …] [--hang S] [--workers N] [--no-guided]
 
-Each target attacks one decoder in a child process of its own.  Whatever is raised beside the declared errors, a
-death of the process, a report of a sanitizer, or more than 4 GB is a crash; one input that takes longer than
-`--hang` is a hang.  The same seed makes the same inputs.  Exit code 1 where there are crashes or hangs.
+Each target attacks one decoder in child processes of its own (`hostile_child`), forked from processes that have
+imported the product once (`hostile_worker`).  Whatever is raised beside the declared errors, a death of the process,
+a report of a sanitizer, or more than 4 GB is a crash; one input that takes more than `--hang` CPU seconds is a hang.
+The same seed makes the same inputs, except those that are guided by coverage (with atheris, extra `fuzz`); every
+finding has its input.  Exit code 1 where there are crashes, hangs, or targets whose memory grows.
 """
 
 import argparse
-import math
+import importlib.util
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.hostile_child import Attack, Figures, Job, run_jobs
-from benchmarks.hostile_sanitizers import environment_for
+from benchmarks.hostile_job import Figures
+from benchmarks.hostile_pool import GUIDED, PLAIN, SANITIZED, Attack, Campaign, Kind, Pool, rate
+from benchmarks.hostile_sanitizers import builds, environment, is_sanitized
 from benchmarks.hostile_worker import targets_of
 from benchmarks.measure import machine, table, write_json
 
@@ -28,23 +32,18 @@ MODULES = (
     "benchmarks.hostile_due",
     "benchmarks.hostile_messages",
     "benchmarks.hostile_queries",
+    "benchmarks.hostile_http",
     "benchmarks.hostile_files",
+    "benchmarks.hostile_archives",
     "benchmarks.hostile_switch",
     "benchmarks.hostile_control",
 )
 """Each lists its TARGETS; those with `SANITIZED = True` run with the sanitizers' libraries."""
 INPUTS = 1_000_000
 SECONDS = 600.0
-_TRIAL = 120
-"""Inputs of a target that tell its rate."""
-_TRIAL_SHARE = 0.2
-"""Of the time, for all trials together."""
-_SHARE_OF_TIME = 0.85
-_LEAST = 200
-_MOST_SHARE = 0.05
-"""Of all inputs, for one target: a cheap one must not stand for the others."""
+_MOST_GROWTH_MB = 32.0
+"""Between the first quarter of a run and its end; more counts as memory that is not flat."""
 _MOST_SHOWN = 200
-_ROUNDS = 4
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,10 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         seconds=options.seconds,
         workers=options.workers,
         attack=Attack(options.seed, options.hang),
+        guided=options.guided,
     )
     _show(found)
     write_json(options.json, {**found, "machine": machine()})
-    return int(bool(found["crashes"] or found["hangs"]))
+    return int(bool(found["crashes"] or found["hangs"] or found["grown"]))
 
 
 def _options(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -72,9 +72,12 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         "--only", nargs="+", default=[], metavar="TARGET", help="targets that begin with this"
     )
     parser.add_argument(
-        "--hang", type=float, default=5.0, metavar="S", help="one input that takes longer hangs"
+        "--hang", type=float, default=5.0, metavar="S", help="one input that takes more CPU time hangs"
     )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="child processes at a time")
+    parser.add_argument(
+        "--no-guided", dest="guided", action="store_false", help="nothing by coverage, also where atheris is"
+    )
     return parser.parse_args(argv)
 
 
@@ -94,93 +97,85 @@ def chosen(only: Sequence[str] = (), modules: Sequence[str] = MODULES) -> dict[s
 
 
 def attack_all(
-    targets: Mapping[str, Sequence[str]], *, inputs: int, seconds: float, workers: int, attack: Attack
+    targets: Mapping[str, Sequence[str]],
+    *,
+    inputs: int,
+    seconds: float,
+    workers: int,
+    attack: Attack,
+    guided: bool = False,
 ) -> dict[str, Any]:
     """The figures of the JSON, without the machine."""
     began = time.monotonic()
-    results = {name: Figures() for names in targets.values() for name in names}
-    modules = {name: module for module, names in targets.items() for name in names}
-    trial = min(_TRIAL, max(1, inputs // max(1, len(results))))
-    longest = seconds * max(1, workers) * _TRIAL_SHARE / max(1, len(results))
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        plan = [
-            (module, [Job(name, 0, trial, longest) for name in names]) for module, names in targets.items()
-        ]
-        for _ in range(_ROUNDS + 1):
-            left = seconds - (time.monotonic() - began)
-            if left <= 0 or not plan:
-                break
-            made = [(module, jobs, attack, left) for module, jobs in plan]
-            for (_, jobs), figures in zip(plan, pool.map(_run, made), strict=True):
-                for job, one in zip(jobs, figures, strict=True):
-                    _add(results[job.target], one)
-            left = seconds - (time.monotonic() - began)
-            counts = shares(results, inputs, left * max(1, workers) * _SHARE_OF_TIME)
-            # the longest first, so that no worker is left alone with it
-            slow = sorted(counts, key=lambda name: counts[name] / _rate(results[name]), reverse=True)
-            plan = [(modules[name], [Job(name, results[name].inputs, counts[name])]) for name in slow]
-    return _figures(results, attack.seed, time.monotonic() - began)
-
-
-def _run(work: tuple[str, Sequence[Job], Attack, float]) -> list[Figures]:
-    module, jobs, attack, seconds = work
-    print(f"{', '.join(f'{job.target} {job.count:,}' for job in jobs)[:150]}", file=sys.stderr, flush=True)
-    return run_jobs(module, jobs, Attack(attack.seed, attack.hang_s, environment_for(module)), seconds)
-
-
-def _rate(figures: Figures) -> float:
-    return max(0.1, figures.inputs / max(figures.seconds, 1e-6))
-
-
-def shares(results: Mapping[str, Figures], inputs: int, seconds: float) -> dict[str, int]:
-    """How many inputs each target gets of those that are left: fast ones more, as much as the time asks for.
-
-    Args:
-        results: with inputs and seconds so far.
-        inputs: of all targets together, those included that were made already.
-        seconds: of one process, that are left.
-    """
-    missing = inputs - sum(one.inputs for one in results.values())
-    if missing <= 0 or seconds <= 0:
-        return {}
-    rates = {name: _rate(one) for name, one in results.items() if one.inputs}
-    counts: dict[str, int] = {}
-    for power in range(5, 21):
-        weights = {name: rate ** (power / 10) for name, rate in rates.items()}
-        whole = math.fsum(weights.values())
-        most = max(_LEAST, round(inputs * _MOST_SHARE), round(missing / len(rates)))
-        counts = {
-            name: min(most, max(_LEAST, round(missing * weight / whole))) for name, weight in weights.items()
+    kinds = {
+        name: SANITIZED if is_sanitized(module) else PLAIN
+        for module, names in targets.items()
+        for name in names
+    }
+    modules = {
+        kind: [each for each in targets if is_sanitized(each) == (kind == SANITIZED)]
+        for kind in (PLAIN, SANITIZED)
+    }
+    by_coverage = [name for name, kind in kinds.items() if kind == PLAIN and guided and _has_atheris()]
+    with ThreadPoolExecutor(1) as builder:
+        # at once, beside the other targets: it takes longer than most of them
+        built = builder.submit(builds) if modules[SANITIZED] else None
+        makers: dict[str, Callable[[], Kind]] = {
+            PLAIN: partial(Kind, modules[PLAIN]),
+            GUIDED: partial(Kind, modules[PLAIN], guided=True),
         }
-        if sum(count / rates[name] for name, count in counts.items()) <= seconds:
-            break
-    return counts
+        if built is not None:
+            makers[SANITIZED] = lambda: Kind(modules[SANITIZED], environment(built.result()[0]))
+        pool = Pool(kinds, makers, workers)
+        try:
+            campaign = Campaign(
+                pool, list(kinds), attack, guided=by_coverage, inputs=inputs, seconds=seconds, workers=workers
+            )
+            campaign.run()
+        finally:
+            pool.close()
+        build_s = built.result()[1] if built else 0.0
+    return _figures(campaign.results, attack.seed, time.monotonic() - began, build_s)
 
 
-def _add(whole: Figures, part: Figures) -> None:
-    whole.inputs += part.inputs
-    whole.crashes += part.crashes
-    whole.hangs += part.hangs
-    whole.seconds += part.seconds
-    # of the longest run: a short one shows what is made once
-    whole.rss_growth_mb = part.rss_growth_mb
-    whole.findings += part.findings
+def _has_atheris() -> bool:
+    if importlib.util.find_spec("atheris") is not None:
+        return True
+    print("atheris is not installed (extra `fuzz`): no inputs are guided by coverage", file=sys.stderr)
+    return False
 
 
-def _figures(results: Mapping[str, Figures], seed: int, seconds: float) -> dict[str, Any]:
+def _figures(results: Mapping[str, Figures], seed: int, seconds: float, build_s: float) -> dict[str, Any]:
     targets = {
         name: {
             "inputs": one.inputs,
+            "guided": one.guided,
             "crashes": one.crashes,
             "hangs": one.hangs,
-            "rss_growth_mb": round(one.rss_growth_mb, 2),
-            "inputs_per_s": round(_rate(one), 1),
+            "rss_first_mb": round(one.rss_first_mb, 1),
+            "rss_last_mb": round(one.rss_last_mb, 1),
+            "peak_mb": round(one.peak_mb, 1),
+            "inputs_per_s": round(rate(one), 1),
+            "cpu_s": round(one.cpu_s, 2),
         }
         for name, one in results.items()
     }
-    totals = {what: sum(one[what] for one in targets.values()) for what in ("inputs", "crashes", "hangs")}
-    findings = [finding for one in results.values() for finding in _distinct(one.findings)]
-    return {**totals, "targets": targets, "seed": seed, "seconds": round(seconds, 1), "findings": findings}
+    totals = {
+        what: sum(one[what] for one in targets.values()) for what in ("inputs", "guided", "crashes", "hangs")
+    }
+    cpu_s = sum(one.cpu_s for one in results.values())
+    grown = [name for name, one in results.items() if one.rss_last_mb - one.rss_first_mb > _MOST_GROWTH_MB]
+    return {
+        **totals,
+        "grown": grown,
+        "targets": targets,
+        "seed": seed,
+        "seconds": round(seconds, 1),
+        "cpu_s": round(cpu_s, 2),
+        "inputs_per_cpu_s": round(totals["inputs"] / max(cpu_s, 1e-6), 1),
+        "sanitizer_builds_s": round(build_s, 1),
+        "findings": [finding for one in results.values() for finding in _distinct(one.findings)],
+    }
 
 
 def _distinct(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -193,14 +188,30 @@ def _distinct(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _show(found: Mapping[str, Any]) -> None:
     rows = [[name, *one.values()] for name, one in found["targets"].items()]
-    table(["target", "inputs", "crashes", "hangs", "RSS growth MB", "inputs/s"], rows)
+    table(
+        [
+            "target",
+            "inputs",
+            "guided",
+            "crashes",
+            "hangs",
+            "first MB",
+            "last MB",
+            "peak MB",
+            "inputs/s",
+            "CPU s",
+        ],
+        rows,
+    )
     for one in found["findings"]:
         print(
             f"\n{one['target']} input {one['index']}: {one['kind']}: {one['error']}\n  {one['input'][:_MOST_SHOWN]}"
         )
         print(one["traceback"])
     print(
-        f"\n{found['inputs']:,} inputs, {found['crashes']} crashes, {found['hangs']} hangs, {found['seconds']} s"
+        f"\n{found['inputs']:,} inputs ({found['guided']:,} guided), {found['crashes']} crashes, {found['hangs']} hangs, "
+        f"{len(found['grown'])} grow; {found['seconds']} s, {found['cpu_s']} CPU s "
+        f"({found['inputs_per_cpu_s']:,.0f} inputs a CPU second), builds {found['sanitizer_builds_s']} s"
     )
 
 

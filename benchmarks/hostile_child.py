@@ -1,196 +1,228 @@
-"""One child process that attacks decoders, watched: it is killed where it hangs or grows, and started again behind."""
+"""The loop that attacks one decoder, in a child process that may die or hang.
 
+    child ── memory shared with its parent: index, counts, memory, the input itself ──► parent
+          └─ findings and the last words: files without a name ─────────────────────────┘
+
+Nothing is sent for each input.  The parent looks at the shared memory now and then.
+"""
+
+import faulthandler
+import gc
 import json
+import mmap
 import os
-import signal
-import subprocess
-import sys
-import tempfile
+import random
+import struct
+import threading
 import time
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import traceback
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, Any
 
-from benchmarks.hostile_worker import PLACE, targets_of
+from benchmarks.hostile_job import Job
+from benchmarks.hostile_mutation import mutate_bytes
+from benchmarks.hostile_target import DecoderTarget
 
-_LOOK_S = 0.05
-_START_S = 600.0
-"""For imports, and for what a target prepares with its first input."""
-_MOST_RESIDENT = 4 << 30
+_HEAD = struct.Struct("<QQQQQ")
+_SAMPLE = struct.Struct("<Q")
+_MOST_SAMPLES = 64
+_DATA_AT = _HEAD.size + _SAMPLE.size * _MOST_SAMPLES
+_MOST_DATA = 1 << 20
+"""Bytes of an input that are shown of one that kills."""
+_MOST_FINDINGS = 50
+"""Of one job in full; more of them are counted only."""
+_MOST_CORPUS = 64
+_LARGEST_OF_CORPUS = 1 << 14
 _PAGE = os.sysconf("SC_PAGE_SIZE")
-_TAIL = 6000
-_MOST_RESTARTS = 20
-"""Of one job: a target that dies so often is no use to attack further."""
 
 
-@dataclass
-class Figures:
-    """What became of one job."""
+class Place:
+    """Memory that the child writes and its parent reads, also after the child's death."""
 
-    inputs: int = 0
-    crashes: int = 0
-    hangs: int = 0
-    seconds: float = 0.0
-    rss_growth_mb: float = 0.0
-    findings: list[dict[str, Any]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._memory = mmap.mmap(-1, _DATA_AT + _MOST_DATA)
 
+    def begin(self, index: int, done: int, data: bytes) -> None:
+        """The input that is tried now, and how many are done."""
+        kept = data[:_MOST_DATA]
+        self._memory[_DATA_AT : _DATA_AT + len(kept)] = kept
+        _HEAD.pack_into(self._memory, 0, index, done, self.crashes, len(kept), self.samples)
 
-@dataclass(frozen=True)
-class Job:
-    """Inputs `first` to `first + count` of one target."""
+    def end(self, done: int) -> None:
+        """All is done: no input is under way."""
+        _HEAD.pack_into(self._memory, 0, 0, done, self.crashes, 0, self.samples)
 
-    target: str
-    first: int
-    count: int
-    seconds: float = 1e9
-    """It stops after these, however many inputs are left."""
+    crashes = 0
+    samples = 0
 
+    def sample(self, resident: int) -> None:
+        """Bytes in memory now; every other sample is dropped where there are too many."""
+        if self.samples == _MOST_SAMPLES:
+            kept = self.resident()[::2]
+            self.samples = 0
+            for one in kept:
+                self.sample(one)
+        _SAMPLE.pack_into(self._memory, _HEAD.size + self.samples * _SAMPLE.size, resident)
+        self.samples += 1
 
-@dataclass(frozen=True)
-class Attack:
-    """What all children share."""
+    def resident(self) -> list[int]:
+        """The samples so far."""
+        return [
+            _SAMPLE.unpack_from(self._memory, _HEAD.size + number * _SAMPLE.size)[0]
+            for number in range(self.samples)
+        ]
 
-    seed: int
-    hang_s: float
-    environment: Mapping[str, str] = field(default_factory=dict)
+    def read(self) -> tuple[int, int, int, bytes, list[int]]:
+        """Index, inputs done, crashes, the input that is tried, samples of memory; for the parent."""
+        index, done, crashes, size, self.samples = _HEAD.unpack_from(self._memory)
+        return index, done, crashes, self._memory[_DATA_AT : _DATA_AT + size], self.resident()
 
+    def moved(self) -> bytes:
+        """Differs as soon as another input is tried."""
+        return self._memory[:16]
 
-def run_jobs(module: str, jobs: Sequence[Job], attack: Attack, seconds: float) -> list[Figures]:
-    """Attack in a child process, in another one where it dies or hangs; figures in the order of the jobs.
-
-    Args:
-        module: where the targets are listed.
-        jobs: in their order.
-        attack: seed, and seconds after which one input hangs.
-        seconds: for all jobs together; what is not done then is left undone.
-    """
-    found = [Figures() for _ in jobs]
-    left, end = list(jobs), time.monotonic() + seconds
-    restarts, number = 0, 0
-    while number < len(jobs) and time.monotonic() < end:
-        stopped = _Child(module, left[number:], attack, end - time.monotonic()).watch(found[number:])
-        if stopped is None:
-            break
-        number, restarts = (number + stopped.job, 0) if stopped.job else (number, restarts + 1)
-        job = left[number]
-        left[number] = replace(job, first=stopped.index + 1, count=job.first + job.count - stopped.index - 1)
-        if left[number].count <= 0 or restarts >= _MOST_RESTARTS:
-            number, restarts = number + 1, 0
-    return found
+    def close(self) -> None:
+        """Give the memory back."""
+        self._memory.close()
 
 
-@dataclass(frozen=True)
-class _Stopped:
-    job: int
-    index: int
+class Attacker:
+    """The loop, in the child."""
+
+    def __init__(self, target: DecoderTarget, job: Job, place: Place, out: IO[bytes]) -> None:
+        self._target, self._job, self._place, self._out = target, job, place, out
+        self._in_threads: list[BaseException] = []
+        self._done = 0
+        self._next_sample = 0.0
+        self._pause = 0.0
+        threading.excepthook = self._thread_died
+
+    def run(self) -> None:
+        """One block of inputs after another, each from target, seed and index alone."""
+        job = self._job
+        target = self._target
+        if job.corpus:
+            target = target._replace(seeds=(*target.seeds, *map(bytes.fromhex, job.corpus)))
+        genuine = len(self._target.seeds)
+        end = time.process_time() + job.seconds
+        for index in range(job.first, job.first + job.count):
+            if self._done and (time.process_time() > end or time.monotonic() > job.until):
+                break
+            # the genuine ones are the first, however many others were found
+            self._try(index, (self._target if index < genuine else target).input(job.seed, index))
+            if self._done == 1 and job.seconds < 1e9:
+                # what is prepared once does not count
+                end = time.process_time() + job.seconds
+        self._place.sample(resident())
+        self._place.end(self._done)
+
+    def guided(self, folder: Path) -> None:
+        """The same with libFuzzer's choice of what to mutate; inputs that reach new code are told at the end."""
+        import atheris
+
+        corpus, seeds = folder / "corpus", folder / "seeds"
+        for each in (corpus, seeds):
+            each.mkdir(exist_ok=True)
+            for old in each.iterdir():
+                old.unlink()
+        for number, seed in enumerate(self._target.seeds):
+            (seeds / str(number)).write_bytes(seed)
+        largest = max(4096, *(2 * len(seed) for seed in self._target.seeds))
+        job = self._job
+        count, end = job.count, time.process_time() + job.seconds
+
+        def one(data: bytes) -> None:
+            if self._done >= count or time.process_time() > end or time.monotonic() > job.until:
+                self._tell_corpus(corpus)
+                self._place.sample(resident())
+                self._place.end(self._done)
+                os._exit(0)
+            self._try(self._done, data)
+
+        atheris.Setup(
+            ["hostile", f"-seed={job.seed}", f"-max_len={largest}", "-rss_limit_mb=0", "-timeout=1000000",
+             "-verbosity=0", "-handle_abrt=0", "-handle_segv=0", str(corpus), str(seeds)],
+            one,
+            # looked up with each call: Setup exchanges it
+            custom_mutator=_mutator(self._target, lambda data, most: atheris.Mutate(data, most)),  # noqa: PLW0108
+        )  # fmt: skip
+        faulthandler.enable()
+        atheris.Fuzz()
+
+    def _tell_corpus(self, folder: Path) -> None:
+        found = [path.read_bytes() for path in sorted(folder.iterdir())]
+        chosen = sorted((one for one in found if len(one) <= _LARGEST_OF_CORPUS), key=len)
+        step = max(1, len(chosen) // _MOST_CORPUS)
+        self._tell({"corpus": [one.hex() for one in chosen[::step][:_MOST_CORPUS]]})
+
+    def _try(self, index: int, data: bytes) -> None:
+        place = self._place
+        place.begin(index, self._done, data)
+        try:
+            self._target.attack(data)
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # noqa: BLE001 - also a panic of a compiled library
+            self._note(index, data, error)
+        while self._in_threads:
+            self._note(index, data, self._in_threads.pop())
+        self._done += 1
+        now = time.monotonic()
+        if now >= self._next_sample:
+            place.sample(resident())
+            # collecting garbage for it must not take more than a small part of the time
+            self._pause = max(0.2, 20 * (time.monotonic() - now))
+            self._next_sample = time.monotonic() + self._pause
+
+    def _note(self, index: int, data: bytes, error: BaseException) -> None:
+        self._place.crashes += 1
+        if self._place.crashes <= _MOST_FINDINGS:
+            self._tell({"finding": finding(self._target.name, index, data, error)})
+
+    def _tell(self, line: dict[str, Any]) -> None:
+        self._out.write(json.dumps(line).encode() + b"\n")
+        self._out.flush()
+
+    def _thread_died(self, died: threading.ExceptHookArgs) -> None:
+        error = died.exc_value
+        if error is not None:
+            trace: TracebackType | None = died.exc_traceback
+            self._in_threads.append(error.with_traceback(trace))
 
 
-class _Child:
-    def __init__(self, module: str, jobs: Sequence[Job], attack: Attack, seconds: float) -> None:
-        self._module, self._jobs, self._attack, self._seconds = module, jobs, attack, seconds
+def _mutator(
+    target: DecoderTarget, libfuzzer: Callable[[bytes, int], bytes]
+) -> Callable[[bytes, int, int], bytes]:
+    def mutate(data: bytes, most: int, seed: int) -> bytes:
+        chance = random.Random(seed)
+        if chance.random() < 0.4:
+            return libfuzzer(data, most)
+        try:
+            return target.mutate(chance, (data, *target.seeds) if data else target.seeds)[:most]
+        except Exception:  # noqa: BLE001 - the structure of damaged data cannot always be changed
+            return mutate_bytes(chance, (data, *target.seeds))[:most]
 
-    def watch(self, figures: Sequence[Figures]) -> _Stopped | None:
-        """Until it ends; where it did not end well, at which input."""
-        with tempfile.TemporaryDirectory(prefix="hostile-") as made:
-            folder = Path(made)
-            progress = folder / "progress"
-            progress.write_bytes(PLACE.pack(0, self._jobs[0].first))
-            with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
-                process = self._started(progress, out, err, folder)
-                began = time.monotonic()
-                cause = self._wait(process, progress)
-                seconds = time.monotonic() - began
-            place = PLACE.unpack(progress.read_bytes())
-            self._collect(folder / "out", figures)
-            if process.returncode == 0:
-                return None
-            stopped = _Stopped(*place)
-            words = (folder / "err").read_bytes()[-_TAIL:].decode(errors="replace")
-            self._note(stopped, cause or _ending(process.returncode), words, figures, seconds)
-            return stopped
-
-    def _started(self, progress: Path, out: Any, err: Any, folder: Path) -> subprocess.Popen[bytes]:
-        jobs = [json.dumps([job.target, job.first, job.count, job.seconds]) for job in self._jobs]
-        command = [sys.executable, "-m", "benchmarks.hostile_worker", self._module, str(self._attack.seed)]
-        environment = {
-            **os.environ,
-            **self._attack.environment,
-            "TMPDIR": str(folder),
-            "PYTHONFAULTHANDLER": "1",
-        }
-        return subprocess.Popen(
-            [*command, str(self._seconds), str(progress), *jobs], stdout=out, stderr=err, env=environment
-        )
-
-    def _wait(self, process: subprocess.Popen[bytes], progress: Path) -> str:
-        """Why it was killed; empty where it ended by itself."""
-        seen, since = b"", time.monotonic()
-        while process.poll() is None:
-            time.sleep(_LOOK_S)
-            now, place = time.monotonic(), progress.read_bytes()
-            if place != seen:
-                seen, since = place, now
-            job, index = PLACE.unpack(place)
-            first = index == self._jobs[job].first
-            cause = ""
-            if now - since > (_START_S if first else self._attack.hang_s):
-                cause = "hang"
-            elif _resident(process.pid) > _MOST_RESIDENT:
-                cause = "memory"
-            if cause:
-                process.send_signal(signal.SIGABRT)  # faulthandler tells where it is
-                try:
-                    process.wait(5)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
-                return cause
-        return ""
-
-    def _collect(self, out: Path, figures: Sequence[Figures]) -> None:
-        numbers = {job.target: number for number, job in enumerate(self._jobs)}
-        shown: Counter[int] = Counter()
-        for line in out.read_text().splitlines(keepends=True):
-            if not line.endswith("\n"):
-                break  # it was killed while it wrote
-            told = json.loads(line)
-            if "finding" in told:
-                number = numbers[told["finding"]["target"]]
-                mine, shown[number] = figures[number], shown[number] + 1
-                mine.findings.append(told["finding"])
-                mine.crashes += 1
-            else:
-                one = told["figures"]
-                mine = figures[one["job"]]
-                mine.inputs += one["done"]
-                mine.seconds += one["seconds"]
-                mine.rss_growth_mb = max(mine.rss_growth_mb, one["rss_growth_mb"])
-                mine.crashes += one["crashes"] - shown[one["job"]]
-
-    def _note(
-        self, stopped: _Stopped, cause: str, words: str, figures: Sequence[Figures], seconds: float
-    ) -> None:
-        job, mine = self._jobs[stopped.job], figures[stopped.job]
-        target = next(each for each in targets_of(self._module) if each.name == job.target)
-        mine.inputs += stopped.index - job.first + 1
-        mine.seconds += seconds
-        mine.hangs += cause == "hang"
-        mine.crashes += cause != "hang"
-        data = target.input(self._attack.seed, stopped.index)
-        shown = {"kind": "hang" if cause == "hang" else "death", "error": cause, "where": cause}
-        mine.findings.append(
-            {"target": job.target, "index": stopped.index, **shown, "input": data.hex(), "traceback": words}
-        )
+    return mutate
 
 
-def _resident(pid: int) -> int:
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
-    except (OSError, IndexError, ValueError):
-        return 0
+def finding(target: str, index: int, data: bytes, error: BaseException) -> dict[str, Any]:
+    """What came out of a decoder and should not."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    return {
+        "target": target,
+        "index": index,
+        "kind": "exception",
+        "error": f"{type(error).__name__}: {error}"[:500],
+        "where": where,
+        "input": data.hex(),
+        "traceback": "".join(traceback.format_exception(error))[-4000:],
+    }
 
 
-def _ending(code: int) -> str:
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+def resident() -> int:
+    """Bytes of this process in memory, garbage not counted."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE

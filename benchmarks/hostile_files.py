@@ -50,13 +50,16 @@ _NOW = 1_700_000_000_000_000_000
 
 
 @cache
-def _folder() -> Path:
+def temporary_folder() -> Path:
+    """One for all targets of this process."""
     return Path(tempfile.mkdtemp(prefix="hostile-"))
 
 
-def _in_file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], object]:
+def in_file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], object]:
+    """A decoder of files as one of bytes."""
+
     def decode(data: bytes) -> object:
-        path = _folder() / name
+        path = temporary_folder() / name
         path.write_bytes(data)
         return read(path)
 
@@ -105,7 +108,7 @@ _SETTINGS = (
     msgspec.json.encode(Options()),
 )
 _TOML = (
-    b'[firewall]\ndry_run = true\n[[switches]]\nname = "s1"\nports = ["1=a", "2=b"]\n',
+    b'[firewall.rules]\ndry_run = true\n[[switches]]\nname = "s1"\nports = ["1=null", "2=veth:b"]\n',
     b"[kitsune]\nfm_grace = 5000\nthreshold = 1.5\n",
 )
 
@@ -128,13 +131,13 @@ def _flows(path: Path) -> None:
 def _model_bytes() -> bytes:
     network = KitNet(WIDTH, fm_grace=120, ad_grace=120, max_ae=10, clip=0.0, kernel=load_kernel())
     network.process(np.random.default_rng(1).normal(size=(300, WIDTH)))
-    path = _folder() / "genuine.npz"
+    path = temporary_folder() / "genuine.npz"
     save_model(path, network, {"senders": [], "trained_at_us": 5})
     return path.read_bytes()
 
 
 def _run_file(data: bytes) -> None:
-    folder = _folder()
+    folder = temporary_folder()
     if not hasattr(_run_file, "lock"):
         (folder / "run.lock").write_text(str(os.getpid()))
         lock = os.open(folder / "run.lock", os.O_RDWR)
@@ -149,8 +152,8 @@ def _run_bytes() -> bytes:
         pid=1, started=_NOW, updates="redis://127.0.0.1:1", archive="sqlite:////a.db", coordinator="http://127.0.0.1:2",
         switch={"name": "s1", "ports": [1]}, parts={"kitsune": 7}, health={"kitsune": {"state": "running"}},
     )  # fmt: skip
-    write(_folder(), running)
-    return (_folder() / "run.json").read_bytes()
+    write(temporary_folder(), running)
+    return (temporary_folder() / "run.json").read_bytes()
 
 
 _FRAME = PackedFrame("a.b.app", "app", "i", 1, 1, _NOW, _NOW, _NOW, _NOW, False, FRAMES[1])
@@ -159,7 +162,7 @@ _SPOOLED = msgspec.msgpack.encode(_FRAME)
 
 @cache
 def _spool() -> DiskSpool:
-    return DiskSpool(_folder(), 1 << 24)
+    return DiskSpool(temporary_folder(), 1 << 24)
 
 
 def _spool_row(data: bytes) -> list[PackedFrame]:
@@ -171,7 +174,7 @@ def _spool_row(data: bytes) -> list[PackedFrame]:
 
 
 def _spool_file(data: bytes) -> None:
-    folder = _folder() / "spools"
+    folder = temporary_folder() / "spools"
     folder.mkdir(exist_ok=True)
     for path in folder.iterdir():
         path.unlink()
@@ -187,7 +190,7 @@ def _spool_file(data: bytes) -> None:
 
 @cache
 def _spool_bytes() -> bytes:
-    folder = _folder() / "genuine"
+    folder = temporary_folder() / "genuine"
     spool = DiskSpool(folder, 1 << 20)
     spool.put([_FRAME] * 5)
     spool.close()
@@ -199,7 +202,7 @@ _ITEMS = [Item("a.b.app", {"n": n}, _NOW + n, _NOW + n, "app", "i", n) for n in 
 
 @cache
 def _archive() -> tuple[SqliteArchive, sqlite3.Connection]:
-    path = _folder() / "rows.db"
+    path = temporary_folder() / "rows.db"
     archive = SqliteArchive(f"sqlite://{path}")
     archive.insert(_ITEMS)
     return archive, sqlite3.connect(path, isolation_level=None)
@@ -213,8 +216,8 @@ def _archive_row(data: bytes) -> list[Item]:
 
 
 def _archive_file(data: bytes) -> None:
-    path = _folder() / "archive.db"
-    for each in _folder().glob("archive.db*"):
+    path = temporary_folder() / "archive.db"
+    for each in temporary_folder().glob("archive.db*"):
         each.unlink()
     path.write_bytes(data)
     archive = SqliteArchive(f"sqlite://{path}")
@@ -228,7 +231,7 @@ def _archive_file(data: bytes) -> None:
 
 @cache
 def _archive_bytes() -> bytes:
-    path = _folder() / "genuine.db"
+    path = temporary_folder() / "genuine.db"
     archive = SqliteArchive(f"sqlite://{path}")
     archive.insert(_ITEMS)
     archive.close()
@@ -240,20 +243,20 @@ _FLOWS = tuple(text.encode("latin-1") for text in (ZEEK, BINETFLOW, CICFLOWMETER
 _TRUSTED = f"# mine\n{'ab' * 32} a program\n{'cd' * 32}\n".encode()
 
 TARGETS = (
-    DecoderTarget("capture", _in_file("c", _capture), (CaptureError,), _both(tuple(CAPTURES.values()))),
-    DecoderTarget("tshark table", _in_file("t", _table), (TsvError,), _both((_TSV,)), mutate_text),
+    DecoderTarget("capture", in_file("c", _capture), (CaptureError,), _both(tuple(CAPTURES.values()))),
+    DecoderTarget("tshark table", in_file("t", _table), (TsvError,), _both((_TSV,)), mutate_text),
     DecoderTarget(
         "labels",
-        _in_file("l", read_labels),
+        in_file("l", read_labels),
         (LabelsError,),
         _both(tuple(text.encode() for text in LABELS.values())),
         mutate_text,
     ),
-    DecoderTarget("flow table", _in_file("f", _flows), (FlowTableError,), _both(_FLOWS), mutate_text),
-    DecoderTarget("settings file", _in_file("s", _settings), (InvalidOption,), _SETTINGS, mutate_json),
-    DecoderTarget("sdnator.toml", _in_file("sdnator.toml", _toml), (WrongConfiguration,), _TOML, mutate_text),
-    DecoderTarget("trusted programs", _in_file("p", read_trusted), (TrustError,), (_TRUSTED,), mutate_text),
-    DecoderTarget("kitsune model", _in_file("m", load_model), (ModelFileError,), (_model_bytes(),)),
+    DecoderTarget("flow table", in_file("f", _flows), (FlowTableError,), _both(_FLOWS), mutate_text),
+    DecoderTarget("settings file", in_file("s", _settings), (InvalidOption,), _SETTINGS, mutate_json),
+    DecoderTarget("sdnator.toml", in_file("sdnator.toml", _toml), (WrongConfiguration,), _TOML, mutate_text),
+    DecoderTarget("trusted programs", in_file("p", read_trusted), (TrustError,), (_TRUSTED,), mutate_text),
+    DecoderTarget("kitsune model", in_file("m", load_model), (ModelFileError,), (_model_bytes(),)),
     DecoderTarget("run file", _run_file, (BadInput,), (_run_bytes(),), mutate_json),
     DecoderTarget("spool row", _spool_row, (BackendError,), (_SPOOLED,)),
     DecoderTarget("spool file", _spool_file, (BackendError,), (_spool_bytes(),)),

@@ -86,16 +86,16 @@ def _target(app: str, key: str, decode: Decode, *values: Any) -> DecoderTarget:
 
 
 _SENDER = Sender(switch="s1", port=3, mac="aa:bb:cc:dd:ee:ff", ip="10.0.0.1")
-_ALERT = Alert(
+ALERT = Alert(
     id="a1", sender=_SENDER, event_time=_NOW, first_packet=7, packets=9, over=8, peak_score=2.5,
     anomalous_seconds=3, rate=9.0, training_rate=1.0, mac_addresses=1, reason="many",
 )  # fmt: skip
 _TARGET = Target(kind="ip", address="10.0.0.0/8")
-_DECISION = Decision(
+DECISION = Decision(
     id="d1", action="block", switch="s1", target=_TARGET, reason="anomalous", event_time=_NOW, expires=_NOW + 1,
     evidence=(Exhibit(key="network.anomaly.kitsune.alert", timestamp=_NOW, summary="3 of 10"),),
 )  # fmt: skip
-_CONFIRMATION = Confirmation(
+CONFIRMATION = Confirmation(
     id="d1", switch="s1", state="installed", action="block", target=_TARGET, handle="t[a=1]", event_time=_NOW
 )
 _COMMAND = TableCommand(
@@ -110,7 +110,7 @@ _COMMAND = TableCommand(
     ),
 )
 _INSTRUCTION = Instruction(id="i1", verb="block", subject="10.0.0.1", reason="mine", seconds=60)
-_STATE = {
+STATE = {
     "switch": "s1", "primary": True, "event_time": _NOW, "base_us": _NOW // 1000,
     "blocks": [{"id": "d1", "packets": 5}], "change": "primary",
 }  # fmt: skip
@@ -119,6 +119,15 @@ _TRAINING = TrainingState(packets=9, wanted=10, done=False, seconds=60.0, sender
 _BASELINE = CountBaseline(
     text="query ddos", low=11, newcomer=20.0, middle=12.0, highest={"10.0.0.1": 12.0}, event_time=_NOW
 )
+_EVIDENCE = {
+    "id": "e1", "kind": "scan", "source": "contacts", "sender": _SENDER.to_value(), "victims": ["10.0.0.2"],
+    "victim_count": 1, "service": "tcp/22", "packets": 9, "text": "9 failed", "nats": 9.5, "since": _NOW, "event_time": _NOW + 5,
+}  # fmt: skip
+INCIDENT = {
+    "id": "i1", "kind": "scan", "change": "opened", "attacker_text": "192.0.2.66", "begun": _NOW, "last": _NOW + 20,
+    "event_time": _NOW + 20, "victims": ["192.0.2.1"], "attacker": _SENDER.to_value(), "nats": 12.0,
+    "actions": [{"remedy": "block", "since": _NOW + 1, "effective": _NOW + 7}],
+}  # fmt: skip
 _QUESTIONS = RecordBatch({name: np.arange(4).astype(kind) for name, kind in controller.QUESTION.items()})
 _SEND = {"port": [1, 2], "length": [3, 4], "frames": b"abcdefg"}
 
@@ -149,17 +158,17 @@ _PROGRAM = ProgramInfo.from_text(find().p4info.read_text(encoding="utf-8"))
 _OUTS = PacketOuts(_PROGRAM, _NOW // 1000)
 
 
-def entries_in(item: Item) -> list[Any]:
+def command_in(item: Item) -> list[Any]:
     """A command, and the entries that it means."""
     return [_PROGRAM.entry(update) for update in controller.command_in(item).updates]
 
 
-def send_in(item: Item) -> list[Any]:
+def frames_in(item: Item) -> list[Any]:
     """Frames for a switch, as packet-outs."""
     return _OUTS.frames(controller.frames_in(item))
 
 
-def ask_in(item: Item) -> object:
+def questions_in(item: Item) -> object:
     """A request for cells, as packet-outs."""
     return _OUTS.questions(controller.questions_in(item))
 
@@ -184,14 +193,14 @@ _PACKETS = packets()
 _SWITCH_KEY = "network.switch.p4runtime_ctrl.s1"
 
 TARGETS = (
-    _target("firewall", "network.anomaly.kitsune.alert", firewall.alert_in, _ALERT.to_value()),
+    _target("firewall", "network.anomaly.kitsune.alert", firewall.alert_in, ALERT.to_value()),
     _target(
         "firewall",
         "network.confirmation.p4runtime_ctrl.s1",
         firewall.confirmation_in,
-        _CONFIRMATION.to_value(),
+        CONFIRMATION.to_value(),
     ),
-    _target("firewall", "network.block.firewall.ipv4", firewall.decision_in, _DECISION.to_value()),
+    _target("firewall", "network.block.firewall.ipv4", firewall.decision_in, DECISION.to_value()),
     _target("firewall", "network.p4_command.firewall.s1", firewall.command_in, _COMMAND.to_value()),
     _target("firewall", "network.instruction.cli.firewall", firewall.instruction_in, _INSTRUCTION.to_value()),
     _target(
@@ -200,7 +209,7 @@ TARGETS = (
         firewall.answer_in,
         Answer(id="i1", done=True, text="x").to_value(),
     ),
-    _target("firewall", _SWITCH_KEY, firewall.state_in, _STATE),
+    _target("firewall", _SWITCH_KEY, firewall.state_in, STATE),
     _target(
         "firewall",
         "network.handshake.sonata.tcp",
@@ -216,14 +225,21 @@ TARGETS = (
     _target("firewall", "network.traffic_capture.sonata.tcp", firewall.syns_in, _PACKETS),
     _target("firewall", "network.traffic_capture.sonata.tcp", firewall.syn_acks_in, _PACKETS),
     _target("firewall", "network.traffic_capture.sonata.arp", firewall.arps_in, _PACKETS),
+    _target("firewall", "network.evidence.kitsune.contacts", firewall.spoken_in, _EVIDENCE),
+    _target("firewall", "network.training.kitsune", firewall.training_in, _TRAINING.to_value()),
+    _target("firewall", "network.incident.firewall.scan", firewall.incident_in, INCIDENT),
+    _target("kitsune", _SWITCH_KEY, kitsune.tick_in, STATE),
+    _target(
+        "controller", "network.clock.replay.s1", controller.clock_in, {"switch": "s1", "event_time": _NOW}
+    ),
     _target("kitsune", "network.packets.p4runtime_ctrl.s1.all", kitsune.packets_in, _PACKETS),
-    _target("kitsune", "network.block.firewall.ipv4", kitsune.decision_in, _DECISION.to_value()),
-    _target("controller", "network.block.firewall.ipv4", controller.decision_in, _DECISION.to_value()),
-    _target("controller", "network.p4_command.app.s1", entries_in, _COMMAND.to_value()),
+    _target("kitsune", "network.block.firewall.ipv4", kitsune.decision_in, DECISION.to_value()),
+    _target("controller", "network.block.firewall.ipv4", controller.decision_in, DECISION.to_value()),
+    _target("controller", "network.p4_command.app.s1", command_in, _COMMAND.to_value()),
     _target("controller", "network.telemetry.sonata.q1", controller.offer_in, _OFFER.to_value()),
-    _target("controller", "network.cell_request.sonata.s1", ask_in, _QUESTIONS),
-    _target("controller", "network.packet_out.firewall.s1", send_in, _SEND),
-    _target("sonata", _SWITCH_KEY, adapter.state_in, _STATE),
+    _target("controller", "network.cell_request.sonata.s1", questions_in, _QUESTIONS),
+    _target("controller", "network.packet_out.firewall.s1", frames_in, _SEND),
+    _target("sonata", _SWITCH_KEY, adapter.state_in, STATE),
     _target("sonata", "network.p4_command.sonata.s1", adapter.command_in, _COMMAND.to_value()),
     _target("sonata", "network.packets.p4runtime_ctrl.s1.q", adapter.data_in, _PACKETS),
     _target("sonata", "network.frames.p4runtime_ctrl.s1.q", adapter.data_in, _raw()),

@@ -168,7 +168,7 @@ def mutate_json(chance: random.Random, seeds: Sequence[bytes]) -> bytes:
     tree = json.loads(chance.choice(seeds))
     for _ in range(chance.randint(1, _MOST_CHANGES)):
         tree = changed(chance, tree, _json_atom)
-    return json.dumps(tree).encode("utf-8", "surrogatepass")
+    return json.dumps(tree).encode("utf-8", "surrogatepass")[: _limit(seeds)]
 
 
 def mutate_value(chance: random.Random, seeds: Sequence[bytes]) -> bytes:

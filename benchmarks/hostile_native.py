@@ -1,7 +1,7 @@
 """Our C under the address and undefined-behaviour sanitizers: Kitsune's kernel and the generated switch program.
 
 A report of a sanitizer ends the process, which is a crash.  Only a process with the sanitizers' libraries can
-load these builds (`hostile_sanitizers.environment_for`).
+load these builds (`hostile_sanitizers.environment`).
 """
 
 import random

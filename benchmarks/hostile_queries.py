@@ -27,6 +27,7 @@ from due import Item
 from due.drivers.memory_archive import MemoryArchive
 from due.drivers.query import parse
 from due.errors import DueError, InvalidKey, InvalidQuery
+from due.keys import Key
 
 _WIDTH = 256
 _CPU = 510
@@ -64,6 +65,20 @@ class _Engine:
     def get(self, query: Any, *, limit: int | None = None) -> list[Item]:
         return _archive().find(query, limit=limit)
 
+    def observe(self, key: str) -> Any:
+        """Raises InvalidKey."""
+        Key.parse(key)
+        return self
+
+    def subscribe(self, callback: Callable[[Item], None]) -> Any:
+        """All there is comes at once."""
+        for item in _ITEMS:
+            callback(item)
+        return self
+
+    def dispose(self) -> None:
+        """Nothing is held."""
+
 
 class _Health(dict[str, Any]):
     """A Coordinator's, all of whose counters stand at 0."""
@@ -83,6 +98,11 @@ def _application() -> tuple[Callable[..., Any], asyncio.AbstractEventLoop]:
         "due.event.coordinator",
     )
     return application(north), asyncio.new_event_loop()
+
+
+def coordinator_application() -> Callable[..., Any]:
+    """The Coordinator's API around an archive in memory."""
+    return _application()[0]
 
 
 class _ServerError(Exception):

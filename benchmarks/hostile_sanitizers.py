@@ -1,16 +1,18 @@
 """Builds of our C under the address and undefined-behaviour sanitizers, for a process with their libraries.
 
-hand-written C (Kitsune)      the library, built once a process
+hand-written C (Kitsune)      the library
 generated C (switch program)  `sanitized_switches()`: what the compiler back end loads from then on
+
+All are built once, before the processes start that load them, and kept beside the switch's own builds.
 """
 
-import atexit
 import hashlib
 import importlib
 import os
 import shutil
 import subprocess
-import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,12 @@ from typing import Any
 import cffi
 
 import apps.kitsune
-from dataplane.compiler import c_machine
+from benchmarks.hostile_switch import PROGRAM
+from dataplane.compiler import c_machine, layout
+from dataplane.compiler.c_build import cache_directory
+from dataplane.compiler.c_code import generate
+from dataplane.v1model.program import load
+from sdnator.p4_program import find
 
 SOURCES = tuple(Path(apps.kitsune.__file__).with_name(name) for name in ("afterimage.c", "kitnet.c"))
 _FLAGS = (
@@ -26,14 +33,18 @@ _FLAGS = (
     *("-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
 )
 _KERNEL = ("-ffp-contract=off", "-fno-builtin-pow")
+_SWITCH = ("-std=gnu11", "-x", "c", "-")
 _BUILDS = "HOSTILE_BUILDS"
 _LIBRARIES = ("libasan.so", "libubsan.so")
 
 
-def environment_for(module: str) -> dict[str, str]:
-    """What a process needs that runs the targets of a module; nothing where they are not sanitized."""
-    if not getattr(importlib.import_module(module), "SANITIZED", False):
-        return {}
+def is_sanitized(module: str) -> bool:
+    """Whether its targets run with the sanitizers' libraries."""
+    return bool(getattr(importlib.import_module(module), "SANITIZED", False))
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """What a process needs that loads the builds of a folder."""
     paths = [
         subprocess.check_output([compiler(), f"-print-file-name={name}"], text=True).strip()
         for name in _LIBRARIES
@@ -41,8 +52,21 @@ def environment_for(module: str) -> dict[str, str]:
     return {
         "LD_PRELOAD": " ".join(paths),
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=1:handle_segv=1",
-        _BUILDS: str(_folder()),
+        _BUILDS: str(folder),
     }
+
+
+def builds() -> tuple[Path, float]:
+    """All that the targets will load; where it is, and the seconds that it took (0 where it was there)."""
+    began = time.monotonic()
+    folder = cache_directory() / "sanitized"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    programs = [load(path.read_bytes()) for path in (find().bmv2_json, PROGRAM.with_suffix(".json"))]
+    texts = [generate(program, layout.make(program)).encode() for program in programs]
+    work = [*((_SWITCH, text) for text in texts), (_kernel_arguments(), _kernel_text())]
+    with ThreadPoolExecutor(len(work)) as pool:
+        list(pool.map(lambda one: _built(one[0], one[1], folder), work))
+    return folder, time.monotonic() - began
 
 
 def compiler() -> str:
@@ -53,36 +77,36 @@ def compiler() -> str:
     return found
 
 
-def _built(arguments: tuple[str, ...], text: bytes) -> Path:
+def _built(arguments: tuple[str, ...], text: bytes, folder: Path) -> Path:
     """A library, built once for its text."""
-    name = hashlib.sha256(text + repr(arguments).encode()).hexdigest()[:32]
-    path = _folder() / f"{name}.so"
+    version = subprocess.check_output([compiler(), "-dumpfullversion"])
+    name = hashlib.sha256(b"\0".join([text, repr((_FLAGS, arguments)).encode(), version])).hexdigest()[:32]
+    path = folder / f"{name}.so"
     if not path.exists():
-        clean = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
         part = path.with_suffix(f".{os.getpid()}")
-        subprocess.run(
-            [compiler(), *_FLAGS, *arguments, "-o", str(part), "-lm"], check=True, env=clean, input=text
-        )
+        subprocess.run([compiler(), *_FLAGS, *arguments, "-o", str(part), "-lm"], check=True, input=text)
         part.replace(path)
     return path
 
 
-@cache
-def _folder() -> Path:
-    """Private to this run: other users must not put libraries there."""
-    given = os.environ.get(_BUILDS)
-    if given:
-        return Path(given)
-    made = Path(tempfile.mkdtemp(prefix="hostile-builds-"))
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
-    return made
+def _loaded(arguments: tuple[str, ...], text: bytes) -> Path:
+    """One that was built before: the compiler does not run beside the sanitizers' libraries."""
+    os.environ.pop("LD_PRELOAD", None)
+    return _built(arguments, text, Path(os.environ[_BUILDS]))
+
+
+def _kernel_arguments() -> tuple[str, ...]:
+    return (*_KERNEL, *map(str, SOURCES))
+
+
+def _kernel_text() -> bytes:
+    return b"".join(path.read_bytes() for path in sorted(SOURCES[0].parent.glob("*.[ch]")))
 
 
 @cache
 def kernel_library() -> Path:
     """Kitsune's C."""
-    text = b"".join(path.read_bytes() for path in sorted(SOURCES[0].parent.glob("*.[ch]")))
-    return _built((*_KERNEL, *map(str, SOURCES)), text)
+    return _loaded(_kernel_arguments(), _kernel_text())
 
 
 def sanitized_switches() -> None:
@@ -93,4 +117,4 @@ def sanitized_switches() -> None:
 def _switch_library(text: str, declarations: str) -> tuple[Any, Any]:
     ffi = cffi.FFI()
     ffi.cdef(declarations)
-    return ffi, ffi.dlopen(str(_built(("-std=gnu11", "-x", "c", "-"), text.encode())))
+    return ffi, ffi.dlopen(str(_loaded(_SWITCH, text.encode())))

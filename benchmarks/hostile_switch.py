@@ -46,6 +46,8 @@ _CALLS = (
     "StreamChannel",
 )
 _TIMEOUT_S = 20.0
+_HIGHEST = (1 << 64) - 1
+"""The primary's election id, so that no mutated one takes its place for good."""
 _MEANT = frozenset(
     ("INVALID_ARGUMENT", "NOT_FOUND", "ALREADY_EXISTS", "PERMISSION_DENIED", "RESOURCE_EXHAUSTED",
      "FAILED_PRECONDITION", "ABORTED", "OUT_OF_RANGE", "UNIMPLEMENTED")
@@ -134,7 +136,7 @@ def stream_messages() -> tuple[bytes, ...]:
     packet.packet.payload = bytes(40)
     packet.packet.metadata.add(metadata_id=1, value=b"\x03")
     packet.packet.metadata.add(metadata_id=2, value=b"\x00")
-    ack.digest_ack.digest_id = 5
+    ack.digest_ack.digest_id = program_config(PROGRAM).p4info.digests[0].preamble.id
     return tuple(each.SerializeToString() for each in (hello, packet, ack))
 
 
@@ -168,6 +170,16 @@ def _p4infos() -> tuple[bytes, ...]:
     return tuple(config.p4info.SerializeToString() for config in configs)
 
 
+def _claim(message: Any) -> None:
+    message.election_id.high = message.election_id.low = _HIGHEST
+
+
+def _claimed(data: bytes) -> bytes:
+    request = p4runtime.WriteRequest.FromString(data)
+    _claim(request)
+    return bytes(request.SerializeToString())
+
+
 class _LiveServer:
     """An embedded switch with ports and a gRPC server on a Unix socket, and a channel to it."""
 
@@ -190,12 +202,12 @@ class _LiveServer:
         self._stream: Any = channel.stream_stream(_SERVICE + _CALLS[-1])
         hello = p4runtime.StreamMessageRequest()
         hello.arbitration.device_id = 1
-        hello.arbitration.election_id.low = 1
+        _claim(hello.arbitration)
         self._primary = self._stream(self._held(hello.SerializeToString()))
         next(self._primary)
-        self._config = _set_request(
-            p4runtime.SetForwardingPipelineConfigRequest.VERIFY_AND_COMMIT
-        ).SerializeToString()
+        config = _set_request(p4runtime.SetForwardingPipelineConfigRequest.VERIFY_AND_COMMIT)
+        _claim(config)
+        self._config = config.SerializeToString()
         self._inputs = 0
 
     def _held(self, first: bytes) -> Any:
@@ -244,8 +256,9 @@ def _live_seeds() -> tuple[bytes, ...]:
     get = p4runtime.GetForwardingPipelineConfigRequest(device_id=1).SerializeToString()
     verify = _set_request(p4runtime.SetForwardingPipelineConfigRequest.VERIFY)
     verify.config.p4_device_config = b'{"pipelines": []}'
+    _claim(verify)
     return (
-        *(b"\0" + one for one in _writes()),
+        *(b"\0" + _claimed(one) for one in _writes()),
         *(b"\1" + one for one in _reads()),
         b"\2" + verify.SerializeToString(),
         b"\3" + get,

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from benchmarks.hostile_mutation import Mutate, mutate_bytes
+from due.errors import DueError
 
 
 class DecoderTarget(NamedTuple):
@@ -22,7 +23,11 @@ class DecoderTarget(NamedTuple):
         """Input number `index`: the first ones are the genuine ones."""
         if index < len(self.seeds):
             return self.seeds[index]
-        return self.mutate(random.Random(f"{seed} {self.name} {index}"), self.seeds)
+        chance = random.Random(f"{seed} {self.name} {index}")
+        try:
+            return self.mutate(chance, self.seeds)
+        except (ValueError, DueError, RecursionError):
+            return mutate_bytes(chance, self.seeds)  # what was found by coverage need not have a structure
 
     def attack(self, data: bytes) -> None:
         """Decode; whatever is raised beside the declared errors comes out."""

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import time
 
 from benchmarks.hostile_mutation import mutate_json
 from benchmarks.hostile_target import DecoderTarget
@@ -20,12 +19,19 @@ def _wrong_exception(data: bytes) -> object:
 
 def _hangs(data: bytes) -> None:
     while data.endswith(b"\xff"):
-        time.sleep(1)
+        pass
 
 
 def _dies(data: bytes) -> None:
     if data.startswith(b"\xff"):
         os.kill(os.getpid(), signal.SIGSEGV)
+
+
+_kept: list[bytes] = []
+
+
+def _hoards(data: bytes) -> None:
+    _kept.append(bytes(1 << 19) + data)
 
 
 _SEED = b'{"a": 1}'
@@ -34,5 +40,6 @@ TARGETS = (
     DecoderTarget("sound", _sound, _ERRORS, (_SEED,), mutate_json),
     DecoderTarget("wrong exception", _wrong_exception, _ERRORS, (_SEED,), mutate_json),
     DecoderTarget("hang", _hangs, (), (_SEED,)),
+    DecoderTarget("hoard", _hoards, (), (_SEED,)),
     DecoderTarget("death", _dies, (), (_SEED,)),
 )

@@ -1,20 +1,28 @@
 """The harness for hostile inputs finds what is planted, and the product's decoders are clean."""
 
+import io
 import random
+import threading
 
 import pytest
 
-from benchmarks import hostile
-from benchmarks.hostile import attack_all, shares
-from benchmarks.hostile_child import Attack, Figures
+from apps.firewall import arrivals as firewall
+from apps.kitsune import service as kitsune
+from apps.p4runtime_ctrl import arrivals as controller
+from apps.sonata_adapter import arrivals as adapter
+from benchmarks import hostile, hostile_messages
+from benchmarks.hostile import attack_all
+from benchmarks.hostile_child import Attacker, Place
+from benchmarks.hostile_job import Figures, Job
 from benchmarks.hostile_mutation import message_fields, mutate_protobuf
+from benchmarks.hostile_pool import Attack, shares
 from benchmarks.hostile_worker import targets_of
 from tests.benchmarks import planted
 
 PLANTED = planted.__name__
 INPUTS = 150
 SLOW_INPUTS = 6
-SLOW = {"bmv2 json", "p4info", "controller p4info", "kitsune model", "sdnator.toml"}
+SLOW = {"bmv2 json", "p4info", "controller p4info", "kitsune model", "sdnator.toml", "settings in variables"}
 """Milliseconds an input."""
 SANITIZED = "benchmarks.hostile_native"
 
@@ -27,7 +35,62 @@ def test_a_sound_decoder_is_clean():
     found = attack("sound")
     assert (found["crashes"], found["hangs"], found["findings"]) == (0, 0, [])
     assert found["inputs"] >= 60
-    assert set(found["targets"]["sound"]) == {"inputs", "crashes", "hangs", "rss_growth_mb", "inputs_per_s"}
+    assert set(found["targets"]["sound"]) == {
+        *(
+            "inputs",
+            "guided",
+            "crashes",
+            "hangs",
+            "rss_first_mb",
+            "rss_last_mb",
+            "peak_mb",
+            "inputs_per_s",
+            "cpu_s",
+        ),
+    }
+    assert found["cpu_s"] > 0
+    assert found["grown"] == []
+
+
+def test_memory_that_grows_is_found():
+    """A target that keeps what it is given is told apart from one that makes something once."""
+    assert attack("hoard", 400)["grown"] == ["hoard"]
+
+
+def test_inputs_of_a_corpus_are_mutated_too(monkeypatch):
+    """What the guided loop has found is a seed for the other one; damaged ones must not end it."""
+    job = Job("sound", 0, 200, corpus=(b'{"found": 1}'.hex(), b"\xff{".hex()))
+    seen: list[bytes] = []
+    monkeypatch.setattr(
+        threading, "excepthook", threading.excepthook
+    )  # it takes that, in a process of its own
+    target = planted.TARGETS[0]._replace(decode=seen.append)
+    place = Place()
+    Attacker(target, job, place, io.BytesIO()).run()
+    place.close()
+    assert len(seen) == 200
+    assert any(b"found" in one for one in seen)
+
+
+def test_every_decoder_of_messages_is_attacked():
+    """Whoever adds one adds a target."""
+    attacked = {target.name for target in hostile_messages.TARGETS}
+    for app, module in (
+        ("firewall", firewall),
+        ("kitsune", kitsune),
+        ("controller", controller),
+        ("sonata", adapter),
+    ):
+        for name in vars(module):
+            if (
+                name.endswith("_in")
+                and not name.startswith("_")
+                and module.__name__ == getattr(module, name).__module__
+            ):
+                short = f"{app} {name.removesuffix('_in')} "
+                assert any(each.startswith(short) for each in attacked), (
+                    f"no target for {module.__name__}.{name}"
+                )
 
 
 def test_a_wrong_exception_is_found_with_its_input():
