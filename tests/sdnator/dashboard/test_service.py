@@ -3,6 +3,7 @@
 import socket
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
+from typing import Any, cast
 
 import pytest
 
@@ -35,7 +36,7 @@ class Archive:
 
 
 def test_an_archived_item_that_nobody_understands_does_not_keep_the_pages_from_starting():
-    dashboard = DashboardService(Archive(), Settings())
+    dashboard = DashboardService(cast("Any", Archive()), Settings())
     dashboard._take_up_history()
     assert dashboard.health()["misunderstood"] == len(service.DECISIONS) + 2
 
@@ -59,7 +60,7 @@ def test_a_coordinator_that_answers_nonsense_ends_no_thread(tmp_path, said):
         Thread(target=server.serve_forever, daemon=True).start()
         place = tmp_path / "coordinator"
         place.write_text(f"http://127.0.0.1:{server.server_port}")
-        dashboard = DashboardService(Archive(), Settings(coordinator_file=str(place)))
+        dashboard = DashboardService(cast("Any", Archive()), Settings(coordinator_file=str(place)))
         poll = Thread(target=dashboard._poll, daemon=True)
         poll.start()
         try:
