@@ -17,6 +17,7 @@ INCIDENT: Final = "network.incident"
 INCIDENTS: Final = f"{INCIDENT}.firewall.*"
 MOST_CONTRIBUTIONS: Final = 8
 MOST_ACTIONS: Final = 32
+MOST_PLACES: Final = 64
 EFFECTIVE_S: Final = 5.0
 """An incident counts as mitigated if a remedy was in force within this time of its first packet."""
 _SECOND: Final = 1_000_000_000
@@ -59,6 +60,8 @@ class IncidentAction(Message, frozen=True, kw_only=True):
     until: Time = 0
     """Its end, ns; 0 = none."""
     state: ActionState = "decided"
+    places: Annotated[tuple[Words, ...], Meta(max_length=MOST_PLACES)] = ()
+    """Enforcers with the places where it is in force, such as `p4runtime_ctrl s1`."""
     reason: Words = ""
     """Why; for `alert` why nothing stronger was done."""
     nats: Nats = 0.0

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
+from apps.enforcement import EnforcementReport
 from apps.evidence import Evidence, TrainingState
 from apps.firewall.syn.recent_syns import SYN_COLUMNS
 from apps.firewall.syn.services import TcpService
@@ -94,9 +95,18 @@ def training_in(item: Item) -> TrainingState:
 
 
 def confirmation_in(item: Item) -> Confirmation:
-    """`network.confirmation.p4runtime_ctrl.<switch>`."""
+    """`network.confirmation.<enforcer>.<place>`."""
     sender_of(item)
     return Confirmation.from_value(item.value)
+
+
+def report_in(item: Item) -> EnforcementReport:
+    """`network.enforced.<enforcer>.<place>`."""
+    app = sender_of(item)
+    report = EnforcementReport.from_value(item.value)
+    if (report.enforcer, report.place) != (app, item.key.rpartition(".")[2]):
+        raise MessageError("fields", f"{item.key}: its value is about {report.enforcer!r} {report.place!r}")
+    return report
 
 
 def decision_in(item: Item) -> Decision:

@@ -15,11 +15,13 @@ from uuid import uuid4
 from msgspec import structs
 
 import due.service
+from apps.enforcement import ALLOWED, CONFIRMED, ENFORCED, SWITCHES, EnforcementReport
 from apps.evidence import EVIDENCE, TRAINING, Evidence, TrainingState
 from apps.firewall import arrivals
 from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
+from apps.firewall.enforcement.declared_enforcers import DeclaredEnforcers
 from apps.firewall.enforcement.event_sink import event_sinks
 from apps.firewall.enforcement.mirrors import Mirrors
 from apps.firewall.enforcement.storing import StoredAnswers
@@ -75,6 +77,8 @@ SYN_INTERESTS = (
     Interest("network.traffic_capture.sonata.arp"),
 )
 """Interests that are observed only if the settings ask for them, with the settings' parameters."""
+ENFORCER_INTERESTS = (Interest(f"{CONFIRMED}.*.*"), Interest(f"{ENFORCED}.*.*"))
+"""Of the enforcers that the settings name."""
 CAPABILITIES = (
     Capability("network.block.firewall.ipv4", delivery="reliable", archive="always"),
     Capability("network.block.firewall.ipv6", delivery="reliable", archive="always"),
@@ -85,6 +89,7 @@ CAPABILITIES = (
     Capability("network.protect.firewall.ipv6", delivery="reliable", archive="always"),
     Capability(f"{EVENTS}.*", delivery="reliable", archive="always"),
     INCIDENT_CAPABILITY,
+    Capability(ALLOWED, delivery="reliable", archive="always"),
     Capability("network.p4_command.firewall.*", delivery="reliable"),
     Capability(f"{KEPT}.*", delivery="reliable", archive="always"),
     Capability("network.packet_out.firewall.*", delivery="reliable"),
@@ -142,7 +147,8 @@ class FirewallService:
         )
         self._archive = Archive(engine, settings.archive_patience_s)
         self._past = ArchivedPast(self._archive, self._intake, settings)
-        self._mirrors = Mirrors()
+        self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
+        self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
@@ -185,7 +191,10 @@ class FirewallService:
         apps = (f"{app}.*" for app in self._settings.evidence_apps)
         for key in (KITSUNES_EVIDENCE, *(f"{EVIDENCE}.{each}" for each in (*queries, *apps))):
             self._hear(key, arrivals.spoken_in, self._on_evidence)
-        self._hear("network.confirmation.p4runtime_ctrl.*", arrivals.confirmation_in, self._on_confirmation)
+        for enforcer in dict.fromkeys((SWITCHES, *self._settings.enforcers)):
+            self._hear(f"{CONFIRMED}.{enforcer}.*", arrivals.confirmation_in, self._on_confirmation)
+            if enforcer != SWITCHES:
+                self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
         self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)
         if self._settings.detect:
@@ -229,6 +238,7 @@ class FirewallService:
         wanted = self._allow_entries.everything()
         wanted += [prefix_update("insert", target.address) for target in targets if is_prefix(target)]
         self._leftovers = self._past.leftovers(wanted)
+        self._enforcers.tell_allowed(self._desk.entries)
 
     def tick(self) -> None:
         """Examine suspected floods that are due, and write known sources in batches."""
@@ -275,6 +285,7 @@ class FirewallService:
             "times_doubted": self._time.doubted + self._row_time.doubted,
             **self._incidents.health(),
             **self._intake.health(),
+            **self._enforcers.health(),
             **self._announcer.health(),
         }
 
@@ -300,6 +311,7 @@ class FirewallService:
         updates = self._allow_entries.change(self._desk.entries)
         for switch in self._switches if updates else ():
             self._keep(switch, updates)
+        self._enforcers.tell_allowed(self._desk.entries)
         return answer
 
     def _read_archived_words(self) -> None:
@@ -506,21 +518,33 @@ class FirewallService:
                 self._carry_out_prefix(block.decision, [switch])
         self._command(switch, self._known.everything())
 
-    def _on_confirmation(self, _: Item, confirmation: Confirmation) -> None:
+    def _on_confirmation(self, item: Item, confirmation: Confirmation) -> None:
         with self._lock:
-            self._ledger.confirm(confirmation)
-            self._incidents.confirmed(confirmation)
+            if self._enforcers.confirmed(item.app_id, confirmation):
+                self._ledger.confirm(confirmation)
+            self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
             self._resets.confirm(confirmation.id, confirmation.state, time.monotonic())
         if confirmation.state == "failed":
             cause = one_line(confirmation.cause)
-            log.error("switch %s refused %s: %s", confirmation.switch, confirmation.id, cause)
+            log.error("%s %s refused %s: %s", item.app_id, confirmation.switch, confirmation.id, cause)
+
+    def _on_enforced(self, _: Item, report: EnforcementReport) -> None:
+        with self._lock:
+            for held in report.blocks:
+                self._count(report.enforcer, report.place, held.id, held.packets, self._now)
+            if problem := self._enforcers.news_of(report):
+                self._announcer.say(OperatorNotice("enforcer", problem, self._now))
+
+    def _count(self, enforcer: str, place: str, decision: str, packets: int, now: int) -> None:
+        total = self._enforcers.count(decision, enforcer, place, packets)
+        self._ledger.count_drops(decision, total, now)
+        self._incidents.count(decision, total, now)
 
     def _on_switch(self, item: Item, state: SwitchReport) -> None:
         with self._lock:
             believed = state.event_time > 0 and self._time.hear(state.event_time)
             for reading in state.blocks if believed else ():
-                self._ledger.count_drops(reading.id, reading.packets, state.event_time)
-                self._incidents.count(reading.id, reading.packets, state.event_time)
+                self._count(SWITCHES, state.switch, reading.id, reading.packets, state.event_time)
             self._mirrors.note(state.switch, mirror=state.mirror)
             self._arm(item, state)
             self._examinations.live = state.clock != "packets"

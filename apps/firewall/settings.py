@@ -42,6 +42,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Seconds without a competing claim after which a later binding counts; a claim of it is only reported."""
     arp_contest_s: int = 60
     """Seconds after a claim within which the owner must send a frame to be taken as present."""
+    enforcers: tuple[str, ...] = ("p4runtime_ctrl",)
+    """Apps that carry blocks out, by app id: the switches' controller, nftables, webhook_enforcer, or your own."""
     eve_file: str = ""
     """File to which incidents and decisions are appended as EVE JSON, one per line; empty: none."""
     eve_redis: str = ""
@@ -58,6 +60,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Seconds that a decision waits for the sender's history from Data Archives."""
 
     def __post_init__(self) -> None:
-        for name in (*self.evidence_queries, *self.evidence_apps):
+        for name in (*self.evidence_queries, *self.evidence_apps, *self.enforcers):
             if not _SEGMENT.fullmatch(name):
                 raise ValueError(f"{name!r} is no name of a query or an app: letters, digits and _ only")
+        if not self.enforcers or len(set(self.enforcers)) < len(self.enforcers):
+            raise ValueError(f"enforcers={list(self.enforcers)}: name one or more apps, each once")

@@ -93,6 +93,7 @@ def incident_event(incident: Incident) -> Event:
         "evidence": [f"{piece.source}: {piece.text}" for piece in incident.evidence[-_ALIKE:]],
         "remedy": [remedy_words(action) for action in incident.actions],
         "decision": [action.decision for action in incident.actions if action.decision],
+        "enforcers": sorted({place for action in incident.actions for place in action.places}),
         "dropped": [str(cost.dropped)],
         "challenged": [str(cost.challenged)],
         "metered": [str(cost.metered)],

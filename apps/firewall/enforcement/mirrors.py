@@ -18,8 +18,10 @@ _EVERY_SWITCH: Final = ("", "*")
 class Mirrors:
     """The mirrors among the connected switches."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, elsewhere: bool = False) -> None:
         self._mirrors: set[str] = set()
+        self._elsewhere = elsewhere
+        """Enforcers that are no switches carry blocks out, whatever the switches see."""
 
     def __contains__(self, switch: str) -> bool:
         return switch in self._mirrors
@@ -35,6 +37,8 @@ class Mirrors:
         """The decision, as a dry run where no switch that could carry it out sees more than copies."""
         all_copies = bool(connected) and self._mirrors.issuperset(connected)
         if decision.switch not in self._mirrors and not (decision.switch in _EVERY_SWITCH and all_copies):
+            return decision
+        if self._elsewhere and decision.action in ("block", "unblock"):
             return decision
         said = decision.reason.endswith(COPIES)
         reason = decision.reason if said or decision.dry_run else decision.reason + COPIES

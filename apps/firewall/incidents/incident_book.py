@@ -13,7 +13,7 @@ All times are capture time in ns, and believed: whoever calls has refused those 
 """
 
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from ipaddress import ip_address, ip_network
 from typing import Final
 
@@ -28,7 +28,7 @@ from apps.firewall.incidents.open_incident import (
     not_past,
     who,
 )
-from apps.incidents import Change, Contribution, Incident, IncidentAction, Remedy
+from apps.incidents import MOST_PLACES, Change, Contribution, Incident, IncidentAction, Remedy
 from apps.messages import Alert, Confirmation, Decision, Sender, one_line
 
 SECOND: Final = 1_000_000_000
@@ -205,8 +205,12 @@ class IncidentBook:
         news = before is None or before.reason != action.reason
         return self._told(found, "decided" if news else "more", now, may_open=True)
 
-    def confirmed(self, confirmation: Confirmation) -> list[Incident]:
-        """Take what a switch says about a decision.
+    def confirmed(self, confirmation: Confirmation, places: Sequence[str] = ()) -> list[Incident]:
+        """Take what an enforcer says about a decision.
+
+        Args:
+            confirmation: the answer.
+            places: where the decision is in force now.
 
         Returns:
             Incidents to publish.
@@ -226,7 +230,8 @@ class IncidentBook:
             # one switch of several may refuse what others carry out
             after = action if action.state == "in_force" else structs.replace(action, state="failed")
         else:
-            after = structs.replace(action, state="over")
+            after = action if places else structs.replace(action, state="over")
+        after = structs.replace(after, places=tuple(places[:MOST_PLACES]))
         if after == action:
             return self._due(now)
         self._act(found, confirmation.id, after)

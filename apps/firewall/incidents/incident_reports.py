@@ -3,7 +3,7 @@
 The service tells it what happens, in the order in which it happens; it publishes what the book returns.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import due
@@ -81,9 +81,14 @@ class IncidentReports:
         if not self._book.has(decision.id):
             self._lines.event(line_of(decision_event(decision), self._form), important=True)
 
-    def confirmed(self, confirmation: Confirmation) -> None:
-        """A switch has answered a decision."""
-        self._publish(self._book.confirmed(confirmation))
+    def confirmed(self, confirmation: Confirmation, places: Sequence[str] = ()) -> None:
+        """An enforcer has answered a decision.
+
+        Args:
+            confirmation: the answer.
+            places: where the decision is in force now.
+        """
+        self._publish(self._book.confirmed(confirmation, places))
 
     def count(self, decision: str, packets: int, now: int) -> None:
         """A switch has counted packets that a decision dropped, challenged or metered so far.

@@ -1,0 +1,352 @@
+"""Carries decisions out with one enforcer, reads back, confirms, reports.  I/O: one worker thread, a bounded queue.
+
+Callbacks of DUE only put into the queue; whatever the enforcer does, and however long it takes, no decision of
+anybody else waits for it.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from apps.enforcement import EnforcementReport, HeldBlock
+from apps.enforcers.enforcer import Enforcer, EnforcerAway, HeldCount
+from apps.enforcers.wishes import AllowedSenders, Wish, WishList, wish_of
+from apps.messages import Confirmation, Decision, State, one_line
+
+_FIRST_PAUSE_S: Final = 0.2
+_LONGEST_PAUSE_S: Final = 30.0
+_REPORT_EVERY_S: Final = 10.0
+_TOGETHER: Final = 1_000
+"""Decisions that are carried out at once, at most."""
+_CLOSE_S: Final = 10.0
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Spoken:
+    """A decision, and the wall time (ns) at which it was written."""
+
+    decision: Decision
+    written: int
+    restored: bool = False
+    """From the archive, at a start: it may stand already."""
+
+
+Job = Spoken | tuple[str, ...] | None
+"""A decision, the allow-list, or None: look around."""
+
+
+@dataclass
+class _Outlook:
+    """When to try, to read back and to report again: monotonic seconds."""
+
+    try_at: float = 0.0
+    pause: float = _FIRST_PAUSE_S
+    check_at: float = 0.0
+    report_at: float = 0.0
+    problem: str = ""
+    """Why nothing can be done now."""
+    found: str = ""
+    """What the last reading found and put right."""
+    told: object = None
+    since: dict[str, float] = field(default_factory=dict)
+    """Since when a decision waits."""
+
+
+class EnforcerDesk:
+    """Between the messages and one enforcer.
+
+    Args:
+        enforcer: adds, removes, lists back.
+        names: the app's id and its place, for confirmations and reports.
+        confirm: called with every confirmation, from the worker thread.
+        report: called with every report, from the worker thread.
+        check_s: seconds between two readings.
+        patience_s: seconds after which a decision that cannot be carried out is answered as failed.
+        size: most decisions that may wait.
+        limit: most blocks that may stand.
+    """
+
+    def __init__(
+        self,
+        enforcer: Enforcer,
+        names: tuple[str, str],
+        confirm: Callable[[Confirmation], None],
+        report: Callable[[EnforcementReport], None],
+        *,
+        check_s: float,
+        patience_s: float,
+        size: int = 10_000,
+        limit: int = 65_536,
+    ) -> None:
+        self._enforcer = enforcer
+        self._app, self._place = names
+        self._confirm = confirm
+        self._tell = report
+        self._check_s = check_s
+        self._patience_s = patience_s
+        self._limit = limit
+        self._jobs: queue.Queue[Job] = queue.Queue(size)
+        self._wishes = WishList()
+        self._allowed = AllowedSenders()
+        self._held: Mapping[str, HeldCount] = {}
+        self._outlook = _Outlook()
+        self._closing = threading.Event()
+        self._allow_again = True
+        self._counts = dict.fromkeys(
+            ("installed", "removed", "expired", "failed", "restored", "refused_full", "tries_failed"), 0
+        )
+        self._thread = threading.Thread(target=self._work, name=f"enforcer {self._app}", daemon=True)
+
+    def restore_allowed(self, entries: tuple[str, ...]) -> None:
+        """The allow-list from the archive; before `start`."""
+        self._allowed.replace(entries)
+
+    def restore(self, spoken: Iterable[Spoken]) -> None:
+        """Blocks from the archive, however many; before `start`."""
+        for each in spoken:
+            self._decide(each)
+
+    def start(self) -> None:
+        """Begin to work."""
+        self._thread.start()
+
+    def put(self, job: Job) -> None:
+        """Queue a decision or an allow-list; never waits.  What does not fit is counted and answered as failed."""
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            if isinstance(job, Spoken):
+                self._counts["refused_full"] += 1
+                self._answer(job.decision, "failed", f"{self._jobs.maxsize:,} decisions wait already")
+
+    def knows(self, decision_id: str) -> bool:
+        """Whether a block of this id stands or waits to be carried out; may be a moment old."""
+        return decision_id in self._wishes.standing or decision_id in self._wishes.adding
+
+    def check(self) -> None:
+        """Raises `RuntimeError` if the worker thread has ended with an error."""
+        if not self._thread.is_alive() and not self._closing.is_set():
+            raise RuntimeError(f"the thread of {self._app} has ended with an error; the log has the reason")
+
+    def close(self) -> None:
+        """Carry out what waits, within ten seconds, and end."""
+        self._closing.set()
+        self.put(None)
+        if self._thread.ident is not None:
+            self._thread.join(_CLOSE_S)
+
+    def health(self) -> dict[str, Any]:
+        """Counters for the operator and for Prometheus."""
+        return {
+            "blocks": len(self._held),
+            "waiting": self._jobs.qsize() + len(self._wishes.adding) + len(self._wishes.removing),
+            "working": not self._outlook.problem,
+            "problem": self._outlook.problem,
+            **self._counts,
+        }
+
+    # -- the worker ---------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while not self._closing.is_set():
+            self._take(self._wait_s())
+            self._step()
+        self._take(0.0)
+        self._step(last=True)
+        try:
+            self._enforcer.end(list(self._wishes.standing.values()))
+        except EnforcerAway as error:
+            log.warning("at the end: %s", one_line(str(error)))
+
+    def _wait_s(self) -> float:
+        """Seconds until there is something to do by time alone."""
+        now, outlook = time.monotonic(), self._outlook
+        moments = [outlook.check_at, outlook.report_at]
+        if self._waits():
+            moments.append(outlook.try_at)
+        if (end := self._wishes.next_end()) and not self._wishes.removing:
+            moments.append(now + (end - time.time_ns()) / 1e9)
+        return max(0.0, min(moments) - now)
+
+    def _waits(self) -> bool:
+        return bool(self._wishes.adding or self._wishes.removing or self._allow_again)
+
+    def _take(self, wait_s: float) -> None:
+        """Everything that has come, after waiting for the first of it."""
+        try:
+            job = self._jobs.get(timeout=wait_s) if wait_s > 0 else self._jobs.get_nowait()
+            for _ in range(_TOGETHER):
+                self._hear(job)
+                job = self._jobs.get_nowait()
+            self._hear(job)
+        except queue.Empty:
+            pass
+
+    def _hear(self, job: Job) -> None:
+        if isinstance(job, tuple):
+            self._allowed.replace(job)
+            self._allow_again = True
+            for wish in [*self._wishes.standing.values(), *self._wishes.adding.values()]:
+                if self._allowed.cover(wish.target):
+                    self._wishes.remove(wish.id)
+        elif job is not None and not job.decision.dry_run:
+            self._decide(job)
+
+    def _decide(self, spoken: Spoken) -> None:
+        decision = spoken.decision
+        if decision.action == "unblock":
+            if not self._wishes.remove(decision.id):
+                self._answer(decision, "removed", "it was not in force here")
+            return
+        if decision.action != "block":
+            return
+        wish = wish_of(decision, min(spoken.written, time.time_ns()))
+        if self._allowed.cover(wish.target):
+            self._answer(decision, "failed", "it is on the allow-list")
+        elif not wish.lasts(time.time_ns()):
+            if not spoken.restored:
+                self._answer(decision, "failed", "its end had passed when it arrived")
+        elif len(self._wishes) >= self._limit and decision.id not in self._wishes.standing:
+            self._answer(decision, "failed", f"{self._limit:,} blocks stand already")
+        elif self._wishes.add(wish):
+            self._outlook.since.setdefault(wish.id, time.monotonic())
+        else:
+            self._answer(decision, "exists")
+
+    def _step(self, *, last: bool = False) -> None:
+        now, outlook = time.monotonic(), self._outlook
+        for name in self._wishes.ended(time.time_ns()):
+            self._wishes.remove(name)
+        try:
+            if self._waits() and (last or now >= outlook.try_at):
+                self._carry_out()
+            if not last and now >= outlook.check_at:
+                self._read_back()
+        except EnforcerAway as error:
+            self._away(str(error))
+        self._report()
+
+    def _carry_out(self) -> None:
+        if self._allow_again:
+            self._enforcer.allow(self._allowed.entries)
+        adding, removing = dict(self._wishes.adding), dict(self._wishes.removing)
+        refused = self._enforcer.change(list(adding.values()), list(removing.values()))
+        self._allow_again = False
+        stood = set(self._wishes.standing)
+        self._wishes.carried_out(refused)
+        self._held = {name: self._held.get(name, HeldCount()) for name in self._wishes.standing}
+        self._answer_all(adding, removing, refused, stood)
+        self._works()
+
+    def _works(self) -> None:
+        if self._outlook.problem:
+            log.info("works again")
+            self._outlook.problem = ""
+        self._outlook.pause, self._outlook.try_at = _FIRST_PAUSE_S, 0.0
+
+    def _answer_all(
+        self,
+        adding: Mapping[str, Wish],
+        removing: Mapping[str, Wish],
+        refused: Mapping[str, str],
+        stood: set[str],
+    ) -> None:
+        now = time.time_ns()
+        for name, wish in removing.items():
+            if name not in adding:
+                self._answer(wish.decision, "removed" if wish.lasts(now) else "expired")
+        for name, wish in adding.items():
+            self._outlook.since.pop(name, None)
+            state: State = "failed" if name in refused else "exists" if name in stood else "installed"
+            self._answer(wish.decision, state, refused.get(name, ""))
+
+    def _read_back(self) -> None:
+        self._outlook.check_at = time.monotonic() + self._check_s
+        wanted = {
+            name: wish for name, wish in self._wishes.standing.items() if name not in self._wishes.removing
+        }
+        held = self._enforcer.held(list(wanted.values()))
+        now = time.time_ns()
+        missing = [wish for name, wish in wanted.items() if name not in held and wish.lasts(now)]
+        said = ""
+        if missing:
+            self._enforcer.change(missing, ())
+            self._counts["restored"] += len(missing)
+            said = f"restored {len(missing)} of {len(wanted)} blocks that somebody else had removed"
+            log.error("%s", said)
+            held = {**held, **{wish.id: HeldCount() for wish in missing}}
+        self._outlook.found = said
+        self._held = held
+        self._works()
+
+    def _away(self, cause: str) -> None:
+        now, outlook = time.monotonic(), self._outlook
+        self._counts["tries_failed"] += 1
+        if outlook.problem != cause:
+            outlook.problem = cause
+            log.error("%s", one_line(cause))
+        outlook.try_at = now + outlook.pause
+        outlook.check_at = max(outlook.check_at, outlook.try_at)
+        outlook.pause = min(2 * outlook.pause, _LONGEST_PAUSE_S)
+        for name, since in list(outlook.since.items()):
+            if now - since >= self._patience_s:
+                del outlook.since[name]
+                wish = self._wishes.adding.pop(name, None)
+                if wish is not None:
+                    self._wishes.standing.pop(name, None)
+                    self._answer(wish.decision, "failed", cause)
+
+    def _answer(self, decision: Decision, state: State, cause: str = "") -> None:
+        if state in self._counts:
+            self._counts[state] += 1
+        self._confirm(
+            Confirmation(
+                id=decision.id,
+                switch=self._place,
+                state=state,
+                action=decision.action,
+                target=decision.target,
+                handle=place_handle(self._app, decision),
+                cause=cause,
+                event_time=decision.event_time,
+            )
+        )
+
+    def _report(self) -> None:
+        now, outlook = time.monotonic(), self._outlook
+        standing = self._wishes.standing
+        held = [(standing[name], count) for name, count in self._held.items() if name in standing]
+        waiting = len(self._wishes.adding) + len(self._wishes.removing)
+        problem = outlook.problem or outlook.found
+        what = (problem, tuple((wish.id, count) for wish, count in held), waiting)
+        if what == outlook.told and now < outlook.report_at:
+            return
+        outlook.told, outlook.report_at = what, now + _REPORT_EVERY_S
+        blocks = tuple(_held_block(wish, count) for wish, count in held)
+        self._tell(
+            EnforcementReport(
+                enforcer=self._app,
+                place=self._place,
+                working=not outlook.problem,
+                problem=problem,
+                blocks=blocks,
+                waiting=waiting,
+                restored=self._counts["restored"],
+                event_time=time.time_ns(),
+            )
+        )
+
+
+def place_handle(app: str, decision: Decision) -> str:
+    """The block as the enforcer knows it."""
+    return f"{app} {decision.target.kind} {decision.target.address}"
+
+
+def _held_block(wish: Wish, count: HeldCount) -> HeldBlock:
+    return HeldBlock(id=wish.id, target=wish.target, packets=count.packets, bytes=count.bytes)

@@ -1,0 +1,147 @@
+"""Our table in the kernel: written in transactions, read back, made anew when somebody has changed it.  I/O."""
+
+import logging
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, Literal
+
+from apps.enforcers.enforcer import EnforcerAway, HeldCount
+from apps.enforcers.nftables.nft_program import NftProgram, TransactionRefused
+from apps.enforcers.nftables.ruleset import (
+    Element,
+    TableListing,
+    TablePlan,
+    element_of,
+    elements_of,
+    listing_in,
+    outermost,
+)
+from apps.enforcers.wishes import Wish
+
+AtEnd = Literal["keep", "remove"]
+_NONE: Final = HeldCount()
+
+log = logging.getLogger(__name__)
+
+
+class NftTable:
+    """An `Enforcer`: one table of this network namespace.
+
+    Args:
+        plan: name and place of the table.
+        program: runs nft.
+        at_end: what becomes of the table when the app ends in order.
+    """
+
+    def __init__(self, plan: TablePlan, program: NftProgram, at_end: AtEnd = "keep") -> None:
+        self._plan = plan
+        self._nft = program
+        self._at_end: AtEnd = at_end
+        self._wishes: dict[str, Wish] = {}
+        self._allowed: tuple[str, ...] = ()
+        self._shape: str | None = None
+        """As it was right after it was made; None: it is to be made."""
+        self._before: dict[Element, HeldCount] = {}
+        """What elements had counted before they were made anew."""
+
+    def change(self, add: Sequence[Wish], remove: Sequence[Wish]) -> Mapping[str, str]:
+        """Add and remove in one transaction; nothing is refused for good."""
+        wanted = {**self._wishes, **{wish.id: wish for wish in add}}
+        for wish in remove:
+            wanted.pop(wish.id, None)
+        old, new = elements_of(self._wishes.values()), elements_of(wanted.values())
+        if self._shape is None:
+            self._make(new)
+        else:
+            self._differ(old, new)
+        self._wishes = wanted
+        self._before = {each: count for each, count in self._before.items() if each in new}
+        return {}
+
+    def allow(self, entries: Sequence[str]) -> None:
+        """Make the table anew with these entries, at the next change: in the same transaction."""
+        self._allowed = tuple(entries)
+        self._shape = None
+
+    def held(self, wishes: Sequence[Wish]) -> Mapping[str, HeldCount]:
+        """Read back.  Nothing stands in a table that lacks a rule: it is made anew with the next change."""
+        listing = self._read()
+        if listing is None or listing.shape != self._shape:
+            if self._shape is not None:
+                log.error("table inet %s was changed by somebody else; it is made anew", self._plan.name)
+            self._shape, self._wishes = None, {}
+            if not wishes:
+                self._make({})
+            return {}
+        wanted = elements_of(wishes)
+        standing = listing.elements
+        held = {
+            wish.id: self._count(element, standing[element])
+            for wish in wishes
+            if (element := outermost(element_of(wish.target), wanted)) in standing
+        }
+        self._wishes = {wish.id: wish for wish in wishes if wish.id in held}
+        if foreign := [each for each in standing if each not in wanted]:
+            self._remove_foreign(foreign)
+        return held
+
+    def end(self, wishes: Sequence[Wish]) -> None:
+        """Leave the table, whose elements end by their time-outs, or remove it."""
+        if self._at_end == "remove":
+            try:
+                self._nft.apply(self._plan.delete())
+            except TransactionRefused as error:
+                raise EnforcerAway(f"table inet {self._plan.name} stays: {error}") from None
+        else:
+            log.info("table inet %s stays with %d blocks", self._plan.name, len(wishes))
+
+    def _count(self, element: Element, now: HeldCount) -> HeldCount:
+        before = self._before.get(element, _NONE)
+        return HeldCount(before.packets + now.packets, before.bytes + now.bytes)
+
+    def _differ(self, old: Mapping[Element, int], new: Mapping[Element, int]) -> None:
+        changed = {each: end for each, end in new.items() if old.get(each, -1) != end}
+        gone = [each for each in old if each not in new]
+        if again := [each for each in changed if each in old]:
+            self._keep_counts(self._read(), again)
+        # an outer prefix makes room for inner ones, and the other way round: removals come first
+        commands = self._plan.change(changed, gone, old, time.time_ns())
+        try:
+            self._nft.apply(commands)
+        except TransactionRefused as error:
+            log.warning("changed by somebody else? %s; the table is made anew", error)
+            self._make(new)
+
+    def _make(self, elements: Mapping[Element, int]) -> None:
+        listing = self._read()
+        self._keep_counts(listing, listing.elements if listing is not None else ())
+        self._shape = None
+        try:
+            self._nft.apply(self._plan.create(self._allowed, elements, time.time_ns()))
+        except TransactionRefused as error:
+            raise EnforcerAway(f"nftables refuses table inet {self._plan.name}: {error}") from None
+        made = self._read()
+        self._shape = made.shape if made is not None else None
+
+    def _remove_foreign(self, elements: Sequence[Element]) -> None:
+        log.error("table inet %s: elements of somebody else are removed: %s", self._plan.name, elements[:10])
+        try:
+            self._nft.apply(self._plan.change({}, elements, {}, time.time_ns()))
+        except TransactionRefused:
+            self._shape = None  # made anew with the next change or reading
+
+    def _keep_counts(self, listing: TableListing | None, elements: Iterable[Element]) -> None:
+        """These elements begin to count anew."""
+        counted = listing.elements if listing is not None else {}
+        for element in elements:
+            if element in counted:
+                self._before[element] = self._count(element, counted[element])
+
+    def _read(self) -> TableListing | None:
+        found = self._nft.table(self._plan.name)
+        if found is None:
+            return None
+        try:
+            return listing_in(found)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise EnforcerAway(f"table inet {self._plan.name} cannot be read: {error}") from None

@@ -1,0 +1,1 @@
+"""Blocks of the firewall at somebody else's firewall, by signed HTTP requests whose answers confirm or refuse."""
