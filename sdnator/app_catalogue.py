@@ -10,7 +10,7 @@ Installing a package is enough: its app gets a section in `sdnator.toml`, is sta
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 GROUP = "sdnator.apps"
 OURS = ("p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall")
 """In the order in which they are started and shown; others follow by name."""
+ENFORCERS = ("nftables", "webhook_enforcer")
+"""Of the product, but run only where the firewall's setting `enforcers` names them."""
 RESERVED = frozenset(
     {"up", "switches", "dashboard", "log", "metrics", "due", "coordinator", "supervisor", "grants", "updates"}
 )
@@ -103,6 +105,23 @@ def names() -> tuple[str, ...]:
     return tuple(app.name for app in apps())
 
 
+def to_run(enforcers: Collection[str]) -> tuple[str, ...]:
+    """Ids of the apps that a pipeline runs.
+
+    Args:
+        enforcers: those that the firewall's settings name.
+
+    Raises:
+        BadInput: an enforcer is not installed; otherwise as `apps`.
+    """
+    installed = names()
+    for name in enforcers:
+        if name not in installed:
+            known = ", ".join((OURS[0], *ENFORCERS))
+            raise BadInput(f"firewall.enforcers: no app {name!r} is installed; the product has {known}")
+    return tuple(name for name in installed if name not in ENFORCERS or name in enforcers)
+
+
 def of(name: str) -> CataloguedApp:
     """The installed app of this id; raises BadInput."""
     found = next((app for app in apps() if app.name == name), None)
@@ -129,7 +148,7 @@ def catalogued(found: Iterable[EntryPoint]) -> tuple[CataloguedApp, ...]:
         one = CataloguedApp(entry.name, entry.value.partition(":")[0], brought)
         if not _APP_ID.fullmatch(entry.name):
             raise BadInput(f"{brought} brings an app {entry.name!r}: app ids are letters, digits, _ and -")
-        if entry.name in RESERVED or (entry.name in OURS and brought != "sdnator"):
+        if entry.name in RESERVED or (entry.name in (*OURS, *ENFORCERS) and brought != "sdnator"):
             raise BadInput(
                 f"{brought} brings an app {entry.name!r}, a name of the product: uninstall {brought}"
             )

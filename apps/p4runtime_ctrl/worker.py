@@ -329,9 +329,16 @@ class SwitchWorker:
             self._uncounted = True
             if time.monotonic() - self._counted_at > _CALM_S:
                 self._count_soon()
+            self._say_if_none_is_left()
 
     def _command(self, command: TableCommand) -> None:
         self._confirm(self._switch.command(command, self._session))
+        self._say_if_none_is_left()
+
+    def _say_if_none_is_left(self) -> None:
+        """Without blocks no counter is read, and the last one would be listed until a packet comes."""
+        if self._readings.shown and not self._switch.blocks:
+            self._write_state()
 
     def _want(self, demand: Demand) -> None:
         """Unwanted keys are no longer published; new keys are, before they are requested of the switch."""

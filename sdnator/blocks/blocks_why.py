@@ -1,13 +1,15 @@
 """A decision's whole life for people: what led to it, what the archive knew, what the switches did."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
+from apps.enforcement import CONFIRMED, ENFORCED
 from apps.firewall.evidence.history import DECISIONS, count_offences, instructions_in, offences_query
 from apps.messages import Decision, Exhibit
 from due import Item
 from sdnator.blocks.blocks_archive import find
+from sdnator.blocks.blocks_places import PlaceAnswer, action_word, last_answers, places_words
 from sdnator.blocks.five_lines import five_lines
 from sdnator.counted import counted
 from sdnator.errors import BadInput
@@ -24,13 +26,12 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
     steps = [Decision.from_value(item.value) for item in found]
     first = steps[0]
     earlier = find(archive, offences_query(first.target))
-    confirmations = find(
-        archive, {"dataKey": "network.confirmation.p4runtime_ctrl.*", "value.id": decision_id}
-    )
+    confirmations = find(archive, {"dataKey": f"{CONFIRMED}.*.*", "value.id": decision_id})
+    answers = last_answers(confirmations).get(decision_id, ())
     incident = incident_of(archive, decision_id)
     return {
         "id": decision_id,
-        "why": list(five_lines(first, steps[-1], incident)),
+        "why": list(five_lines(first, steps[-1], incident, places_words(steps[-1], answers))),
         "incident": incident.to_value() if incident is not None else None,
         "target": first.target.address,
         "steps": [
@@ -38,7 +39,10 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
         ],
         "evidence": [_evidence(each, archive) for each in dict.fromkeys(_all_evidence(steps))],
         "offences_before": count_offences(earlier, first.target, first.event_time),
-        "confirmations": [{"written": item.timestamp} | dict(item.value) for item in confirmations],
+        "confirmations": [
+            {"written": item.timestamp, "enforcer": item.app_id} | dict(item.value) for item in confirmations
+        ],
+        "enforcers": [answer.to_value() for answer in answers],
         "stopped": _stopped(decision_id, archive),
         "events": [
             {"written": item.timestamp} | dict(item.value)
@@ -62,12 +66,13 @@ def _evidence(evidence: Exhibit, archive: str) -> dict[str, Any]:
 
 
 def _stopped(decision_id: str, archive: str) -> dict[str, dict[str, int]]:
-    """By switch: the last reading of the decision's drop counter."""
-    query = {"dataKey": "network.switch.p4runtime_ctrl.*", "value.blocks.id": decision_id}
+    """By place: the last reading of the decision's drop counter."""
     last: dict[str, dict[str, int]] = {}
-    for item in find(archive, query):
-        for reading in _readings(item, decision_id):
-            last[str(item.value["switch"])] = reading
+    for key in ("network.switch.p4runtime_ctrl.*", f"{ENFORCED}.*.*"):
+        for item in find(archive, {"dataKey": key, "value.blocks.id": decision_id}):
+            where = str(item.value.get("switch") or f"{item.app_id} {item.value.get('place')}")
+            for reading in _readings(item, decision_id):
+                last[where] = reading
     return last
 
 
@@ -89,7 +94,8 @@ def as_text(life: dict[str, Any]) -> Iterator[str]:
         events.append((step["written"], decision_line(made)))
     for said in life["confirmations"]:
         words = f"{said['state']} {said['handle']} {said['cause']}"
-        events.append((said["written"], f"  switch {said['switch']}: {words}".rstrip()))
+        where = PlaceAnswer(said["enforcer"], said["switch"], "", "").where()
+        events.append((said["written"], f"  {where}: {words}".rstrip()))
     events += [(said["written"], f"  {said['text']}") for said in life["events"]]
     yield from (f"{time_text(at)} {text}" for at, text in sorted(events, key=lambda event: event[0]))
     before = life["offences_before"]
@@ -102,13 +108,21 @@ def as_text(life: dict[str, Any]) -> Iterator[str]:
         yield f"stopped by {switch}: {counted(reading['packets'], 'packet')}, {counted(reading['bytes'], 'byte')}"
 
 
-def decision_line(decision: Decision) -> str:
-    """A decision in one line."""
+def decision_line(decision: Decision, answers: Collection[PlaceAnswer] | None = None) -> str:
+    """A decision in one line.
+
+    Args:
+        decision: the decision.
+        answers: what enforcers said of it last; None: that is told elsewhere.
+    """
     until = f"until {time_text(decision.expires)}" if decision.expires else "without end"
     target = decision.target
     where = f"{target.address} port {target.port}" if target.port is not None else target.address
     action = f"would {decision.action}" if decision.dry_run else decision.action
-    return f"{decision.id} {action} {where} on {decision.switch} {until}: {decision.reason}"
+    if answers is None:
+        return f"{decision.id} {action} {where} on {decision.switch} {until}: {decision.reason}"
+    action, places = action_word(decision, answers), places_words(decision, answers)
+    return f"{decision.id} {action} {where} on {decision.switch} {until} ({places}): {decision.reason}"
 
 
 def time_text(time_ns: int) -> str:

@@ -11,13 +11,14 @@ _WORDS = 100
 """Characters of a text in a line; what follows a semicolon is detail, which the history below has."""
 
 
-def five_lines(first: Decision, last: Decision, incident: Incident | None) -> Iterator[str]:
+def five_lines(first: Decision, last: Decision, incident: Incident | None, places: str = "") -> Iterator[str]:
     """Explain a decision.
 
     Args:
         first: as it was made.
         last: as it is now: extended or lifted, perhaps.
         incident: the incident that it belongs to, as last reported; None if it belongs to none.
+        places: where it is in force, in words; empty: unknown.
 
     Yields:
         Five lines.
@@ -25,7 +26,8 @@ def five_lines(first: Decision, last: Decision, incident: Incident | None) -> It
     action = _action(first, incident)
     yield f"sum: {_sum(first, action)}"
     yield f"largest contributions: {_contributions(first, action)}"
-    yield f"remedy: {_remedy(first, last, action)}"
+    where = f" ({places})" if places and not _is_lifted(last) else ""
+    yield f"remedy: {_remedy(first, last, action)}{where}"
     yield f"until: {_until(last)}"
     yield f"undo: {_undo(first, last)}"
 

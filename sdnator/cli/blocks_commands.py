@@ -8,9 +8,9 @@ import json
 import os
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 from uuid import uuid4
 
 import typer
@@ -25,12 +25,13 @@ from apps.firewall.evidence.history import (
 )
 from apps.firewall.policy.instructions import target_in
 from apps.firewall.policy.rules import AllowList
-from apps.messages import Answer, Instruction
+from apps.messages import Answer, Decision, Instruction
 from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item
 from due.config import Options
 from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
 from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.blocks.blocks_nft import nft_sets
+from sdnator.blocks.blocks_places import PlaceAnswer, answers_of
 from sdnator.blocks.blocks_why import as_text, decision_line, life_of
 from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
@@ -67,15 +68,20 @@ def list_blocks(
     """
     decisions = all_decisions(archive)
     shown = decisions if every else in_force(decisions)
+    answers = answers_of({decision.id for decision in shown}, archive) if shown and not nft else {}
     if nft:
         typer.echo(nft_sets(shown))
     elif as_json:
-        typer.echo(json.dumps([decision.to_value() for decision in shown]))
+        typer.echo(json.dumps([_as_value(decision, answers.get(decision.id, ())) for decision in shown]))
     elif not shown:
         typer.echo("nothing is blocked or guarded")
     else:
         for decision in shown:
-            typer.echo(decision_line(decision))
+            typer.echo(decision_line(decision, answers.get(decision.id, ())))
+
+
+def _as_value(decision: Decision, answers: Collection[PlaceAnswer]) -> dict[str, Any]:
+    return decision.to_value() | {"enforcers": [answer.to_value() for answer in answers]}
 
 
 @blocks.command("why")

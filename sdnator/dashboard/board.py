@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from apps.enforcement import SWITCHES, place_text
 from apps.incidents import Incident
 from apps.messages import Alert, Confirmation, Decision
 
@@ -71,7 +72,7 @@ class Board:
         self.alerts: deque[Alert] = deque(maxlen=ALERTS_KEPT)
         self.decisions: OrderedDict[tuple[str, str, str, int | None], Decision] = OrderedDict()
         self.answers: OrderedDict[str, str] = OrderedDict()
-        """What switches said of decisions, by decision and switch."""
+        """What enforcers said of decisions, by decision and place."""
         self.incidents: OrderedDict[str, Incident] = OrderedDict()
         """By id, as last reported, the one heard of last at the end."""
         self.switches: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
@@ -122,10 +123,12 @@ class Board:
                     self.decisions.popitem(last=False)
                 self._changed("decisions")
 
-    def confirm(self, confirmation: Confirmation) -> None:
-        """What a switch said."""
+    def confirm(self, confirmation: Confirmation, enforcer: str = SWITCHES) -> None:
+        """What an enforcer said; `enforcer` is its app id."""
+        place = confirmation.switch
         with self.lock:
-            name = f"{confirmation.id} {confirmation.switch}"
+            where = place if enforcer == SWITCHES else place_text(enforcer, place)
+            name = f"{confirmation.id} {where}"
             text = confirmation.state + (f": {confirmation.cause}" if confirmation.cause else "")
             self.answers.pop(name, None)
             self.answers[name] = text

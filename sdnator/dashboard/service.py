@@ -16,8 +16,9 @@ from typing import Any
 from uuid import uuid4
 
 import due.service
+from apps.enforcement import CONFIRMED
 from apps.incidents import INCIDENTS, Incident
-from apps.messages import Alert, Answer, Confirmation, Decision, Instruction
+from apps.messages import Alert, Answer, Confirmation, Decision, Instruction, sender_of
 from due import NO_WAIT, Capability, Engine, Interest, Item
 from due.errors import DueError, InvalidOption
 from sdnator.dashboard.board import Board
@@ -28,13 +29,14 @@ from sdnator.errors import SdnatorError
 ANSWERS = "network.answer.firewall.dashboard"
 INSTRUCTION = "network.instruction.dashboard.firewall"
 DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*")
+CONFIRMATIONS = f"{CONFIRMED}.*.*"
 _STATE = "network.switch.p4runtime_ctrl"
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.score"),
     Interest("network.anomaly.kitsune.alert"),
     *(Interest(key) for key in DECISIONS),
-    Interest("network.confirmation.p4runtime_ctrl.*"),
+    Interest(CONFIRMATIONS),
     Interest(INCIDENTS),
     Interest(f"{_STATE}.*"),
     Interest("due.health.*"),
@@ -120,9 +122,7 @@ class DashboardService:
             "network.anomaly.kitsune.score": lambda item: board.score(item.value, time.time()),
             "network.anomaly.kitsune.alert": lambda item: board.alert(Alert.from_value(item.value)),
             **dict.fromkeys(DECISIONS, lambda item: board.decide([Decision.from_value(item.value)])),
-            "network.confirmation.p4runtime_ctrl.*": lambda item: board.confirm(
-                Confirmation.from_value(item.value)
-            ),
+            CONFIRMATIONS: lambda item: board.confirm(Confirmation.from_value(item.value), sender_of(item)),
             INCIDENTS: lambda item: board.incident(Incident.from_value(item.value)),
             f"{_STATE}.*": lambda item: board.switch(item.value),
             "due.health.*": lambda item: board.healthy(item.app_id, item.value, time.monotonic()),

@@ -7,6 +7,8 @@ from apps.incidents import Incident
 from apps.messages import Alert, Decision, Target
 from sdnator.incidents.incident_rows import row
 
+_STANDING = ("installed", "exists")
+
 
 def clock(time_ns: int) -> str:
     """A UTC time of day, with the date where that is not today's."""
@@ -33,9 +35,11 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     until = f"until {clock(one.expires)}" if one.expires else "without end"
     said = ", ".join(f"{switch}: {text}" for switch, text in answers.items())
     where = "all switches" if one.switch in ("", "*") else one.switch
+    # without any answer nobody knows: the page may be younger than the block
+    nowhere = bool(answers) and not any(text.startswith(_STANDING) for text in answers.values())
     return {
         "id": one.id,
-        "action": f"would {one.action}" if one.dry_run else one.action,
+        "action": f"would {one.action}" if one.dry_run or nowhere else one.action,
         "target": target(one.target),
         "address": one.target.address,
         "where": f"{where} · {until}",

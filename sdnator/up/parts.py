@@ -184,6 +184,8 @@ class UpParts:
 
     def _controller_places(self) -> Mapping[str, Any]:
         program = p4_program.find()
+        # a switch that is no enforcer decides as one that sees copies does
+        enforced = "p4runtime_ctrl" in self.plan.settings_of("firewall").get("enforcers", ("p4runtime_ctrl",))
         return {
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
@@ -198,7 +200,7 @@ class UpParts:
                     "target": switch.kind,
                     "forward": {str(number): egress for number, egress in switch.forward.items()},
                     "fail": switch.fail,
-                    "mirror": switch.mirror,
+                    "mirror": switch.mirror or not enforced,
                     **({"learn": msgspec.to_builtins(switch.learn)} if switch.learn.ports else {}),
                 }
                 for switch in self.plan.switches

@@ -59,7 +59,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
     settings["coordinator"] = _coordinator(config, given.quota or own.quota, embedded=not archive)
     settings["kitsune"] = _kitsune(config, given)
     settings["firewall"] = _firewall(config, given)
-    installed = app_catalogue.names()
+    installed = app_catalogue.to_run(config.struct("firewall").enforcers)
     settings |= {name: config.section(name) for name in installed if name not in settings}
     log, metrics = config.struct("log"), config.struct("metrics")
     return StandingPlan(

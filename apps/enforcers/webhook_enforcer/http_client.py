@@ -106,6 +106,7 @@ class SignedHttpClient:
                 raise http.client.HTTPException(f"an answer of over {_MOST_BYTES:,} bytes")
             if time.monotonic() > deadline:
                 raise TimeoutError(f"no whole answer within {self._timeout_s:g} s")
+        answer.close()  # read to its end: the connection may be used again
         if answer.will_close:
             self.close()
         return answer.status, bytes(found)
