@@ -236,10 +236,10 @@ def type_name(kind: Any) -> str:
 
 def keys() -> str:
     """Who writes and wants which key, and what the values hold."""
-    from sdnator.report.flow_picture import SERVICES
+    from sdnator.report.flow_picture import ENFORCER_SERVICES, SERVICES
 
     lines: list[str] = []
-    for name, module in {"coordinator": "coordinator.service", **SERVICES}.items():
+    for name, module in {"coordinator": "coordinator.service", **SERVICES, **ENFORCER_SERVICES}.items():
         service = import_module(module)
         lines += [f"## {name}", "", "Can make:", ""]
         made = ((_code(one.key), one.delivery, one.archive) for one in service.CAPABILITIES)
@@ -252,7 +252,7 @@ def keys() -> str:
     )
     lines += ["## Packets", "", *_packets(), "## Messages", "", times, ""]
     base = import_module("apps.messages").Message
-    for module in ("apps.messages", "apps.evidence", "apps.incidents"):
+    for module in ("apps.messages", "apps.evidence", "apps.incidents", "apps.enforcement"):
         for kind in vars(import_module(module)).values():
             own = inspect.isclass(kind) and kind.__module__ == module
             if own and issubclass(kind, base) and kind is not base:

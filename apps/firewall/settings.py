@@ -5,6 +5,7 @@ from typing import Final, Literal
 
 import msgspec
 
+from apps.firewall.enforcement.syslog_sink import Facility, syslog_place
 from apps.firewall.policy.rules import Rules
 from apps.firewall.syn.syn_policy import SynRules
 
@@ -52,6 +53,13 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Name of that list."""
     eve_format: Literal["eve", "ecs"] = "eve"
     """Fields of these lines: Suricata's EVE, or those of the Elastic Common Schema."""
+    syslog: str = ""
+    """Collector that gets the same lines as syslog messages (RFC 5424): udp://, tcp:// or tls://HOST:PORT; empty:
+    none."""
+    syslog_facility: Facility = "local0"
+    """Facility of these messages."""
+    syslog_ca: str = ""
+    """CA certificates that may have signed the collector's (tls), a file; empty: the system's."""
     webhook: str = ""
     """URL to which decisions and notices are sent as JSON by POST; empty: none."""
     webhook_token: str = ""
@@ -63,5 +71,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for name in (*self.evidence_queries, *self.evidence_apps, *self.enforcers):
             if not _SEGMENT.fullmatch(name):
                 raise ValueError(f"{name!r} is no name of a query or an app: letters, digits and _ only")
+        if self.syslog:
+            syslog_place(self.syslog)
         if not self.enforcers or len(set(self.enforcers)) < len(self.enforcers):
             raise ValueError(f"enforcers={list(self.enforcers)}: name one or more apps, each once")

@@ -6,7 +6,7 @@ from typing import Any
 
 from apps.enforcement import CONFIRMED, ENFORCED
 from apps.firewall.evidence.history import DECISIONS, count_offences, instructions_in, offences_query
-from apps.messages import Decision, Exhibit
+from apps.messages import Decision, Exhibit, writer_of
 from due import Item
 from sdnator.blocks.blocks_archive import find
 from sdnator.blocks.blocks_places import PlaceAnswer, action_word, last_answers, places_words
@@ -40,7 +40,8 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
         "evidence": [_evidence(each, archive) for each in dict.fromkeys(_all_evidence(steps))],
         "offences_before": count_offences(earlier, first.target, first.event_time),
         "confirmations": [
-            {"written": item.timestamp, "enforcer": item.app_id} | dict(item.value) for item in confirmations
+            {"written": item.timestamp, "enforcer": writer_of(item.key)} | dict(item.value)
+            for item in confirmations
         ],
         "enforcers": [answer.to_value() for answer in answers],
         "stopped": _stopped(decision_id, archive),

@@ -52,13 +52,15 @@ PRODUCT_SECTIONS: Mapping[str, Section] = {
     "kitsune": Section("apps.kitsune.service", "Settings"),
     "sonata_adapter": Section("apps.sonata_adapter.service", "Settings"),
     "firewall": Section("apps.firewall.service", "Settings", defaults={"allow_surroundings": True}),
+    "nftables": Section("apps.enforcers.nftables.settings", "Settings"),
+    "webhook_enforcer": Section("apps.enforcers.webhook_enforcer.settings", "Settings"),
 }
 
 
 @cache
 def sections() -> Mapping[str, Section]:
     """All sections of the file, including one for each installed app."""
-    others = {app.name: Section(app.module, "Settings") for app in apps() if not app.ours}
+    others = {app.name: Section(app.module, "Settings") for app in apps() if app.name not in PRODUCT_SECTIONS}
     return {**PRODUCT_SECTIONS, **others}
 
 

@@ -11,12 +11,14 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from sdnator.app_catalogue import OURS
+from sdnator.app_catalogue import ENFORCERS, OURS
 
 if TYPE_CHECKING:
     from coordinator.matching import Flow
     from due import Interest
 
+ENFORCER_SERVICES = {name: f"apps.enforcers.{name}.service" for name in ENFORCERS}
+"""Not in the picture: they run only where the settings name them."""
 SERVICES = {**{name: f"apps.{name}.service" for name in OURS}, "dashboard": "sdnator.dashboard.service"}
 """Who declares interests and capabilities, in the order of the lanes."""
 

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 import msgspec
 import pytest
 
-from sdnator.app_catalogue import GROUP, OURS, apps, catalogued
+from sdnator.app_catalogue import ENFORCERS, GROUP, OURS, apps, catalogued, to_run
 from sdnator.errors import BadInput
 
 
@@ -30,6 +30,18 @@ def test_our_own_apps_are_found_like_everybody_s():
         assert app.service.__module__ == app.module
 
 
+def test_enforcers_run_only_where_the_firewall_names_them():
+    """Whoever installs the product changes no host's firewall by that."""
+    assert not {*ENFORCERS} & {*to_run(("p4runtime_ctrl",))}
+    assert "nftables" in to_run(("p4runtime_ctrl", "nftables"))
+    for app in apps():
+        if app.name in ENFORCERS:
+            assert app.interests
+            assert app.capabilities
+    with pytest.raises(BadInput, match="no app 'iptables'"):
+        to_run(("iptables",))
+
+
 def test_others_follow_ours_by_name():
     found = catalogued([entry("zeta"), entry("alpha"), entry("firewall", "apps.firewall.service", "sdnator")])
     assert [app.name for app in found] == ["firewall", "alpha", "zeta"]
@@ -40,6 +52,7 @@ def test_others_follow_ours_by_name():
     [
         ([entry("up")], "a name of the product"),
         ([entry("kitsune")], "a name of the product"),
+        ([entry("nftables")], "a name of the product"),
         ([entry("a.b")], "letters, digits"),
         ([entry("mine", "one.service", "one"), entry("mine", "two.service", "two")], "both bring"),
     ],

@@ -1,4 +1,4 @@
-"""Sinks for events: a file, a Redis list, a webhook.  I/O, each in its own thread.
+"""Sinks for events: a file, a Redis list, syslog, a webhook.  I/O, each in its own thread.
 
 A slow or broken sink blocks nobody: its queue is bounded.  Lines that do not fit, or that could not be
 delivered after all attempts, are counted in `lost`.
@@ -16,6 +16,7 @@ from typing import Final
 
 import redis
 
+from apps.firewall.enforcement.syslog_sink import to_syslog
 from apps.firewall.settings import Settings
 from due.drivers.redis_wire import client
 from due.errors import DueError
@@ -145,5 +146,8 @@ def event_sinks(settings: Settings) -> tuple[list[EventSink], list[EventSink]]:
     every = [EventSink("eve_file", to_file(settings.eve_file))] if settings.eve_file else []
     if settings.eve_redis:
         every.append(EventSink("eve_redis", to_redis_list(settings.eve_redis, settings.eve_list)))
+    if settings.syslog:
+        deliver = to_syslog(settings.syslog, settings.syslog_facility, settings.syslog_ca)
+        every.append(EventSink("syslog", deliver))
     hook = to_webhook(settings.webhook, settings.webhook_token) if settings.webhook else None
     return every, [EventSink("webhook", hook)] if hook else []

@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 from typer.testing import CliRunner
 
-from sdnator.app_catalogue import OURS
+from sdnator.app_catalogue import ENFORCERS, OURS
 from sdnator.cli.coordinator_commands import declarations, declared_flows, draw
 from sdnator.errors import BadInput, PipelineError
 from tests.end_to_end.operator_app import app
@@ -107,7 +107,7 @@ def test_the_loop_is_closed_in_what_the_apps_declare():
     """Packets to Kitsune, alerts to the firewall, decisions to the controller: found by matching alone."""
     arrows = {(one["producer"], one["consumer"]) for one in declared_flows()}
     assert {("p4runtime_ctrl", "kitsune"), ("kitsune", "firewall"), ("firewall", "p4runtime_ctrl")} <= arrows
-    assert set(declarations()) == set(OURS)
+    assert set(declarations()) == {*OURS, *ENFORCERS}
 
 
 def test_nothing_to_draw_is_said():
