@@ -8,7 +8,7 @@ from apps.evidence import Evidence
 from apps.firewall.arrivals import evidence_of
 from apps.firewall.enforcement.announcer import Announcer
 from apps.firewall.evidence import history
-from apps.firewall.evidence.archive import Archive
+from apps.firewall.evidence.archive import OFFENCES_READ, Archive
 from apps.firewall.incidents.incident_reports import IncidentReports
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider, Proposal
@@ -19,8 +19,6 @@ from due import Item
 
 EVIDENCE_KEPT: Final = 10
 SENDERS_KEPT: Final = 10_000
-OFFENCES_READ: Final = 1_000
-"""Most archived blocks read per address, the newest."""
 
 
 class EvidenceHandler:

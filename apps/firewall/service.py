@@ -31,7 +31,7 @@ from apps.firewall.evidence.archive import Archive
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
 from apps.firewall.evidence.past import ArchivedPast
 from apps.firewall.evidence.recent_rows import AGED_S
-from apps.firewall.evidence_handler import OFFENCES_READ, EvidenceHandler
+from apps.firewall.evidence_handler import EvidenceHandler
 from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
 from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
@@ -80,13 +80,11 @@ SYN_INTERESTS = (
 ENFORCER_INTERESTS = (Interest(f"{CONFIRMED}.*.*"), Interest(f"{ENFORCED}.*.*"))
 """Of the enforcers that the settings name."""
 CAPABILITIES = (
-    Capability("network.block.firewall.ipv4", delivery="reliable", archive="always"),
-    Capability("network.block.firewall.ipv6", delivery="reliable", archive="always"),
-    Capability("network.block.firewall.mac", delivery="reliable", archive="always"),
-    Capability("network.block_prefix.firewall.ipv4", delivery="reliable", archive="always"),
-    Capability("network.block_prefix.firewall.ipv6", delivery="reliable", archive="always"),
-    Capability("network.protect.firewall.ipv4", delivery="reliable", archive="always"),
-    Capability("network.protect.firewall.ipv6", delivery="reliable", archive="always"),
+    *(
+        Capability(f"network.{family}.firewall.{kind}", delivery="reliable", archive="always")
+        for family in ("block", "block_prefix", "protect")
+        for kind in ("ipv4", "ipv6", *(["mac"] if family == "block" else ()))
+    ),
     Capability(f"{EVENTS}.*", delivery="reliable", archive="always"),
     INCIDENT_CAPABILITY,
     Capability(ALLOWED, delivery="reliable", archive="always"),
@@ -393,7 +391,8 @@ class FirewallService:
     def _look(self, due: Examination) -> None:
         """Examine the SYNs of a suspected flood, and decide."""
         watch = self._syn.suspect(due.suspicion, due.at)
-        offences = self._offences(watch.often(self._settings.syn), watch.now) if due.sure else {}
+        often = watch.often(self._settings.syn) if due.sure else ()
+        offences = self._past.offences(often, watch.now)
         for decision in self._syn.conclude(watch, offences, sure=due.sure):
             # the guard before the block has had the source's connections reset
             decision = self._publish(decision, resets=False)  # noqa: PLW2901 - as it was published
@@ -403,16 +402,6 @@ class FirewallService:
                 self._resets.plan(decision.id, wanted, time.monotonic())
         if watch.unsure:
             self._examinations.doubt(due, time.monotonic())
-
-    def _offences(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
-        """Earlier blocks by address; None if the archive does not answer."""
-        if not addresses:
-            return {}
-        items = self._archive.find(history.offences_of_many(addresses), most=OFFENCES_READ * len(addresses))
-        if items is None:
-            return None
-        targets = {address: Target(kind="ip", address=address) for address in addresses}
-        return {address: history.count_offences(items, target, now) for address, target in targets.items()}
 
     def _reset(self) -> None:
         halves = self._resets.due(time.monotonic(), sorted(self._switches), self._syn.spared)

@@ -14,6 +14,7 @@ Source: Suricata's EVE format and its `etc/schema.json`.
 """
 
 import json
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from ipaddress import ip_address
 from typing import Any, Final, Literal
@@ -103,8 +104,13 @@ def incident_event(incident: Incident) -> Event:
     return event
 
 
-def decision_event(decision: Decision) -> Event:
-    """A decision that belongs to no incident: a block is an alert with the action `blocked`."""
+def decision_event(decision: Decision, places: Sequence[str] = ()) -> Event:
+    """A decision that belongs to no incident: a block is an alert with the action `blocked`.
+
+    Args:
+        decision: the decision.
+        places: enforcers that have confirmed it; none: it was decided just now.
+    """
     number, signature, severity = DECISION_SIGNATURES.get(decision.action, _OTHER_DECISION)
     target = decision.target
     event = _event("alert", decision.event_time)
@@ -125,6 +131,8 @@ def decision_event(decision: Decision) -> Event:
         "reason": [decision.reason],
         "until": [time_text(decision.expires)] if decision.expires else [],
         "dry_run": ["yes"] if decision.dry_run else [],
+        "event": ["confirmed"] if places else [],
+        "enforcers": list(places),
     }
     action = "blocked" if blocks else "allowed"
     event["alert"] = _alert(number, signature, decision.action, severity, action, said)

@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 
 MOST: Final = 100_000
 """Most items of one query, the newest."""
+OFFENCES_READ: Final = 1_000
+"""Most archived blocks read per address, the newest."""
 
 
 class _Question(threading.Thread):

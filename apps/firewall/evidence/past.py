@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, TypeVar
 
 from apps.firewall.arrivals import (
@@ -15,12 +15,28 @@ from apps.firewall.arrivals import (
     instruction_in,
 )
 from apps.firewall.enforcement.switch_entries import KEPT, leftovers
-from apps.firewall.evidence.archive import MOST, Archive
-from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, in_force
+from apps.firewall.evidence.archive import MOST, OFFENCES_READ, Archive
+from apps.firewall.evidence.history import (
+    ANSWERS,
+    DECISIONS,
+    INSTRUCTIONS,
+    count_offences,
+    in_force,
+    offences_of_many,
+)
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
 from apps.firewall.settings import Settings
 from apps.incidents import INCIDENTS, Incident
-from apps.messages import LONGEST_BLOCK_S, Answer, Decision, Instruction, Intake, MessageError, TableUpdate
+from apps.messages import (
+    LONGEST_BLOCK_S,
+    Answer,
+    Decision,
+    Instruction,
+    Intake,
+    MessageError,
+    TableUpdate,
+    Target,
+)
 from due import Item
 
 _PATIENCE_S: Final = 30.0
@@ -77,6 +93,16 @@ class ArchivedPast:
         shakes = self._read(HANDSHAKES, "handshake", _archived_handshake, since=since, most=most)
         learn_archived(known, shakes, days)
         log.info("%d known sources in the archive", len(known))
+
+    def offences(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
+        """Earlier blocks by address, before a capture time (ns); None if the archive does not answer."""
+        if not addresses:
+            return {}
+        items = self._archive.find(offences_of_many(addresses), most=OFFENCES_READ * len(addresses))
+        if items is None:
+            return None
+        targets = {address: Target(kind="ip", address=address) for address in addresses}
+        return {address: count_offences(items, target, now) for address, target in targets.items()}
 
     def leftovers(self, wanted: Iterable[TableUpdate]) -> dict[str, list[TableUpdate]]:
         """By switch: deletions of entries of an earlier run that are no longer wanted."""

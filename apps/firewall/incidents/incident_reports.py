@@ -3,6 +3,7 @@
 The service tells it what happens, in the order in which it happens; it publishes what the book returns.
 """
 
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -16,6 +17,7 @@ from apps.messages import Alert, Confirmation, Decision
 from due import Capability, Engine
 
 INCIDENT_CAPABILITY: Final = Capability(f"{INCIDENT}.firewall.*", delivery="reliable", archive="always")
+_MOST_ALONE: Final = 8_192
 IMPORTANT: Final = ("decided", "over")
 """Changes of which the webhook hears too."""
 
@@ -38,6 +40,8 @@ class IncidentReports:
         self._form: EveFormat = form
         self._book = book or IncidentBook()
         self._written = 0
+        self._alone: OrderedDict[str, tuple[Decision, tuple[str, ...]]] = OrderedDict()
+        """Standing decisions that belong to no incident, and the places that were told."""
 
     def restore(self, incidents: Iterable[Incident]) -> None:
         """Go on with what was open before a restart.
@@ -79,6 +83,7 @@ class IncidentReports:
         """
         self._publish(self._book.decided(decision))
         if not self._book.has(decision.id):
+            self._note_alone(decision)
             self._lines.event(line_of(decision_event(decision), self._form), important=True)
 
     def confirmed(self, confirmation: Confirmation, places: Sequence[str] = ()) -> None:
@@ -89,6 +94,19 @@ class IncidentReports:
             places: where the decision is in force now.
         """
         self._publish(self._book.confirmed(confirmation, places))
+        decision, told = self._alone.get(confirmation.id, (None, ()))
+        if decision is None or tuple(places) == told:
+            return
+        self._alone[decision.id] = decision, tuple(places)
+        if set(places) - set(told):
+            self._lines.event(line_of(decision_event(decision, places), self._form))
+
+    def _note_alone(self, decision: Decision) -> None:
+        _, told = self._alone.pop(decision.id, (None, ()))
+        if decision.action in ("block", "protect") and not decision.dry_run:
+            self._alone[decision.id] = decision, told
+            if len(self._alone) > _MOST_ALONE:
+                self._alone.popitem(last=False)
 
     def count(self, decision: str, packets: int, now: int) -> None:
         """A switch has counted packets that a decision dropped, challenged or metered so far.

@@ -66,9 +66,12 @@ class Switches:
     def wait_for(self, decision, *states):
         wait_for(lambda: (self.states(decision) or [""])[-1] in states, why=self._stage.log)
 
-    def held(self, decision):
+    def stands(self, decision):
         state = (self._heard.values("network.switch") or [{"blocks": []}])[-1]
         return decision.id in {each["id"] for each in state["blocks"]}
+
+    def is_gone(self, decision):
+        return not self.stands(decision)
 
 
 class Others(EnforcerRun):
@@ -76,8 +79,11 @@ class Others(EnforcerRun):
 
     ends_by_itself = True
 
-    def held(self, decision):
-        return decision.id in super().held()
+    def stands(self, decision):
+        return decision.id in self.held()
+
+    def is_gone(self, decision):
+        return not self.stands(decision)
 
 
 @contextmanager
@@ -122,10 +128,10 @@ def test_blocks_are_added_confirmed_listed_and_removed(enforcer):
     for address in ADDRESSES:
         block = enforcer.decide(enforcer.block(address))
         enforcer.wait_for(block, "installed")
-        wait_for(lambda one=block: enforcer.held(one))
+        wait_for(partial(enforcer.stands, block))
         enforcer.lift(block)
         enforcer.wait_for(block, "removed")
-        wait_for(lambda one=block: not enforcer.held(one))
+        wait_for(partial(enforcer.is_gone, block))
         assert enforcer.states(block) == ["installed", "removed"]
 
 
@@ -143,9 +149,9 @@ def test_a_dry_run_is_neither_carried_out_nor_confirmed(enforcer):
     dry = enforcer.decide(enforcer.block("192.0.2.1", dry_run=True))
     real = enforcer.decide(enforcer.block("192.0.2.2"))
     enforcer.wait_for(real, "installed")
-    wait_for(lambda: enforcer.held(real))
+    wait_for(lambda: enforcer.stands(real))
     assert not enforcer.states(dry)
-    assert not enforcer.held(dry)
+    assert not enforcer.stands(dry)
 
 
 def test_a_killed_one_takes_up_what_is_in_force(enforcer):
@@ -156,7 +162,7 @@ def test_a_killed_one_takes_up_what_is_in_force(enforcer):
     enforcer.kill()
     enforcer.lift(lifted)
     enforcer.start()
-    wait_for(lambda: enforcer.held(stays) and not enforcer.held(lifted))
+    wait_for(lambda: enforcer.stands(stays) and not enforcer.stands(lifted))
 
 
 def test_a_block_ends_with_its_time(enforcer):
@@ -166,4 +172,4 @@ def test_a_block_ends_with_its_time(enforcer):
     if not enforcer.ends_by_itself:
         enforcer.lift(block)
     enforcer.wait_for(block, "removed", "expired")
-    wait_for(lambda: not enforcer.held(block))
+    wait_for(lambda: not enforcer.stands(block))

@@ -6,12 +6,12 @@ from itertools import count
 
 import pytest
 
-from apps.enforcement import AllowedEntries
+from apps.enforcement import AllowedEntries, EnforcementReport
 from apps.enforcers.arrivals import allowed_in, decision_in
 from apps.enforcers.desk import EnforcerDesk, Spoken
 from apps.enforcers.enforcer import EnforcerAway, HeldCount
 from apps.enforcers.wishes import AllowedSenders
-from apps.messages import Decision, MessageError, Target
+from apps.messages import Confirmation, Decision, MessageError, Target
 from due import Item
 from sdnator.testing.waiting import wait_for
 from tests.apps.hostile import NOW, carried, mutations
@@ -62,8 +62,8 @@ class Told:
 
     def __init__(self, **options):
         self.enforcer = Obedient()
-        self.said = []
-        self.reports = []
+        self.said: list[Confirmation] = []
+        self.reports: list[EnforcementReport] = []
         chosen = {"check_s": 0.05, "patience_s": 0.2, **options}
         names = ("app", "place")
         self.desk = EnforcerDesk(self.enforcer, names, self.said.append, self.reports.append, **chosen)

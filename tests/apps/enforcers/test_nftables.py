@@ -116,6 +116,11 @@ def test_a_killed_enforcer_leaves_its_blocks_and_takes_them_up_again(lab, run):
         wait_for(lambda: run.held() == {stays.id}, why=run.words)
 
 
+def restored(run, number):
+    """Whether blocks were restored so often."""
+    return run.reports[-1].restored >= number
+
+
 def test_what_somebody_else_removes_is_put_back_and_told(lab, run):
     """The whole ruleset, a rule, an element: each comes back."""
     block = run.decide(run.block(SENDERS[4]))
@@ -130,7 +135,7 @@ def test_what_somebody_else_removes_is_put_back_and_told(lab, run):
             start=1,
         ):
             lab.nft(*spoiling)
-            wait_for(lambda n=number: run.reports[-1].restored >= n, why=run.words)
+            wait_for(partial(restored, run, number), why=run.words)
             wait_for(lambda: not path.passes(), why=run.words)
     assert any("somebody else" in each.problem for each in run.reports)
 

@@ -5,12 +5,15 @@ import socket
 import ssl
 import subprocess
 import threading
+import time
 
 import pytest
 
 from apps.enforcers.webhook_enforcer.exchange import answer_in, listing_in
 from apps.enforcers.webhook_enforcer.settings import Settings
 from apps.messages import MessageError
+from due import Item
+from due.backends import open_archive
 from sdnator.errors import PipelineError
 from sdnator.testing.enforcer_run import EnforcerRun
 from sdnator.testing.waiting import wait_for
@@ -104,6 +107,22 @@ def test_a_block_ends_there_without_anybody_s_word(tmp_path, secret):
         run.start()
         block = run.decide(run.block("192.0.2.1", seconds=1))
         run.wait_for(block, "expired")
+        assert not server.blocks
+
+
+def test_a_panic_in_the_archive_is_heard_without_a_firewall(tmp_path, secret):
+    """As `blocks panic` writes it where nobody answers: past Data Updates."""
+    with WebhookServer() as server, started(tmp_path, secret, server.url) as run:
+        run.start()
+        block = run.decide(run.block("192.0.2.1"))
+        run.wait_for(block, "installed")
+        value = block.to_value() | {"action": "unblock", "event_time": time.time_ns()}
+        archive = open_archive(f"sqlite://{tmp_path / 'archive.db'}")
+        archive.insert(
+            [Item("network.block.firewall.ipv4", value, time.time_ns(), 1, "firewall", "other", 1)]
+        )
+        archive.close()
+        run.wait_for(block, "removed")
         assert not server.blocks
 
 

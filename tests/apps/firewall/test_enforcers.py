@@ -114,6 +114,20 @@ def test_eve_names_the_places_of_an_incident(tmp_path):
     assert {each["action"] for each in confirmed} == {"blocked"}
 
 
+def test_eve_names_the_places_of_a_block_by_hand(tmp_path):
+    """It belongs to no incident: one line when it is decided, one for each place, none for a repetition."""
+    eve = tmp_path / "eve.json"
+    desk = Desk(enforcers=BOTH, eve_file=str(eve))
+    made = block(desk)
+    for _ in range(2):
+        answer(desk, made, "installed")
+    desk.confirm(made)
+    answer(desk, made, "failed")
+    desk.service.stop()
+    said = [json.loads(line)["alert"]["metadata"].get("enforcers") for line in eve.read_text().splitlines()]
+    assert said == [None, ["nftables gateway"], ["nftables gateway", "p4runtime_ctrl s1"]]
+
+
 def test_trouble_of_an_enforcer_is_told_once():
     desk = Desk(enforcers=BOTH)
     for _ in range(3):

@@ -73,7 +73,9 @@ class Collector:
 
 
 def check(message):
-    priority, kind, text = HEADER.fullmatch(message).groups()
+    found = HEADER.fullmatch(message)
+    assert found
+    priority, kind, text = found.groups()
     assert int(priority) == 8 * 16 + 3  # local0, and the severity of a block
     assert kind == b"alert"
     assert json.loads(text) == json.loads(LINE)
