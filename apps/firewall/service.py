@@ -514,15 +514,15 @@ class FirewallService:
             self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
             self._resets.confirm(confirmation.id, confirmation.state, time.monotonic())
         if confirmation.state == "failed":
-            cause = one_line(confirmation.cause)
-            log.error("%s %s refused %s: %s", item.app_id, confirmation.switch, confirmation.id, cause)
+            words = f"{item.app_id} {confirmation.switch} refused {confirmation.id}: {confirmation.cause}"
+            log.error("%s", one_line(words))
 
     def _on_enforced(self, _: Item, report: EnforcementReport) -> None:
         with self._lock:
             for held in report.blocks:
                 self._count(report.enforcer, report.place, held.id, held.packets, self._now)
-            if problem := self._enforcers.news_of(report):
-                self._announcer.say(OperatorNotice("enforcer", problem, self._now))
+            if news := self._enforcers.news_of(report):
+                self._announcer.say(OperatorNotice("enforcer", news, self._now))
 
     def _count(self, enforcer: str, place: str, decision: str, packets: int, now: int) -> None:
         total = self._enforcers.count(decision, enforcer, place, packets)
