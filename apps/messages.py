@@ -437,6 +437,32 @@ class Exhibit(Message, frozen=True, kw_only=True):
     summary: Text
 
 
+class Ground(Message, frozen=True, kw_only=True):
+    """A kind of evidence that a decision rests on, as narrow as it can be called a false alarm."""
+
+    source: Name
+    """`<app>.<source>` of the evidence."""
+    sender: Sender | None = None
+    victim: Name = ""
+    """Where the evidence names no service, or accuses nobody by name."""
+    service: Annotated[str, Meta(max_length=32)] = ""
+    """`tcp/445`, `udp/ephemeral`; empty where the evidence is about no single one."""
+    nats: Annotated[float, Meta(ge=0, le=1e12)] = 0.0
+    """What it had added when the decision was made."""
+
+    def check(self) -> None:
+        """Check the sender.
+
+        Raises:
+            MessageError: an address is invalid.
+        """
+        if self.sender is not None:
+            self.sender.check()
+
+
+MOST_GROUNDS: Final = 8
+
+
 class Decision(Message, frozen=True, kw_only=True):
     """What the firewall wants the switch to do, and why."""
 
@@ -454,14 +480,42 @@ class Decision(Message, frozen=True, kw_only=True):
     dry_run: bool = False
     first_packet: Number = 0
     """Arrival number of the packet that tipped the scales."""
+    grounds: Annotated[tuple[Ground, ...], Meta(max_length=MOST_GROUNDS)] = ()
+    """The evidence that added up to it, the strongest first; empty where something else decided."""
 
     def check(self) -> None:
-        """Check the target.
+        """Check target and grounds.
 
         Raises:
-            MessageError: its address is invalid.
+            MessageError: an address is invalid.
         """
         self.target.check()
+        for ground in self.grounds:
+            ground.check()
+
+
+class FalseAlarm(Message, frozen=True, kw_only=True):
+    """`network.false_alarm.firewall.<change>`: what an operator has taught about a decision, or taken back."""
+
+    id: Name
+    """The decision's."""
+    grounds: Annotated[tuple[Ground, ...], Meta(max_length=MOST_GROUNDS)]
+    """Evidence that counts less from now on."""
+    event_time: Time
+    """Capture time at which it was said, ns."""
+    expires: Time
+    """Capture time from which the evidence counts in full again, ns."""
+    reason: Words = ""
+    revoked: bool = False
+
+    def check(self) -> None:
+        """Check the grounds.
+
+        Raises:
+            MessageError: an address is invalid.
+        """
+        for ground in self.grounds:
+            ground.check()
 
 
 class Confirmation(Message, frozen=True, kw_only=True):
@@ -485,9 +539,11 @@ class Instruction(Message, frozen=True, kw_only=True):
     """`network.instruction.<app>.firewall`: what an operator asks of the firewall."""
 
     id: Name
-    verb: Literal["block", "unblock", "allow", "disallow", "panic"]
+    verb: Literal["block", "unblock", "allow", "disallow", "panic", "false_alarm", "revoke"]
+    """`false_alarm` and `revoke` are heard from operators only: the command line and the page."""
     subject: Name = ""
-    """An address or MAC to block; a decision's id or an address to unblock; an allow-list entry."""
+    """An address or MAC to block; a decision's id or an address to unblock; an allow-list entry; the id of a decision
+    that was a false alarm."""
     reason: Words = ""
     seconds: Annotated[int, Meta(ge=1, le=LONGEST_BLOCK_S)] = 600
     """Length of a block."""

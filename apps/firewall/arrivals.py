@@ -21,6 +21,7 @@ from apps.messages import (
     Confirmation,
     Decision,
     Exhibit,
+    FalseAlarm,
     Instruction,
     Message,
     MessageError,
@@ -131,6 +132,12 @@ def instruction_in(item: Item) -> Instruction:
     """`network.instruction.<app>.firewall`."""
     sender_of(item)
     return Instruction.from_value(item.value)
+
+
+def lesson_in(item: Item) -> FalseAlarm:
+    """An archived lesson of this app."""
+    sender_of(item)
+    return FalseAlarm.from_value(item.value)
 
 
 def answer_in(item: Item) -> Answer:

@@ -1,8 +1,10 @@
 """Alerts and evidence → decisions: asks the decider, looks up history, carries out what is due, reports the rest."""
 
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
+
+from msgspec import structs
 
 from apps.evidence import Evidence
 from apps.firewall.arrivals import evidence_of
@@ -12,9 +14,10 @@ from apps.firewall.evidence.archive import OFFENCES_READ, Archive
 from apps.firewall.incidents.incident_reports import IncidentReports
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider, Proposal
+from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.prefix_aggregation import gather_blocks
 from apps.firewall.syn.syn_defence import UNKNOWN_HISTORY, SynDefence
-from apps.messages import Alert, Decision, Exhibit, Sender, Target
+from apps.messages import Alert, Decision, Exhibit, FalseAlarm, Sender, Target
 from due import Item
 
 EVIDENCE_KEPT: Final = 10
@@ -31,6 +34,7 @@ class EvidenceHandler:
         archive: earlier offences.
         announcer: notices.
         incidents: what belongs together.
+        lessons: what was called a false alarm.
         publish: writes a decision.
     """
 
@@ -42,6 +46,7 @@ class EvidenceHandler:
         archive: Archive,
         announcer: Announcer,
         incidents: IncidentReports,
+        lessons: FalseAlarms,
         publish: Callable[[Decision], Decision],
     ) -> None:
         self.decider = decider
@@ -50,6 +55,7 @@ class EvidenceHandler:
         self._archive = archive
         self._announcer = announcer
         self._incidents = incidents
+        self._lessons = lessons
         self._publish = publish
         self._exhibits: defaultdict[Sender, deque[Exhibit]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
 
@@ -71,19 +77,32 @@ class EvidenceHandler:
         if evidence.sender is not None:
             self._remember(evidence.sender, evidence_of(item, evidence.text))
         at = evidence.event_time
+        placed = self._lessons.weighed(self.decider.test.placed(evidence), item.app_id)
+        self._lessons.note(placed, item.app_id)
+        changes = {name: getattr(placed, name) for name in ("nats", "supporting", "source", "text")}
+        evidence = structs.replace(evidence, **changes)
         proposal = self.decider.evidence(evidence, item.app_id, lambda target: self._offences_of(target, at))
         if evidence.nats > 0:
             self._incidents.evidence(self.decider.test.placed(evidence), *self.decider.sum_of(evidence))
         if proposal is not None:
             self._follow(proposal, item)
 
+    def learnt(self, lesson: FalseAlarm) -> None:
+        """Forget what was added up meanwhile against those whom a lesson is about: it had its full weight."""
+        for ground in lesson.grounds if not lesson.revoked else ():
+            subject = ground.sender or (ground.victim, ground.service)
+            self.decider.test.forget(subject)
+            self._lessons.book.take(subject, lesson.event_time)
+
     def _follow(self, proposal: Proposal, item: Item) -> None:
         """Carry a proposal out, or report why it is not."""
         evidence = proposal.evidence
         if proposal.service is not None:
             exhibits = (evidence_of(item, evidence.text),)
+            subject = (proposal.service.address, evidence.service)
             for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
-                self._publish(decision)
+                grounds = self._lessons.book.take(subject, evidence.event_time)
+                self._publish(structs.replace(decision, grounds=grounds))
             self.decider.settled(proposal)
         elif proposal.target is None or evidence.sender is None:
             self._announcer.say(OperatorNotice("refused", proposal.reason, evidence.event_time))
@@ -112,14 +131,29 @@ class EvidenceHandler:
             training_rate=cause.training_rate,
             host=sender.ip,
         )
-        self._publish(decision)
+        grounds = self._lessons.book.take(sender, cause.event_time) if isinstance(cause, Evidence) else ()
+        self._publish(structs.replace(decision, grounds=grounds))
         for each in gather_blocks(self._ledger, self._syn.gather, cause.event_time):
             self._publish(each)
 
     def _offences_of(self, target: Target, now: int) -> int | None:
         """Earlier blocks of a target; None if the archive does not answer."""
         earlier = self._archive.find(history.offences_query(target), most=OFFENCES_READ)
-        return None if earlier is None else history.count_offences(earlier, target, now)
+        return None if earlier is None else history.count_offences(earlier, target, now, self._lessons)
+
+    def offences_of_many(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
+        """Earlier blocks by address; None if the archive does not answer."""
+        if not addresses:
+            return {}
+        query = history.offences_of_many(addresses)
+        items = self._archive.find(query, most=OFFENCES_READ * len(addresses))
+        if items is None:
+            return None
+        targets = {address: Target(kind="ip", address=address) for address in addresses}
+        return {
+            address: history.count_offences(items, target, now, self._lessons)
+            for address, target in targets.items()
+        }
 
     def _remember(self, sender: Sender, exhibit: Exhibit) -> None:
         if len(self._exhibits) >= SENDERS_KEPT and sender not in self._exhibits:

@@ -36,7 +36,8 @@ from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, Incide
 from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider
-from apps.firewall.policy.instructions import Desk, refused_as_late
+from apps.firewall.policy.false_alarms import FalseAlarms
+from apps.firewall.policy.instructions import Desk, refused_as_foreign, refused_as_late
 from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
 from apps.firewall.syn.examinations import Examination, Examinations
@@ -92,6 +93,7 @@ CAPABILITIES = (
     Capability(f"{KEPT}.*", delivery="reliable", archive="always"),
     Capability("network.packet_out.firewall.*", delivery="reliable"),
     Capability(f"{history.ANSWERS}.*", delivery="reliable", archive="always"),
+    Capability(history.LESSONS, delivery="reliable", archive="always"),
 )
 
 COMMAND = "network.p4_command.firewall"
@@ -129,7 +131,6 @@ class FirewallService:
         self._answers = Answers(settings.syn.sample, AGED_S + after_s)
         allow_list = AllowList.parse(allowed)
         self._syn = SynDefence(settings.syn, services, self._ledger, allow_list, self._known, self._is_silent)
-        self._desk = Desk(self._ledger, self._syn, allowed)
         self._allow_entries = AllowEntries()
         self._leftovers: dict[str, list[TableUpdate]] = {}
         self._switches: dict[str, str] = {}
@@ -147,6 +148,8 @@ class FirewallService:
         self._past = ArchivedPast(self._archive, self._intake, settings)
         self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
         self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
+        self._lessons = FalseAlarms(settings.rules.false_alarm_days)
+        self._desk = Desk(self._ledger, self._syn, allowed, self._lessons, self._past.decision)
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
@@ -156,6 +159,7 @@ class FirewallService:
             self._archive,
             self._announcer,
             self._incidents,
+            self._lessons,
             self._publish,
         )
         self._stored = StoredAnswers(engine)
@@ -226,6 +230,8 @@ class FirewallService:
         self._ledger.restore(standing)
         self._syn.restore(standing)
         self._incidents.restore(self._past.incidents())
+        self._lessons.restore(self._past.false_alarms())
+        self._handler.decider.trained(self._past.training())
         if standing:
             log.info("decisions in force from the archive: %d", len(standing))
 
@@ -267,6 +273,7 @@ class FirewallService:
             "guards": len(self._syn.guarded),
             "known_sources": len(self._known),
             "allowed": len(self._desk.entries),
+            "false_alarms": len(self._lessons),
             "allowed_left_out": self._allow_entries.left_out,
             "refused_by_cap": self._ledger.refused,
             "blocking_stopped": int(bool(self._ledger.stopped)),
@@ -301,11 +308,15 @@ class FirewallService:
         summary = f"{instruction.verb} {instruction.subject}: {instruction.reason}"
         evidence = evidence_of(item, summary)
         self._stored.began(instruction.id)
-        if (late := refused_as_late(instruction, time.time_ns())) is not None:
-            return late
+        refused = refused_as_late(instruction, time.time_ns()) or refused_as_foreign(instruction, item.app_id)
+        if refused is not None:
+            return refused
         decisions, answer = self._desk.carry_out(instruction, evidence, self._now or evidence.timestamp)
         for decision in decisions:
             self._publish(decision)
+        for lesson in self._lessons.told():
+            self._handler.learnt(lesson)
+            self._engine.write(history.lesson_key(lesson), lesson.to_value(), [due.NO_WAIT])
         updates = self._allow_entries.change(self._desk.entries)
         for switch in self._switches if updates else ():
             self._keep(switch, updates)
@@ -392,7 +403,7 @@ class FirewallService:
         """Examine the SYNs of a suspected flood, and decide."""
         watch = self._syn.suspect(due.suspicion, due.at)
         often = watch.often(self._settings.syn) if due.sure else ()
-        offences = self._past.offences(often, watch.now)
+        offences = self._handler.offences_of_many(often, watch.now)
         for decision in self._syn.conclude(watch, offences, sure=due.sure):
             # the guard before the block has had the source's connections reset
             decision = self._publish(decision, resets=False)  # noqa: PLW2901 - as it was published
@@ -557,6 +568,7 @@ class FirewallService:
         kind = ("ipv6" if ":" in target.address else "ipv4") if target.kind == "ip" else "mac"
         log.warning("%s %s: %s", decision.action, target.address, one_line(decision.reason))
         self._incidents.decided(decision)
+        self._lessons.decided(decision)
         family = "protect" if decision.action in ("protect", "unprotect") else "block"
         if is_prefix(target):
             family = "block_prefix"

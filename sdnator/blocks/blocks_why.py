@@ -4,13 +4,16 @@ from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
+from msgspec import structs
+
 from apps.enforcement import CONFIRMED, ENFORCED
 from apps.firewall.evidence.history import DECISIONS, count_offences, instructions_in, offences_query
-from apps.messages import Decision, Exhibit, writer_of
+from apps.messages import Decision, Exhibit, Ground, writer_of
 from due import Item
 from sdnator.blocks.blocks_archive import find
 from sdnator.blocks.blocks_places import PlaceAnswer, action_word, last_answers, places_words
 from sdnator.blocks.five_lines import five_lines
+from sdnator.blocks.lessons import ground_words, lesson_lines, lessons_in_force
 from sdnator.counted import counted
 from sdnator.errors import BadInput
 from sdnator.incidents.incidents_archive import incident_of
@@ -29,6 +32,7 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
     confirmations = find(archive, {"dataKey": f"{CONFIRMED}.*.*", "value.id": decision_id})
     answers = last_answers(confirmations).get(decision_id, ())
     incident = incident_of(archive, decision_id)
+    lessons = lessons_in_force(archive)
     return {
         "id": decision_id,
         "why": list(five_lines(first, steps[-1], incident, places_words(steps[-1], answers))),
@@ -38,7 +42,16 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
             {"written": item.timestamp} | made.to_value() for item, made in zip(found, steps, strict=True)
         ],
         "evidence": [_evidence(each, archive) for each in dict.fromkeys(_all_evidence(steps))],
-        "offences_before": count_offences(earlier, first.target, first.event_time),
+        "offences_before": count_offences(
+            earlier, first.target, first.event_time, {each.id for each in lessons}
+        ),
+        "false_alarm": [line for each in lessons if each.id == decision_id for line in lesson_lines(each)],
+        "counted_less": [
+            f"{ground_words(ground)}: {each.id} was called a false alarm"
+            for each in lessons
+            for ground in each.grounds
+            if each.id != decision_id and _same(ground) in {_same(mine) for mine in first.grounds}
+        ],
         "confirmations": [
             {"written": item.timestamp, "enforcer": writer_of(item.key)} | dict(item.value)
             for item in confirmations
@@ -51,6 +64,11 @@ def life_of(decision_id: str, archive: str) -> dict[str, Any]:
             if decision_id in str(item.value.get("text", ""))
         ],
     }
+
+
+def _same(ground: Ground) -> Ground:
+    """Without its weight, which differs from time to time."""
+    return structs.replace(ground, nats=0.0)
 
 
 def _all_evidence(steps: list[Decision]) -> Iterator[Exhibit]:
@@ -87,6 +105,8 @@ def as_text(life: dict[str, Any]) -> Iterator[str]:
     """Five lines that explain it, then its life in the order of what happened."""
     yield from life["why"]
     yield ""
+    yield from life["false_alarm"]
+    yield from (f"counted less: {text}" for text in life["counted_less"])
     if life["incident"] is not None:
         yield f"part of incident {life['incident']['id']}: `sdnator incidents show {life['incident']['id']}`"
     events: list[tuple[int, str]] = []

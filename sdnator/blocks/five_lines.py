@@ -78,7 +78,8 @@ def _undo(first: Decision, last: Decision) -> str:
     if first.action == "protect" and not first.expires:
         return "take the service out of `guard` in the firewall's settings"
     never = f"; never again: sdnator allow add {first.target.address}" if first.action == "block" else ""
-    return f"sdnator blocks remove {first.id}{never}"
+    wrong = f"; false alarm: sdnator blocks false-alarm {first.id}" if first.grounds else ""
+    return f"sdnator blocks remove {first.id}{wrong}{never}"
 
 
 def _short(text: str) -> str:

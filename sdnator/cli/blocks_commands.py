@@ -33,11 +33,14 @@ from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.blocks.blocks_nft import nft_sets
 from sdnator.blocks.blocks_places import PlaceAnswer, answers_of
 from sdnator.blocks.blocks_why import as_text, decision_line, life_of
+from sdnator.blocks.lessons import lesson_lines, lessons_in_force
 from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
 from sdnator.up import running
 
-blocks = typer.Typer(help="Blocks and guards: list, add, remove, explain, lift all.", no_args_is_help=True)
+blocks = typer.Typer(
+    help="Blocks and guards: list, add, remove, explain, false alarms, lift all.", no_args_is_help=True
+)
 allow = typer.Typer(help="Addresses, prefixes and MACs that are never blocked.", no_args_is_help=True)
 
 _ANSWER: Final = "network.answer.firewall.operator"
@@ -128,6 +131,43 @@ def remove_block(
     Example: sdnator blocks remove 192.0.2.66
     """
     _instruct("unblock", subject, reason, updates, archive)
+
+
+@blocks.command("false-alarm")
+def false_alarm(
+    subject: Annotated[
+        str, typer.Argument(metavar="ID", help="Of a decision, as `blocks list --all` shows it.")
+    ],
+    *,
+    revoke: Annotated[
+        bool, typer.Option("--revoke", help="Take it back: its evidence counts in full again.")
+    ] = False,
+    reason: ReasonOption = "",
+    updates: UpdatesOption = "",
+    archive: ArchiveOption = "",
+) -> None:
+    """Undo a block or guard, and let evidence of this kind about this sender count a tenth from now on.
+
+    What is taught is narrow: the sender, what found it, and the service. Whatever else the sender does counts in
+    full. It holds for `rules.false_alarm_days`.
+
+    Example: sdnator blocks false-alarm 1f0c2a9be771 --reason "the new backup"
+    """
+    _instruct("revoke" if revoke else "false_alarm", subject, reason, updates, archive)
+
+
+@blocks.command("false-alarms")
+def false_alarms(*, archive: ArchiveOption = "", as_json: JsonOption = False) -> None:
+    """What was called a false alarm and still counts less.
+
+    Example: sdnator blocks false-alarms
+    """
+    lessons = lessons_in_force(archive)
+    if as_json:
+        typer.echo(json.dumps([each.to_value() for each in lessons]))
+    else:
+        lines = [line for each in lessons for line in lesson_lines(each)]
+        typer.echo("\n".join(lines) or "nothing was called a false alarm")
 
 
 @blocks.command("panic")
@@ -227,7 +267,7 @@ def allow_list(*, archive: ArchiveOption = "") -> None:
     typer.echo("\n".join(allowed_by(instructions)) or "the allow-list has no entries added by operators")
 
 
-Verb = Literal["block", "unblock", "allow", "disallow", "panic"]
+Verb = Literal["block", "unblock", "allow", "disallow", "panic", "false_alarm", "revoke"]
 
 
 def _instruct(

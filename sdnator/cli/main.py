@@ -30,7 +30,7 @@ COMMANDS = {
     ),
     "blocks": (
         "sdnator.cli.blocks_commands:blocks",
-        "Blocks and guards: list, add, remove, explain, lift all.",
+        "Blocks and guards: list, add, remove, explain, false alarms, lift all.",
     ),
     "config": (
         "sdnator.cli.config_commands:config",

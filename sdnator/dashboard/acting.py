@@ -64,7 +64,7 @@ class Acting:
         self._service.sessions.sign_out(self._session)
         ui.navigate.reload()
 
-    async def instruct(self, verb: Literal["unblock", "allow"], subject: str) -> None:
+    async def instruct(self, verb: Literal["unblock", "allow", "false_alarm"], subject: str) -> None:
         """Tell the firewall, and show what it says."""
         if not self.allowed:
             ui.notify("sign in first", type="warning")

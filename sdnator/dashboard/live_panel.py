@@ -73,9 +73,12 @@ class LivePanel:
                 ui.label("Blocks and guards").classes("panel-title")
                 undo = _button("undo", ':label="props.row.undo"', "undo", 'v-if="props.row.undo"')
                 buttons = undo + _button("allow", 'label="Allow"', "verified_user", 'v-if="props.row.allow"')
+                wrong = 'v-if="props.row.false_alarm"'
+                buttons += _button("false_alarm", 'label="False alarm"', "school", wrong)
                 self._decisions = self._feed("decisions", buttons, "nothing is blocked or guarded")
                 self._decisions.on("undo", self._undo)
                 self._decisions.on("allow", self._allow)
+                self._decisions.on("false_alarm", self._false_alarm)
             with ui.element("div").classes("panel"):
                 ui.label("Alerts").classes("panel-title")
                 self._alerts = self._feed("alerts", "", "no alerts")
@@ -93,6 +96,9 @@ class LivePanel:
 
     async def _allow(self, event: "GenericEventArguments") -> None:
         await self._acting.instruct("allow", str(event.args["address"]))
+
+    async def _false_alarm(self, event: "GenericEventArguments") -> None:
+        await self._acting.instruct("false_alarm", str(event.args["id"]))
 
     def refresh(self) -> None:
         """Send what has changed since the last time."""

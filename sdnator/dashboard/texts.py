@@ -48,6 +48,8 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
         # a guard without end is one that the settings name: it stays
         "undo": "Undo" if one.action == "block" else "Release" if one.expires else "",
         "allow": one.action == "block",
+        # only what evidence added up to can be unlearnt
+        "false_alarm": bool(one.grounds),
     }
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from apps.messages import Decision, Instruction, MessageError, Target
+from apps.messages import Decision, FalseAlarm, Instruction, MessageError, Target
 from due import Item
 
 
@@ -25,13 +25,13 @@ def offences_of_many(addresses: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def count_offences(items: Iterable[Item], target: Target, before: int) -> int:
-    """Earlier blocks of the target, counted by decision; an extension is not a new offence."""
+def count_offences(items: Iterable[Item], target: Target, before: int, excused: Container[str] = ()) -> int:
+    """Earlier blocks of the target, counted by decision; neither extensions nor the excused ones are offences."""
     ids = set()
     for decision in _readable(items):
         if decision.target == target and decision.event_time < before and not decision.dry_run:
             ids.add(decision.id)
-    return len(ids)
+    return sum(each not in excused for each in ids)
 
 
 DECISIONS: Final = (
@@ -42,6 +42,14 @@ DECISIONS: Final = (
 ANSWERS: Final = "network.answer.firewall"
 """`<ANSWERS>.<who asked>`"""
 INSTRUCTIONS: Final = "network.instruction.*.firewall"
+
+
+LESSONS: Final = "network.false_alarm.firewall.*"
+
+
+def lesson_key(lesson: FalseAlarm) -> str:
+    """The key of a lesson: `taught`, or `revoked`."""
+    return f"network.false_alarm.firewall.{'revoked' if lesson.revoked else 'taught'}"
 
 
 def answer_key(instruction: str) -> str:

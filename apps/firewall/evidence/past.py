@@ -3,9 +3,10 @@
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, Final, TypeVar
 
+from apps.evidence import TRAINING, TrainingState
 from apps.firewall.arrivals import (
     answer_in,
     command_in,
@@ -13,17 +14,12 @@ from apps.firewall.arrivals import (
     handshake_in,
     incident_in,
     instruction_in,
+    lesson_in,
+    training_in,
 )
 from apps.firewall.enforcement.switch_entries import KEPT, leftovers
-from apps.firewall.evidence.archive import MOST, OFFENCES_READ, Archive
-from apps.firewall.evidence.history import (
-    ANSWERS,
-    DECISIONS,
-    INSTRUCTIONS,
-    count_offences,
-    in_force,
-    offences_of_many,
-)
+from apps.firewall.evidence.archive import MOST, Archive
+from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, LESSONS, in_force
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
 from apps.firewall.settings import Settings
 from apps.incidents import INCIDENTS, Incident
@@ -31,11 +27,11 @@ from apps.messages import (
     LONGEST_BLOCK_S,
     Answer,
     Decision,
+    FalseAlarm,
     Instruction,
     Intake,
     MessageError,
     TableUpdate,
-    Target,
 )
 from due import Item
 
@@ -46,6 +42,7 @@ _LONGEST_NS: Final = LONGEST_BLOCK_S * 1_000_000_000 + _DAY_NS
 _INSTRUCTIONS: Final = 20_000
 _ANSWERS: Final = 1_000
 _INCIDENTS: Final = 20_000
+_LESSONS: Final = 20_000
 _SOURCE_SHARE: Final = 10
 """Archived handshakes read per known source."""
 
@@ -81,6 +78,22 @@ class ArchivedPast:
         found = [each for key in DECISIONS for each in self._read(key, "decision", decision_in, since=since)]
         return in_force(each for each in found if not each.dry_run)
 
+    def decision(self, name: str) -> Decision | None:
+        """A decision by its id, as it was made; None if the archive has none or does not answer."""
+        for key in DECISIONS:
+            found = self._read({"dataKey": key, "value.id": name}, "decision", decision_in)
+            if found:
+                return found[0]
+        return None
+
+    def false_alarms(self) -> list[FalseAlarm]:
+        """What operators have called false alarms, and taken back, oldest first."""
+        return self._read(LESSONS, "false alarm", lesson_in, most=_LESSONS)
+
+    def training(self) -> TrainingState | None:
+        """How far training was when that was last said; None if nothing was."""
+        return next(iter(self._read(f"{TRAINING}.*", "training", training_in, most=1)), None)
+
     def incidents(self) -> list[Incident]:
         """Reports of incidents that may still be open, oldest first."""
         since = time.time_ns() - _LONGEST_NS
@@ -93,16 +106,6 @@ class ArchivedPast:
         shakes = self._read(HANDSHAKES, "handshake", _archived_handshake, since=since, most=most)
         learn_archived(known, shakes, days)
         log.info("%d known sources in the archive", len(known))
-
-    def offences(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
-        """Earlier blocks by address, before a capture time (ns); None if the archive does not answer."""
-        if not addresses:
-            return {}
-        items = self._archive.find(offences_of_many(addresses), most=OFFENCES_READ * len(addresses))
-        if items is None:
-            return None
-        targets = {address: Target(kind="ip", address=address) for address in addresses}
-        return {address: count_offences(items, target, now) for address, target in targets.items()}
 
     def leftovers(self, wanted: Iterable[TableUpdate]) -> dict[str, list[TableUpdate]]:
         """By switch: deletions of entries of an earlier run that are no longer wanted."""

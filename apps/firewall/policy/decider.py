@@ -78,8 +78,8 @@ class Decider:
         self._told: dict[object, int] = {}
         self.test = SequentialTest(rules.false_blocks_per_day)
 
-    def trained(self, state: TrainingState) -> None:
-        """Training goes on, or is done."""
+    def trained(self, state: TrainingState | None) -> None:
+        """Training goes on, or is done; None: nobody has trained."""
         self.test.training = state
 
     def alert(self, alert: Alert) -> PolicyVerdict:

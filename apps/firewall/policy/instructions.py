@@ -1,24 +1,47 @@
-"""Instructions of operators: block, unblock, allow, disallow, panic.  Pure."""
+"""Instructions of operators: block, unblock, allow, disallow, panic, false alarm, revoke.  Pure."""
 
 import ipaddress
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Final
 
 from apps.firewall.evidence.history import allowed_by
 from apps.firewall.policy.block_lifecycle import BlockLifecycle
+from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.rules import AllowList, is_mac
 from apps.firewall.syn.syn_defence import EVERY_SWITCH, SynDefence
 from apps.messages import Answer, Decision, Exhibit, Instruction, Target
 
 _MOST_ENTRIES = 10_000
+OPERATORS: Final = ("operator", "dashboard")
+"""Apps that speak for people: the command line and the page."""
+_TEACHING: Final = ("false_alarm", "revoke")
+"""Verbs that weaken what is decided later, so that no other app may use them."""
 Outcome = tuple[list[Decision], Answer]
 
 
 class Desk:
-    """Applies instructions to blocks, guards and the allow-list; time is capture time in ns."""
+    """Applies instructions to blocks, guards, the allow-list and lessons; time is capture time in ns.
 
-    def __init__(self, ledger: BlockLifecycle, syn: SynDefence, entries: Iterable[str]) -> None:
+    Args:
+        ledger: blocks in force.
+        syn: guards in force.
+        entries: the allow-list of the settings.
+        lessons: what was called a false alarm.
+        archived: looks a decision up that is not in force; None if there is none.
+    """
+
+    def __init__(
+        self,
+        ledger: BlockLifecycle,
+        syn: SynDefence,
+        entries: Iterable[str],
+        lessons: FalseAlarms,
+        archived: Callable[[str], Decision | None] = lambda _: None,
+    ) -> None:
         self._ledger = ledger
         self._syn = syn
+        self._lessons = lessons
+        self._archived = archived
         self.entries = tuple(entries)
         self.allow = AllowList.parse(self.entries)
 
@@ -60,6 +83,34 @@ class Desk:
             )
         return self._lift(found, now, "by hand") + guards, f"{len(found) + len(guards)} lifted"
 
+    def _false_alarm(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
+        """Undo a decision, and learn that its evidence means less."""
+        name = instruction.subject
+        found = self._ledger.matching(name)
+        names = [each.id for each in found] or [name]
+        if not found and (past := self._archived(name)) is not None:
+            self._lessons.decided(past)
+        elif not found and not self._syn.holds(name):
+            raise ValueError(f"no decision has the id {name}; see `sdnator blocks list --all`")
+        taught = [
+            self._lessons.teach(each, grounds, now, instruction.reason)
+            for each in names
+            if (grounds := self._lessons.grounds_of(each))
+        ]
+        decisions = self._lift(found, now, "a false alarm") + self._syn.release(name, now, "a false alarm")
+        kinds = sorted({ground.source for lesson in taught for ground in lesson.grounds})
+        learnt = (
+            f"{', '.join(kinds)} of this sender counts a tenth from now on"
+            if kinds
+            else "nothing is learnt, since no evidence was added up; `sdnator allow add` spares the sender"
+        )
+        return decisions, f"{len(decisions)} lifted; {learnt}"
+
+    def _revoke(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
+        lesson = self._lessons.revoke(instruction.subject, now)
+        kinds = sorted({ground.source for ground in lesson.grounds})
+        return [], f"{', '.join(kinds)} counts in full again; the decision itself is not made again"
+
     def _panic(self, _: Instruction, __: Exhibit, now: int) -> tuple[list[Decision], str]:
         blocks = [block.decision for block in self._ledger.blocks.values()]
         decisions = self._lift(blocks, now, "panic: everything is lifted")
@@ -99,6 +150,14 @@ def refused_as_late(instruction: Instruction, wall_ns: int) -> Answer | None:
         return None
     late = (wall_ns - instruction.expires) / 1e9
     text = f"came {late:.0f} s after its end and was not carried out; ask again (are both clocks right?)"
+    return Answer(id=instruction.id, done=False, text=text)
+
+
+def refused_as_foreign(instruction: Instruction, app: str) -> Answer | None:
+    """The answer to an app that wants to teach; None if it may say what it says."""
+    if instruction.verb not in _TEACHING or app in OPERATORS:
+        return None
+    text = f"{app} may not say so: only operators call something a false alarm, by `sdnator` or on the page"
     return Answer(id=instruction.id, done=False, text=text)
 
 

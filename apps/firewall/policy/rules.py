@@ -47,6 +47,8 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Length of that prefix for IPv4."""
     prefix_v6: int = 64
     """Length of that prefix for IPv6."""
+    false_alarm_days: int = 90
+    """Days of capture time for which evidence that was called a false alarm counts less."""
     dry_run: bool = False
     """Decide and archive, but write nothing to the switch."""
 
@@ -55,6 +57,8 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(
                 f"false_blocks_per_day={self.false_blocks_per_day}: must be greater than 0, for instance 0.1"
             )
+        if not 1 <= self.false_alarm_days <= 3_650:
+            raise ValueError(f"false_alarm_days={self.false_alarm_days}: 1 to 3,650")
 
 
 @dataclass(frozen=True)

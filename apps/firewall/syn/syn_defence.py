@@ -200,6 +200,10 @@ class SynDefence:
             if decision.action == "protect" and decision.expires and port is not None:
                 self._guarded[TcpService(decision.target.address, port)] = decision
 
+    def holds(self, which: str) -> bool:
+        """Whether a guard set because of a flood has this id or address."""
+        return any(which in (each.id, service.address) for service, each in self._guarded.items())
+
     def release(self, which: str, now: int, reason: str) -> list[Decision]:
         """Lift guards set because of floods, by id or address; a flood that continues sets them again."""
         found = [service for service, each in self._guarded.items() if which in (each.id, service.address)]
