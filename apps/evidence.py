@@ -2,6 +2,7 @@
 
     kitsune, sonata_adapter, any app ──Evidence──► firewall   network.evidence.<app>.<kind>
     kitsune ──TrainingState──► firewall, page                 network.training.<app>
+    kitsune ──DriftState──► people                            network.drift.<app>
 
 The weight of evidence is a number of nats, so that evidence of different sources adds up: how much more likely
 an attack makes what was seen than the benign traffic of training does.
@@ -16,6 +17,7 @@ from apps.messages import (
     MessageError,
     Name,
     Number,
+    Port,
     Rate,
     Role,
     Sender,
@@ -28,6 +30,8 @@ EVIDENCE: Final = "network.evidence"
 """`<EVIDENCE>.<app>.<kind>`"""
 TRAINING: Final = "network.training"
 """`<TRAINING>.<app>`"""
+DRIFT: Final = "network.drift"
+"""`<DRIFT>.<app>`"""
 MOST_VICTIMS: Final = 16
 MOST_NATS: Final = 1_000.0
 
@@ -97,6 +101,14 @@ class Evidence(Message, frozen=True, kw_only=True):
             raise MessageError("time", "evidence: it ends before it begins")
 
 
+class PortTraining(Message, frozen=True, kw_only=True):
+    """Packets of training that came in by a port."""
+
+    switch: Name
+    port: Port
+    packets: Number
+
+
 class TrainingState(Message, frozen=True, kw_only=True):
     """How far training is, and what evidence can rest on when it is done."""
 
@@ -110,3 +122,22 @@ class TrainingState(Message, frozen=True, kw_only=True):
     senders: Number
     """Senders that training has seen."""
     event_time: Time
+    """Of the last packet, ns."""
+    seconds_left: Rate | None = None
+    """Seconds until training is done, at the rate of the last two minutes; None if nobody can say."""
+    ports: Annotated[tuple[PortTraining, ...], Meta(max_length=64)] = ()
+    """Where the packets came from; empty for a model that was loaded."""
+
+
+class DriftState(Message, frozen=True, kw_only=True):
+    """Benign scores of the last day have left the distribution of training, or are within it again."""
+
+    drifted: bool
+    share: Rate
+    """Share of packets over the score that one packet of training in a hundred exceeds; mean over half hours."""
+    limit: Rate
+    """The share that would still be no drift."""
+    blocks: Number
+    """Half hours of the last day that count."""
+    event_time: Time
+    text: Words

@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.evidence import Evidence
+from apps.kitsune.accused import LEAST_NATS, Accused
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
 from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS, Behaviour, Finding
 from apps.kitsune.behaviour.contacts import PacketRow
 from apps.kitsune.behaviour.rows import parts_of
+from apps.kitsune.drift import TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
 from apps.kitsune.evidence import evidence_of
 from apps.kitsune.kernel import Columns, Kernel
 from apps.kitsune.kitnet import KitNet
@@ -132,7 +134,16 @@ class Detector:
         self._evidence: list[Evidence] = []
         self._tail: deque[npt.NDArray[np.float64]] = deque()
         """Features of the last packets of training."""
+        self._sample: list[npt.NDArray[np.float64]] = []
+        """Features of some packets of each tenth of training."""
         self.calibration = Calibration(settings.calibration_packets)
+        self.accused = Accused()
+        self.drift: Drift | None = None
+        """None while training goes on."""
+        self.drift_changed = False
+        """Scores have drifted, or no longer do; whoever tells people sets it back."""
+        self.trained_for: dict[str, Any] = {}
+        """What the model belongs to; kept in its file."""
         if model is None:
             self.model = KitNet(
                 fm_grace=settings.fm_grace,
@@ -163,6 +174,7 @@ class Detector:
             self._check.see(batch, trained)
             self._trained_at_us = int(batch["time_us"][trained - 1])
             self._keep_tail(features[:trained])
+            self._keep_sample(features[:trained], before)
         state = np.full(len(scores), SCORED, dtype=np.uint8)
         state[:trained] = TRAIN
         line = self.line
@@ -181,6 +193,7 @@ class Detector:
             self._to_blocked if self.senders.blocked else None,
         )
         self._evidence += [self._as_evidence(finding) for finding in findings]
+        self._follow_drift(batch, scores, trained, findings)
         over = int(np.count_nonzero(~(scores[trained:] < line)))
         if trained and self.model.is_trained:
             self.training_warnings = self._check.warnings(self.senders.known())
@@ -200,12 +213,37 @@ class Detector:
 
     def _rescored(self) -> npt.NDArray[np.float64]:
         """Scores of the last packets of training, now that the model is trained."""
-        if not self._tail:
+        if not self._tail or not self._sample:
             return np.zeros(0)  # a model of an earlier version, which knows scores only
         features = np.concatenate(list(self._tail))[-CALIBRATION_PACKETS:]
         self._tail.clear()
         scores, _ = self.model.score(features)
+        sample, _ = self.model.score(np.concatenate(self._sample))
+        self._sample.clear()
+        self.drift = Drift.of(sample)
         return scores
+
+    def _keep_sample(self, features: npt.NDArray[np.float64], before: int) -> None:
+        """The first packets of each tenth of training."""
+        tenth = max(1, self.model.training_packets // TRAINING_BLOCKS)
+        numbers = np.arange(before, before + len(features))
+        chosen = numbers % tenth < min(tenth, TRAINING_SAMPLE)
+        if chosen.any():
+            self._sample.append(features[chosen].copy())
+
+    def _follow_drift(
+        self, batch: Columns, scores: npt.NDArray[np.float64], trained: int, findings: list[Finding]
+    ) -> None:
+        """Benign scores only: those of senders that nothing speaks against."""
+        for finding in findings:
+            if finding.sender is not None and not finding.supporting and finding.total >= LEAST_NATS:
+                self.accused.accuse(finding.sender[2], finding.time)
+        if self.drift is None or trained == len(scores):
+            return
+        times = seconds(batch)[trained:]
+        benign = self.accused.benign(batch, float(times[-1]))
+        chosen = slice(None) if benign is None else benign[trained:]
+        self.drift_changed |= self.drift.add(scores[trained:][chosen], times[chosen])
 
     def _as_evidence(self, finding: Finding) -> Evidence:
         rate = training_rate = 0
@@ -238,6 +276,8 @@ class Detector:
             "benign": None if benign is None else benign.to_state(),
             "trained_at_us": self._trained_at_us,
             "training_warnings": self.training_warnings,
+            "drift": None if self.drift is None else self.drift.to_state(),
+            "trained_for": self.trained_for,
         }
 
     def save(self, path: Path) -> None:
@@ -257,6 +297,9 @@ class Detector:
             self.senders = Senders.from_state(notes.get("senders"))
             if notes.get("behaviour"):
                 self.behaviour = Behaviour.from_state(notes["behaviour"])
+            if notes.get("drift"):
+                self.drift = Drift.from_state(notes["drift"])
+            self.trained_for = dict(notes.get("trained_for") or {})
             self._trained_at_us = int(notes.get("trained_at_us", 0))
             self.training_warnings = [str(warning) for warning in notes.get("training_warnings", ())]
         except (KeyError, TypeError, ValueError) as error:

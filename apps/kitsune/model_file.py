@@ -52,7 +52,7 @@ class Model:
 
 
 def save_model(path: Path, network: KitNet, notes: dict[str, Any]) -> None:
-    """Writes a trained network and plain `notes`; the file appears whole or not at all.
+    """Writes a trained network and plain `notes`; the file appears whole or not at all, readable by its owner only.
 
     Raises `ModelFileError` when the network is untrained or the file cannot be written.
     """
@@ -79,7 +79,13 @@ def save_model(path: Path, network: KitNet, notes: dict[str, Any]) -> None:
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     partial = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        partial.write_bytes(buffer.getvalue())
+        # it names the hosts of a network, and what they do
+        partial.unlink(missing_ok=True)
+        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(buffer.getvalue())
+            file.flush()
+            os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
         partial.unlink(missing_ok=True)

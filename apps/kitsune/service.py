@@ -7,18 +7,23 @@ so instances cannot share one stream without changing scores.
 import logging
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 import due.service
-from apps.evidence import EVIDENCE, TRAINING, TrainingState
+from apps.evidence import DRIFT, EVIDENCE, TRAINING, DriftState, PortTraining, TrainingState
 from apps.kitsune.detector import Detector, DetectorSettings, Scored
+from apps.kitsune.kept_model import KeptModel, trained_for
 from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
-from apps.messages import Alert, Decision, Intake, Message, Name, Number, Time, sender_of
+from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder, late, order_in
+from apps.kitsune.training_progress import TrainingProgress
+from apps.messages import Alert, Answer, Decision, Intake, Message, Name, Number, Time, sender_of
 from apps.packets import PACKET_COLUMNS, SteadyTime, read_columns
 from due import NO_WAIT, Capability, Engine, Interest, Item, RecordBatch
 
@@ -29,13 +34,16 @@ SCORE: Final = "network.anomaly.kitsune.score"
 ALERT: Final = "network.anomaly.kitsune.alert"
 EVIDENCE_KEY: Final = f"{EVIDENCE}.kitsune"
 TRAINING_KEY: Final = f"{TRAINING}.kitsune"
+DRIFT_KEY: Final = f"{DRIFT}.kitsune"
 
-INTERESTS = (Interest(PACKETS), Interest(BLOCKS), Interest(SWITCHES))
+INTERESTS = (Interest(PACKETS), Interest(BLOCKS), Interest(SWITCHES), Interest(ORDERS))
 CAPABILITIES = (
     Capability(SCORE, delivery="reliable", archive="always"),
     Capability(ALERT, delivery="reliable", archive="always"),
     Capability(f"{EVIDENCE_KEY}.*", delivery="reliable", archive="always"),
     Capability(TRAINING_KEY, delivery="reliable", archive="always"),
+    Capability(DRIFT_KEY, delivery="reliable", archive="always"),
+    Capability(ANSWER, delivery="reliable", archive="always"),
 )
 
 _USED: Final = {
@@ -88,6 +96,11 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
     """File of a trained model; empty: train on the first packets."""
     save_model: str = ""
     """File to which the model is written when training ends and when the app stops; empty: nowhere."""
+    keep_model: str = ""
+    """File that is loaded if its model was trained for the same switches, ports and settings, and written otherwise;
+    empty: none, or `load_model` and `save_model` say. `sdnator up` sets it."""
+    switches: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
+    """Switches and their ports, to compare `keep_model` with. `sdnator up` sets it."""
 
 
 class KitsuneService:
@@ -96,8 +109,12 @@ class KitsuneService:
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
         self._settings = settings
-        self._detector = _detector(settings)
-        self._told = bool(settings.load_model)
+        self._kernel = load_kernel()
+        self._belongs = trained_for(settings, settings.switches)
+        self._kept = KeptModel(Path(settings.keep_model), self._belongs) if settings.keep_model else None
+        self._detector = self._first_detector()
+        self._told = self._detector.model.is_trained
+        self._progress = TrainingProgress(self._detector.model.training_packets)
         self._intake = Intake(_log)
         self._time = SteadyTime(_STEP_US)
         self._lock = threading.Lock()
@@ -119,7 +136,23 @@ class KitsuneService:
             observe(BLOCKS).subscribe(reading(BLOCKS, decision_in, self._on_decision)),
             observe(PACKETS).subscribe(reading(PACKETS, packets_in, self._score)),
             observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self._on_tick)),
+            observe(ORDERS).subscribe(reading(ORDERS, order_in, self._on_order)),
         ]
+        if self._kept is not None:
+            _log.info("%s", self._kept.text)
+
+    def ready(self) -> dict[str, str]:
+        """For the ready line: what became of the kept model."""
+        return {"model": self._kept.text} if self._kept is not None else {}
+
+    def _first_detector(self) -> Detector:
+        settings = self._settings
+        if settings.load_model:
+            path = Path(settings.load_model)
+            model = load_model(path, clip=settings.scale_limit, kernel=self._kernel)
+            return Detector(settings, model=model, kernel=self._kernel)
+        kept = self._kept.detector(settings, self._kernel) if self._kept is not None else None
+        return kept or Detector(settings, kernel=self._kernel)
 
     def tick(self) -> None:
         """Does nothing: no state depends on wall time."""
@@ -130,8 +163,20 @@ class KitsuneService:
             subscription.dispose()
         with self._lock:
             self._write_alerts(self._detector.finish())
-            if self._settings.save_model and self._detector.model.is_trained:
-                self._detector.save(Path(self._settings.save_model))
+            self._save()
+
+    def _save(self) -> None:
+        """Write the model to where it is kept."""
+        if not self._detector.model.is_trained:
+            return
+        self._detector.trained_for = self._belongs
+        if self._settings.save_model:
+            self._detector.save(Path(self._settings.save_model))
+        if self._kept is not None:
+            try:
+                self._kept.keep(self._detector)
+            except (ModelFileError, OSError) as error:
+                _log.error("the model is not kept: %s", error)
 
     def health(self) -> dict[str, Any]:
         """Counters and settings for metrics and the dashboard."""
@@ -143,12 +188,59 @@ class KitsuneService:
             "evidence": self._found,
             "line": self._detector.line,
             "training_warnings": self._detector.training_warnings,
+            "model": self._model_health(),
             "clock_jumps": self._detector.senders.clock_jumps,
             "times_doubted": self._time.doubted,
             "blocked": len(self._detector.senders.blocked),
             **self._intake.health(),
             **self._detector.afterimage.counts,
         }
+
+    def _model_health(self) -> dict[str, Any]:
+        """Its life, for `sdnator status`, `sdnator model show` and the page."""
+        detector, progress = self._detector, self._progress
+        drift = detector.drift.reading if detector.drift is not None else None
+        return {
+            "done": detector.model.is_trained,
+            "packets": detector.model.trained,
+            "wanted": detector.model.training_packets,
+            "seconds_left": None if self._told else progress.seconds_left(self._capture_us()),
+            "ports": [
+                {"name": f"{switch} port {port}", "packets": count}
+                for (switch, port), count in list(progress.ports.items())
+            ],
+            "trained_at_us": detector.trained_at_us,
+            "trained_s": detector.behaviour.seconds,
+            "senders": len(detector.behaviour.senders),
+            "file": self._settings.keep_model or self._settings.save_model or self._settings.load_model,
+            "drifted": drift is not None and drift.drifted,
+            "drift_share": None if drift is None else drift.share,
+            "drift_limit": None if detector.drift is None else detector.drift.limit,
+            "drift_blocks": 0 if drift is None else drift.blocks,
+        }
+
+    def _capture_us(self) -> int:
+        """Capture time by packets and by the clocks of switches."""
+        return max([self._time.now or 0, *(tick.event_time // 1_000 for tick in list(self._ticks.values()))])
+
+    def _on_order(self, _: Item, order: ModelOrder) -> None:
+        """An operator wants another model."""
+        with self._lock:
+            answer = late(order, time.time_ns()) or Answer(id=order.id, done=True, text=self._retrain())
+        self._engine.write(ANSWER, answer.to_value(), [NO_WAIT])
+
+    def _retrain(self) -> str:
+        """Throw the model away and train on the next packets."""
+        aside = self._kept.set_aside() if self._kept is not None else None
+        self._write_alerts(self._detector.finish())
+        before, self._detector = self._detector, Detector(self._settings, kernel=self._kernel)
+        self._detector.senders.blocked = before.senders.blocked
+        self._progress = TrainingProgress(self._detector.model.training_packets)
+        self._told, self._training_step = False, -1
+        text = f"training anew on the next {self._progress.wanted:,} packets; nobody is blocked until then"
+        text += f"; the old model is kept as {aside}" if aside is not None else ""
+        _log.warning("an operator asked for it: %s", text)
+        return text
 
     def _on_decision(self, _: Item, decision: Decision) -> None:
         with self._lock:
@@ -160,7 +252,10 @@ class KitsuneService:
         switch = item.key.split(".")[3]
         with self._lock:
             batch = self._steady(batch)
+            before = self._detector.trained
             scored, alerts = self._detector.process(batch, switch)
+            if self._detector.trained > before:
+                self._progress.see(batch, switch, self._detector.trained - before)
             self._packets += len(batch)
             self._is_open = True
             self._note_arrival(switch, int(batch["arrival"][-1]))
@@ -169,6 +264,7 @@ class KitsuneService:
             self._write_evidence()
             self._write_alerts(alerts)
             self._tell_training(event_time)
+            self._tell_drift(event_time)
             if self._detector.model.is_trained and not self._told:
                 self._end_of_training()
 
@@ -207,8 +303,7 @@ class KitsuneService:
         self._told = True
         for warning in self._detector.training_warnings:
             _log.warning("training: %s", warning)
-        if self._settings.save_model:
-            self._detector.save(Path(self._settings.save_model))
+        self._save()
 
     def _summary(self, batch: Any, switch: str, scored: Scored) -> dict[str, Any]:
         arrival = batch["arrival"]
@@ -233,9 +328,9 @@ class KitsuneService:
             self._engine.write(key, evidence.to_value(), [NO_WAIT], event_time=evidence.event_time)
 
     def _tell_training(self, event_time: int) -> None:
-        """Every tenth of training, and its end."""
+        """Every hundredth of training, and its end."""
         model, behaviour = self._detector.model, self._detector.behaviour
-        step = 10 if model.is_trained else 10 * model.trained // model.training_packets
+        step = 100 if model.is_trained else 100 * model.trained // model.training_packets
         if step == self._training_step:
             return
         self._training_step = step
@@ -246,22 +341,44 @@ class KitsuneService:
             seconds=behaviour.seconds,
             senders=len(behaviour.senders),
             event_time=event_time,
+            seconds_left=0.0 if model.is_trained else self._progress.seconds_left(event_time // 1_000),
+            ports=tuple(
+                PortTraining(switch=switch, port=port, packets=count)
+                for (switch, port), count in self._progress.ports.items()
+            ),
         )
         self._engine.write(TRAINING_KEY, state.to_value(), [NO_WAIT], event_time=event_time)
+
+    def _tell_drift(self, event_time: int) -> None:
+        """Once when scores have left training's distribution, and once when they are back."""
+        drift = self._detector.drift
+        if not self._detector.drift_changed or drift is None or drift.reading is None:
+            return
+        self._detector.drift_changed = False
+        reading = drift.reading
+        now = (
+            f"{reading.share:.1%} of benign packets of the last day score over what 1 % of training did, in "
+            f"{reading.blocks} half hours; up to {reading.limit:.0%} would be no drift"
+        )
+        text = f"benign scores have drifted: {now}; `sdnator model retrain` trains anew"
+        if not reading.drifted:
+            text = f"benign scores are like those of training again: {now}"
+        _log.warning("%s", text)
+        state = DriftState(
+            drifted=reading.drifted,
+            share=reading.share,
+            limit=reading.limit,
+            blocks=reading.blocks,
+            event_time=event_time,
+            text=text,
+        )
+        self._engine.write(DRIFT_KEY, state.to_value(), [NO_WAIT], event_time=event_time)
 
     def _write_alerts(self, alerts: list[Alert]) -> None:
         for alert in alerts:
             self._alerts += 1
             _log.warning("%s", alert.reason)
             self._engine.write(ALERT, alert.to_value(), [NO_WAIT], event_time=alert.event_time)
-
-
-def _detector(settings: Settings) -> Detector:
-    kernel = load_kernel()
-    model = None
-    if settings.load_model:
-        model = load_model(Path(settings.load_model), clip=settings.scale_limit, kernel=kernel)
-    return Detector(settings, model=model, kernel=kernel)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

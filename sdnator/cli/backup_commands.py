@@ -28,6 +28,8 @@ from sdnator.up import running
 
 SCHEMA = 1
 """Format of the backup; a newer one is refused."""
+_KEPT = "kept/kitsune.npz"
+"""The model of the state folder."""
 _MANIFEST, _ARCHIVE, _CONFIG, _MODELS = "manifest.json", "archive.db", "sdnator.toml", "models"
 _PRIVATE = 0o600
 
@@ -80,6 +82,9 @@ def _own_files(path: Path | None, settings: config_file.Config) -> Iterator[dict
         model = settings.given.get("kitsune", {}).get(name, "")
         if model and Path(model).is_file():
             parts[f"{_MODELS}/{Path(model).name}"] = Path(model)
+    kept = running.model_file(running.state_folder())
+    if kept.is_file():
+        parts[_KEPT] = kept
     url = _archive_url(settings)
     with tempfile.TemporaryDirectory(prefix="sdnator-backup-") as folder:
         if url.startswith("sqlite:"):
@@ -138,8 +143,8 @@ def restore(
 ) -> None:
     """Restore archive, configuration and models from a backup.
 
-    The archive goes into the data folder, the configuration into the configuration folder, and models
-    beside the archive. Existing files are kept with `.before-restore` appended to their names. An archive
+    The archive goes into the data folder, the configuration into the configuration folder, models
+    beside the archive, and the kept model into the state folder. Existing files are kept with `.before-restore` appended to their names. An archive
     of an older version is migrated; one of a newer version is refused. No pipeline may run.
     Exit codes: 0 restored, 1 a pipeline runs or something cannot be written, 2 the file cannot be used.
 
@@ -193,7 +198,7 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
 
 def _is_ours(name: str) -> bool:
     path = Path(name)
-    return name in (_ARCHIVE, _CONFIG) or (len(path.parts) == 2 and path.parts[0] == _MODELS)
+    return name in (_ARCHIVE, _CONFIG, _KEPT) or (len(path.parts) == 2 and path.parts[0] == _MODELS)
 
 
 def _check_archive(path: Path) -> None:
@@ -214,7 +219,7 @@ def _check_archive(path: Path) -> None:
 def _place(name: str, data: Path) -> Path:
     if name == _CONFIG:
         return config_file.configuration_folder() / config_file.NAME
-    return data / name
+    return running.model_file(running.state_folder()) if name == _KEPT else data / name
 
 
 def _put_back(source: Path, place: Path) -> Path | None:

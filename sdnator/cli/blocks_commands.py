@@ -5,11 +5,8 @@ firewall, `panic` lifts all decisions in Data Archives and clears the switch its
 """
 
 import json
-import os
-import queue
 import time
-from collections.abc import Callable, Collection
-from contextlib import suppress
+from collections.abc import Collection
 from typing import Annotated, Any, Final, Literal
 from uuid import uuid4
 
@@ -25,9 +22,9 @@ from apps.firewall.evidence.history import (
 )
 from apps.firewall.policy.instructions import target_in
 from apps.firewall.policy.rules import AllowList
-from apps.messages import Answer, Decision, Instruction
-from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item
-from due.config import Options
+from apps.messages import Decision, Instruction
+from due import DueError
+from sdnator.asking import Question, ask
 from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
 from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.blocks.blocks_nft import nft_sets
@@ -44,8 +41,6 @@ blocks = typer.Typer(
 allow = typer.Typer(help="Addresses, prefixes and MACs that are never blocked.", no_args_is_help=True)
 
 _ANSWER: Final = "network.answer.firewall.operator"
-_LOOK_SECONDS: Final = 0.5
-_CLOCKS_DIFFER_NS: Final = 60 * 10**9
 _ANSWER_SECONDS: Final = 10.0
 _PANIC_SECONDS: Final = 3.0
 
@@ -287,7 +282,6 @@ def _instruct(
     PipelineError: no pipeline runs, or its firewall does not answer; the instruction is then withdrawn.
     """
     _check_subject(verb, subject)
-    url = updates or os.environ.get("DUE_UPDATES") or running.need().updates
     instruction = Instruction(
         id=uuid4().hex[:12],
         verb=verb,
@@ -296,32 +290,8 @@ def _instruct(
         seconds=seconds,
         expires=time.time_ns() + round(patience * 1e9),
     )
-    engine = Engine(Options(connect_timeout=2.0))
-    engine.set_pubsub(url)
-    engine.set_db(archive_url(archive))
-    answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-
-    def on_answer(item: Item) -> None:
-        answer = Answer.from_value(item.value)
-        if answer.id == instruction.id:
-            answers.put(answer)
-
-    told = Capability(INSTRUCTION, delivery="reliable", archive="always")
-    engine.init("operator", PRODUCER | CONSUMER, capabilities=[told], instances="shared")
-    try:
-        engine.observe(_ANSWER).subscribe(on_answer)
-        engine.write(INSTRUCTION, instruction.to_value())
-        engine.flush(patience)
-        answer = _answer(engine, answers, on_answer, patience)
-    except DueError as error:
-        raise PipelineError(
-            f"the firewall cannot be reached ({error}); the instruction was not and will not be carried out"
-        ) from error
-    finally:
-        engine.close()
-    if not answer.done:
-        raise BadInput(answer.text)
-    typer.echo(answer.text)
+    question = Question("firewall", INSTRUCTION, _ANSWER, instruction.id, instruction.to_value())
+    typer.echo(ask(question, updates, archive_url(archive), patience))
 
 
 def _check_subject(verb: Verb, subject: str) -> None:
@@ -333,24 +303,3 @@ def _check_subject(verb: Verb, subject: str) -> None:
             AllowList.parse((subject,))
     except ValueError as error:
         raise BadInput(str(error)) from None
-
-
-def _answer(
-    engine: Engine, answers: "queue.SimpleQueue[Answer]", look: Callable[[Item], None], patience: float
-) -> Answer:
-    """The next of `answers`; raises PipelineError after `patience` seconds.
-
-    The firewall may answer before our interest has reached it; then only the archive has the answer.
-    """
-    begun, deadline = time.time_ns() - _CLOCKS_DIFFER_NS, time.monotonic() + patience
-    while time.monotonic() < deadline:
-        try:
-            return answers.get(timeout=_LOOK_SECONDS)
-        except queue.Empty:
-            with suppress(DueError):
-                for item in engine.get({"dataKey": _ANSWER, "timestamp": {"$gte": begun}}):
-                    look(item)
-    raise PipelineError(
-        f"the firewall did not answer within {patience:.0f} s, so the instruction is withdrawn; "
-        "see `sdnator status` and try again"
-    )

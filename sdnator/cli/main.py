@@ -71,6 +71,7 @@ COMMANDS = {
         "List all keys with producers, consumers and delivery.",
     ),
     "logs": ("sdnator.cli.logs_command:logs", "Show the logs of the pipeline's parts."),
+    "model": ("sdnator.cli.model_commands:model", "Kitsune's model: show it, train it anew."),
     "observe": ("sdnator.cli.due_commands:observe", "Show items as they arrive."),
     "program": (
         "sdnator.cli.program_commands:program",
@@ -172,6 +173,12 @@ def replay(
     ] = None,
     fm_grace: Annotated[int | None, typer.Option(help="Packets that train the feature map.", min=1)] = None,
     ad_grace: Annotated[int | None, typer.Option(help="Packets that train the autoencoders.", min=1)] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Trained model to score with; default: train on the first packets.", metavar="FILE"
+        ),
+    ] = None,
     pace: Annotated[
         str, typer.Option(help="Speed: max, or a multiple of real time such as 1x or 10x.")
     ] = "max",
@@ -205,6 +212,7 @@ def replay(
             train=train,
             fm_grace=fm_grace,
             ad_grace=ad_grace,
+            model=model,
             pace=pace,
             window=window,
             telemetry=telemetry,

@@ -48,6 +48,7 @@ class ReplayRequest:
     window: int
     telemetry: str = "packet-in"
     queries: bool = True
+    model: Path | None = None
     report: Path | None
     keep: Path | None
     as_json: bool
@@ -58,6 +59,8 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
     if (request.fm_grace is None) != (request.ad_grace is None):
         raise BadInput("--fm-grace and --ad-grace go together: give both, or --train N")
     check_switch(request.switch, request.inject)
+    if request.model is not None:
+        _check_model(request)
     train = request.train or DEFAULT_TRAIN
     fm_grace = train // TRAIN_SHARE
     ad_grace = train - fm_grace
@@ -72,8 +75,22 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
         window=request.window,
         telemetry=_telemetry(request.telemetry),
         queries=request.queries,
+        model=request.model,
         keep=request.keep,
     )
+
+
+def _check_model(request: ReplayRequest) -> None:
+    """Refuse a model that cannot be loaded before anything starts; raises BadInput."""
+    from apps.kitsune.model_file import ModelFileError, load_model
+
+    assert request.model is not None  # noqa: S101 - asked by the caller
+    if request.train is not None or request.fm_grace is not None:
+        raise BadInput("--model: nothing is trained with it; leave out --train, --fm-grace and --ad-grace")
+    try:
+        load_model(request.model)
+    except ModelFileError as error:
+        raise BadInput(f"--model {error}") from None
 
 
 def check_switch(switch: str, inject: str | None) -> None:
@@ -169,7 +186,12 @@ def _with_data_set(request: ReplayRequest) -> ReplayRequest:
     if found.note:
         console.print(f"[yellow]note:[/] {escape(found.note)}", soft_wrap=True)
     request = replace(request, capture=found.capture, labels=found.labels)
-    if found.training is None or request.train is not None or request.fm_grace is not None:
+    if (
+        found.training is None
+        or request.model is not None
+        or request.train is not None
+        or request.fm_grace is not None
+    ):
         return request
     return replace(request, fm_grace=found.training.fm_grace, ad_grace=found.training.ad_grace)
 

@@ -13,6 +13,7 @@ import typer
 from sdnator.cli.plain_table import plain_table
 from sdnator.counted import counted
 from sdnator.errors import PipelineError
+from sdnator.model_words import model_lines, model_of
 from sdnator.redaction import redacted
 from sdnator.up import running
 from sdnator.up.running import shown
@@ -45,6 +46,7 @@ def status(*, as_json: Json = False) -> None:
     health = _health(found.coordinator) if apps is not None else None
     control = controlled(health) if health is not None else None
     incidents = open_incidents(health) if health is not None else None
+    model = model_of(health) if health is not None else None
     damaged = damaged_by_app(health or {})
     away = [name for name, one in found.health.items() if one["state"] != "running"]
     well = all(part["alive"] for part in parts.values()) and apps is not None and not away
@@ -59,6 +61,7 @@ def status(*, as_json: Json = False) -> None:
                     "apps": apps,
                     "control": control,
                     "incidents_open": incidents,
+                    "training": model,
                     "damaged": damaged,
                 }
             )
@@ -68,6 +71,8 @@ def status(*, as_json: Json = False) -> None:
         wired = {str(one["name"]) for one in found.switches if one.get("forward")}
         for line in (*control_lines(control, wired), *damage_lines(damaged)):
             print(line)
+        for number, line in enumerate(model_lines(model) if model is not None else ()):
+            print(line if number else f"model: {line}")
         if incidents is not None:
             more = "; see `sdnator incidents list --open`" if incidents else ""
             print(f"{counted(incidents, 'incident')} open{more}")

@@ -75,7 +75,11 @@ def up(
         int | None, typer.Option(help="Packets that Kitsune trains on; default: 55,000.", min=11)
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(help="Trained model: used if it exists, written otherwise.", metavar="FILE")
+        Path | None,
+        typer.Option(
+            help="Trained model: used if it exists, written otherwise; default: kept in the state folder.",
+            metavar="FILE",
+        ),
     ] = None,
     no_mitigate: Annotated[bool, typer.Option("--no-mitigate", help="Decide, but block nothing.")] = False,
     quota: Annotated[
@@ -197,6 +201,8 @@ def _announce(found: running.Running, *, as_json: bool) -> None:
     ]
     if found.config:
         lines.append(("configuration", found.config))
+    if found.model:
+        lines.append(("model", found.model))
     if found.dashboard:
         lines += [("dashboard", found.dashboard), ("", f"sign in with the token in {found.token_file}")]
     for name, where in lines:

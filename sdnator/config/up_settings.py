@@ -14,6 +14,9 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Data Archives, mongodb:// or sqlite:///; empty: a file in the data folder."""
     quota: float = 10.0
     """GiB that the embedded archive may take; the oldest items go first."""
+    keep_model: bool = True
+    """Keep Kitsune's model in the state folder, and take it up at the next start where switches, ports and settings
+    are the same; off: train at every start, unless `kitsune.load_model` or `--model` names a model."""
 
     def __post_init__(self) -> None:
         if not self.quota >= 0.01:

@@ -215,6 +215,11 @@ class Board:
             found.setdefault(app, Counter()).update(rates)
         return found
 
+    def model(self) -> Mapping[str, Any] | None:
+        """What Kitsune says of its model."""
+        found = self.health.get("kitsune", {}).get("app", {}).get("model")
+        return found if isinstance(found, Mapping) else None
+
     def line(self) -> float | None:
         """The score from which Kitsune calls a packet anomalous."""
         value = self.health.get("kitsune", {}).get("app", {}).get("line")

@@ -7,6 +7,7 @@ from nicegui import ui
 
 from sdnator.dashboard.charts import score_chart, score_points, threshold, top
 from sdnator.dashboard.texts import alert_row, decision_row, incident_row, number
+from sdnator.model_words import model_lines
 
 if TYPE_CHECKING:
     from nicegui.events import GenericEventArguments
@@ -62,6 +63,7 @@ class LivePanel:
                 with ui.element("div").classes("figure"):
                     self._numbers[name] = ui.label("-").classes("number")
                     ui.label(name).classes("name")
+        self._model = ui.label("").classes("quiet model q-mb-sm").style("white-space: pre-line")
         with ui.element("div").classes("board"):
             with ui.element("div").classes("panel wide"):
                 ui.label("Anomaly scores").classes("panel-title")
@@ -113,6 +115,10 @@ class LivePanel:
                 self._listed = time.monotonic()
                 rows = self._rows()
             figures = self._figures(now)
+            model = board.model()
+        told = "\n".join(model_lines(model)) if model is not None else ""
+        if self._model.text != told:
+            self._model.set_text(told)
         if points is not None:
             self._draw(points, line)
         tables = {"incidents": self._incidents, "decisions": self._decisions, "alerts": self._alerts}

@@ -96,6 +96,8 @@ class ReplayOptions:
     """How headers come from the switch."""
     queries: bool = True
     """Run the Sonata adapter, and the parts of the firewall that need it; False: Kitsune alone."""
+    model: Path | None = None
+    """A trained model; None = train on the first packets."""
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
 
@@ -106,8 +108,14 @@ class ReplayOptions:
 
     @property
     def training_packets(self) -> int:
-        """Packets that Kitsune trains on: the reference trains on one more than asked for."""
-        return self.fm_grace + self.ad_grace + 1
+        """Packets that Kitsune trains on: the reference trains on one more than asked for; none with a model."""
+        return self.fm_grace + self.ad_grace + 1 if self.model is None else 0
+
+    @property
+    def kitsune(self) -> dict[str, Any]:
+        """Settings of Kitsune."""
+        chosen: dict[str, Any] = {"fm_grace": self.fm_grace, "ad_grace": self.ad_grace, "mode": "reference"}
+        return chosen | ({"load_model": str(self.model.absolute())} if self.model is not None else {})
 
 
 @dataclass(eq=False)
@@ -257,7 +265,7 @@ class ReplayPass:
                 times_us=self._survey.time_ns // 1_000,
                 telemetry=options.telemetry,
                 first=partial(self._join, engine),
-                kitsune={"fm_grace": options.fm_grace, "ad_grace": options.ad_grace, "mode": "reference"},
+                kitsune=options.kitsune,
                 queries=options.queries,
                 firewall=_firewall(mitigate=self._result.mitigate, queries=options.queries),
             )

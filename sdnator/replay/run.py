@@ -93,6 +93,8 @@ def run(
     alone = one_pass("Kitsune alone", False) if both or not mitigate else None
     blocking = one_pass("with blocking", True) if mitigate else None
     notes = surveyed.notes()
+    if options.model is not None:
+        notes.append(f"nothing was trained here: the model is {options.model}")
     if options.switch != "embedded":
         notes.append(
             f"packets have the capture's times, but what switch {options.switch} measures itself runs on its own "

@@ -1,4 +1,4 @@
-"""The plan of `sdnator up`, and which changes of it can be applied while it runs.  Pure."""
+"""The plan of `sdnator up`, and which changes of it can be applied while it runs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -67,12 +67,17 @@ def changes(old: StandingPlan, new: StandingPlan) -> PlanChanges:
     if (old.dashboard is None) != (new.dashboard is None):
         waits.append("dashboard.enabled: takes effect when the pipeline is restarted")
     again = [part for part in old.parts() if part in new.parts() and _differs(part, old, new)]
-    if "kitsune" in again and not new.settings_of("kitsune").get("load_model"):
+    if "kitsune" in again and not _has_model(new.settings_of("kitsune")):
         again.remove("kitsune")
         waits.append(
             "kitsune: a restart would train it again; set kitsune.load_model, or restart the pipeline"
         )
     return PlanChanges(tuple(again), tuple(waits))
+
+
+def _has_model(settings: Mapping[str, Any]) -> bool:
+    kept = settings.get("keep_model", "")
+    return bool(settings.get("load_model")) or (bool(kept) and Path(kept).exists())
 
 
 _FOR_NEXT_START = ("updates", "archive", "switches", "apps", "metrics_host", "supervisor")

@@ -57,7 +57,10 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
     archive = given.archive or own.archive
     settings = {"p4runtime_ctrl": config.section("p4runtime_ctrl"), "sonata_adapter": _adapter(config, given)}
     settings["coordinator"] = _coordinator(config, given.quota or own.quota, embedded=not archive)
-    settings["kitsune"] = _kitsune(config, given)
+    switches = tuple(_planned(each) for each in _switches(config, given))
+    settings["kitsune"] = (
+        _kept(_kitsune(config, given), switches, state) if own.keep_model else _kitsune(config, given)
+    )
     settings["firewall"] = _firewall(config, given)
     installed = app_catalogue.to_run(config.struct("firewall").enforcers)
     settings |= {name: config.section(name) for name in installed if name not in settings}
@@ -66,7 +69,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
         state=state,
         updates=given.updates or own.updates,
         archive=_checked_archive(archive) if archive else _own_archive(),
-        switches=tuple(_planned(each) for each in _switches(config, given)),
+        switches=switches,
         settings=settings,
         apps=installed,
         engine=config.section("due"),
@@ -109,6 +112,17 @@ def _kitsune(config: "Config", given: Given) -> dict[str, Any]:
         fm_grace = given.train // TRAIN_SHARE
         settings |= {"fm_grace": fm_grace, "ad_grace": given.train - fm_grace}
     return settings | model_settings(given.model)
+
+
+def _kept(settings: dict[str, Any], switches: tuple[PlannedSwitch, ...], state: Path) -> dict[str, Any]:
+    """Kitsune's settings with the model of the state folder, unless they name one."""
+    if any(settings.get(name) for name in ("load_model", "save_model", "keep_model")):
+        return settings
+    places = {
+        one.name: [one.kind, *(f"{number}={kind}" for number, kind in sorted(one.ports.items()))]
+        for one in switches
+    }
+    return {**settings, "keep_model": str(running.model_file(state)), "switches": places}
 
 
 def model_settings(model: Path | None) -> dict[str, Any]:

@@ -73,6 +73,7 @@ class UpReport:
             token_file=str((plan.dashboard or {}).get("token_file", "")),
             metrics=metrics,
             config=self._config,
+            model=pipeline.endpoints("model").get("kitsune", ""),
         )
         running.write(plan.state, found)
         write_targets(plan.metrics_targets, metrics)

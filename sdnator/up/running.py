@@ -1,6 +1,6 @@
 """Which pipeline runs on this machine: the run file of `sdnator up`, and the folders of the product.
 
-    $XDG_STATE_HOME/sdnator   run.json, run.lock (with the process id), logs, settings of the parts, spools
+    $XDG_STATE_HOME/sdnator   run.json, run.lock (with the process id), logs, settings of the parts, spools, model/
     $XDG_DATA_HOME/sdnator    archive.db
     $XDG_CONFIG_HOME/sdnator  sdnator.toml
 
@@ -57,6 +57,8 @@ class Running:
     """HOST:PORT of Prometheus endpoints, by part."""
     config: str = ""
     """File that was read."""
+    model: str = ""
+    """What became of the kept model at the last start of Kitsune; empty: none is kept."""
     schema: int = SCHEMA
 
 
@@ -86,6 +88,11 @@ def _xdg(variable: str, default: str) -> Path:
     named = Path(os.environ.get(variable, ""))
     # the XDG standard says to ignore relative paths
     return (named if named.is_absolute() else Path.home() / default) / "sdnator"
+
+
+def model_file(folder: Path) -> Path:
+    """Where the model of a state folder is kept."""
+    return folder / "model" / "kitsune.npz"
 
 
 @contextmanager

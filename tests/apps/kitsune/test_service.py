@@ -10,9 +10,11 @@ import time
 import numpy as np
 import pytest
 
+from apps.kitsune.model_orders import ANSWER
 from apps.kitsune.service import (
     ALERT,
     CAPABILITIES,
+    DRIFT_KEY,
     EVIDENCE_KEY,
     INTERESTS,
     PACKETS,
@@ -132,5 +134,8 @@ def test_wrong_settings_end_with_a_sentence(server, tmp_path, settings, text):
 
 def test_declares_what_it_does():
     assert Interest(PACKETS) in INTERESTS
-    assert {each.key for each in CAPABILITIES} == {SCORE, ALERT, f"{EVIDENCE_KEY}.*", TRAINING_KEY}
+    assert {each.key for each in CAPABILITIES} == {
+        *(SCORE, ALERT, f"{EVIDENCE_KEY}.*", TRAINING_KEY),
+        *(DRIFT_KEY, ANSWER),
+    }
     assert all(c.delivery == "reliable" and c.archive == "always" for c in CAPABILITIES)

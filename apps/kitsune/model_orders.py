@@ -1,0 +1,32 @@
+"""What operators ask of the model.  Pure."""
+
+from typing import Final, Literal
+
+from apps.messages import Answer, Message, Name, sender_of
+from due import Item
+
+ORDERS: Final = "network.instruction.operator.kitsune"
+"""Only the command line's own key is heard: no other app may throw a model away."""
+ANSWER: Final = "network.answer.kitsune.operator"
+
+
+class ModelOrder(Message, frozen=True, kw_only=True):
+    """`network.instruction.operator.kitsune`."""
+
+    id: Name
+    verb: Literal["retrain"]
+    expires: int = 0
+    """Wall time, ns since the epoch, after which it must not be carried out any more; 0 = never."""
+
+
+def order_in(item: Item) -> ModelOrder:
+    """An order, written by the operator's app; raises `MessageError`."""
+    sender_of(item)
+    return ModelOrder.from_value(item.value)
+
+
+def late(order: ModelOrder, wall_ns: int) -> Answer | None:
+    """The answer to an order that is too old; None if it may be carried out."""
+    if not 0 < order.expires < wall_ns:
+        return None
+    return Answer(id=order.id, done=False, text="the order came too late and was not carried out; ask again")
