@@ -90,8 +90,9 @@ def spoken_in(item: Item) -> Evidence:
 
 
 def training_in(item: Item) -> TrainingState:
-    """`network.training.<app>`."""
-    sender_of(item)
+    """`network.training.kitsune`: another app's word would move the bound that all evidence has to reach."""
+    if sender_of(item) != "kitsune":
+        raise MessageError("sender", f"{item.key}: only Kitsune says how far training is")
     return TrainingState.from_value(item.value)
 
 

@@ -122,3 +122,13 @@ def test_the_rule_of_the_paper_blocks_at_the_first_packet_over_the_threshold():
 def test_a_budget_has_to_be_possible():
     with pytest.raises(ValueError, match="false_blocks_per_day"):
         Rules(false_blocks_per_day=0)
+
+
+def test_no_other_app_can_say_that_training_is_done():
+    """A longer training than there was would lower the bound for all."""
+    on = desk(seconds=2.0, evidence_apps=("honeypot",))
+    state = TrainingState(packets=9, wanted=9, done=True, seconds=1e9, senders=1, event_time=NOW)
+    on.hand("network.training.honeypot", state.to_value(), pattern="network.training.*")
+    hear(on, evidence(40.0, AT))
+    assert not on.blocked
+    assert on.service.health()["refused_by_cause"] == {"sender": 1}

@@ -73,7 +73,7 @@ def test_it_survives_a_restart():
     drift = trained()
     live(drift, 1, shift=0.8)
     again = Drift.from_state(json.loads(json.dumps(drift.to_state())))
-    assert again.reading.drifted
+    assert again.to_state()["drifted"]
     assert live(again, 0.5, first=DAY_BLOCKS, shift=0.8) == []  # it was told before
     for damage in ({"limit": 0}, {"line": "x"}, {"blocks": [[1, 2]]}):
         with pytest.raises((ValueError, TypeError)):

@@ -2,6 +2,7 @@
 
 import json
 import stat
+from typing import Any, cast
 
 import pytest
 
@@ -9,6 +10,7 @@ from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kept_model import MOST_ASIDE, KeptModel, models_aside, set_aside, trained_for
 from apps.kitsune.model_orders import ANSWER, ORDERS
 from apps.kitsune.service import PACKETS, TRAINING_KEY, KitsuneService, Settings
+from due import Engine
 from sdnator.testing.packet_rows import part
 from tests.apps.hostile import Hands
 from tests.apps.kitsune.test_hostile import KEY, mixed
@@ -87,8 +89,14 @@ def test_models_beside_are_bounded(tmp_path):
 
 
 def service(tmp_path, engine=None, **changes):
-    fields = {"fm_grace": 20, "ad_grace": 200, "keep_model": str(tmp_path / "model" / "kitsune.npz")}
-    made = KitsuneService(engine or Hands(), Settings(**(fields | {"switches": HERE} | changes)))
+    fields: dict[str, Any] = {
+        "fm_grace": 20,
+        "ad_grace": 200,
+        "keep_model": str(tmp_path / "model" / "kitsune.npz"),
+    }
+    made = KitsuneService(
+        cast("Engine", engine or Hands()), Settings(**(fields | {"switches": HERE} | changes))
+    )
     made.start()
     return made
 
