@@ -78,7 +78,12 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
             words += ["--fm-grace", "90", "--ad-grace", "900"]
     values = {"CAPTURE.pcap": str(capture), "LABELS.csv": str(labels_path(capture)), "12000": "1000"}
     arguments = [values.get(word, word) for word in words[1:]]
-    if words[1] == "replay" and "--train" not in words:
+    if words[1] == "model":
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    if "--model" in words:
+        trained = ["--fm-grace", "100", "--ad-grace", "900", "--save-model", words[words.index("--model") + 1]]
+        assert sdnator("detect", str(capture), "--out", "scores", *trained).returncode == 0
+    if words[1] == "replay" and "--train" not in words and "--model" not in words:
         arguments += ["--train", "1000"]
     done = sdnator(*arguments)
     assert done.returncode == 0, done.stderr[-2000:]

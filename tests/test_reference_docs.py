@@ -150,7 +150,12 @@ def test_commands_that_no_test_runs_exist_at_least(made, document, command):
 
 
 @pytest.mark.parametrize(
-    ("example", "mark"), [("foreign_detector.py", "wrapper"), ("analyser.py", "analyser")]
+    ("example", "mark"),
+    [
+        ("foreign_detector.py", "wrapper"),
+        ("river_evidence.py", "wrapper"),
+        ("analyser.py", "analyser"),
+    ],
 )
 def test_onboarding_shows_the_examples(example, mark):
     """The code on the page is that of the example, which is run by other tests, and is ten lines at most."""

@@ -135,7 +135,7 @@ class Detector:
         self._tail: deque[npt.NDArray[np.float64]] = deque()
         """Features of the last packets of training."""
         self._sample: list[npt.NDArray[np.float64]] = []
-        """Features of some packets of each tenth of training."""
+        """Features of some packets of training."""
         self.calibration = Calibration(settings.calibration_packets)
         self.accused = Accused()
         self.drift: Drift | None = None
@@ -224,10 +224,9 @@ class Detector:
         return scores
 
     def _keep_sample(self, features: npt.NDArray[np.float64], before: int) -> None:
-        """The first packets of each tenth of training."""
-        tenth = max(1, self.model.training_packets // TRAINING_BLOCKS)
-        numbers = np.arange(before, before + len(features))
-        chosen = numbers % tenth < min(tenth, TRAINING_SAMPLE)
+        """Packets of all of training, evenly spaced."""
+        step = max(1, self.model.training_packets // (TRAINING_BLOCKS * TRAINING_SAMPLE))
+        chosen = np.arange(before, before + len(features)) % step == 0
         if chosen.any():
             self._sample.append(features[chosen].copy())
 

@@ -36,7 +36,7 @@ _FACTOR: Final = 5.0
 _TRAINING_FACTOR: Final = 2.0
 TRAINING_BLOCKS: Final = 10
 TRAINING_SAMPLE: Final = 500
-"""Successive packets of each tenth of training whose scores stand for it."""
+"""Packets of each tenth of training, evenly spaced, whose scores stand for it."""
 _MOST_LIMIT: Final = 0.9
 
 
