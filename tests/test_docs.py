@@ -81,7 +81,14 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
     if words[1] == "model":
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     if "--model" in words:
-        trained = ["--fm-grace", "100", "--ad-grace", "900", "--save-model", words[words.index("--model") + 1]]
+        trained = [
+            "--fm-grace",
+            "100",
+            "--ad-grace",
+            "900",
+            "--save-model",
+            words[words.index("--model") + 1],
+        ]
         assert sdnator("detect", str(capture), "--out", "scores", *trained).returncode == 0
     if words[1] == "replay" and "--train" not in words and "--model" not in words:
         arguments += ["--train", "1000"]

@@ -14,8 +14,13 @@ from pathlib import Path
 
 import pytest
 
+from apps.kitsune.detector import Detector
+from apps.kitsune.kept_model import KeptModel, models_aside, trained_for
 from due.drivers.embedded_redis import EmbeddedServer, server_program
 from sdnator.capture.interfaces import VethPair
+from sdnator.up import running
+from tests.apps.kitsune.test_hostile import mixed
+from tests.apps.kitsune.test_kept_model import SMALL
 from tests.end_to_end.test_bad_input import MARK, processes_of
 from tests.requirements import optional_program, require_netns
 
@@ -120,6 +125,30 @@ def test_all_parts_run_and_all_apps_are_active(standing):
     assert {found["apps"][app] for app in APPS} == {"active"}
     assert found["pid"] == said["pid"]
     assert "kitsune" in operator.run("status").stdout
+
+
+def test_the_kept_model_is_taken_up_shown_and_thrown_away(operator):
+    """Through `up`, `status` and `model`; with another length of training it stays beside."""
+    state, config = (
+        Path(operator.environment[f"XDG_{name}_HOME"]) / "sdnator" for name in ("STATE", "CONFIG")
+    )
+    path = running.model_file(state)
+    config.mkdir(parents=True)
+    (config / "sdnator.toml").write_text("[kitsune]\nfm_grace = 20\nad_grace = 200\n")
+    detector = Detector(SMALL)
+    detector.process(mixed(400), "s1")
+    KeptModel(path, trained_for(SMALL, {"s1": ["embedded"]})).keep(detector)
+    with operator.up() as (_, said):
+        assert said["model"].startswith("took up the model of")
+        until(lambda: (operator.well() or {}).get("training", {}).get("done"))
+        assert "model: trained until" in operator.run("status").stdout
+        assert "training anew on the next 221 packets" in operator.run("model", "retrain").stdout
+        until(lambda: "training 0 %, waiting for packets" in operator.run("model", "show").stdout)
+        assert not path.exists()
+    KeptModel(path, trained_for(SMALL, {"s1": ["embedded"]})).keep(detector)
+    with operator.up("--train", "330") as (_, said):
+        assert "it was trained with fm_grace=20, not 30" in said["model"]
+    assert len(models_aside(path)) == 2
 
 
 def test_a_second_one_is_refused(standing):

@@ -13,6 +13,7 @@ from due import Item
 from due.backends import open_archive
 from sdnator.cli.main import app
 from sdnator.errors import BadInput, PipelineError
+from sdnator.up import running
 from sdnator.up.running import claimed
 
 
@@ -50,8 +51,13 @@ def test_archive_configuration_and_model_come_back(home):
     model = home / "home.model"
     model.write_bytes(b"trained")
     config.write_text(f'[kitsune]\nload_model = "{model}"\n')
+    kept = running.model_file(running.state_folder())
+    kept.parent.mkdir(parents=True)
+    kept.write_bytes(b"kept")
     done = run("backup", home / "b.tar.gz", "--json")
-    assert json.loads(done.stdout)["files"] == ["archive.db", "models/home.model", "sdnator.toml"]
+    names = ["archive.db", "kept/kitsune.npz", "models/home.model", "sdnator.toml"]
+    assert json.loads(done.stdout)["files"] == names
+    kept.unlink()
     assert (home / "b.tar.gz").stat().st_mode & 0o077 == 0
     fill(home, 2)
     config.write_text("# another\n")
@@ -59,6 +65,7 @@ def test_archive_configuration_and_model_come_back(home):
     assert values(home) == [1]
     assert "load_model" in config.read_text()
     assert (home / "data" / "sdnator" / "models" / "home.model").read_bytes() == b"trained"
+    assert kept.read_bytes() == b"kept"
     assert (config.parent / "sdnator.toml.before-restore").read_text() == "# another\n"
     assert len(found["kept"]) == 2
 

@@ -1,8 +1,9 @@
 """What a row says of a decision, and which button it has."""
 
 import pytest
+from msgspec import structs
 
-from apps.messages import Decision, Target
+from apps.messages import Decision, Ground, Target
 from sdnator.dashboard.texts import decision_row, incident_row
 from tests.sdnator.incidents.samples import life
 
@@ -18,6 +19,22 @@ def test_blocks_are_undone_and_guards_released_but_those_of_the_settings_stay(ac
     row = decision_row(one, {"s1": "installed"})
     assert (row["undo"], row["said"]) == (button, "s1: installed")
     assert row["where"].startswith("all switches")
+
+
+def test_only_what_evidence_led_to_can_be_called_a_false_alarm():
+    ground = Ground(source="kitsune.targets", nats=9.0)
+    one = Decision(
+        id="d",
+        action="block",
+        switch="s1",
+        target=Target(kind="ip", address="192.0.2.1"),
+        reason="r",
+        event_time=1,
+        expires=2,
+        grounds=(ground,),
+    )
+    assert decision_row(one, {})["false_alarm"]
+    assert not decision_row(structs.replace(one, grounds=()), {})["false_alarm"]
 
 
 def test_an_incident_says_who_whom_and_what_was_done():

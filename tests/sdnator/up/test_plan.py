@@ -32,7 +32,7 @@ def test_what_the_switches_know_waits_for_the_next_start():
     assert taken_up(PLAN, new, found.again) == PLAN
 
 
-def test_kitsune_keeps_its_training():
+def test_kitsune_keeps_its_training(tmp_path):
     """Unless a trained model is named; whether that is being written or used is no change."""
     new = replace(PLAN, settings={"firewall": {}, "kitsune": {"threshold": 2.0}})
     found = changes(PLAN, new)
@@ -40,6 +40,11 @@ def test_kitsune_keeps_its_training():
     assert taken_up(PLAN, new, found.again) == PLAN
     model = replace(PLAN, settings={"firewall": {}, "kitsune": {"threshold": 2.0, "load_model": "/m"}})
     assert changes(PLAN, model).again == ("kitsune",)
+    kept = tmp_path / "kitsune.npz"
+    new = replace(PLAN, settings={"firewall": {}, "kitsune": {"threshold": 2.0, "keep_model": str(kept)}})
+    assert changes(PLAN, new).again == ()
+    kept.write_bytes(b"trained")
+    assert changes(PLAN, new).again == ("kitsune",)
     trained = replace(PLAN, settings={"firewall": {}, "kitsune": {"load_model": "/m"}})
     assert changes(PLAN, trained).again == ()
 
