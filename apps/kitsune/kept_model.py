@@ -1,4 +1,4 @@
-"""The model that `sdnator up` keeps: taken up where it belongs, set aside where it does not.
+"""The model that `sdnator up` keeps: taken up where it belongs, set aside where it does not.  I/O.
 
 start ─► is there a file? ─► was it trained for these switches, ports and settings? ─► taken up
               │ no                    │ no: the reason in one line, the file is kept beside

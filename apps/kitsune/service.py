@@ -99,7 +99,7 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
     keep_model: str = ""
     """File that is loaded if its model was trained for the same switches, ports and settings, and written otherwise;
     empty: none, or `load_model` and `save_model` say. `sdnator up` sets it."""
-    switches: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
+    keep_for: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
     """Switches and their ports, to compare `keep_model` with. `sdnator up` sets it."""
 
 
@@ -110,7 +110,7 @@ class KitsuneService:
         self._engine = engine
         self._settings = settings
         self._kernel = load_kernel()
-        self._belongs = trained_for(settings, settings.switches)
+        self._belongs = trained_for(settings, settings.keep_for)
         self._kept = KeptModel(Path(settings.keep_model), self._belongs) if settings.keep_model else None
         self._detector = self._first_detector()
         self._told = self._detector.model.is_trained

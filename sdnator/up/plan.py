@@ -9,7 +9,7 @@ from sdnator.app_catalogue import OURS
 from sdnator.config.planned_switches import PlannedSwitch
 from sdnator.supervisor.settings import SupervisorSettings
 
-_MODEL_FILES = ("load_model", "save_model", "keep_model", "switches")
+_MODEL_FILES = ("load_model", "save_model", "keep_model", "keep_for")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -122,7 +122,7 @@ def _kept(settings: dict[str, Any], switches: tuple[PlannedSwitch, ...], state: 
         one.name: [one.kind, *(f"{number}={kind}" for number, kind in sorted(one.ports.items()))]
         for one in switches
     }
-    return {**settings, "keep_model": str(running.model_file(state)), "switches": places}
+    return {**settings, "keep_model": str(running.model_file(state)), "keep_for": places}
 
 
 def model_settings(model: Path | None) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from sdnator.cli import (
     coordinator_commands,
     doctor,
     due_commands,
-    model_commands,
     status_command,
     switch_commands,
     up_command,
@@ -23,7 +22,6 @@ COMMANDS = (
     switch_commands.tables,
     switch_commands.counters,
     doctor.doctor,
-    model_commands.model,
 )
 
 __all__ = ["COMMANDS", "app"]

@@ -95,7 +95,7 @@ def service(tmp_path, engine=None, **changes):
         "keep_model": str(tmp_path / "model" / "kitsune.npz"),
     }
     made = KitsuneService(
-        cast("Engine", engine or Hands()), Settings(**(fields | {"switches": HERE} | changes))
+        cast("Engine", engine or Hands()), Settings(**(fields | {"keep_for": HERE} | changes))
     )
     made.start()
     return made
