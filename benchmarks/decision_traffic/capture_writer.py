@@ -4,7 +4,7 @@ Frames are as long as they were on the wire; payloads are zeros (those of names 
 them the columns that were written, except `port`, `sequence` and `arrival`, which no pcap has.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -84,8 +84,7 @@ def write_captures(parts: Iterable[Traffic], path: Path, *, snap: int | None = N
     with CaptureWriter(path) as writer:
         for part in parts:
             for some in part.batches(_ROWS):
-                rows = map(_Row._make, zip(*(some.columns[name].tolist() for name in _NEEDED), strict=True))
-                for row in rows:
+                for row in _rows(some):
                     data = frame(row)
                     writer.write(row.time_us * 1_000, data[:snap], len(data))
                 is_attack = some.attack != 0
@@ -96,6 +95,16 @@ def write_captures(parts: Iterable[Traffic], path: Path, *, snap: int | None = N
                     for mac, flag in zip(senders, is_attack.tolist(), strict=True)
                 ]
     write_labels(labels_path(path), Labels.of(np.concatenate([np.zeros(0, np.bool_), *attack]), attackers))
+
+
+def frames_in(part: Traffic) -> Iterator[bytes]:
+    """The frames of the packets, in order, as long as on the wire."""
+    for some in part.batches(_ROWS):
+        yield from map(frame, _rows(some))
+
+
+def _rows(part: Traffic) -> Iterator[_Row]:
+    return map(_Row._make, zip(*(part.columns[name].tolist() for name in _NEEDED), strict=True))
 
 
 def frame(row: _Row) -> bytes:
