@@ -443,20 +443,41 @@ class RedisPublisher:
     def _restore(self, wire: Wire, ledger: StreamLedger, *, restarted: bool) -> None:
         """Resend what the server may not have; readers recognise repeats."""
         self._guarded_settle(wire)
-        entries = list(ledger.kept)
         ledger.lasting = False
-        if not restarted:
-            entries = [e for e in entries if e.id is None]
-        else:
-            ledger.forget_ids()
-            if not wire.call("EXISTS", stream_name(ledger.path)):
-                entries = [*ledger.retained, *entries]
         self._send_announcement(ledger)
+        if restarted:
+            ledger.forget_ids()
+            empty = not self._called(wire, "EXISTS", stream_name(ledger.path))
+            retained = list(ledger.retained) if empty else []
+            self._resend(wire, retained)
+            self._restore_groups(wire, ledger, len(retained))
+        self._resend(wire, [entry for entry in ledger.kept if entry.id is None])
+
+    def _restore_groups(self, wire: Wire, ledger: StreamLedger, done: int) -> None:
+        """The groups that lived go on behind what they had all done, whether or not a member of them still lives.
+
+        A new member of a group that is not there would begin with what comes after it.
+        """
+        groups = sorted(ledger.living_groups())
+        if groups:
+            name = stream_name(ledger.path)
+            # what others have appended already may be new to the group
+            start = "$" if self._called(wire, "XLEN", name) == done else "0"
+            for group in groups:
+                # refused for a group that a member, or another producer, was quicker to make
+                self._called(wire, "XGROUP", "CREATE", name, group, start, "MKSTREAM")
+
+    def _resend(self, wire: Wire, entries: Iterable[StreamEntry]) -> None:
         for entry in entries:
             self._counts["resent"] += 1
             wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
             self._outstanding.append(entry)
             self._collect()
+
+    def _called(self, wire: Wire, *command: bytes | str) -> Any:
+        """The reply, after all replies to what was sent before; an error of the server is one, too."""
+        self._guarded_settle(wire)
+        return wire.call(*command)
 
     def _guarded_settle(self, wire: Wire) -> None:
         while self._outstanding:

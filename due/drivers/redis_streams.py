@@ -5,7 +5,8 @@
 A payload stays in `kept` until every live group of readers has acknowledged it; `kept` is bounded by
 the window, and that bound is the back-pressure.  A group lives while one of its instances renews its
 lease: until this producer has watched all of them unchanged for `group_timeout` (see `redis_leases`).
-If the server comes back empty, retained and kept payloads are sent again; readers recognise repeats.
+If the server comes back empty, retained and kept payloads are sent again; readers recognise repeats.  The groups
+that lived are made again between the two: a member that died, too, is followed by one that has never read.
 A stream without writer and reader for `LIFETIME_S` expires, with its groups and leases.
 """
 
@@ -109,6 +110,10 @@ class StreamLedger:
     def live_groups(self, leases: Mapping[bytes, bytes], asked: float, answered: float) -> set[bytes]:
         """Groups to wait for: seen alive within the timeout, on the server or by us before it lost them."""
         self._leases.look(leases, asked, answered)
+        return self.living_groups()
+
+    def living_groups(self) -> set[bytes]:
+        """Groups that lived when the readers were last asked about."""
         return {group_of(field) for field in self._leases.living(self._group_timeout)}
 
     def acknowledged(self, up_to: tuple[int, int]) -> None:

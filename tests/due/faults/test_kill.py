@@ -45,6 +45,27 @@ def test_killed_consumer(programs, own_server):
     assert again == sorted(again), "order is kept after the take-over"
 
 
+def test_reader_and_server_killed_together(programs, tmp_path):
+    """What the dead reader had not done comes to the next one, though the server has forgotten both."""
+    count = 20_000
+    with EmbeddedServer(tmp_path / "u") as server:
+        first = programs("consume", server.url, "reader", count, 0.1)
+        first.wait_for("ready")
+        producer = programs("produce", server.url, "reliable", count, 20)
+        first.wait_for("3000 ")
+        first.kill()
+        server.kill()
+        server.start()
+        producer.wait_for("flushed")
+        _until(lambda: _entries(server.url))
+        second = programs("consume", server.url, "reader", 10**9, 0)
+        second.wait_for("ready")
+        producer.say()
+        _until(lambda: set(first.numbers()) | set(second.numbers()) == set(range(count + 1)))
+        again = second.numbers()
+        assert again == sorted(again), "order is kept after the take-over"
+
+
 def test_killed_producer(programs, own_server):
     consumer = programs("consume", own_server.url, "reader", 10**9, 0)
     consumer.wait_for("ready")
@@ -55,6 +76,13 @@ def test_killed_producer(programs, own_server):
     programs("produce", own_server.url, "reliable", 5_000, 20).wait_for("flushed")
     _until(lambda: len(consumer.numbers()) >= 15_000)
     assert consumer.numbers() == [*range(10_000), *range(5_000)]
+
+
+def _entries(url: str) -> int:
+    wire = Wire(url)
+    entries = wire.call("XLEN", "due:stream:fault.stream")
+    wire.close()
+    return int(entries)
 
 
 def _used_memory(url: str) -> int:
