@@ -198,6 +198,7 @@ class FirewallService:
             if enforcer != SWITCHES:
                 self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
+        self._answer_again()
         self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)
         if self._settings.detect:
             self._hear_tcp()
@@ -303,14 +304,27 @@ class FirewallService:
         if answer is not None:
             answer, key = answer if again else self._stored.checked(answer), history.answer_key(item.key)
             self._engine.write(key, answer.to_value(), [due.NO_WAIT])
+            # once this returns, those who sent the instruction need not send it again
+            self._stored.keep(answer)
+
+    def _answer_again(self) -> None:
+        """What an earlier run received, but did not answer, or answered without being heard."""
+        for key, answer in self._past.recent_answers():
+            self._engine.write(key, answer.to_value(), [due.PUB_ONLY, due.NO_WAIT])
+        for item, instruction in self._past.unanswered(self._stored):
+            self._on_instruction(item, instruction)
 
     def _carry_out(self, instruction: Instruction, item: Item) -> Answer:
         summary = f"{instruction.verb} {instruction.subject}: {instruction.reason}"
         evidence = evidence_of(item, summary)
         self._stored.began(instruction.id)
-        refused = refused_as_late(instruction, time.time_ns()) or refused_as_foreign(instruction, item.app_id)
-        if refused is not None:
-            return refused
+        early = (
+            self._desk.decided_before(instruction, evidence)
+            or refused_as_late(instruction, time.time_ns())
+            or refused_as_foreign(instruction, item.app_id)
+        )
+        if early is not None:
+            return early
         decisions, answer = self._desk.carry_out(instruction, evidence, self._now or evidence.timestamp)
         for decision in decisions:
             self._publish(decision)

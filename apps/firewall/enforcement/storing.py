@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Final
 
 from msgspec import structs
@@ -50,6 +51,12 @@ class StoredAnswers:
         checked = self._checked(answer)
         self._note(answer.id, checked)
         return checked
+
+    def keep(self, answer: Answer) -> None:
+        """Wait until the answer itself is stored, too: what led to it is forgotten by those who sent it."""
+        if answer.done:
+            with suppress(DueError):
+                self._engine.flush(self._patience_s)
 
     def _note(self, instruction: str, answer: Answer | None) -> None:
         self._given[instruction] = answer

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import Any, Final, TypeVar
 
 from apps.evidence import TRAINING, TrainingState
@@ -41,6 +41,10 @@ _LONGEST_NS: Final = LONGEST_BLOCK_S * 1_000_000_000 + _DAY_NS
 """Longest block plus a day for clock changes: older decisions are no longer in force."""
 _INSTRUCTIONS: Final = 20_000
 _ANSWERS: Final = 1_000
+_UNANSWERED: Final = 1_000
+_TOLD_AGAIN: Final = 100
+_RECENT_NS: Final = 2 * 3600 * 1_000_000_000
+"""Longer than the wall clocks of two machines differ."""
 _INCIDENTS: Final = 20_000
 _LESSONS: Final = 20_000
 _SOURCE_SHARE: Final = 10
@@ -66,6 +70,17 @@ class ArchivedPast:
     def answered(self) -> list[Answer]:
         """What was answered most recently."""
         return self._read(f"{ANSWERS}.*", "answer", answer_in, most=_ANSWERS)
+
+    def recent_answers(self) -> list[tuple[str, Answer]]:
+        """The newest answers, with their keys: whom they were for may not have heard them."""
+        since = time.time_ns() - _RECENT_NS
+        return self._read(f"{ANSWERS}.*", "answer", _keyed_answer, since=since, most=_TOLD_AGAIN)
+
+    def unanswered(self, answered: Container[str]) -> list[tuple[Item, Instruction]]:
+        """Recent instructions that an earlier run received, or not, and did not answer; oldest first."""
+        since = time.time_ns() - _RECENT_NS
+        found = self._read(INSTRUCTIONS, "instruction", _whole_instruction, since=since, most=_UNANSWERED)
+        return [each for each in found if each[1].id not in answered]
 
     def panics(self) -> list[str]:
         """Ids of the panics in the archive, which were carried out already."""
@@ -127,6 +142,14 @@ class ArchivedPast:
         items = self._archive.find(query, _PATIENCE_S, since=since, most=most) or ()
         found = (self._intake.read(kind, decode, item) for item in items)
         return [each for each in found if each is not None]
+
+
+def _keyed_answer(item: Item) -> tuple[str, Answer]:
+    return item.key, answer_in(item)
+
+
+def _whole_instruction(item: Item) -> tuple[Item, Instruction]:
+    return item, instruction_in(item)
 
 
 def _archived_handshake(item: Item) -> tuple[str, int]:

@@ -57,6 +57,15 @@ class Desk:
             return [], Answer(id=instruction.id, done=False, text=str(error))
         return decisions, Answer(id=instruction.id, done=True, text=text)
 
+    def decided_before(self, instruction: Instruction, evidence: Exhibit) -> Answer | None:
+        """The answer to an instruction whose block stands: the firewall was killed before it could answer."""
+        if instruction.verb == "block":
+            for block in self._ledger.blocks.values():
+                if evidence in block.decision.evidence:
+                    text = f"block {block.decision.id} of {instruction.subject}, decided before a restart"
+                    return Answer(id=instruction.id, done=True, text=text)
+        return None
+
     def _block(self, instruction: Instruction, evidence: Exhibit, now: int) -> tuple[list[Decision], str]:
         target = target_in(instruction.subject)
         if self.allow.covers_target(target):

@@ -199,6 +199,38 @@ def test_instruction_that_is_sent_again_is_not_carried_out_again():
     assert answers[1] == answers[2]
 
 
+def test_an_instruction_that_an_earlier_run_did_not_answer_is_carried_out():
+    """It was acknowledged as written, and may have been lost with Data Updates and the firewall."""
+    engine, now = FakeEngine(), time.time_ns()
+    for number, (name, at) in enumerate((("old", 1), ("answered", now), ("new", now)), start=1):
+        said = Instruction(id=name, verb="block", subject=f"192.0.2.{number}").to_value()
+        engine.archived.append(Item(INSTRUCTION, said, at, at, "operator", "o1", number))
+    first = Answer(id="answered", done=True, text="blocked").to_value()
+    engine.archived.append(Item("network.answer.firewall.operator", first, now, now, "firewall", "f1", 1))
+    desk = Desk(engine=engine)
+    assert desk.blocked == ["192.0.2.3"]
+    answers = desk.written("network.answer.firewall.operator")
+    assert [(each["id"], each["done"]) for each in answers] == [("answered", True), ("new", True)]
+    desk.hand(INSTRUCTION, said, pattern=INSTRUCTIONS)
+    assert desk.blocked == ["192.0.2.3"], "it may come by Data Updates, too"
+
+
+def test_an_instruction_whose_block_stands_since_before_a_restart_is_done():
+    """The firewall was killed between its decision and its answer."""
+    engine, now = FakeEngine(), time.time_ns()
+    said = Instruction(id="a", verb="block", subject="192.0.2.1")
+    engine.archived.append(Item(INSTRUCTION, said.to_value(), now, now, "operator", "o1", 1))
+    decision = Desk(engine=engine).decisions[0]
+    archived = Item("network.block.firewall.ipv4", decision.to_value(), now, now, "firewall", "f1", 1)
+    second = FakeEngine()
+    second.archived = [*engine.archived, archived]
+    desk = Desk(engine=second)
+    answers = desk.written("network.answer.firewall.operator")
+    assert [(each["id"], each["done"]) for each in answers] == [("a", True)]
+    assert decision.id in answers[0]["text"]
+    assert not desk.blocked
+
+
 def test_an_instruction_is_answered_as_done_when_its_decision_is_stored():
     """A firewall that is killed while the disk is full forgets what is in its memory only."""
     engine = FakeEngine()
