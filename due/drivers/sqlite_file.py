@@ -138,6 +138,7 @@ class SqliteFile:
 
     def _reset(self) -> None:
         self._pid = os.getpid()
+        self._file: tuple[int, int] | None = None
         self._writer: sqlite3.Connection | None = None
         self._idle: deque[sqlite3.Connection] = deque()
         self.keys = Dictionary("keys", "key_id", "key")
@@ -152,9 +153,21 @@ class SqliteFile:
             if self._writer is not None:
                 _inherited.append(self._writer)
             self._reset()
+        if self._file is not None and self._file != self._named():
+            # moved away or replaced: what is written into the old file would be in no archive
+            self._let_go()
+
+    def _named(self) -> tuple[int, int] | None:
+        """Which file has the archive's name now."""
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            return None
+        return found.st_dev, found.st_ino
 
     def _connect(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
+        before = self._named()
         connection = sqlite3.connect(
             self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
         )
@@ -163,6 +176,7 @@ class SqliteFile:
         except BaseException:
             connection.close()
             raise
+        self._file = self._file or before or self._named()
         return connection
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
@@ -237,7 +251,7 @@ class SqliteFile:
             ) from error
 
     def _let_go(self) -> None:
-        """Drop connections to a damaged file; the next call reopens it.  Running reads close their own."""
+        """Drop connections to a damaged or moved file; the next call reopens it.  Running reads close their own."""
         for connection in self._idle:
             connection.close()
         self._reset()

@@ -225,6 +225,36 @@ def test_a_damaged_file_is_unavailable_until_it_is_moved_away(tmp_path: Path) ->
     archive.close()
 
 
+@pytest.mark.parametrize("instead", [False, True], ids=["nothing", "a_copy"])
+def test_a_file_that_is_moved_away_is_written_no_more(tmp_path: Path, *, instead: bool) -> None:
+    """Damage that no statement meets, or a copy put there by hand: what is archived goes where the name is."""
+    archive, reader = opened(tmp_path), opened(tmp_path)
+    archive.insert(items(2))
+    assert len(reader.find({})) == 2
+    if instead:
+        copy = sqlite3.connect(tmp_path / "copy.db")
+        with sqlite3.connect(tmp_path / "archive.db") as source:
+            source.backup(copy)
+        copy.close()
+    archive.insert(items(1, start=3))
+    for end in ("-wal", "-shm", ""):
+        (tmp_path / f"archive.db{end}").rename(tmp_path / f"old.db{end}")
+    if instead:
+        (tmp_path / "copy.db").rename(tmp_path / "archive.db")
+    archive.insert(items(1, start=4))
+    numbers = [1, 2, 4] if instead else [4]
+    for each in (archive, reader, opened(tmp_path)):
+        assert [item.sequence for item in each.find({})] == numbers
+        each.close()
+    (tmp_path / "folder").mkdir()
+    for end in ("-wal", "-shm", ""):
+        if (old := tmp_path / f"old.db{end}").exists():
+            old.rename(tmp_path / "folder" / f"archive.db{end}")
+    old = opened(tmp_path / "folder")
+    assert [item.sequence for item in old.find({})] == [1, 2, 3], "what stood there stays readable"
+    old.close()
+
+
 def test_a_damaged_row_costs_that_row_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     archive = opened(tmp_path)
     archive.insert_frames([pack(items(10, start=start)) for start in (1, 11, 21)])
