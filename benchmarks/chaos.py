@@ -5,45 +5,64 @@
 A seeded scheduler draws fault and moment (`chaos_schedule`), `chaos_faults` carries them out on the parts of
 `chaos_stage`, `chaos_probes` and `chaos_frames` note what was promised and what came, and `chaos_checker`
 holds one against the other.  Exit code 1 where a promise was broken.
+
+`forwarding_gap_ms` is the longest run of frames by fault that the switch lost or forwarded later than half a second,
+`machine_gap_ms` that of the same frames at the same time through a program that only copies them: on a busy machine
+both have gaps.  `none` is what came before the first fault.  Ctrl-C and SIGTERM end the faults early, and judge
+what was; after each fault the file has the figures so far (`"unfinished": true`).
 """
 
 import argparse
+import os
 import shutil
+import signal
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from benchmarks.chaos_checker import Violation, check
-from benchmarks.chaos_faults import ACTIONS, NOT_DONE, FaultAction, left_out
+from benchmarks.chaos_faults import ACTIONS, FaultAction, left_out
 from benchmarks.chaos_frames import LATE_S, ForwardingProbe
 from benchmarks.chaos_probes import Probes, until
-from benchmarks.chaos_schedule import KINDS, PAIR, PlannedFault, schedule
-from benchmarks.chaos_stage import ChaosStage
+from benchmarks.chaos_schedule import CONTROLLERS, KINDS, PAIR, PlannedFault, schedule
+from benchmarks.chaos_stage import PREFIX, ChaosStage, remove_orphans
 from benchmarks.faults_stage import ChildProgram
 from benchmarks.measure import machine, table, write_json
+from sdnator.capture.interfaces import VethPair
 
 _LOOK_S = 0.05
 _SETTLE_S = 90.0
-_WARM_S = 10.0
+_WARM_S = 30.0
 _AGAIN_S = 1.0
-_REACHES_SWITCH = ("switch", "p4runtime_ctrl", "firewall", "updates", "coordinator", "disk")
+_REACHES_SWITCH = ("switch", *CONTROLLERS, "firewall", "updates", "coordinator", "disk")
+_PROGRESS_S = 60.0
 
 
 class ChaosRun:
     """One run; `go` returns its figures."""
 
     def __init__(
-        self, seed: int, seconds: float, kinds: Sequence[str], folder: Path, keep: Path | None = None
+        self,
+        seed: int,
+        seconds: float,
+        kinds: Sequence[str],
+        folder: Path,
+        keep: Path | None = None,
+        report: Path | None = None,
     ) -> None:
         self._seed, self._seconds = seed, seconds
         self._faults = schedule(seed, seconds, kinds)
         self._folder = folder
         self._keep = keep
+        self._report = report
+        self._asked_to_end = threading.Event()
+        self._asked_before = False
+        self._excused = 0
         self._stack = ExitStack()
         self._pair: dict[str, ChildProgram] = {}
         self._pair_dead: dict[str, float] = {}
@@ -62,7 +81,8 @@ class ChaosRun:
             for name in PAIR:
                 self._speak(name)
             self._probes.start()
-            self._wire = self._forwarding()
+            self._wire = self._forwarding(self._stage.wires, self._probes.blocked)
+            self._control = self._forwarding(self._stage.control, list)
             self._look_for(_WARM_S)
             self._break()
             self._settle()
@@ -70,11 +90,21 @@ class ChaosRun:
                 shutil.copytree(self._stage.disk, self._keep, ignore=_no_sockets, dirs_exist_ok=True)
             return self._figures()
 
-    def _forwarding(self) -> ForwardingProbe | None:
-        if self._stage.wires is None:
+    def end_early(self) -> None:
+        """No more faults: settle, and judge what was.  Raises KeyboardInterrupt when asked again."""
+        if self._asked_before:
+            raise KeyboardInterrupt
+        self._asked_before = True
+        self._asked_to_end.set()
+
+    @staticmethod
+    def _forwarding(
+        wires: tuple[VethPair, VethPair] | None, blocked: Callable[[], list[str]]
+    ) -> ForwardingProbe | None:
+        if wires is None:
             return None
-        entry, leave = self._stage.wires
-        probe = ForwardingProbe(entry.near, leave.far, self._probes.blocked)
+        entry, leave = wires
+        probe = ForwardingProbe(entry.near, leave.far, blocked)
         probe.start()
         return probe
 
@@ -91,7 +121,7 @@ class ChaosRun:
 
     def _look_for(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
+        while time.monotonic() < deadline and not self._asked_to_end.is_set():
             self._look()
 
     def _speak(self, name: str) -> None:
@@ -109,30 +139,65 @@ class ChaosRun:
 
     def _break(self) -> None:
         began = time.monotonic()
+        told = began + _PROGRESS_S
         lasting: list[tuple[float, FaultAction]] = []
         for fault in [*self._faults, None]:
             due = began + (fault.at if fault is not None else self._seconds)
-            while (now := time.monotonic()) < due:
+            while (now := time.monotonic()) < due and not self._asked_to_end.is_set():
                 for ends, action in [each for each in lasting if each[0] <= now]:
                     action.end()
                     lasting.remove((ends, action))
+                self._excuse()
                 self._look()
+                if now >= told:
+                    told = now + _PROGRESS_S
+                    self._tell(now - began)
+            if self._asked_to_end.is_set():
+                break
             if fault is not None:
-                print(
-                    f"{fault.at:7.1f} s  {fault.kind:12} {'+'.join(fault.targets)}",
-                    file=sys.stderr,
-                    flush=True,
-                )
-                action = ACTIONS[fault.kind](fault, self._stage, self._pid)
-                self._begun.append((now, fault))
-                action.begin()
-                lasting.append((now + fault.seconds, action))
+                lasting.append((now + fault.seconds, self._begin(fault, now)))
         for _, action in lasting:
             action.end()
+        self._excuse()
+
+    def _begin(self, fault: PlannedFault, now: float) -> FaultAction:
+        targets = "+".join(fault.targets)
+        print(f"{fault.at:7.1f} s  {fault.kind:12} {targets}", file=sys.stderr, flush=True)
+        action = ACTIONS[fault.kind](fault, self._stage, self._pid)
+        self._begun.append((now, fault))
+        action.begin()
+        write_json(self._report, {"unfinished": True, **self._so_far()})
+        return action
+
+    def _excuse(self) -> None:
+        for copy in self._stage.restored[self._excused :]:
+            self._probes.excuse(copy)
+            self._excused += 1
+
+    def _so_far(self) -> dict[str, Any]:
+        return {
+            "seed": self._seed,
+            "faults": {"count": len(self._begun), "planned": len(self._faults)},
+            "operations": self._operations(),
+            "restarts": self._restarts(),
+        }
+
+    def _tell(self, seconds: float) -> None:
+        done, restarts = self._operations(), sum(self._restarts().values())
+        print(
+            f"{seconds:7.1f} s  of {self._seconds:.0f}: {len(self._begun)} of {len(self._faults)} faults,"
+            f" {restarts} restarts, {done['delivered']} delivered, {done['answers']} of {done['instructions']} answers",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def _restarts(self) -> dict[str, int]:
+        return {each.name: each.restarts for each in self._stage.supervisor.reports()}
 
     def _settle(self) -> None:
         """Faults have ended: the load ends, and what was promised may arrive."""
         began = time.monotonic()
+        self._asked_to_end.clear()
         finishing = threading.Thread(target=self._probes.finish, daemon=True)
         finishing.start()
         while finishing.is_alive():
@@ -145,8 +210,9 @@ class ChaosRun:
         done = until(lambda: not self._stage.away() and self._probes.settled(), _SETTLE_S, look)
         self._probes.read_decisions()
         self._settled_s = time.monotonic() - began if done else float("nan")
-        if self._wire is not None:
-            self._wire.close()
+        for probe in (self._wire, self._control):
+            if probe is not None:
+                probe.close()
 
     def _figures(self) -> dict[str, Any]:
         record = self._probes.record
@@ -156,23 +222,32 @@ class ChaosRun:
             for at, fault in self._begun
             if any(name in _REACHES_SWITCH for name in fault.targets)
         ]
-        gaps = self._gaps()
+        gaps, machine_gaps = self._gaps(self._wire), self._gaps(self._control)
         if self._wire is not None:
             record.passed = self._wire.passed
         found = check(record)
         return {
-            "faults": {"count": len(self._begun), "list": [self._told(*each, gaps) for each in self._begun]},
+            "faults": {
+                "count": len(self._begun),
+                "planned": len(self._faults),
+                "list": [self._told(number, gaps, machine_gaps) for number in range(len(self._begun))],
+            },
             "violations": {"count": len(found), "list": [_as_map(each) for each in found]},
             "forwarding_gap_ms": self._gap_by_target(gaps),
-            "forwarding_lost_ms": self._gap_by_target(self._gaps(float("inf"))),
+            "machine_gap_ms": self._gap_by_target(machine_gaps),
+            "forwarding_lost_ms": self._gap_by_target(self._gaps(self._wire, float("inf"))),
+            "machine_lost_ms": self._gap_by_target(self._gaps(self._control, float("inf"))),
             "seed": self._seed,
             "seconds": self._seconds,
             "settled_s": self._settled_s,
             "operations": self._operations(),
-            "restarts": {each.name: each.restarts for each in self._stage.supervisor.reports()},
+            "restarts": self._restarts(),
             "supervisor": self._stage.told,
             "probe_errors": self._probes.errors,
-            "left_out": {**NOT_DONE, **left_out()},
+            "left_out": left_out(),
+            "archives_restored": self._excused,
+            "numbers_excused": len(record.excused - set(record.archived)),
+            "addresses_excused": sorted(record.forgotten),
             "machine": machine(),
         }
 
@@ -196,10 +271,10 @@ class ChaosRun:
             "frames_of_blocked_sources_passed": len(self._wire.passed) if self._wire else 0,
         }
 
-    def _gaps(self, late_s: float = LATE_S) -> dict[int, float]:
+    def _gaps(self, probe: ForwardingProbe | None, late_s: float = LATE_S) -> dict[int, float]:
         """Longest gap in ms by fault: a gap is that of the last fault that had begun, -1 for none."""
         longest: dict[int, float] = {}
-        for at, length in self._wire.gaps(late_s) if self._wire is not None else []:
+        for at, length in probe.gaps(late_s) if probe is not None else []:
             index = max((n for n, (begun, _) in enumerate(self._begun) if begun <= at + 0.05), default=-1)
             longest[index] = max(longest.get(index, 0.0), length)
         return longest
@@ -211,14 +286,15 @@ class ChaosRun:
             found[name] = max(found.get(name, 0.0), gaps.get(index, 0.0))
         return found if self._wire is not None else {}
 
-    def _told(self, at: float, fault: PlannedFault, gaps: dict[int, float]) -> dict[str, Any]:
-        index = next(n for n, (begun, each) in enumerate(self._begun) if (begun, each) == (at, fault))
+    def _told(self, number: int, gaps: dict[int, float], machine_gaps: dict[int, float]) -> dict[str, Any]:
+        fault = self._begun[number][1]
         return {
             "time": fault.at,
             "kind": fault.kind,
             "target": "+".join(fault.targets),
             "seconds": fault.seconds,
-            "forwarding_gap_ms": gaps.get(index, 0.0),
+            "forwarding_gap_ms": gaps.get(number, 0.0),
+            "machine_gap_ms": machine_gaps.get(number, 0.0),
         }
 
 
@@ -240,13 +316,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--keep", type=Path, help="folder that takes logs and archive after the run")
     options = parser.parse_args(argv)
     kinds = [each for each in options.only or KINDS if each not in left_out()]
-    with tempfile.TemporaryDirectory(prefix="chaos-") as folder:
-        figures = ChaosRun(options.seed, options.seconds, kinds, Path(folder), options.keep).go()
+    remove_orphans()
+    with tempfile.TemporaryDirectory(prefix=f"{PREFIX}{os.getpid()}-") as folder:
+        run = ChaosRun(options.seed, options.seconds, kinds, Path(folder), options.keep, options.json)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: run.end_early())
+        figures = run.go()
     rows = [
-        [each["time"], each["kind"], each["target"], each["forwarding_gap_ms"]]
+        [each[name] for name in ("time", "kind", "target", "forwarding_gap_ms", "machine_gap_ms")]
         for each in figures["faults"]["list"]
     ]
-    table(["s", "fault", "target", "gap ms"], rows)
+    table(["s", "fault", "target", "gap ms", "machine ms"], rows)
+    for name in ("forwarding_gap_ms", "machine_gap_ms"):
+        print(f"{name} before the first fault: {figures[name].get('none', 0.0):.0f}")
     for each in figures["violations"]["list"]:
         print(f"{each['kind']}: {each['detail']}")
     print(f"{len(rows)} faults, {figures['violations']['count']} violations; {figures['operations']}")

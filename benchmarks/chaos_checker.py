@@ -10,6 +10,7 @@ The model.  The probes live through every fault, on a disk and with a clock of t
 
 Delivery is at least once to an app and once to an instance that lives; the reading probe is never killed, so
 that a number that it gets twice was delivered again after it was done with it.
+What a damaged archive took with it is excused: its operator put a copy there, which has what came before.
 The state of the switch is judged after the last fault, when the pipeline has had time to settle.
 A frame of a blocked source may pass while the switch is being given its entries again: until `RESTORED_S`
 after a fault of switch or controller.
@@ -23,6 +24,9 @@ RESTORED_S = 60.0
 """A switch that was broken holds its entries again after so many seconds."""
 LONGEST_OVERLAP_S = 0.3
 """A turn of the other instance shorter than this, between two turns of one, is no failover: that takes longer."""
+
+LONGEST_TURN_S = 1.5
+"""The same for controllers, which report once a second: an instance is given up after two seconds of silence."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,10 @@ class RunRecord:
     unwanted: set[int] = field(default_factory=set)
     """Numbers of which `write` said that nobody wants them: promised to nobody."""
     archive_acknowledged: int = 0
+    excused: set[int] = field(default_factory=set)
+    """Numbers that a damaged archive took with it."""
+    forgotten: set[str] = field(default_factory=set)
+    """Addresses about which a damaged archive had decisions that its copy has not."""
     archived: list[int] = field(default_factory=list)
     asked: list[Asked] = field(default_factory=list)
     answers: dict[str, bool] = field(default_factory=dict)
@@ -94,6 +102,8 @@ class RunRecord:
     """When somebody asked for its end, by address."""
     passed: list[Passed] = field(default_factory=list)
     words: list[Word] = field(default_factory=list)
+    reports: list[Word] = field(default_factory=list)
+    """The same of the controllers: when what they say of the switch came, and from which instance."""
     switch_faults: list[float] = field(default_factory=list)
     """When the switch, its controller, or what both hear the firewall by was broken."""
     away: list[str] = field(default_factory=list)
@@ -104,11 +114,12 @@ def check(record: RunRecord) -> list[Violation]:
     """All promises that the record breaks; empty: none."""
     return [
         *_delivery(record.acknowledged, record.delivered, record.unwanted),
-        *_archive(record.archive_acknowledged, record.archived),
+        *_archive(record.archive_acknowledged, record.archived, record.excused),
         *_instructions(record),
         *_switch(record),
         *_verdicts(record),
-        *_actives(record.words),
+        *_actives(record.words, LONGEST_OVERLAP_S),
+        *_actives(record.reports, LONGEST_TURN_S),
         *(Violation("part_away", f"{name} did not run at the end") for name in record.away),
     ]
 
@@ -126,8 +137,8 @@ def _delivery(acknowledged: int, delivered: Sequence[int], unwanted: set[int]) -
     yield from _missing("acknowledged_not_delivered", acknowledged, seen | unwanted)
 
 
-def _archive(acknowledged: int, archived: Sequence[int]) -> Iterator[Violation]:
-    yield from _missing("acknowledged_not_archived", acknowledged, set(archived))
+def _archive(acknowledged: int, archived: Sequence[int], excused: set[int]) -> Iterator[Violation]:
+    yield from _missing("acknowledged_not_archived", acknowledged, set(archived) | excused)
     if len(archived) != len(set(archived)):
         yield Violation("archived_twice", f"{len(archived) - len(set(archived))} numbers are there twice")
 
@@ -145,6 +156,8 @@ def _instructions(record: RunRecord) -> Iterator[Violation]:
             yield Violation(
                 "acknowledged_not_answered", f"{asked.verb} {asked.address} at {asked.at:.1f} s: no answer"
             )
+        if asked.address in record.forgotten:
+            continue
         if record.answers.get(asked.id) and (asked.verb, asked.address) not in decided:
             yield Violation("acknowledged_not_decided", f"{asked.verb} {asked.address} was answered as done")
 
@@ -162,9 +175,9 @@ def _switch(record: RunRecord) -> Iterator[Violation]:
         yield Violation("switch_unreadable", "the switch did not answer at the end")
         return
     wanted = in_force(record.decisions)
-    for address in sorted(wanted - record.entries):
+    for address in sorted(wanted - record.entries - record.forgotten):
         yield Violation("decision_without_entry", f"{address} is to be dropped, and is not")
-    for address in sorted(record.entries - wanted):
+    for address in sorted(record.entries - wanted - record.forgotten):
         yield Violation("entry_without_decision", f"{address} is dropped, and no decision says so")
 
 
@@ -172,6 +185,8 @@ def _verdicts(record: RunRecord) -> Iterator[Violation]:
     told: set[str] = set()
     for each in record.passed:
         since = record.installed.get(each.address)
+        if each.address in record.forgotten:
+            continue
         if since is None or each.at <= since or each.at >= record.lifted.get(each.address, float("inf")):
             continue
         if any(fault <= each.at <= fault + RESTORED_S for fault in record.switch_faults):
@@ -183,7 +198,7 @@ def _verdicts(record: RunRecord) -> Iterator[Violation]:
             )
 
 
-def _actives(words: Sequence[Word]) -> Iterator[Violation]:
+def _actives(words: Sequence[Word], longest_s: float) -> Iterator[Violation]:
     turns: list[tuple[str, float, float]] = []
     for word in sorted(words, key=lambda each: each.at):
         if turns and turns[-1][0] == word.speaker:
@@ -194,9 +209,9 @@ def _actives(words: Sequence[Word]) -> Iterator[Violation]:
     for (before, _, ended), (_, began, _), (after, again, _) in zip(
         turns, turns[1:], turns[2:], strict=False
     ):
-        if before == after and again - ended < LONGEST_OVERLAP_S:
+        if before == after and again - ended < longest_s:
             # one overlap is one violation, however often the two took turns in it
-            if began - spoiled > LONGEST_OVERLAP_S:
+            if began - spoiled > longest_s:
                 yield Violation("two_actives", f"both spoke from {began:.2f} s on")
             spoiled = began
 

@@ -1,10 +1,16 @@
-"""Numbered frames through the switch: what came, what came late, and which blocked sources came through."""
+"""Numbered frames through the switch: what came, what came late, and which blocked sources came through.
+
+The same frames also go through a program that only copies them from one interface to another, and that no fault
+hits (`python -m benchmarks.chaos_frames IN OUT`): what it misses, the machine has missed, not the switch.
+Frames are timed by the kernel as they arrive, so that a busy reader makes none late.
+"""
 
 import ipaddress
 import random
 import select
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +24,9 @@ _MAGIC = b"sdnator-chaos"
 _NUMBER = struct.Struct("!13sBQd")
 _HEAD = 42
 _FREE_SOURCES = 40
+_TIMESTAMP = 35
+"""SO_TIMESTAMPNS of Linux, which Python does not name."""
+_STAMP = struct.Struct("@qq")
 
 
 def frame(source: str, kind: int, number: int, at: float) -> bytes:
@@ -97,7 +106,8 @@ class ForwardingProbe:
             if self._ended.is_set() and quiet_until == float("inf"):
                 quiet_until = time.monotonic() + 2 * LATE_S
             if select.select([self._out], [], [], 0.1)[0]:
-                self._note(self._out.recv(2048), time.monotonic())
+                data, ancillary, _, _ = self._out.recvmsg(2048, 64)
+                self._note(data, _arrival(ancillary))
 
     def _note(self, data: bytes, now: float) -> None:
         if len(data) < _HEAD + _NUMBER.size:
@@ -111,8 +121,33 @@ class ForwardingProbe:
             self.came.setdefault(number, now - at)
 
 
+def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """When the kernel had the frame, s, monotonic."""
+    now = time.monotonic()
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMP):
+            seconds, nanoseconds = _STAMP.unpack_from(data)
+            waited: float = time.time() - seconds - nanoseconds / 1e9
+            return now - max(0.0, waited)
+    return now
+
+
+def copy(entry: str, leave: str) -> None:
+    """Send what comes in at one interface out at the other, for ever."""
+    source, sink = _open(entry), _open(leave)
+    while True:
+        data, origin = source.recvfrom(16_384)
+        if origin[2] != socket.PACKET_OUTGOING:
+            sink.send(data)
+
+
 def _open(interface: str) -> socket.socket:
     opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+    opened.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
     opened.bind((interface, 0))
     return opened
+
+
+if __name__ == "__main__":
+    copy(*sys.argv[1:3])

@@ -25,6 +25,8 @@ class UnixLink:
         self._whole = threading.Event()
         self._whole.set()
         self._slow = False
+        self._flowing = threading.Event()
+        self._flowing.set()
         self._ended = False
         self._lock = threading.Lock()
         self._sockets: set[socket.socket] = set()
@@ -42,15 +44,21 @@ class UnixLink:
         """At most `SLOW_BYTES_S` bytes a second each way and connection."""
         self._slow = True
 
+    def hold(self) -> None:
+        """As when a cable is pulled and nobody has noticed: what is sent arrives when it is whole again."""
+        self._flowing.clear()
+
     def mend(self) -> None:
         """As before."""
         self._slow = False
+        self._flowing.set()
         self._whole.set()
 
     def close(self) -> None:
         """No more connections."""
         self._ended = True
         self._whole.set()
+        self._flowing.set()
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -97,6 +105,7 @@ class UnixLink:
             while data := source.recv(_CHUNK):
                 if self._slow:
                     time.sleep(len(data) / SLOW_BYTES_S)
+                self._flowing.wait()
                 sink.sendall(data)
         for each in (source, sink):
             with suppress(OSError):

@@ -17,6 +17,7 @@ from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram, P4R
 from benchmarks.chaos_checker import Asked, Decided, RunRecord, Word, in_force
 from benchmarks.faults_programs import SPEECH
 from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item, Options
+from due.backends import open_archive
 from p4rt import P4RuntimeStub
 from sdnator import p4_program
 from sdnator.blocks.blocks_archive import INSTRUCTION
@@ -25,6 +26,7 @@ RELIABLE = "chaos.number.chaos_writer.reliable"
 ARCHIVED = "chaos.number.chaos_writer.archived"
 _ANSWER = "network.answer.firewall.operator"
 _CONFIRMATIONS = "network.confirmation.p4runtime_ctrl.*"
+_REPORTS = "network.switch.p4runtime_ctrl.*"
 _SCORES = "network.anomaly.kitsune.score"
 _BLOCK_S = 86_400
 _FLUSH_S = 120.0
@@ -54,6 +56,8 @@ class Probes:
         self._draw = random.Random(seed)
         self._folder, self._updates, self._archive = folder, updates, archive
         self._ended = threading.Event()
+        self._written = 0
+        self._asking: str | None = None
         self._blocked: dict[str, None] = {}
         self._lock = threading.Lock()
         self._engines: list[Engine] = []
@@ -69,6 +73,7 @@ class Probes:
         self._reader.observe(_SCORES).subscribe(self._scored)
         self._operator.observe(_ANSWER).subscribe(self._answered)
         self._operator.observe(_CONFIRMATIONS).subscribe(self._confirmed)
+        self._reader.observe(_REPORTS).subscribe(self._reported)
         for each in self._threads:
             each.start()
 
@@ -96,7 +101,8 @@ class Probes:
             return False
         self.read_decisions()
         wanted = in_force(record.decisions)
-        return record.entries == wanted and len(record.archived) >= record.archive_acknowledged
+        switch = record.entries is not None and not (record.entries ^ wanted) - record.forgotten
+        return switch and len({*record.archived, *record.excused}) >= record.archive_acknowledged
 
     def read_decisions(self) -> None:
         """Decisions and numbers as the archive has them now."""
@@ -104,6 +110,22 @@ class Probes:
             found = decisions_in(self._reader.get("network.block.firewall.*"))
             self.record.decisions = [Decided(each.id, each.action, each.target.address) for each in found]
             self.record.archived = [item.value for item in self._reader.get(ARCHIVED)]
+
+    def excuse(self, copy: Path) -> None:
+        """A damaged archive was replaced by this copy: what it had beyond the copy is lost."""
+        driver = open_archive(f"sqlite://{copy}")
+        try:
+            numbers = {item.value for item in driver.find({"dataKey": ARCHIVED})}
+            found = decisions_in(driver.find({"dataKey": "network.block.firewall.*"}))
+        finally:
+            driver.close()
+        decided = {(each.action, each.target.address) for each in found}
+        self.record.excused |= set(range(self._written)) - numbers
+        self.record.forgotten |= {
+            each.address for each in list(self.record.asked) if (each.verb, each.address) not in decided
+        }
+        if self._asking is not None:
+            self.record.forgotten.add(self._asking)
 
     def read_entries(self, address: str) -> None:
         """What the switch drops now."""
@@ -123,11 +145,12 @@ class Probes:
     def _write(self) -> None:
         written = 0
         while not self._ended.is_set():
-            for number in range(written, written + _BATCH):
+            self._written = written + _BATCH
+            for number in range(written, self._written):
                 if not self._writer.write(RELIABLE, number):
                     self.record.unwanted.add(number)
                 self._writer.write(ARCHIVED, number)
-            written += _BATCH
+            written = self._written
             with self._noted("flush of numbers"):
                 self._writer.flush(_FLUSH_S)
                 self.record.acknowledged = self.record.archive_acknowledged = written
@@ -144,6 +167,7 @@ class Probes:
             said = Instruction(id=uuid4().hex[:12], verb=verb, subject=address, seconds=_BLOCK_S)  # type: ignore[arg-type]
             if lifts:
                 self.record.lifted[address] = time.monotonic()
+            self._asking = address
             with self._noted("flush of an instruction"):
                 taken = self._operator.write(INSTRUCTION, said.to_value())
                 self._operator.flush(_FLUSH_S)
@@ -172,6 +196,10 @@ class Probes:
 
     def _heard(self, item: Item) -> None:
         self.record.words.append(Word(item.timestamp / 1e9 - self._began, item.instance_id))
+
+    def _reported(self, item: Item) -> None:
+        if item.value.get("primary"):
+            self.record.reports.append(Word(time.time() - self._began, item.instance_id))
 
     def _scored(self, item: Item) -> None:
         self.scores += len(item.value["score"]) if "score" in item.value else 1

@@ -4,7 +4,9 @@ import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-APPS = ("coordinator", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "dashboard")
+CONTROLLERS = ("p4runtime_ctrl", "p4runtime_ctrl-b")
+"""One works, the other stands by."""
+APPS = ("coordinator", *CONTROLLERS, "kitsune", "sonata_adapter", "firewall", "dashboard")
 PAIR = ("standby-a", "standby-b")
 EVERY = ("switch", "updates", *APPS, *PAIR)
 FIRST_S = 3.0
@@ -28,12 +30,14 @@ KINDS: Mapping[str, FaultKind] = {
     "redis_empty": FaultKind(("updates",), weight=2),
     "cut": FaultKind(APPS, weight=2, seconds=(1.0, 10.0)),
     "slow": FaultKind(APPS, seconds=(5.0, 15.0)),
-    "cut_switch": FaultKind(("p4runtime_ctrl",), seconds=(1.0, 10.0)),
-    "slow_switch": FaultKind(("p4runtime_ctrl",), seconds=(5.0, 15.0)),
+    "cut_switch": FaultKind(CONTROLLERS, seconds=(1.0, 10.0)),
+    "slow_switch": FaultKind(CONTROLLERS, seconds=(5.0, 15.0)),
+    "controllers_split": FaultKind(CONTROLLERS, weight=2, seconds=(5.0, 20.0)),
     "full_disk": FaultKind(("disk",), weight=2, seconds=(2.0, 15.0)),
     "clock": FaultKind((*APPS, "updates"), weight=2),
     "memory": FaultKind(APPS, weight=2, seconds=(5.0, 10.0)),
     "corrupt": FaultKind(APPS),
+    "corrupt_archive": FaultKind(("archive",), seconds=(2.0, 10.0)),
 }
 """Every kind of fault; `benchmarks.chaos_faults` carries them out."""
 

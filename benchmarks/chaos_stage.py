@@ -3,6 +3,8 @@
 import os
 import shutil
 import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -12,15 +14,18 @@ from types import TracebackType
 from typing import Any, Self
 
 from benchmarks.chaos_links import UnixLink
-from benchmarks.chaos_schedule import APPS
+from benchmarks.chaos_schedule import APPS, CONTROLLERS
 from sdnator.capture.interfaces import VethPair
 from sdnator.config.planned_switches import PlannedSwitch
-from sdnator.supervisor import Supervisor
-from sdnator.supervisor.spec import PartSpec
+from sdnator.supervisor import Child, Supervisor
+from sdnator.supervisor.app_command import Backends, app_command
+from sdnator.supervisor.spec import PartProcess, PartSpec
 from sdnator.up.parts import UpParts
 from sdnator.up.plan import StandingPlan
 
-DISK_MIB = 768
+DISK_MIB = 1024
+PREFIX = "chaos-"
+"""Of the folder of a run; the process id follows."""
 _LIBRARY = "*/faketime/libfaketimeMT.so.1"
 
 
@@ -35,16 +40,34 @@ def faketime_library() -> Path | None:
 
 
 class _RelayedParts(UpParts):
-    """The controller reaches the switch through a relay."""
+    """Each controller reaches the switch through a relay of its own."""
 
-    relay = ""
+    relays: Mapping[str, str]
 
     def settings(self, name: str) -> Mapping[str, Any]:
         """See `UpParts.settings`."""
-        found = super().settings(name)
-        if name != "p4runtime_ctrl":
-            return found
-        return {**found, "switches": [{**each, "address": self.relay} for each in found["switches"]]}
+        if name not in CONTROLLERS:
+            return super().settings(name)
+        found = super().settings(CONTROLLERS[0])
+        return {**found, "switches": [{**each, "address": self.relays[name]} for each in found["switches"]]}
+
+    def standby_controller(self) -> PartProcess:
+        """Start the second controller, which `sdnator up` has not."""
+        name, folder = CONTROLLERS[1], self.plan.state / "standby"
+        folder.mkdir(exist_ok=True)
+        backends = Backends(updates=self.updates, archive=self.plan.archive, options=self.plan.engine)
+        directory = self.plan.state / "due" / name
+        command = app_command(CONTROLLERS[0], folder, backends, self.settings(name), directory=directory)
+        return Child(name, [*command, "--log", self.plan.log_level], self.logs, heartbeat=True)
+
+
+def remove_orphans() -> None:
+    """Folders, with their disks, of runs that were killed before they could remove them."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
+        owner = folder.name.split("-")[1]
+        if owner.isdigit() and not Path(f"/proc/{owner}").exists():
+            subprocess.run(["umount", "-l", str(folder / "disk")], capture_output=True, check=False)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 class ChaosStage:
@@ -60,10 +83,14 @@ class ChaosStage:
         self.told: list[str] = []
         self.clocks: dict[str, int] = {}
         """Seconds that a part's wall clock is off from its next start on."""
+        self.restored: list[Path] = []
+        """Copies that took the place of a damaged archive."""
         self._stack = ExitStack()
         self.disk = folder / "disk"
         self.disk.mkdir()
         self.wires: tuple[VethPair, VethPair] | None = None
+        self.control: tuple[VethPair, VethPair] | None = None
+        """Wires through a program that copies, instead of through the switch."""
         try:
             if may_mount():
                 self._mount()
@@ -71,10 +98,13 @@ class ChaosStage:
                     VethPair.make(self._stack, "ci"),
                     VethPair.make(self._stack, "co"),
                 )
+                self.control = (VethPair.make(self._stack, "cx"), VethPair.make(self._stack, "cy"))
+                self._copy(self.control[0].far, self.control[1].near)
             self.parts = _RelayedParts(self._plan(), self._stack)
             self.links = {name: self._link(name) for name in APPS}
-            self.switch_link = self._link_to_switch()
-            specs = tuple(self._prepared(spec) for spec in self.parts.specs())
+            self.switch_links = {name: self._link_to_switch(name) for name in CONTROLLERS}
+            self.parts.relays = {name: link.url for name, link in self.switch_links.items()}
+            specs = tuple(self._prepared(spec) for spec in self._specs())
             self.supervisor = Supervisor(specs, self._tell)
         except BaseException:
             self._stack.close()
@@ -107,6 +137,11 @@ class ChaosStage:
         return self.parts.plan.archive
 
     @property
+    def archive_file(self) -> Path:
+        """Where it stands."""
+        return self.disk / "archive.db"
+
+    @property
     def switch_address(self) -> str:
         """Of its P4Runtime server."""
         return self.parts.switch_address(self.parts.plan.switches[0])
@@ -133,6 +168,11 @@ class ChaosStage:
         # lazily: a part that is still ending may have a file open
         self._stack.callback(subprocess.run, ["umount", "-l", str(self.disk)], check=False)
 
+    def _copy(self, entry: str, leave: str) -> None:
+        program = subprocess.Popen([sys.executable, "-m", "benchmarks.chaos_frames", entry, leave])
+        self._stack.callback(program.wait)
+        self._stack.callback(program.kill)
+
     def _plan(self) -> StandingPlan:
         ports = {1: "null", 2: "null"}
         if self.wires is not None:
@@ -143,7 +183,7 @@ class ChaosStage:
         token.write_text("a-token-of-the-benchmark\n")
         return StandingPlan(
             state=state,
-            archive=f"sqlite://{self.disk / 'archive.db'}",
+            archive=f"sqlite://{self.archive_file}",
             switches=(PlannedSwitch(ports=ports, forward={1: 2, 2: 1}),),
             # bounded as an operator would have it, but beyond what half an hour of this load writes
             settings={"coordinator": {"retain_bytes": 600 << 20}},
@@ -156,12 +196,19 @@ class ChaosStage:
         self._stack.callback(link.close)
         return link
 
-    def _link_to_switch(self) -> UnixLink:
-        """The controller's way to the switch."""
-        link = UnixLink(self.folder / "switch.sock", Path(self.switch_address.removeprefix("unix:")))
+    def _link_to_switch(self, name: str) -> UnixLink:
+        """A controller's way to the switch."""
+        target = Path(self.switch_address.removeprefix("unix:"))
+        link = UnixLink(self.folder / f"switch-{name}.sock", target)
         self._stack.callback(link.close)
-        self.parts.relay = link.url
         return link
+
+    def _specs(self) -> Iterator[PartSpec]:
+        """The parts of `sdnator up`, and a controller that stands by."""
+        for spec in self.parts.specs():
+            yield spec
+            if spec.name == CONTROLLERS[0]:
+                yield replace(spec, name=CONTROLLERS[1], start=self.parts.standby_controller)
 
     def _prepared(self, spec: PartSpec) -> PartSpec:
         if spec.name in APPS:

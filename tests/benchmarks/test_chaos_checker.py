@@ -48,6 +48,7 @@ def test_a_run_that_kept_every_promise_has_no_violation():
         ({"entries": None}, "switch_unreadable"),
         ({"passed": [Passed(11.0, "20.0.7.9")]}, "passed_while_blocked"),
         ({"words": [Word(1.0, "a"), Word(1.1, "b"), Word(1.2, "a")]}, "two_actives"),
+        ({"reports": [Word(1.0, "a"), Word(1.6, "b"), Word(2.0, "a")]}, "two_actives"),
         ({"away": ["kitsune"]}, "part_away"),
     ],
 )
@@ -110,3 +111,15 @@ def test_gaps_are_runs_of_missed_frames():
     sent = [0.0, 0.5, 1.0, 1.5, 2.0]
     assert gap_ms(sent, [1, 2, 4]) == [(0.5, 1000.0), (2.0, 500.0)]
     assert gap_ms(sent, []) == []
+
+
+def test_what_a_damaged_archive_took_with_it_is_excused():
+    """Its numbers, and its decisions with their entries; nothing else is."""
+    record = clean()
+    record.archived, record.excused = [0], {1}
+    record.decisions, record.forgotten = [], {"20.0.7.9"}
+    record.passed = [Passed(11.0, "20.0.7.9")]
+    assert not check(record)
+    record.archive_acknowledged = 3
+    record.entries = frozenset({"20.0.7.9", "20.0.7.10"})
+    assert kinds(record) == ["acknowledged_not_archived", "entry_without_decision"]

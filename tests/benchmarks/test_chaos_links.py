@@ -72,3 +72,18 @@ def test_a_slow_link_passes_everything_on(tmp_path, echo):
             came += opened.recv(4096)
     assert came == b"x" * 5_000
     link.close()
+
+
+def test_what_is_sent_into_a_held_link_arrives_when_it_is_mended(tmp_path, echo):
+    """A cable that is pulled without anybody's notice."""
+    link = UnixLink(tmp_path / "link.sock", echo)
+    with connected(link) as opened:
+        link.hold()
+        opened.sendall(b"ping")
+        opened.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            opened.recv(4)
+        link.mend()
+        opened.settimeout(30)
+        assert opened.recv(4) == b"ping"
+    link.close()
