@@ -41,6 +41,8 @@ _STEP_S = 10.0
 _SETTLE_S = 5.0
 _CARRIED = 0.98
 _PROGRESS_S = 300.0
+_WARM_S = 3600.0
+"""Bounded state fills first: Kitsune keeps an idle stream for 3,000 s, producers retain up to 16 MiB."""
 
 
 class Ended(Exception):
@@ -228,6 +230,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     else:
         more = {}
     samples = read_samples(options.source)
+    if options.warm is None:
+        options.warm = min(_WARM_S, samples[-1]["seconds"] / 2) if samples else 0.0
     found = {
         **figures(samples, options.warm),
         **more,
@@ -247,7 +251,11 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=7200.0, help="length of the load")
     parser.add_argument("--pps", type=float, help="frames a second; default: half of what a probe finds")
     parser.add_argument("--every", type=float, default=5.0, help="seconds between two samples")
-    parser.add_argument("--warm", type=float, default=900.0, help="first seconds, which slopes leave out")
+    parser.add_argument(
+        "--warm",
+        type=float,
+        help="first seconds, which slopes leave out; default: 3,600, at most half of the run",
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the traffic")
     parser.add_argument("--samples", type=Path, help="file for samples; default: beside the figures")
     parser.add_argument("--from", dest="source", type=Path, help="figures of the samples of an earlier run")
