@@ -157,6 +157,12 @@ class SqliteFile:
             # moved away or replaced: what is written into the old file would be in no archive
             self._let_go()
 
+    def _check_place(self) -> None:
+        """Raises `ArchiveUnavailable` if the file was moved while it was written; what is repeated is known by its numbers."""
+        if self._file is not None and self._file != self._named():
+            self._let_go()
+            raise ArchiveUnavailable(f"archive {self._path} was moved away or replaced while it was written")
+
     def _named(self) -> tuple[int, int] | None:
         """Which file has the archive's name now."""
         try:
@@ -202,6 +208,7 @@ class SqliteFile:
             try:
                 yield connection
                 connection.execute("COMMIT")
+                self._check_place()
             except BaseException:
                 self.spans.clear()
                 if connection.in_transaction:

@@ -255,6 +255,19 @@ def test_a_file_that_is_moved_away_is_written_no_more(tmp_path: Path, *, instead
     old.close()
 
 
+def test_a_file_that_is_moved_away_while_it_is_written_has_not_taken_it(tmp_path: Path) -> None:
+    """The writer is told, and writes again."""
+    file = sqlite_file.SqliteFile(tmp_path / "archive.db", "NORMAL")
+    with file.writing():
+        pass
+    with pytest.raises(ArchiveUnavailable, match="moved away"), file.writing():
+        (tmp_path / "archive.db").rename(tmp_path / "old.db")
+    with file.writing():
+        pass
+    file.close()
+    assert (tmp_path / "archive.db").exists()
+
+
 def test_a_damaged_row_costs_that_row_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     archive = opened(tmp_path)
     archive.insert_frames([pack(items(10, start=start)) for start in (1, 11, 21)])
