@@ -225,7 +225,7 @@ class FirewallService:
     def _take_up_history(self) -> None:
         """Restore what was in force before a restart, as it still is in the switch."""
         self._stored.take_up(self._past.answered())
-        self._desk.take_up(history.carried_out(self._past.instructions(), self._stored))
+        self._desk.take_up(history.carried_out(self._past.instructions(), self._stored.carried_out()))
         self._panics.extend(self._past.panics())
         standing = self._past.standing()
         self._ledger.restore(standing)

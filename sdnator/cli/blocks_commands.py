@@ -257,8 +257,8 @@ def allow_list(*, archive: ArchiveOption = "") -> None:
 
     Example: sdnator allow list
     """
-    answered = {str(item.value["id"]) for item in find(archive, f"{ANSWERS}.*")}
-    instructions = carried_out(instructions_in(find(archive, INSTRUCTIONS)), answered)
+    done = {str(item.value["id"]) for item in find(archive, f"{ANSWERS}.*") if item.value["done"]}
+    instructions = carried_out(instructions_in(find(archive, INSTRUCTIONS)), done)
     typer.echo("\n".join(allowed_by(instructions)) or "the allow-list has no entries added by operators")
 
 

@@ -37,6 +37,10 @@ class StoredAnswers:
         """What was answered to this instruction."""
         return self._given.get(instruction)
 
+    def carried_out(self) -> set[str]:
+        """Instructions that were not refused."""
+        return {each for each, answer in self._given.items() if answer is None or answer.done}
+
     def take_up(self, answers: Iterable[Answer]) -> None:
         """Answers of an earlier run."""
         for each in answers:

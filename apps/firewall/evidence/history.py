@@ -68,9 +68,9 @@ def instructions_in(items: Iterable[Item]) -> list[Instruction]:
     return found
 
 
-def carried_out(instructions: Iterable[Instruction], answered: Container[str]) -> list[Instruction]:
-    """Without instructions with a deadline that no firewall answered: their sender was told that nothing was done."""
-    return [each for each in instructions if not each.expires or each.id in answered]
+def carried_out(instructions: Iterable[Instruction], done: Container[str]) -> list[Instruction]:
+    """Without instructions with a deadline that no firewall carried out: their sender was told that nothing was done."""
+    return [each for each in instructions if not each.expires or each.id in done]
 
 
 def decisions_in(items: Iterable[Item]) -> list[Decision]:
