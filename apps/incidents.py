@@ -85,8 +85,6 @@ class IncidentCost(Message, frozen=True, kw_only=True):
     dropped: Number = 0
     challenged: Number = 0
     metered: Number = 0
-    innocents: Number | None = None
-    """Packets of others that were hit; None where nobody can know."""
 
     @property
     def stopped(self) -> int:

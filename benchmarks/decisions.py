@@ -1,20 +1,26 @@
 """What is decided, how soon, and how often wrongly: `python -m benchmarks.decisions --json FILE`.
 
 Detector and decisions alone (`benchmarks.decisions_core`) on generated networks (`benchmarks.decision_traffic`):
-an hour of training, an hour of benign traffic, and in it, each in a process of its own that begins from the
+an hour of training, half an hour of benign traffic, and then, each in a process of its own that begins from the
 trained state, every attack and every kind of benign novelty; then days of benign traffic.  The same for the rule
 of the paper (block at the first score over the threshold) and the rule of seconds (five anomalous seconds of ten).
 
     attacks, mitigated        how many, and how many had an effective decision (block, guard) within 5 s
     median_s_to_decision      capture seconds from the attack's first packet; an attack without any counts as endless
     stopped_share_median      share of the attack's packets that were dropped or challenged
-    innocent_blocks           blocks during attacks of somebody who is not the attacker
+    innocent_blocks           blocks during attacks of somebody who is not the attacker, the victim included
     novelty_blocks            blocks in benign novelty
     false_blocks_per_day, …_upper95   blocks a day of benign traffic, and the upper end of its 95 % interval
-    by_attack, paper_rule, seconds_rule
+    real_benign               the benign part of the real capture: packets behind training, blocks
+    by_attack                 with the packets dropped and challenged, and the packets and hosts of others that were hit
+    paper_rule, seconds_rule  the same under these rules
+    fastnetmon                why it is not among them
 
-Attacks whose number is over 100 are held back: `--held-back` runs those instead.  Not part of it: switch, meters,
-queries as evidence, FastNetMon.
+Attacks are stopped under each rule for itself.  In days, novelty and the real capture all rules judge what one
+detector says and nothing is stopped, which is the same where a rule blocks nobody, and spares two thirds of the time.
+
+Attacks whose number is between 101 and 200 are held back: `--held-back` runs those instead, and captured ones that
+are.  Not part of it: switch, meters, queries as evidence.
 """
 
 import ipaddress
@@ -22,24 +28,31 @@ import json
 import math
 import os
 import pickle
+import select
 import statistics
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
+from time import monotonic
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
 from scipy.stats import chi2
 
 from apps.firewall.policy.rules import Rules
 from benchmarks import measure
+from benchmarks.data_folder import add_data_option
 from benchmarks.decision_traffic.attacks import ATTACKS
 from benchmarks.decision_traffic.network import Network
 from benchmarks.decision_traffic.networks import NETWORKS
 from benchmarks.decision_traffic.novelty import NOVELTIES
+from benchmarks.decision_traffic.real import real_attacks, real_network
 from benchmarks.decision_traffic.traffic import BASE_US, Traffic, merge, renumbered
 from benchmarks.decision_traffic.truth import AttackSpec, AttackTruth
-from benchmarks.decisions_core import DecidedAction, DecisionRun
+from benchmarks.decisions_core import DecidedAction, DecisionRun, detector_for, watch
 
 RULES: Final = {"sequential": "", "paper": "paper_rule", "seconds": "seconds_rule"}
 """Rule of the firewall to the field of its figures; the default's stand at the top."""
@@ -50,6 +63,13 @@ ATTACK_S: Final = BENIGN_S + 60
 LONGEST_S: Final = 120.0
 """Of an attack that is looked at."""
 NOVELTY_S: Final = 900.0
+REAL_TRAINING: Final = 12_000
+"""Packets of the real capture that are training, as in `sdnator replay`."""
+FASTNETMON: Final = (
+    "not run: FastNetMon 1.2.4 of Debian measures rates of an interface by the clock on the wall and reads no captures "
+    "with times of their own; a floods-only comparison would take the captures' own time"
+)
+Figures = dict[str, Any]
 SOON_S: Final = 5.0
 
 
@@ -63,53 +83,62 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--days", type=int, default=6, help="days of benign traffic, one for each network and seed"
     )
     parser.add_argument("--held-back", action="store_true", help="the attacks that nobody tunes on")
+    add_data_option(parser)
     chosen = parser.parse_args(argv)
-    figures: dict[str, Any] = {
+    begun = monotonic()
+    figures: Figures = {
         "machine": measure.machine(),
-        "settings": vars(chosen) | {"json": str(chosen.json)},
+        "settings": {
+            key: str(value) if isinstance(value, Path) else value for key, value in vars(chosen).items()
+        },
+        "fastnetmon": FASTNETMON,
     }
+    rows: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
+    novelty: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
+    for name in chosen.networks:
+        attacks, novelties = _network(name, chosen)
+        for rule in chosen.rules:
+            rows[rule] += attacks[rule]
+            novelty[rule] += novelties[rule]
+    days = _days(chosen)
+    real = _real_benign(chosen)
     for rule, field in RULES.items():
         if rule in chosen.rules:
-            found = _rule(rule, chosen)
+            its_days = [day["shared"] | day[rule] for day in days]
+            found = _summary(rows[rule], novelty[rule], its_days) | {"real_benign": real[rule]}
             figures |= {field: found} if field else found
-            print(
-                json.dumps(
-                    {"rule": rule} | {key: value for key, value in found.items() if key != "by_attack"}
-                )
-            )
-            sys.stdout.flush()
-            if chosen.json:
-                chosen.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+            _print(rule, found)
+    figures["seconds"] = round(monotonic() - begun)
+    print(f"took {figures['seconds']} s")
+    measure.write_json(chosen.json, figures)
     return 0
 
 
-def _rule(rule: str, chosen: Any) -> dict[str, Any]:
-    rows: list[dict[str, Any]] = []
-    novelty: list[dict[str, Any]] = []
-    for name in chosen.networks:
-        found = _network(rule, name, chosen)
-        rows += found["attacks"]
-        novelty += found["novelty"]
-    days = _days(rule, chosen)
-    blocks = sum(day["blocks"] for day in days)
-    seconds = [row["s_to_decision"] for row in rows]
+def _print(rule: str, found: Figures) -> None:
     measure.table(
         ("network", "attack", "seed", "s to decision", "stopped", "wrong"),
         [
-            (
-                row["network"],
-                row["attack"],
-                row["seed"],
-                row["s_to_decision"],
-                row["stopped_share"],
-                row["wrong"],
+            tuple(
+                row[key] for key in ("network", "attack", "seed", "s_to_decision", "stopped_share", "wrong")
             )
-            for row in rows
+            for row in found["by_attack"]
         ],
     )
+    short = {key: value for key, value in found.items() if not key.startswith("by_")}
+    print(json.dumps({"rule": rule} | short))
+    for row in (*found["by_novelty"], *found["by_day"]):
+        if row["blocks"]:
+            print("  ", row)
+    sys.stdout.flush()
+
+
+def _summary(rows: list[Figures], novelty: list[Figures], days: list[Figures]) -> Figures:
+    blocks = sum(day["blocks"] for day in days)
+    seconds = [row["s_to_decision"] for row in rows]
+    upper = float(chi2.ppf(0.95, 2 * (blocks + 1))) / 2
     return {
         "attacks": len(rows),
-        "mitigated": sum(row["s_to_decision"] <= SOON_S for row in rows),
+        "mitigated": sum(each <= SOON_S for each in seconds),
         "median_s_to_decision": statistics.median(seconds) if seconds else None,
         "stopped_share_median": statistics.median(row["stopped_share"] for row in rows) if rows else None,
         "innocent_blocks": sum(row["wrong"] for row in rows),
@@ -117,93 +146,159 @@ def _rule(rule: str, chosen: Any) -> dict[str, Any]:
         "novelty_blocks": sum(row["blocks"] for row in novelty),
         "benign_days": len(days),
         "false_blocks_per_day": blocks / len(days) if days else None,
-        "false_blocks_per_day_upper95": float(chi2.ppf(0.95, 2 * (blocks + 1))) / 2 / len(days)
-        if days
-        else None,
+        "false_blocks_per_day_upper95": upper / len(days) if days else None,
         "by_attack": rows,
         "by_novelty": novelty,
         "by_day": days,
     }
 
 
-def _network(rule: str, name: str, chosen: Any) -> dict[str, list[dict[str, Any]]]:
-    """Train once, and run every attack and novelty from there in a process of its own."""
+def _rules(rule: str) -> Rules:
+    return Rules(rule=rule)  # type: ignore[arg-type]
+
+
+def _network(name: str, chosen: Any) -> tuple[dict[str, list[Figures]], dict[str, list[Figures]]]:
+    """Train once, and run every attack under each rule, and every novelty, from there."""
     network = NETWORKS[name](1)
     benign = merge(*network.chunks(0, BENIGN_S + NOVELTY_S + 60))
-    run = _trained(rule, benign)
-    specs = [each for each in ATTACKS if each.held_back == chosen.held_back and each.fits(network)]
+    known = [*ATTACKS, *_captured(chosen.data)]
+    specs = [each for each in known if each.held_back == chosen.held_back and each.fits(network)]
     specs = specs[: max(1, round(len(specs) * chosen.scale))]
     novelties = list(NOVELTIES)[: max(1, round(len(NOVELTIES) * chosen.scale))]
-    return {
-        "attacks": [
-            {"network": name, "attack": spec.name, "number": spec.number, "seed": seed}
-            | _apart(partial(_attack, run, network, benign, spec, seed))
-            for spec in specs
-            for seed in range(1, chosen.seeds + 1)
-        ],
-        "novelty": [
-            {"network": name, "novelty": which, "seed": seed}
-            | _apart(partial(_novelty, run, network, benign, which, seed))
-            for which in novelties
-            for seed in range(1, chosen.seeds + 1)
-        ],
+    run = DecisionRun(len(benign.between(0, TRAINING_S)), _rules(chosen.rules[0]))
+    run.feed(benign.between(0, TRAINING_S))
+    seeds = range(1, chosen.seeds + 1)
+    attacks = {
+        rule: [
+            {"network": name} | row
+            for row in _apart(partial(_under_rule, rule, run, network, benign, specs, seeds))
+        ]
+        for rule in chosen.rules
+    }
+    runs = [DecisionRun(run.training_packets, _rules(rule), run.detector) for rule in chosen.rules]
+    watch(runs, _from(benign, TRAINING_S, BENIGN_S))
+    found = _all_apart(
+        [partial(_novelty, runs, network, benign, which, seed) for which in novelties for seed in seeds]
+    )
+    return attacks, {
+        rule: [{"network": name} | each["shared"] | each[rule] for each in found] for rule in chosen.rules
     }
 
 
-def _trained(rule: str, benign: Traffic) -> DecisionRun:
-    packets = len(benign.between(0, TRAINING_S))
-    run = DecisionRun(packets, Rules(rule=rule))  # type: ignore[arg-type]
-    run.feed(benign.between(0, BENIGN_S))
+def _captured(data: Path) -> Sequence[AttackSpec]:
+    """The captured attacks, if their files are there."""
+    return real_attacks(data) if data.exists() else ()
+
+
+def _from(benign: Traffic, start_s: float, end_s: float, *more: Traffic) -> Traffic:
+    """A part of the benign traffic, and what is on top of it, numbered as in one stream."""
+    parts = (traffic.between(start_s, end_s) for traffic in (benign, *more))
+    return renumbered(merge(*parts), len(benign.between(0, start_s)))
+
+
+def _under_rule(
+    rule: str,
+    run: DecisionRun,
+    network: Network,
+    benign: Traffic,
+    specs: Sequence[AttackSpec],
+    seeds: Sequence[int],
+) -> list[Figures]:
+    run.decide_by(_rules(rule))
+    run.feed(_from(benign, TRAINING_S, BENIGN_S))
     run.decided.clear()
     run.refused.clear()
-    return run
+    return _all_apart(
+        [
+            partial(_attack, run, network, benign, spec, seed)
+            for spec in specs
+            for seed in seeds
+            if seed in spec.seeds or spec.seeds == (1, 2, 3)
+        ]
+    )
 
 
-def _apart(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _apart(work: Callable[[], Any]) -> Any:
     """Do it in a copy of this process, which alone can copy the detector's state."""
+    return _all_apart([work])[0]
+
+
+def _all_apart(works: Sequence[Callable[[], Any]]) -> list[Any]:
+    """Do each in a copy of this process, as many at a time as there are cores."""
+    found: dict[int, Any] = {}
+    going: dict[int, tuple[int, int]] = {}
+    waiting = list(enumerate(works))[::-1]
+    while waiting or going:
+        while waiting and len(going) < (os.cpu_count() or 1):
+            number, work = waiting.pop()
+            child, pipe = _copied(work)
+            going[pipe] = (number, child)
+        for pipe in select.select(list(going), [], [])[0]:
+            number, child = going.pop(pipe)
+            with os.fdopen(pipe, "rb") as reader:
+                data = reader.read()
+            if os.waitpid(child, 0)[1]:
+                raise SystemExit("benchmarks.decisions: a run failed, see above")
+            found[number] = pickle.loads(data)  # noqa: S301 - our own child's
+    return [found[number] for number in range(len(works))]
+
+
+def _copied(work: Callable[[], Any]) -> tuple[int, int]:
+    """Start a copy of this process; returns its id, and the pipe that its result comes from."""
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
         os.close(reader)
         code = 1
         try:
+            result = pickle.dumps(work())
             with os.fdopen(writer, "wb") as pipe:
-                pickle.dump(work(), pipe)
+                pipe.write(result)
             code = 0
         except BaseException:  # noqa: BLE001 - the copy must not go on as if it were this process
             traceback.print_exc()
         os._exit(code)
     os.close(writer)
-    with os.fdopen(reader, "rb") as pipe:
-        data = pipe.read()
-    if os.waitpid(child, 0)[1]:
-        raise SystemExit("benchmarks.decisions: a run failed, see above")
-    found: dict[str, Any] = pickle.loads(data)  # noqa: S301 - our own child's
-    return found
+    return child, reader
 
 
-def _attack(
-    run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpec, seed: int
-) -> dict[str, Any]:
+def _attack(run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpec, seed: int) -> Figures:
     sent, truth = spec.traffic(network, seed, ATTACK_S)
     end = min(truth.last_us / 1e6 - BASE_US / 1e6, ATTACK_S + LONGEST_S) + 1
-    traffic = renumbered(
-        merge(benign.between(BENIGN_S, end), sent.between(BENIGN_S, end)), len(benign.between(0, BENIGN_S))
-    )
+    traffic = _from(benign, BENIGN_S, end, sent)
     stopped = run.feed(traffic)
     mine = traffic.attack == truth.id
     first_ns = truth.first_us * 1_000
     good = [each for each in run.decided if _helps(each, truth)]
     wrong = [each for each in run.decided if not _helps(each, truth)]
+    others = stopped & ~mine & ~_sent_by(traffic, truth, network.gateway.mac)
+    hit = [traffic.columns[name][others].tolist() for name in ("port", "eth_src", "ip_src_lo")]
     return {
+        "attack": spec.name,
+        "number": spec.number,
+        "seed": seed,
         "s_to_decision": min(((each.time_ns - first_ns) / 1e9 for each in good), default=math.inf),
         "packets": int(mine.sum()),
         "stopped_share": float(stopped[mine].mean()) if mine.any() else 0.0,
-        "innocent_packets": int(stopped[~mine].sum()),
+        "dropped": int((stopped & ~run.challenges)[mine].sum()),
+        "challenged": int(run.challenges[mine].sum()),
+        "innocent_packets": int(others.sum()),
+        "innocent_hosts": len(set(zip(*hit, strict=True))),
         "wrong": len(wrong),
         "decisions": [each.reason for each in (*good[:2], *wrong[:3])],
         "refused": run.refused[:2],
     }
+
+
+def _sent_by(traffic: Traffic, truth: AttackTruth, router: int) -> npt.NDArray[np.bool_]:
+    """Which packets attackers have sent under their own address, as part of the attack or not."""
+    found = np.zeros(len(traffic), bool)
+    columns = traffic.columns
+    for attacker in truth.attackers:
+        if attacker.ip:
+            mine = (columns["port"] == attacker.port) & (columns["eth_src"] == attacker.mac)
+            found |= mine if attacker.mac != router else mine & (columns["ip_src_lo"] == attacker.ip)
+    return found
 
 
 def _helps(decided: DecidedAction, truth: AttackTruth) -> bool:
@@ -223,38 +318,58 @@ def _helps(decided: DecidedAction, truth: AttackTruth) -> bool:
     return False
 
 
-def _novelty(run: DecisionRun, network: Network, benign: Traffic, name: str, seed: int) -> dict[str, Any]:
+def _novelty(runs: Sequence[DecisionRun], network: Network, benign: Traffic, name: str, seed: int) -> Figures:
     sent = NOVELTIES[name](network, seed, ATTACK_S)
-    end = ATTACK_S + NOVELTY_S
-    before = len(benign.between(0, BENIGN_S))
-    run.feed(renumbered(merge(benign.between(BENIGN_S, end), sent.between(BENIGN_S, end)), before))
-    return {"blocks": len(run.decided), "decisions": [each.reason for each in run.decided[:3]]}
+    for run in runs:
+        run.decided.clear()
+    watch(runs, _from(benign, BENIGN_S, ATTACK_S + NOVELTY_S, sent))
+    return {"shared": {"novelty": name, "seed": seed}} | _blocks(runs)
 
 
-def _days(rule: str, chosen: Any) -> list[dict[str, Any]]:
+def _blocks(runs: Sequence[DecisionRun]) -> Figures:
+    return {
+        run.rules.rule: {
+            "blocks": len(run.decided),
+            "decisions": [each.reason for each in run.decided[:5]],
+            "refused": len(run.refused),
+            "bound": run.decider.test.bound,
+        }
+        for run in runs
+    }
+
+
+def _days(chosen: Any) -> list[Figures]:
     """Days of benign traffic after an hour of training: each of another network or seed."""
-    found = []
-    for number in range(chosen.days):
-        name = chosen.networks[number % len(chosen.networks)]
-        seed = 11 + number // len(chosen.networks)
-        found.append({"network": name, "seed": seed} | _apart(partial(_day, rule, name, seed)))
-    return found
+    names = [chosen.networks[number % len(chosen.networks)] for number in range(chosen.days)]
+    return _all_apart(
+        [
+            partial(_day, chosen.rules, name, 11 + number // len(chosen.networks))
+            for number, name in enumerate(names)
+        ]
+    )
 
 
-def _day(rule: str, name: str, seed: int) -> dict[str, Any]:
+def _day(rules: Sequence[str], name: str, seed: int) -> Figures:
     network = NETWORKS[name](seed)
     packets = sum(len(part) for part in network.chunks(0, TRAINING_S))
-    run = DecisionRun(packets, Rules(rule=rule))  # type: ignore[arg-type]
+    detector = detector_for(packets)
+    runs = [DecisionRun(packets, _rules(rule), detector) for rule in rules]
+    benign = 0
     for part in network.chunks(0, TRAINING_S + 86_400):
-        run.feed(part)
-    return {
-        "blocks": len(run.decided),
-        "packets": run.detector.model.trained,
-        "dropped": run.dropped,
-        "decisions": [each.reason for each in run.decided[:5]],
-        "refused": len(run.refused),
-        "bound": run.decider.test.bound,
-    }
+        watch(runs, part)
+        benign += len(part)
+    return {"shared": {"network": name, "seed": seed, "packets": benign}} | _blocks(runs)
+
+
+def _real_benign(chosen: Any) -> Figures:
+    """The benign part of the real capture, behind the training that `sdnator replay` gives it."""
+    if not chosen.data.exists():
+        return dict.fromkeys(chosen.rules, f"not run: no data in {chosen.data}")
+    benign = merge(*real_network(chosen.data).chunks(0, 3_600))
+    detector = detector_for(REAL_TRAINING)
+    runs = [DecisionRun(REAL_TRAINING, _rules(rule), detector) for rule in chosen.rules]
+    watch(runs, benign)
+    return {rule: {"packets": len(benign) - REAL_TRAINING} | found for rule, found in _blocks(runs).items()}
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ A decision is in force for the next rows; within a batch it comes too late, as i
 """
 
 import ipaddress
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -22,7 +22,7 @@ from apps.firewall.policy.rules import AllowList, Rules
 from apps.firewall.syn.services import TcpService
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import load_kernel
-from apps.messages import Alert, Target
+from apps.messages import Alert, Decision, Target
 from benchmarks.decision_traffic.traffic import Traffic
 from due import RecordBatch
 
@@ -48,19 +48,26 @@ class DecisionRun:
     Args:
         training_packets: packets of training.
         rules: the firewall's options.
+        watched: a detector that several runs share; then decisions are made, but nothing is stopped.
     """
 
     training_packets: int
     rules: Rules
+    watched: Detector | None = None
     decided: list[DecidedAction] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     dropped: int = 0
     challenged: int = 0
+    challenges: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """Which packets of the last `feed` were challenged; they are among the stopped."""
 
     def __post_init__(self) -> None:
-        map_packets = max(self.training_packets // 11, 1)
-        settings = DetectorSettings(fm_grace=map_packets, ad_grace=self.training_packets - map_packets - 1)
-        self.detector = Detector(settings, kernel=load_kernel())
+        self.detector = self.watched or detector_for(self.training_packets)
+        self.decide_by(self.rules)
+
+    def decide_by(self, rules: Rules) -> None:
+        """Go on with other rules, as if they had been there from the start of training."""
+        self.rules = rules
         self._ledger = BlockLifecycle(self.rules)
         # capture times of generated traffic: ARP claims are weighed by the detector
         bindings = ArpBindings(training_s=0, settle_s=3_600, contest_s=60)
@@ -71,11 +78,13 @@ class DecisionRun:
     def feed(self, traffic: Traffic) -> npt.NDArray[np.bool_]:
         """Take traffic; returns which of its packets were stopped (dropped, or SYNs that were challenged)."""
         stopped = np.zeros(len(traffic), bool)
+        self.challenges = np.zeros(len(traffic), bool)
         for start in range(0, len(traffic), ROWS):
             columns = {name: column[start : start + ROWS] for name, column in traffic.columns.items()}
             drops = self._drops(columns)
             challenges = self._challenges(columns) & ~drops
             stopped[start : start + ROWS] = drops | challenges
+            self.challenges[start : start + ROWS] = challenges
             self.dropped += int(drops.sum())
             self.challenged += int(challenges.sum())
             left = ~drops
@@ -86,6 +95,10 @@ class DecisionRun:
 
     def _look(self, columns: Mapping[str, Any]) -> None:
         _, alerts = self.detector.process(RecordBatch(dict(columns)), SWITCH)
+        self.judge(alerts, self.detector.take_evidence(), int(columns["time_us"][-1]) * 1_000)
+
+    def judge(self, alerts: Sequence[Alert], heard: Sequence[Evidence], now: int) -> None:
+        """Decide about what the detector has said until a capture time, ns."""
         if not self._told and self.detector.model.is_trained:
             self._told = True
             behaviour = self.detector.behaviour
@@ -99,15 +112,19 @@ class DecisionRun:
                     event_time=0,
                 )
             )
-        for decision in self._ledger.due(int(columns["time_us"][-1]) * 1_000):
-            self.detector.senders.blocked.decide(decision)
+        for decision in self._ledger.due(now):
+            self._tell(decision)
         for alert in alerts:
             if self._ledger.covering(alert.sender) is None:
                 verdict = self.decider.alert(alert)
                 if verdict.target is not None:
                     self._block(alert, verdict.target, verdict.reason)
-        for evidence in self.detector.take_evidence():
+        for evidence in heard:
             self._hear(evidence)
+
+    def _tell(self, decision: Decision) -> None:
+        if self.watched is None:
+            self.detector.senders.blocked.decide(decision)
 
     def _hear(self, evidence: Evidence) -> None:
         proposal = self.decider.evidence(evidence, "kitsune", lambda _: 0)
@@ -131,7 +148,7 @@ class DecisionRun:
         decision = self._ledger.open(
             SWITCH, target, reason, (), cause.event_time, training_rate=cause.training_rate, host=host
         )
-        self.detector.senders.blocked.decide(decision)
+        self._tell(decision)
         self.decided.append(DecidedAction(cause.event_time, reason, target=target))
 
     def _drops(self, columns: Mapping[str, Any]) -> npt.NDArray[np.bool_]:
@@ -158,3 +175,21 @@ class DecisionRun:
                     & (columns["tcp_flags"] & 0x12 == 0x02)
                 )
         return challenges
+
+
+def detector_for(training_packets: int) -> Detector:
+    """Kitsune with a training of so many packets."""
+    map_packets = max(training_packets // 11, 1)
+    settings = DetectorSettings(fm_grace=map_packets, ad_grace=training_packets - map_packets - 1)
+    return Detector(settings, kernel=load_kernel())
+
+
+def watch(runs: Sequence[DecisionRun], traffic: Traffic) -> None:
+    """Feed the detector that runs share, and ask each; as with blocking, as long as nobody is blocked."""
+    detector = runs[0].detector
+    for start in range(0, len(traffic), ROWS):
+        columns = {name: column[start : start + ROWS] for name, column in traffic.columns.items()}
+        _, alerts = detector.process(RecordBatch(columns), SWITCH)
+        heard = detector.take_evidence()
+        for run in runs:
+            run.judge(alerts, heard, int(columns["time_us"][-1]) * 1_000)

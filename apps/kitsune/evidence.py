@@ -3,7 +3,7 @@
 from typing import Final
 
 from apps.evidence import Evidence, Kind
-from apps.kitsune.behaviour.behaviour import Finding, Statistic
+from apps.kitsune.behaviour.behaviour import CONTACTS, Finding, Statistic
 from apps.kitsune.behaviour.contacts import service_text
 from apps.kitsune.behaviour.rows import SenderId, parts_of
 from apps.kitsune.names import ip_text, mac_text
@@ -57,7 +57,7 @@ def evidence_of(
     return Evidence(
         id=f"kitsune-{name}" if sender is None else f"kitsune-{name}-{mac:012x}",
         kind=KINDS[finding.statistic],
-        source=finding.statistic,
+        source="contacts" if finding.statistic in CONTACTS else finding.statistic,
         sender=None if sender is None else sender_of(sender),
         forgeable=not proven,
         forged=forged,
@@ -88,7 +88,7 @@ def _words(finding: Finding, victim: str) -> str:
         "contacts": f"{who} failed to reach {count} new hosts or ports {within}; {usual}",
         "ports": f"{who} failed to reach {count} new ports of {victim} {within}; {usual}",
         "targets": f"{who} failed to reach {service} at {count} new hosts {within}; {usual}",
-        "logins": f"{who} opened {count} connections to {service} of {victim} {within}; {usual}",
+        "logins": f"{who} opened {count} short connections to {service} of {victim} {within}; {usual}",
         "one_way": f"{who} sent {count} packets a second to {victim}, which does not answer; {usual}",
         "claims": f"{who} sent {count} ARP replies that nobody had asked for {within}; {usual}",
         "thefts": f"{who} claims the address of {victim}, which is present",

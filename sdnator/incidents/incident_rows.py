@@ -56,7 +56,6 @@ def with_counters(incident: Incident, packets: Mapping[str, int]) -> Incident:
         dropped=cost.dropped + more["block"],
         challenged=cost.challenged + more["guard"],
         metered=cost.metered + more["meter"],
-        innocents=cost.innocents,
     )
     return structs.replace(incident, actions=actions, cost=counted_up)
 
@@ -170,8 +169,6 @@ def as_text(incident: Incident) -> Iterator[str]:
             f"{counted(action.packets, 'packet')}{name}"
         )
     cost = incident.cost
-    innocents = "" if cost.innocents is None else f"; {counted(cost.innocents, 'packet')} of others hit"
     yield (
         f"packets stopped: {cost.dropped:,} dropped, {cost.challenged:,} challenged, {cost.metered:,} metered"
-        f"{innocents}"
     )

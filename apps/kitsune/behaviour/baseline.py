@@ -1,8 +1,15 @@
 """How much more than in training: counts in sliding windows, weighed in nats.
 
-For each statistic and each window length a subject (a sender, a victim) has a highest count of training.  What
-is above it is weighed by an exponential tail whose scale comes from training as well: its blocks are left out
-one by one, and the excess of each over the highest count of all others is what a new maximum looks like here.
+For each statistic, each window length and each kind of what is counted (a protocol, a service; from inside or
+outside) the highest count of all subjects in training is known, for some statistics also that of each subject.
+Training is divided into blocks that are left out one by one.  How far a block is above all others is the scale of
+an exponential tail.  How often one is, says how many counts above everybody's highest another training would show.
+The bound of the sequential test is that of one such count for each of m senders; if there are n of them, whoever's
+they are and in whatever statistic, then what is above everybody's highest weighs
+
+    ln(m / n) + excess / scale
+
+nats.  A host is above its own highest as often as the bound assumes, so that this weighs excess / scale only.
 Blocks are long, so counts that belong together fall into one, and no independence of packets is assumed.
 
 Source: block maxima and the jackknife (Coles, An Introduction to Statistical Modeling of Extreme Values, 2001,
@@ -12,7 +19,7 @@ chapter 3; Efron, 1982).
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 WINDOWS_S: Final = (1.0, 10.0, 60.0, 600.0)
 BLOCKS: Final = 10
@@ -72,8 +79,8 @@ class SlidingSums:
 
 
 @dataclass
-class SubjectMaxima:
-    """The highest counts of one subject in training, by window; and those of each block."""
+class BlockMaxima:
+    """The highest counts of each block of training, by window."""
 
     blocks: dict[int, list[float]] = field(default_factory=dict)
 
@@ -94,32 +101,87 @@ class SubjectMaxima:
         return columns
 
 
+def _excesses(maxima: Iterable[BlockMaxima], windows: int, early: int) -> tuple[float, float]:
+    """Leave out each block in turn.
+
+    Returns:
+        The mean excess of a block above all others, as a share of their highest count (plus one); and how many
+        blocks of a training are above all others, those apart in which everything was new.
+    """
+    ratios: list[float] = []
+    exceeding = 0
+    for each in maxima:
+        for block, counts in each.blocks.items():
+            rest = each.highest(windows, without=block)
+            above = [(count, most) for count, most in zip(counts, rest, strict=True) if count > most]
+            exceeding += bool(above) and block >= early
+            ratios += [(count - most) / (most + 1) for count, most in above if most]
+    return sum(ratios) / len(ratios) if ratios else 0.0, exceeding * BLOCKS / (BLOCKS - early)
+
+
+class Weighed(NamedTuple):
+    """What a count weighs."""
+
+    nats: float
+    """0 if training saw as much."""
+    window: int
+    """Number of the window that it comes from."""
+    usual: float
+    """The highest count of training that it was compared with."""
+
+    def or_more(self, nats: float, window: int, usual: float) -> "Weighed":
+        """This weight, or another if that is more."""
+        return Weighed(nats, window, usual) if nats > self.nats else self
+
+
 class Baseline:
     """What training saw of one statistic.
 
     Args:
         windows: number of window lengths.
         least_scale: of the tail, where training shows no variation at all.
+        own: compare a subject with its own highest counts, too.
     """
 
-    def __init__(self, windows: int, least_scale: float = LEAST_SCALE) -> None:
+    def __init__(self, windows: int, least_scale: float = LEAST_SCALE, *, own: bool = True) -> None:
         self._windows = windows
         self._least = least_scale
-        self._learning: dict[Any, SubjectMaxima] = {}
+        self._own = own
+        self._learning: dict[Any, BlockMaxima] = {}
+        self._kinds: dict[Any, BlockMaxima] = {}
         self.highest: dict[Any, list[float]] = {}
         """Highest counts by subject and window."""
-        self.newcomer = [0.0] * windows
-        """The same over all subjects: what somebody unknown may do."""
-        self.relative = 0.0
-        """Mean excess of a new maximum, as a share of the former one (plus one)."""
+        self.shared: dict[Any, list[float]] = {}
+        """The same over all subjects, by kind: what somebody unknown may do."""
+        self._own_scale = self._shared_scale = _LEAST_SHARE
+        self.exceeded = 0.0
+        """How often a block of training was above all others, whoever's counts they were."""
+        self.rarity = 0.0
+        """Nats of being above everybody's highest count; set when all statistics have closed."""
 
-    def learn(self, subject: Any, block: int, counts: tuple[float, ...]) -> None:
-        """Note counts of training; `block` is the part of training, from 0."""
+    def learn(self, subject: Any, block: int, counts: tuple[float, ...], kind: Any = None) -> None:
+        """Note counts of training.
+
+        Args:
+            subject: whose counts these are.
+            block: the part of training, from 0.
+            counts: by window.
+            kind: hashable; subjects are compared with all others that do something of this kind.
+        """
+        kinds = self._kinds.get(kind)
+        if kinds is None:
+            # beyond that, kinds are as if training had not seen them
+            kinds = BlockMaxima()
+            if len(self._kinds) < MOST_SUBJECTS:
+                self._kinds[kind] = kinds
+        kinds.see(block, counts)
+        if not self._own:
+            return
         maxima = self._learning.get(subject)
         if maxima is None:
             if len(self._learning) >= MOST_SUBJECTS:
                 return
-            maxima = self._learning[subject] = SubjectMaxima()
+            maxima = self._learning[subject] = BlockMaxima()
         maxima.see(block, counts)
 
     def close(self, early: int = 0) -> None:
@@ -129,70 +191,60 @@ class Baseline:
             early: blocks at its beginning in which all was new, and that say nothing about senders that are
                 known by now; newcomers are compared with them nevertheless.
         """
-        ratios: list[float] = []
-        for subject, maxima in self._learning.items():
-            self.newcomer = [
-                max(pair) for pair in zip(self.newcomer, maxima.highest(self._windows), strict=True)
-            ]
-            late = SubjectMaxima({block: counts for block, counts in maxima.blocks.items() if block >= early})
-            self.highest[subject] = late.highest(self._windows)
-            for block, counts in late.blocks.items():
-                rest = late.highest(self._windows, without=block)
-                ratios += [
-                    (count - most) / (most + 1)
-                    for count, most in zip(counts, rest, strict=True)
-                    if count > most and most
-                ]
-        self.relative = sum(ratios) / len(ratios) if ratios else 0.0
+        self.shared = {kind: maxima.highest(self._windows) for kind, maxima in self._kinds.items()}
+        relative, self.exceeded = _excesses(self._kinds.values(), self._windows, early)
+        self._shared_scale = max(relative, _LEAST_SHARE)
+        late = {
+            subject: BlockMaxima({block: counts for block, counts in maxima.blocks.items() if block >= early})
+            for subject, maxima in self._learning.items()
+        }
+        self.highest = {subject: maxima.highest(self._windows) for subject, maxima in late.items()}
+        self._own_scale = max(_excesses(late.values(), self._windows, early)[0], _LEAST_SHARE)
         self._learning.clear()
+        self._kinds.clear()
 
-    def nats(self, subject: Any, counts: tuple[float, ...]) -> tuple[float, int]:
+    def nats(self, subject: Any, counts: tuple[float, ...], kind: Any = None) -> Weighed:
         """Weigh counts.
 
         Args:
-            subject: whose counts these are; unknown ones are compared with the highest of all subjects.
+            subject: whose counts these are; unknown ones are compared with the highest of their kind only.
             counts: by window.
-
-        Returns:
-            The weight in nats, 0 if training saw as much; and the window that it comes from.
+            kind: as in training; of a kind that training does not know the highest count is 0.
         """
-        most = self._most(subject)
-        best, which = 0.0, 0
-        for number, (count, usual) in enumerate(zip(counts, most, strict=True)):
-            if count > usual:
-                share = max(self.relative, _LEAST_SHARE)
-                weight = (count - usual) / max(self._least, share * usual)
-                if weight > best:
-                    best, which = weight, number
-        return best, which
-
-    def usual(self, subject: Any, window: int) -> float:
-        """The highest count of training in a window."""
-        return self._most(subject)[window]
-
-    def _most(self, subject: Any) -> list[float]:
         own = self.highest.get(subject)
-        if own is None:
-            return self.newcomer
-        return [max(count, _NEIGHBOURS_SHARE * most) for count, most in zip(own, self.newcomer, strict=True)]
+        best = Weighed(0.0, 0, 0.0)
+        shared = self.shared.get(kind) or [0.0] * self._windows
+        for number, (count, most) in enumerate(zip(counts, shared, strict=True)):
+            if count > most:
+                scale = max(self._least, self._shared_scale * most)
+                best = best.or_more(self.rarity + (count - most) / scale, number, most)
+            if own is not None:
+                usual = max(own[number], _NEIGHBOURS_SHARE * most)
+                if count > usual:
+                    # who was quiet and becomes busy is so as others are
+                    scale = max(self._least, self._own_scale * usual, _LEAST_SHARE * most)
+                    best = best.or_more((count - usual) / scale, number, usual)
+        return best
 
     def to_state(self) -> dict[str, Any]:
         """Plain values for the model file."""
         return {
             "highest": [[subject, counts] for subject, counts in self.highest.items() if any(counts)],
-            "newcomer": self.newcomer,
-            "relative": self.relative,
+            "shared": [[kind, counts] for kind, counts in self.shared.items() if any(counts)],
+            "scales": [self._own_scale, self._shared_scale],
+            "rarity": self.rarity,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """The inverse of `to_state`; subjects are lists there, tuples here.
+        """The inverse of `to_state`; subjects and kinds are lists there, tuples here.
 
         Raises:
             KeyError, TypeError, ValueError: the state is not one.
         """
         self.highest = {_frozen(subject): self._counts(counts) for subject, counts in state["highest"]}
-        self.newcomer = self._counts(state["newcomer"])
-        self.relative = float(state["relative"])
+        self.shared = {_frozen(kind): self._counts(counts) for kind, counts in state["shared"]}
+        self._own_scale, self._shared_scale = map(float, state["scales"])
+        self.rarity = float(state["rarity"])
 
     def _counts(self, counts: Iterable[Any]) -> list[float]:
         found = [float(count) for count in counts]

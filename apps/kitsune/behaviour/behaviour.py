@@ -16,8 +16,8 @@ added since the last one about the same subject.
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Final, Literal, Self
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ from apps.kitsune.behaviour.contacts import (
     TCP,
     UDP,
     ContactTracker,
-    FailedContact,
+    EndedContact,
     PacketRow,
 )
 from apps.kitsune.behaviour.rows import SenderId, packet_rows, parts_of
@@ -49,6 +49,12 @@ Statistic = Literal[
     "scores",
     "threshold",
 ]
+CONTACTS: Final[tuple[Statistic, ...]] = ("contacts", "ports", "targets")
+BURST_WINDOWS_S: Final = WINDOWS_S[1:]
+"""Of contacts: a program opens many at once, and how fast it does says nothing."""
+WHOLE: Final[tuple[Statistic, ...]] = (*CONTACTS, "logins", "one_way", "strangers")
+"""Statistics that all of training speaks of.  Scores are learnt from its end only; and all newcomers announce
+themselves, but training may have seen none."""
 LOGINS: Final = frozenset(
     (
         21,
@@ -78,18 +84,26 @@ HALF_LIFE_S: Final = 600.0
 """After so many seconds without more, half of what was found is forgotten."""
 LEAST_NATS: Final = 1.0
 """Less is not worth a message ..."""
-LEAST_STEP: Final = 0.15
-"""... nor is less than this share of what was said already ..."""
+LEAST_STEP: Final = 0.5
+"""... nor is less than this beside what was said already ..."""
+LEAST_SHARE: Final = 0.15
+"""... nor, where more than `DECIDING_NATS` were said already, less than this share of it ..."""
+DECIDING_NATS: Final = 20.0
 MOST_NATS: Final = 50.0
 """... nor anything beyond, since it decides everything."""
+REFUSED_BYTES: Final = 5_000
+"""Bytes on the wire that the initiator sends in a login that is refused, at most: the key exchange of SSH and a few
+passwords are 2,000 to 4,000."""
 REPLIES_COUNT: Final = 10
 """A reply makes up for so many packets: bulk transfers are acknowledged now and then."""
 CALIBRATION_PACKETS: Final = 5_000
 """Packets at the end of training whose scores say how benign ones lie."""
 _KEPT: Final = 65_536
 _TINY: Final = 1e-300
-_SYN, _RST, _ACK = 0x02, 0x04, 0x10
+_FIN, _SYN, _RST, _ACK = 0x01, 0x02, 0x04, 0x10
 _WELL_KNOWN: Final = 1_024
+_CHOSEN: Final = 32_768
+"""Clients choose ports from here on by chance (Linux; others from 49,152)."""
 _ASKED_S: Final = 3.0
 _PRESENT_S: Final = 60.0
 """Seconds for which a host that has sent something is present."""
@@ -142,7 +156,8 @@ class FoundSoFar:
         if former is not None:
             faded = former.nats * 0.5 ** (max(0.0, time - former.time) / HALF_LIFE_S)
         nats = min(nats, MOST_NATS)
-        if nats - faded < max(LEAST_NATS, LEAST_STEP * faded):
+        least = LEAST_SHARE * faded if faded > DECIDING_NATS else LEAST_STEP
+        if nats < LEAST_NATS or nats - faded < least:
             return 0.0
         if former is None and len(self._reported) >= _KEPT:
             del self._reported[next(iter(self._reported))]
@@ -150,29 +165,51 @@ class FoundSoFar:
         return nats - faded
 
 
+class _Seen(NamedTuple):
+    """What a count adds: the part of a finding that comes from its statistic."""
+
+    nats: float
+    total: float
+    events: float
+    window_s: float
+    usual: float
+
+
 class _Counter:
     """One statistic: sliding sums, their baseline, and what was reported."""
 
-    def __init__(self, least_scale: float = LEAST_SCALE, windows: tuple[float, ...] = WINDOWS_S) -> None:
+    def __init__(
+        self,
+        least_scale: float = LEAST_SCALE,
+        windows: tuple[float, ...] = WINDOWS_S,
+        *,
+        own: bool = True,
+    ) -> None:
         self.sums = SlidingSums(windows)
-        self.baseline = Baseline(len(windows), least_scale)
+        self.baseline = Baseline(len(windows), least_scale, own=own)
         self.found = FoundSoFar()
 
     def see(
-        self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0
-    ) -> tuple[float, float, float, float, float] | None:
-        """Count; returns what was added, the weight, the sum, its window and the highest of training."""
-        sums = self.sums.add(subject, time, weight)
+        self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0, kind: Any = None
+    ) -> _Seen | None:
+        """Count, and weigh the sums."""
+        return self.weigh(whose, self.sums.add(subject, time, weight), time, block, kind)
+
+    def weigh(
+        self, whose: Any, sums: tuple[float, ...], time: float, block: int, kind: Any = None
+    ) -> _Seen | None:
+        """Learn sums within the windows, or weigh them; None if nothing is worth a message."""
         if block >= 0:
-            self.baseline.learn(whose, block, sums)
+            self.baseline.learn(whose, block, sums, kind)
             return None
-        nats, which = self.baseline.nats(whose, sums)
-        if nats < LEAST_NATS:
-            return None
-        added = self.found.added(whose, nats, time)
-        if not added:
-            return None
-        return added, nats, sums[which], self.sums.windows[which], self.baseline.usual(whose, which)
+        seen = self.measure(whose, sums, kind)
+        added = self.found.added((whose, kind), seen.total, time) if seen.total >= LEAST_NATS else 0.0
+        return seen._replace(nats=added) if added else None
+
+    def measure(self, whose: Any, sums: tuple[float, ...], kind: Any) -> _Seen:
+        """Weigh sums, whatever was found before."""
+        nats, which, usual = self.baseline.nats(whose, sums, kind)
+        return _Seen(0.0, nats, sums[which], self.sums.windows[which], usual)
 
 
 @dataclass(slots=True)
@@ -181,6 +218,27 @@ class _Exchange:
     out: int = 0
     back: int = 0
     due: int = 0
+
+
+@dataclass(slots=True)
+class _Login:
+    """A connection to a login service."""
+
+    sender: SenderId
+    moved: int
+    """Bytes of the initiator."""
+    settled: bool = False
+    """It has ended, or moved more than a refused login does."""
+
+    def change(self, row: PacketRow) -> float:
+        """What a further packet adds to the count."""
+        if self.settled:
+            return 0.0
+        self.moved += row.length
+        self.settled = self.moved >= REFUSED_BYTES or bool(row.flags & (_FIN | _RST))
+        if not self.settled:
+            return 0.0
+        return -0.5 if self.moved >= REFUSED_BYTES else 0.5
 
 
 class Behaviour:
@@ -205,19 +263,22 @@ class Behaviour:
         """When the owner of an address last sent something."""
         self.contacts = ContactTracker()
         self._counters: dict[Statistic, _Counter] = {
-            "contacts": _Counter(),
-            "ports": _Counter(),
-            "targets": _Counter(),
-            "logins": _Counter(0.9),
-            "one_way": _Counter(8.0),
+            # who was quiet for an hour may do what others do: without the own highest counts
+            "contacts": _Counter(windows=BURST_WINDOWS_S, own=False),
+            "ports": _Counter(windows=BURST_WINDOWS_S),
+            "targets": _Counter(windows=BURST_WINDOWS_S, own=False),
+            "logins": _Counter(0.9, own=False),
+            "one_way": _Counter(8.0, (1.0,), own=False),
             "claims": _Counter(),
             "thefts": _Counter(),
             "strangers": _Counter(1.5, (1.0, 10.0)),
             "scores": _Counter(),
         }
+        self._failures = FoundSoFar()
+        """Of senders: the strongest of `CONTACTS`, which are three views of the same packets."""
         self._exchanges: dict[tuple[int, int], _Exchange] = {}
         self._asked: dict[tuple[int, int], float] = {}
-        self._logins: dict[tuple[int, int, int, int], None] = {}
+        self._logins: dict[tuple[int, int, int, int], _Login] = {}
         self._strangers: dict[tuple[int, int], None] = {}
         self._tail: deque[tuple[SenderId, float]] = deque(maxlen=CALIBRATION_PACKETS)
         """Senders and times of the last packets of training."""
@@ -273,10 +334,10 @@ class Behaviour:
         """All statistics of one packet but its score."""
         found: list[Finding] = []
         for failed in self.contacts.due(row.time):
-            found += self._failed(failed, block)
+            found += self._ended(failed, block)
         ended = self.contacts.add(row)
         if ended is not None:
-            found += self._failed(ended, block)
+            found += self._ended(ended, block)
         found += self._login(row, block)
         found += self._one_way(row, block)
         if row.service == ARP:
@@ -322,24 +383,50 @@ class Behaviour:
         self.contacts.close_training()
         for name, counter in self._counters.items():
             # at the beginning every contact was new
-            early = BLOCKS // 2 if name in ("contacts", "ports", "targets", "strangers") else 0
-            counter.baseline.close(early)
+            counter.baseline.close(BLOCKS // 2 if name in (*CONTACTS, "strangers") else 0)
+        baselines = [self._counters[name].baseline for name in WHOLE]
+        expected = sum(baseline.exceeded for baseline in baselines)
+        for baseline in baselines:
+            baseline.rarity = max(0.0, math.log(len(self.senders) / max(1, expected)))
 
-    def _failed(self, failed: FailedContact, block: int) -> list[Finding]:
-        found: list[Finding | None] = []
-        sender, target, service = failed.sender, failed.target, failed.service
-        if not failed.half_open and not _is_reflected(failed):
-            for statistic, subject in (
-                ("contacts", sender),
-                ("ports", (sender, target)),
-                ("targets", (sender, service)),
-            ):
-                found.append(self._see(statistic, subject, sender, failed, block))
-        if block >= 0 or sender[3] not in self._addresses:
-            key = (target, _flooded(failed))
+    def _ended(self, ended: EndedContact, block: int) -> list[Finding]:
+        """A contact that came about makes up for one that failed."""
+        sender, target = ended.sender, ended.target
+        found: list[Finding] = []
+        if not (ended.failed and ended.half_open) and not _is_reflected(ended):
+            found = self._contact(ended, block)
+        if ended.failed and (block >= 0 or sender[3] not in self._addresses):
+            key = (target, _flooded(ended))
             if self._fresh_stranger(sender[3], key):
-                found.append(self._see("strangers", key, key, failed, block))
-        return [each for each in found if each is not None]
+                seen = self._counters["strangers"].see(key, key, ended.time, block)
+                if seen is not None:
+                    at = (ended.time, ended.arrival)
+                    found.append(Finding("strangers", None, target, key[1], *seen, *at))
+        return found
+
+    def _contact(self, ended: EndedContact, block: int) -> list[Finding]:
+        sender, target, service, time = ended.sender, ended.target, ended.service, ended.time
+        inside, protocol = is_inside(parts_of(sender[3])), _protocol(service)
+        whose = (sender, protocol)
+        views: list[tuple[Statistic, Any, Any, int, int]] = [
+            ("contacts", whose, (protocol, inside), 0, -1),
+            ("ports", (sender, target), (protocol, inside), target, -1),
+            ("targets", (sender, service), (_named(service), inside), 0, service),
+        ]
+        best: Finding | None = None
+        for statistic, subject, kind, victim, single in views:
+            counter = self._counters[statistic]
+            sums = counter.sums.add(subject, time, 1.0 if ended.failed else -1.0)
+            if block >= 0:
+                counter.baseline.learn(whose, block, sums, kind)
+            elif ended.failed:
+                seen = counter.measure(whose, sums, kind)
+                if seen.total >= LEAST_NATS and (best is None or seen.total > best.total):
+                    best = Finding(statistic, sender, victim, single, *seen, time, ended.arrival)
+        if best is None:
+            return []
+        added = self._failures.added(sender, best.total, time)
+        return [replace(best, nats=added)] if added else []
 
     def _fresh_stranger(self, source: int, victim: tuple[int, int]) -> bool:
         key = (source, hash(victim))
@@ -350,36 +437,38 @@ class Behaviour:
         self._strangers[key] = None
         return True
 
-    def _see(
-        self, statistic: Any, subject: Any, whose: Any, failed: FailedContact, block: int
-    ) -> Finding | None:
-        seen = self._counters[statistic].see(subject, whose, failed.time, block)
-        if seen is None:
-            return None
-        stranger = statistic == "strangers"
-        service = _flooded(failed) if stranger else failed.service
-        return Finding(
-            statistic,
-            None if stranger else failed.sender,
-            0 if statistic in ("contacts", "targets") else failed.target,
-            -1 if statistic in ("contacts", "ports") else service,
-            *seen,
-            failed.time,
-            failed.arrival,
-        )
-
     def _login(self, row: PacketRow, block: int) -> list[Finding]:
-        if row.flags & (_SYN | _ACK | _RST) != _SYN or row.service - TCP not in LOGINS or row.quoted:
+        """Connections to login services: half when they begin, whole when they end like a refused login.
+
+        What has moved more than that is somebody's work, and not counted any more.
+        """
+        if not row.is_tcp or row.quoted:
             return []
+        if row.service - TCP not in LOGINS:
+            if not row.flags & (_FIN | _RST) or row.reverse - TCP not in LOGINS:
+                return []
+            # the server closes
+            row = row._replace(
+                source=row.target, target=row.source, service=row.reverse, reverse=row.service, length=0
+            )
         key = (row.source, row.target, row.service, row.reverse)
-        if key in self._logins:
-            return []  # the same SYN again
-        if len(self._logins) >= _KEPT:
-            self._logins.clear()
-        self._logins[key] = None
-        seen = self._counters["logins"].see(
-            (row.sender, row.target, row.service), row.sender, row.time, block
-        )
+        login = self._logins.get(key)
+        if login is None:
+            if row.flags & (_SYN | _ACK | _RST | _FIN) != _SYN:
+                return []
+            if len(self._logins) >= _KEPT:
+                self._logins.clear()
+            self._logins[key] = _Login(row.sender, row.length)
+            weight = 0.5
+        else:
+            weight = login.change(row)
+        if not weight:
+            return []
+        row = row._replace(sender=self._logins[key].sender)
+        counter = self._counters["logins"]
+        sums = counter.sums.add((row.sender, row.target, row.service), row.time, weight)
+        kind = (row.service, is_inside(parts_of(row.source)))
+        seen = counter.weigh((row.sender, row.service), sums, row.time, block, kind)
         return [] if seen is None else [self._finding("logins", row, seen)]
 
     def _one_way(self, row: PacketRow, block: int) -> list[Finding]:
@@ -406,19 +495,14 @@ class Behaviour:
             mine.second, mine.out, mine.back, mine.due = second, 0, 0, 0
         mine.out += 1
         alone = mine.out - REPLIES_COUNT * mine.back
+        if block < 0:
+            if alone < mine.due:
+                return []
+            mine.due = alone + max(1, alone // 8)
+        kind = _protocol(row.service)
         counter = self._counters["one_way"]
-        if block >= 0:
-            counter.baseline.learn(row.sender, block, (float(alone), 0.0, 0.0, 0.0))
-            return []
-        if alone < mine.due:
-            return []
-        mine.due = alone + max(1, alone // 8)
-        nats, _ = counter.baseline.nats(row.sender, (float(alone), 0.0, 0.0, 0.0))
-        added = counter.found.added(row.sender, nats, row.time) if nats >= LEAST_NATS else 0.0
-        if not added:
-            return []
-        usual = counter.baseline.usual(row.sender, 0)
-        return [self._finding("one_way", row, (added, nats, float(alone), 1.0, usual))]
+        seen = counter.weigh((row.sender, kind), (float(alone),), row.time, block, kind)
+        return [] if seen is None else [self._finding("one_way", row, seen)]
 
     def _ask(self, row: PacketRow) -> None:
         if len(self._asked) >= _KEPT:
@@ -470,7 +554,7 @@ class Behaviour:
         if len(self._told) >= _KEPT:
             self._told.clear()
         self._told[row.sender] = row.time
-        seen = (0.0, 0.0, score, 0.0, self.line)
+        seen = _Seen(0.0, 0.0, score, 0.0, self.line)
         return [self._finding("threshold", row, seen, supporting=True)]
 
     def to_state(self) -> dict[str, Any]:
@@ -511,7 +595,7 @@ class Behaviour:
     def _finding(
         statistic: Statistic,
         row: PacketRow,
-        seen: tuple[float, float, float, float, float],
+        seen: _Seen,
         *,
         supporting: bool = False,
     ) -> Finding:
@@ -520,7 +604,7 @@ class Behaviour:
         )
 
 
-def _flooded(failed: FailedContact) -> int:
+def _flooded(failed: EndedContact) -> int:
     """What a victim is flooded with: a service, datagrams from a well-known port, stray segments."""
     if failed.service & ~0xFFFF == UDP and failed.reverse - UDP < _WELL_KNOWN:
         return FROM_UDP | failed.reverse - UDP
@@ -529,7 +613,17 @@ def _flooded(failed: FailedContact) -> int:
     return failed.service
 
 
-def _is_reflected(failed: FailedContact) -> bool:
+def _protocol(service: int) -> int:
+    """The service without its port."""
+    return service & ~0xFFFF
+
+
+def _named(service: int) -> int:
+    """The service; one for all ports that clients choose by chance."""
+    return service if service & 0xFFFF < _CHOSEN else _protocol(service) | _CHOSEN
+
+
+def _is_reflected(failed: EndedContact) -> bool:
     """A datagram from a well-known port outside: who sends it may have been asked in the victim's name."""
     return _flooded(failed) & ~0xFFFF == FROM_UDP and not is_inside(parts_of(failed.sender[3]))
 

@@ -4,8 +4,8 @@
                                           └──► failed: RST, or nothing within the grace period
 
 A contact is an address, another address and a service: a TCP or UDP port, ICMP echo, or ARP.  Only its first
-attempt counts; contacts that training knows never do.  A scanner is known by its contacts that fail (Jung et
-al., Fast Portscan Detection Using Sequential Hypothesis Testing, 2004).
+attempt counts; contacts that training knows never do.  A scanner is known by its contacts that fail, and that few
+come about (Jung et al., Fast Portscan Detection Using Sequential Hypothesis Testing, 2004).
 """
 
 from collections import deque
@@ -55,8 +55,10 @@ class _Pending:
     half_open: bool = False
 
 
-class FailedContact(NamedTuple):
-    """A contact that did not come about."""
+class EndedContact(NamedTuple):
+    """A contact that came about, or failed."""
+
+    failed: bool
 
     time: float
     sender: Any
@@ -93,6 +95,8 @@ class PacketRow(NamedTuple):
     quoted: bool
     answer: bool
     """An ARP reply or an echo reply, which begins nothing."""
+    length: int
+    """Bytes on the wire."""
 
 
 class ContactTracker:
@@ -123,8 +127,8 @@ class ContactTracker:
         """Whether it is known and has not failed."""
         return self.knows(contact) and contact not in self._pending and contact not in self._vain
 
-    def add(self, row: PacketRow) -> FailedContact | None:
-        """Follow one packet; returns the contact that it ends, if it failed."""
+    def add(self, row: PacketRow) -> EndedContact | None:
+        """Follow one packet; returns the contact that it ends, if there is one."""
         if row.quoted or row.group:
             return None
         back: Contact = (row.target, row.source, row.reverse)
@@ -137,7 +141,7 @@ class ContactTracker:
         mine = self._pending.get(there)
         if mine is not None:
             if mine.half_open and row.flags & _ACK and not row.flags & (_RST | _SYN):
-                self._complete(there)
+                return self._complete(there, row.time)
             return None
         if self.knows(there) or (row.is_tcp and _never_begins(row.flags)):
             return None
@@ -149,7 +153,7 @@ class ContactTracker:
             self._order.append((row.time + GRACE_S, there))
         return None
 
-    def due(self, now: float) -> list[FailedContact]:
+    def due(self, now: float) -> list[EndedContact]:
         """Contacts whose grace period is over at `now` (seconds of capture time)."""
         failed = []
         while self._order and self._order[0][0] <= now:
@@ -159,48 +163,54 @@ class ContactTracker:
                 failed.append(self._fail(contact, pending, pending.time + GRACE_S))
         return failed
 
-    def _fail(self, contact: Contact, pending: _Pending, time: float) -> FailedContact:
+    def _fail(self, contact: Contact, pending: _Pending, time: float) -> EndedContact:
         del self._pending[contact]
         if len(self._vain) >= MOST_CONTACTS:
             del self._vain[next(iter(self._vain))]
         self._vain[contact] = None
-        _, target, service = contact
-        return FailedContact(
-            time,
-            pending.sender,
-            target,
-            service,
-            pending.reverse,
-            pending.is_syn,
-            pending.arrival,
-            pending.half_open,
-        )
+        return _ended(contact, pending, time, failed=True)
 
-    def _answered(self, row: PacketRow, contact: Contact, pending: _Pending) -> FailedContact | None:
+    def _answered(self, row: PacketRow, contact: Contact, pending: _Pending) -> EndedContact | None:
         if not row.is_tcp:
-            self._complete(contact)
-        elif row.flags & _RST:
+            return self._complete(contact, row.time)
+        if row.flags & _RST:
             return self._fail(contact, pending, row.time)
-        elif row.flags & (_SYN | _ACK) == _SYN | _ACK:
+        if row.flags & (_SYN | _ACK) == _SYN | _ACK:
             pending.half_open = True
-        else:
-            self._complete(contact)
-        return None
+            return None
+        return self._complete(contact, row.time)
 
     def proven(self, address: int) -> bool:
         """Whether the address has completed a TCP handshake, so that nobody else can have sent under it."""
         return address in self._proven
 
-    def _complete(self, contact: Contact) -> None:
-        if self._pending.pop(contact).half_open:
+    def _complete(self, contact: Contact, time: float) -> EndedContact:
+        pending = self._pending.pop(contact)
+        if pending.half_open:
             if len(self._proven) >= MOST_CONTACTS:
                 del self._proven[next(iter(self._proven))]
             self._proven[contact[0]] = None
+        return _ended(contact, pending, time, failed=False)
 
     def _remember(self, contact: Contact) -> None:
         self._young.add(contact)
         if len(self._young) >= MOST_CONTACTS:
             self._old, self._young = self._young, set()
+
+
+def _ended(contact: Contact, pending: _Pending, time: float, *, failed: bool) -> EndedContact:
+    _, target, service = contact
+    return EndedContact(
+        failed,
+        time,
+        pending.sender,
+        target,
+        service,
+        pending.reverse,
+        pending.is_syn,
+        pending.arrival,
+        pending.half_open,
+    )
 
 
 def _never_begins(flags: int) -> bool:

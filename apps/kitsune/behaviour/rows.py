@@ -67,6 +67,7 @@ def packet_rows(batch: Columns, switch: str) -> Iterator[PacketRow]:
             group.tolist(),
             (batch["quoted"] != 0).tolist(),
             mute.tolist(),
+            batch["length"].tolist(),
             strict=True,
         ),
     )

@@ -41,36 +41,69 @@ def test_events_of_one_subject_and_subjects_are_bounded():
 
 def test_what_training_saw_has_no_weight_and_more_weighs_by_its_scale():
     steady, restless = learnt([4, 4, 4, 4]), learnt([1, 4, 2, 9])
-    assert steady.nats("host", (4,)) == (0.0, 0)
-    assert steady.nats("host", (9,))[0] == pytest.approx(5.0)
-    assert restless.nats("host", (14,))[0] < steady.nats("host", (9,))[0]
+    assert steady.nats("host", (4,)).nats == 0
+    assert steady.nats("host", (9,)) == (pytest.approx(5.0), 0, 4)
+    assert restless.nats("host", (14,)).nats < steady.nats("host", (9,)).nats
 
 
-def test_strangers_are_compared_with_the_busiest_and_known_hosts_with_themselves():
-    baseline = learnt([3, 1])
-    assert baseline.nats("stranger", (3,))[0] == 0
-    baseline = Baseline(1)
-    for block in (0, 1):
-        baseline.learn("busy", block, (20.0,))
-        baseline.learn("quiet", block, (1.0,))
-    baseline.close()
-    assert baseline.nats("busy", (20,))[0] == baseline.nats("stranger", (20,))[0] == 0
-    assert baseline.nats("quiet", (20,))[0] > 10
+def test_strangers_are_compared_with_the_busiest_and_known_hosts_with_themselves_too():
+    """A quiet host that does what a busy one did is told by the tail of the busy one."""
+
+    def of(own):
+        baseline = Baseline(1, own=own)
+        for block in (0, 1):
+            baseline.learn("busy", block, (20.0,))
+            baseline.learn("quiet", block, (1.0,))
+        baseline.close()
+        return baseline
+
+    for baseline in (of(own=True), of(own=False)):
+        assert baseline.nats("busy", (20,)).nats == baseline.nats("stranger", (20,)).nats == 0
+    assert of(own=True).nats("quiet", (20,)).nats == pytest.approx(18 / 5)
+    assert of(own=False).nats("quiet", (20,)).nats == 0
 
 
 def test_the_beginning_of_training_says_nothing_about_known_hosts():
     """There everything was new; a newcomer's beginning is compared with it."""
     baseline = learnt([50, 1, 1, 1], early=2)
-    assert baseline.nats("host", (20,))[0] > 5
-    assert baseline.nats("newcomer", (50,))[0] == 0
+    assert baseline.nats("host", (20,)).nats > 1
+    assert baseline.nats("newcomer", (50,)).nats == 0
+
+
+def test_each_kind_has_its_own_highest_count():
+    """What many do at one service proves nothing at another."""
+    baseline = Baseline(1, own=False)
+    for block in range(3):
+        baseline.learn("host", block, (9.0,), "common")
+    baseline.close()
+    assert baseline.nats("host", (9,), "common").nats == 0
+    assert baseline.nats("host", (9,), "never seen").nats > 10
+
+
+def test_being_above_everybody_weighs_more_than_above_oneself():
+    baseline = learnt([4, 4, 4, 4])
+    plain = baseline.nats("stranger", (9,)).nats
+    baseline.rarity = 3.0
+    assert baseline.nats("stranger", (9,)).nats == pytest.approx(plain + 3)
+    assert baseline.nats("stranger", (4,)).nats == 0
+
+
+def test_maxima_of_the_last_blocks_are_what_is_still_to_be_expected():
+    """At the beginning every kind is new, which does not go on."""
+    steady, growing = learnt([50, 1, 1, 1], early=2), learnt([1, 1, 1, 50], early=2)
+    assert steady.exceeded == 0
+    assert growing.exceeded > 0
 
 
 def test_state_survives_json():
     baseline = Baseline(1)
-    baseline.learn(("s1", 1, (2, 3)), 0, (7.0,))
+    baseline.learn(("s1", 1, (2, 3)), 0, (7.0,), (23, True))
     baseline.close()
+    baseline.rarity = 2.0
     again = Baseline(1)
     again.restore(json.loads(json.dumps(baseline.to_state())))
-    assert again.nats(("s1", 1, (2, 3)), (9,)) == baseline.nats(("s1", 1, (2, 3)), (9,))
+    for kind in ((23, True), None):
+        seen = baseline.nats(("s1", 1, (2, 3)), (9,), kind)
+        assert again.nats(("s1", 1, (2, 3)), (9,), kind) == seen
     with pytest.raises(ValueError, match="windows"):
         Baseline(2).restore(baseline.to_state())

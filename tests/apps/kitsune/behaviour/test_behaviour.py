@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from apps.kitsune.behaviour.behaviour import Behaviour
+from apps.kitsune.behaviour.behaviour import CONTACTS, Behaviour
 from due import RecordBatch
 from sdnator.testing.packet_rows import blank
 
 HOST, SERVER, STRANGER = 0x0A000005, 0x0A000001, 0x0A0000C8
-SYN, SYN_ACK, ACK, RST = 0x02, 0x12, 0x10, 0x04
+FIN, SYN, SYN_ACK, ACK, RST = 0x01, 0x02, 0x12, 0x10, 0x04
 BASE_US = 1_600_000_000_000_000
 
 
@@ -61,16 +61,16 @@ def feed(behaviour, rows, trained=0, **more):
     return behaviour.add(traffic, "s1", np.zeros(len(rows)), trained, lambda: np.zeros(0), **more)
 
 
-def total(found, statistic):
-    return sum(each.nats for each in found if each.statistic == statistic)
+def total(found, *statistics):
+    return sum(each.nats for each in found if each.statistic in statistics)
 
 
 def test_a_scan_is_found_by_its_failed_contacts_within_a_second():
     behaviour = quiet_network()
     rows = [packet(700 + n / 50, STRANGER, SERVER, 50_000, 1_000 + n, SYN) for n in range(50)]
     found = feed(behaviour, rows)
-    assert total(found, "ports") > 12
-    assert {each.sender[3] for each in found} == {STRANGER}
+    assert total(found, *CONTACTS) > 12
+    assert {each.sender[3] for each in found if each.sender} == {STRANGER}
     assert found[0].time < BASE_US / 1e6 + 701
 
 
@@ -83,6 +83,23 @@ def test_connections_that_come_about_are_no_scan():
     assert feed(behaviour, [*rows, packet(720, HOST, SERVER, 1, 80, ACK)]) == []
 
 
+def test_contacts_that_come_about_make_up_for_some_that_fail():
+    """A browser that opens its pages again reaches most of them."""
+
+    def with_answers(share):
+        rows = []
+        for n in range(40):
+            at, target = 700 + n / 10, 0x08000000 + n
+            answered = n % 10 < share * 10
+            one = handshake(at, STRANGER, target, 50_000 + n, 443)
+            rows += one if answered else one[:1]
+        rows.append(packet(720, HOST, SERVER, 1, 80, ACK))
+        return total(feed(quiet_network(), sorted(rows, key=lambda row: row["time_us"])), *CONTACTS)
+
+    assert with_answers(0.7) < 3
+    assert with_answers(0.1) > 12
+
+
 def test_answers_of_a_scanned_host_do_not_speak_against_it():
     behaviour = quiet_network()
     rows = []
@@ -92,10 +109,45 @@ def test_answers_of_a_scanned_host_do_not_speak_against_it():
     assert {each.sender[3] for each in feed(behaviour, rows) if each.sender} == {STRANGER}
 
 
-def test_many_connections_to_a_login_service_are_guessing():
-    behaviour = quiet_network()
-    rows = [row for n in range(15) for row in handshake(700 + n / 2, STRANGER, SERVER, 50_000 + n, 22)]
-    assert total(feed(behaviour, rows), "logins") > 12
+def test_many_short_connections_to_a_login_service_are_guessing():
+    """It does not matter who closes them; those that stay open count half."""
+
+    def guessed(closing):
+        rows = []
+        for n in range(12):
+            at, sport = 700 + n / 2, 50_000 + n
+            rows += handshake(at, STRANGER, SERVER, sport, 22)
+            if closing == "client":
+                rows.append(packet(at + 0.3, STRANGER, SERVER, sport, 22, FIN | ACK))
+            if closing == "server":
+                rows.append(packet(at + 0.3, SERVER, STRANGER, 22, sport, FIN | ACK))
+        return total(feed(quiet_network(), rows), "logins")
+
+    assert guessed("client") == pytest.approx(guessed("server"))
+    assert guessed("server") > 12
+    assert guessed("nobody") < 0.6 * guessed("server")
+
+
+def test_logins_that_move_data_are_no_guessing():
+    """Work over SSH is short connections, too, but not as short as a refused password."""
+    rows = []
+    for n in range(15):
+        at, sport = 700 + n / 2, 50_000 + n
+        rows += handshake(at, STRANGER, SERVER, sport, 22)
+        for part in range(1, 5):
+            rows.append(packet(at + part / 50, STRANGER, SERVER, sport, 22, ACK) | {"length": 1_500})
+            rows.append(packet(at + part / 50 + 0.001, SERVER, STRANGER, 22, sport, ACK))
+    assert total(feed(quiet_network(), rows), "logins") < 3
+
+
+def test_a_flood_of_answered_pings_is_found():
+    """An echo reply does not say that anybody wants the pings."""
+    rows = []
+    for n in range(400):
+        ping = {"icmp_type": 8, "icmp_code": 0}
+        rows.append(packet(700 + n / 400, STRANGER, SERVER, **ping))
+        rows.append(packet(700.001 + n / 400, SERVER, STRANGER, icmp_type=0, icmp_code=0))
+    assert total(feed(quiet_network(), rows), "one_way") > 12
 
 
 def test_a_flood_is_found_and_a_transfer_is_not():
@@ -153,7 +205,7 @@ def test_only_what_is_new_is_said_again():
     """Findings add up to the weight, which has an upper end."""
     behaviour = quiet_network()
     rows = [packet(700 + n / 200, STRANGER, SERVER, 50_000, 1_000 + n, SYN) for n in range(2_000)]
-    found = [each for each in feed(behaviour, rows) if each.statistic == "ports"]
+    found = [each for each in feed(behaviour, rows) if each.statistic in CONTACTS]
     assert sum(each.nats for each in found) == pytest.approx(found[-1].total, rel=0.05)
     assert len(found) < 40
 
