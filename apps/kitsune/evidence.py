@@ -1,5 +1,6 @@
 """A finding as a message: who, against whom, how strong, and in words."""
 
+import math
 from typing import Final
 
 from apps.evidence import Evidence, Kind
@@ -81,7 +82,7 @@ def evidence_of(
 def _words(finding: Finding, victim: str) -> str:
     sender = finding.sender
     who = "" if sender is None else (address_text(sender[3]) or mac_text(sender[2]))
-    count, usual = f"{finding.count:,.0f}", f"at most {finding.usual:,.0f} in training"
+    count, usual = f"{math.ceil(finding.count):,}", f"at most {finding.usual:,.0f} in training"
     within = f"within {finding.window_s:g} s"
     service = service_text(finding.service) if finding.service >= 0 else ""
     texts: dict[Statistic, str] = {
