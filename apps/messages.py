@@ -157,7 +157,7 @@ def address_in(text: object, what: str) -> str:
 
 
 Role = Literal["host", "gateway", "dns", "dhcp", "multicast"]
-Action = Literal["block", "unblock", "protect", "unprotect"]
+Action = Literal["block", "unblock", "protect", "unprotect", "meter", "unmeter"]
 TargetKind = Literal["ip", "mac"]
 State = Literal["installed", "exists", "removed", "expired", "failed"]
 
@@ -462,6 +462,51 @@ class Ground(Message, frozen=True, kw_only=True):
 
 MOST_GROUNDS: Final = 8
 
+FloodKind = Literal["udp", "udp_from", "udp_to", "tcp", "icmp"]
+"""Datagrams; those from a port, as reflectors send them; those to a port; TCP segments to a port that are no SYNs; and
+echo requests."""
+MOST_SPARED: Final = 64
+"""Sources that a rate limit names; evidence names no more."""
+
+
+class RateLimit(Message, frozen=True, kw_only=True):
+    """What of the traffic towards a victim may come at which rate: packets over it are dropped.
+
+    Source: RFC 8955 (FlowSpec), `traffic-rate-packets`.
+    """
+
+    kind: FloodKind
+    port: Port | None = None
+    """The source port of `udp_from`, the destination port of `udp_to` and `tcp`; None for others."""
+    rate: Annotated[int, Meta(ge=1, le=1 << 31)]
+    """Packets per second of all sources together that may pass."""
+    spared: Annotated[tuple[Name, ...], Meta(max_length=MOST_SPARED)] = ()
+    """Sources that training knows: beyond the limit each of them has `spared_rate` of its own."""
+    spared_rate: Annotated[int, Meta(ge=1, le=1 << 31)] = 1
+    """Packets per second."""
+
+    def check(self) -> None:
+        """Check that the kind has its port, and the addresses of spared sources.
+
+        Raises:
+            MessageError: it has none, or one too many; or an address is invalid.
+        """
+        if (self.port is None) != (self.kind in ("udp", "icmp")):
+            raise MessageError("fields", f"rate limit of {self.kind}: port {self.port} does not fit")
+        for source in self.spared:
+            address_in(source, "rate limit")
+
+    @property
+    def words(self) -> str:
+        """What it matches, in words."""
+        return {
+            "udp": "UDP",
+            "udp_from": f"UDP from port {self.port}",
+            "udp_to": f"UDP to port {self.port}",
+            "tcp": f"TCP to port {self.port} but SYNs",
+            "icmp": "ICMP echo requests",
+        }[self.kind]
+
 
 class Decision(Message, frozen=True, kw_only=True):
     """What the firewall wants the switch to do, and why."""
@@ -482,16 +527,36 @@ class Decision(Message, frozen=True, kw_only=True):
     """Arrival number of the packet that tipped the scales."""
     grounds: Annotated[tuple[Ground, ...], Meta(max_length=MOST_GROUNDS)] = ()
     """The evidence that added up to it, the strongest first; empty where something else decided."""
+    limit: RateLimit | None = None
+    """What `meter` and `unmeter` are about: a kind of packets towards the target; None for other actions."""
 
     def check(self) -> None:
-        """Check target and grounds.
+        """Check target, grounds and rate limit.
 
         Raises:
-            MessageError: an address is invalid.
+            MessageError: an address is invalid, or a rate limit is missing or one too many.
         """
         self.target.check()
         for ground in self.grounds:
             ground.check()
+        if (self.limit is not None) != (self.action in ("meter", "unmeter")):
+            raise MessageError("fields", f"{self.action} of {self.target.address}: limit does not fit")
+        if self.limit is not None:
+            self.limit.check()
+            if self.target.kind != "ip" or self.target.port is not None:
+                raise MessageError("fields", "a rate limit's target is an IP address or prefix")
+
+    @property
+    def doing(self) -> str:
+        """The action in words, `would …` where it is a dry run."""
+        words = {"meter": "rate limit", "unmeter": "lift rate limit"}.get(self.action, self.action)
+        return f"would {words}" if self.dry_run else words
+
+    @property
+    def what(self) -> str:
+        """What it is about, in words: the target, its port, and the packets of a rate limit."""
+        port = "" if self.target.port is None else f" port {self.target.port}"
+        return f"{self.target.address}{port}" + (f" ({self.limit.words})" if self.limit is not None else "")
 
 
 class FalseAlarm(Message, frozen=True, kw_only=True):

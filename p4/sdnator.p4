@@ -1,9 +1,10 @@
 /* The switch program of SDNator, for the v1model architecture (BMv2 and the embedded target).
  *
  *   frame ─► parser ─► number ─► enforcement ─► SYN guard ─► forwarding ─► telemetry ─► egress ─► deparser
- *                      it        allow, blocks  challenges   port to       which        packet-in
- *                                (no copy of    unknown      port, or      queries      header on
- *                                a blocked one) sources      L2 per VLAN   want it?     copies
+ *                      it        allow, blocks, challenges   port to       which        packet-in
+ *                                rate limits    unknown      port, or      queries      header on
+ *                                (no copy of    sources      L2 per VLAN   want it?     copies
+ *                                what it drops)
  *
  * Tables are named ingress.<table> whatever control they stand in, so that a control plane need not
  * know how the program is cut into files.
@@ -13,6 +14,7 @@
 
 #include "include/headers.p4"
 #include "include/parser.p4"
+#include "include/rate_limits.p4"
 #include "include/enforcement.p4"
 #include "include/syn_guard.p4"
 #include "include/telemetry.p4"

@@ -43,7 +43,7 @@ class FramesToSend(msgspec.Struct, frozen=True):
 
 
 def decision_in(item: Item) -> Decision:
-    """`network.block.firewall.*`, `network.protect.firewall.*`."""
+    """`network.block.firewall.*`, `network.protect.firewall.*`, `network.meter.firewall.*`."""
     sender_of(item)
     return Decision.from_value(item.value)
 

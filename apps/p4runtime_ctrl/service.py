@@ -38,6 +38,7 @@ from due import Assignment, Capability, Engine, Interest, Item, RecordBatch
 INTERESTS = (
     Interest("network.block.firewall.*"),
     Interest("network.protect.firewall.*"),
+    Interest("network.meter.firewall.*"),
     Interest("network.p4_command.*.*"),
     Interest("network.telemetry.*.*"),
     Interest("network.cell_request.*.*"),

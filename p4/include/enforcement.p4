@@ -1,4 +1,5 @@
-// Who may send at all.  `allow` always wins; a blocked frame is neither forwarded nor copied.
+// Who may send at all, and how much.  `allow` always wins; a blocked frame is neither forwarded nor copied, and
+// neither is one that is over a rate limit.
 // Frames that the parser cannot take apart are counted by cause, and pass unless the cause has an entry.
 
 control Enforcement(inout headers_t hdr, inout metadata_t meta, in standard_metadata_t standard) {
@@ -8,6 +9,8 @@ control Enforcement(inout headers_t hdr, inout metadata_t meta, in standard_meta
     @name(".ingress.block_counter") direct_counter(CounterType.packets_and_bytes) block_counter;
     @name(".ingress.unparsed_counter") direct_counter(CounterType.packets_and_bytes) unparsed_counter;
     @name(".ingress.unparsed_frames") counter(8, CounterType.packets_and_bytes) unparsed_frames;
+
+    RateLimits() rate_limits;
 
     @name(".ingress.allow_frame") action allow_frame() { allow_counter.count(); }
     @name(".ingress.no_allow") action no_allow() { allow_counter.count(); }
@@ -116,6 +119,9 @@ control Enforcement(inout headers_t hdr, inout metadata_t meta, in standard_meta
                         }
                     }
                 }
+            }
+            if (meta.blocked == 0) {
+                rate_limits.apply(meta);
             }
         }
     }

@@ -42,6 +42,9 @@ const bit<8> PROTO_ICMPV6 = 58;
 const bit<8> PROTO_NO_NEXT = 59;
 const bit<8> PROTO_DESTINATION_OPTIONS = 60;
 
+const bit<2> METER_GREEN = 0;             // v1model's colours; 1 is yellow
+const bit<2> METER_RED = 2;
+
 typedef bit<48> mac_t;
 typedef bit<128> address_t;               // IPv6, or IPv4 in the low 32 bits
 typedef bit<256> query_map_t;             // one bit for each telemetry query

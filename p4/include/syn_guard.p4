@@ -23,9 +23,6 @@ const bit<32> SYN_SLOTS = 1048576;
 const bit<32> PROVEN_SLOTS = 65536;
 const bit<32> SERVICES = 256;
 
-const bit<2> METER_GREEN = 0;
-const bit<2> METER_RED = 2;               // 1 is yellow
-
 // index of guard_outcomes
 const bit<32> OUTCOME_KNOWN = 0;
 const bit<32> OUTCOME_UNCHALLENGED = 1;

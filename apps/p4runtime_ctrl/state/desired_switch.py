@@ -5,6 +5,7 @@ changes are written at once; after a lost connection `bring_up` reads the entrie
 difference.  It has no thread, clock or socket: the worker calls it from one thread.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -12,6 +13,7 @@ from typing import Any, Literal, Protocol
 from apps.messages import Confirmation, Decision, State, TableCommand
 from apps.p4runtime_ctrl.errors import EntryError, P4InfoError, SwitchError
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+from apps.p4runtime_ctrl.state import limits
 from apps.p4runtime_ctrl.state.blocks import BLOCK_TABLES
 from apps.p4runtime_ctrl.state.desired_state import (
     DELETE,
@@ -123,7 +125,8 @@ class DesiredSwitch:
         self._clock = clock
         self._classifier = Classifier(program)
         self._book = EntryUpdates(program, guard or GuardSettings(), self._classifier.table_ids)
-        self._blocks = {program.table(each).id: 0 for each in BLOCK_TABLES}
+        self._blocks = {program.table(each).id: 0 for each in (*BLOCK_TABLES, limits.OVER)}
+        self._over, self._limit = program.table(limits.OVER).id, program.table(limits.LIMIT).id
         self._forward = wires_of(program, forward or {})
         self._desired = EntrySet(self._forward)
         self.stations = MacLearning(program, learn) if learn is not None else None
@@ -270,25 +273,36 @@ class DesiredSwitch:
 
     @property
     def counted_tables(self) -> list[int]:
-        """Tables with entries that drop traffic."""
-        return sorted(table for table, blocks in self._blocks.items() if blocks)
+        """Tables with entries that drop traffic; and rate limits, which say what they let pass."""
+        found = {table for table, blocks in self._blocks.items() if blocks}
+        return sorted(found | {self._limit} if self._over in found else found)
 
     def readings(self, entries: Iterable[Any]) -> list[dict[str, Any]]:
         """Results of `read_counters` for these tables, with the decisions that the entries come from.
 
+        `packets` are dropped ones; of a rate limit `seen` says how many it looked at.
+
         The only method that another thread may call: with many entries it takes long.
         """
         found = []
+        seen: Counter[str] = Counter()
+        """Packets that rate limits looked at, by decision."""
         for entry in entries:
             owner = self._owners.get(entry_key(entry))
-            found.append(
-                {
-                    "id": owner.id if owner else "",
-                    "handle": self.program.describe(entry),
-                    "packets": entry.counter_data.packet_count,
-                    "bytes": entry.counter_data.byte_count,
-                }
-            )
+            name = owner.id if owner else ""
+            if entry.table_id == self._limit:
+                seen[name] += entry.counter_data.packet_count
+                continue
+            reading = {
+                "id": name,
+                "handle": self.program.describe(entry),
+                "packets": entry.counter_data.packet_count,
+                "bytes": entry.counter_data.byte_count,
+            }
+            found.append(reading | {"seen": 0} if entry.table_id == self._over else reading)
+        for reading in found:
+            if "seen" in reading:  # the tables were read one after the other
+                reading["seen"] = max(seen[reading["id"]], reading["packets"])
         return found
 
     def withdraw(self, transport: Transport) -> None:

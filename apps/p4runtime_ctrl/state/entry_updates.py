@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-from apps.messages import Decision, TableCommand, TableUpdate, Target
+from apps.messages import Decision, RateLimit, TableCommand, TableUpdate, Target
 from apps.p4runtime_ctrl.errors import EntryError
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
-from apps.p4runtime_ctrl.state import guard
+from apps.p4runtime_ctrl.state import guard, limits
 from apps.p4runtime_ctrl.state.blocks import table_update
 from apps.p4runtime_ctrl.state.desired_state import DELETE, INSERT, MODIFY, Change, entry_key, table_id
 from apps.p4runtime_ctrl.state.guard import GuardSettings, Service
+from apps.p4runtime_ctrl.state.limits import LimitKey
 
 _KINDS: Final = {"insert": INSERT, "modify": MODIFY, "delete": DELETE}
 
@@ -38,6 +39,7 @@ class EntryUpdate:
     owner: Owner
     changes: tuple[Change, ...]
     service: Service | None = None
+    limit: LimitKey | None = None
 
     @property
     def main(self) -> Change:
@@ -50,7 +52,7 @@ class EntryUpdate:
 
 
 class EntryUpdates:
-    """Makes `EntryUpdate`s for one program, and assigns the slots of protected services.
+    """Makes `EntryUpdate`s for one program, and assigns the slots of protected services and of rate limits.
 
     `reserved` are tables that no command may touch.
     """
@@ -60,6 +62,8 @@ class EntryUpdates:
         self._settings = settings
         self._reserved = frozenset(reserved)
         self._slots: dict[Service, int] = {}
+        self._limits: dict[LimitKey, int] = {}
+        """Slots of rate limits."""
         self._metered = program.table(guard.KNOWN_SOURCES).id if guard.KNOWN_SOURCES in program.names else 0
 
     @property
@@ -72,6 +76,8 @@ class EntryUpdates:
         owner = owner_of(decision)
         if decision.action in ("block", "unblock"):
             return EntryUpdate(owner, (self._change(table_update(decision, self._program)),))
+        if decision.limit is not None:
+            return self._limit(owner, decision.target, decision.limit)
         service = guard.service_of(decision.target)
         if decision.action == "protect":
             changes = guard.protection(self._program, service, self._slot(service), self._settings)
@@ -97,6 +103,24 @@ class EntryUpdates:
         """The switch refused the update: free its slot."""
         if order.owner.action == "protect" and order.service is not None:
             self._slots.pop(order.service, None)
+        if order.owner.action == "meter" and order.limit is not None:
+            self._limits.pop(order.limit, None)
+
+    def _limit(self, owner: Owner, target: Target, limit: RateLimit) -> EntryUpdate:
+        key = limits.key_of(target, limit)
+        if owner.action == "meter":
+            if key not in self._limits:
+                taken = set(self._limits.values())
+                free = next((slot for slot in range(limits.SLOTS) if slot not in taken), None)
+                if free is None:
+                    raise EntryError(f"{limits.SLOTS} rate limits are in force already; lift one first")
+                self._limits[key] = free
+            changes = limits.limiting(self._program, target, limit, self._limits[key])
+        elif key in self._limits:
+            changes = limits.lifting(self._program, target, limit, self._limits.pop(key))
+        else:
+            raise EntryError(f"no rate limit of {limit.words} towards {target.address} is in force")
+        return EntryUpdate(owner, tuple(changes), limit=key)
 
     def _slot(self, service: Service) -> int:
         if service not in self._slots:

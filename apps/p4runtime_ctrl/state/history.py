@@ -7,7 +7,7 @@ from apps.messages import Decision, Intake, TableCommand
 from apps.p4runtime_ctrl.arrivals import command_in, decision_in
 from due import Item
 
-DECISIONS: Final = ("network.block.firewall.*", "network.protect.firewall.*")
+DECISIONS: Final = ("network.block.firewall.*", "network.protect.firewall.*", "network.meter.firewall.*")
 
 LONGEST_S: Final = 31 * 86_400
 """Older decisions are no longer in force: the firewall's blocks are shorter, or were decided again since."""

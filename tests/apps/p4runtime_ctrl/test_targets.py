@@ -3,8 +3,9 @@
 import threading
 
 import pytest
+from msgspec import structs
 
-from apps.messages import Decision, TableCommand, TableUpdate
+from apps.messages import Decision, RateLimit, TableCommand, TableUpdate
 from apps.messages import Target as Sender
 from apps.p4runtime_ctrl.southbound.connection import Connection
 from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram
@@ -87,10 +88,11 @@ def make(**options):
     return DesiredSwitch("s1", program(), lambda: (0, 0), **options)
 
 
-def decision(number, action, sender):
+def decision(number, action, sender, limit=None):
     return Decision(
-        id=f"d{number}", action=action, switch="s1", target=sender, reason="", event_time=1, expires=0
-    )
+        id=f"d{number}", action=action, switch="s1", target=sender, reason="", event_time=1, expires=0,
+        limit=limit,
+    )  # fmt: skip
 
 
 SENDERS = (
@@ -185,3 +187,49 @@ def test_a_backup_takes_over(target, attach):
     assert not standby.reports
     active.connection.close()
     assert str(standby.until_up()) == "nothing to change"
+
+
+LIMIT = RateLimit(kind="udp_from", port=53, rate=40, spared=("192.0.2.53", "192.0.2.54"), spared_rate=60)
+LIMITED = Sender(kind="ip", address="10.0.0.80")
+
+
+def test_a_rate_limit_is_set_read_back_and_lifted(target, attach):
+    """Meters and their rates are in the switch: a controller that comes again finds nothing to change."""
+    switch = make()
+    attached = attach(switch)
+    attached.until_up()
+    (said,) = switch.decide([decision(1, "meter", LIMITED, LIMIT)], attached.session)
+    assert (said.state, said.id) == ("installed", "d1")
+    assert said.handle.startswith("ingress.limit[is_ipv4=1,dst=10.0.0.80,protocol=17,sport=53]"), said.handle
+    entries = [entry for table in switch.counted_tables for entry in attached.session.read_counters(table)]
+    (reading,) = switch.readings(entries)
+    assert (reading["id"], reading["packets"], reading["seen"]) == ("d1", 0, 0)
+    attached.connection.break_off()
+    assert str(attached.until_up(2)) == "nothing to change"
+    (other,) = switch.decide(
+        [decision(2, "meter", LIMITED, structs.replace(LIMIT, port=123))], attached.session
+    )
+    assert other.state == "installed"
+    lifted = switch.decide([decision(1, "unmeter", LIMITED, LIMIT)], attached.session)
+    assert [(each.id, each.state) for each in lifted] == [("d1", "removed")]
+    attached.connection.break_off()
+    assert str(attached.until_up(3)) == "nothing to change"
+    switch.decide([decision(2, "unmeter", LIMITED, structs.replace(LIMIT, port=123))], attached.session)
+    left = [entry for entry in attached.session.read_entries() if "limit" in program().describe(entry)]
+    assert not left
+    assert switch.blocks == 0
+
+
+def test_a_rate_limit_of_the_archive_is_written_by_a_controller_that_is_started_again(target, attach):
+    """What a controller before it had set and nobody wants any more goes; another rate is put right."""
+    switch = make()
+    attached = attach(switch)
+    attached.until_up()
+    switch.decide([decision(1, "meter", LIMITED, LIMIT)], attached.session)
+    attached.connection.close()
+    again = make()
+    faster = structs.replace(LIMIT, rate=400, spared=LIMIT.spared[:1])
+    assert not again.restore([decision(3, "meter", LIMITED, faster)], ())
+    report = attach(again, rank=2).until_up()
+    assert not report.failed
+    assert (report.modified, report.removed) == (2, 1)
