@@ -13,6 +13,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from apps.messages import (
+    MOST_SPARED,
     Message,
     MessageError,
     Name,
@@ -34,6 +35,7 @@ DRIFT: Final = "network.drift"
 """`<DRIFT>.<app>`"""
 MOST_VICTIMS: Final = 16
 MOST_NATS: Final = 1_000.0
+MOST_USUAL: Final = MOST_SPARED
 
 Kind = Literal["scan", "flood", "guessing", "spoofing", "unlike_training", "offence", "other"]
 """What the operator calls it."""
@@ -60,7 +62,8 @@ class Evidence(Message, frozen=True, kw_only=True):
     """Addresses of the first victims; `victim_count` says how many there are."""
     victim_count: Number = 0
     service: Annotated[str, Meta(max_length=32)] = ""
-    """`tcp/22`, `udp/53`, `arp`; empty if there is no single one."""
+    """`tcp/22`, `udp/53`, `icmp`, `arp`, `udp` for datagrams to many ports; of floods also `from-udp/53` for datagrams
+    from a port and `tcp-ack/80` for segments of no connection; empty if there is no single one."""
     nats: Annotated[float, Meta(ge=0, le=MOST_NATS)]
     """Log-likelihood ratio of what is new since the source's last evidence about the same sender."""
     since: Time
@@ -72,9 +75,13 @@ class Evidence(Message, frozen=True, kw_only=True):
     first_packet: Number = 0
     """Arrival number at the switch of the packet that made it due."""
     rate: Rate = 0.0
-    """Packets a second of the sender at that time."""
+    """Packets a second of the sender at that time; without a sender, of the `service` towards the victim."""
     training_rate: Rate = 0.0
-    """The highest rate of any second of training; 0 for a sender never seen in training."""
+    """The highest rate of any second of training; 0 where training has seen none."""
+    usual_sources: Annotated[tuple[Name, ...], Meta(max_length=MOST_USUAL)] = ()
+    """Without a sender: who sent the victim such packets in training, the busiest first."""
+    usual_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    """Part of training's packets of that kind that these sources sent."""
     mac_addresses: Number = 0
     """How many IP addresses were seen behind the sender's MAC."""
     role: Role = "host"
@@ -93,8 +100,8 @@ class Evidence(Message, frozen=True, kw_only=True):
             address_in(self.address, "evidence")
         if self.sender is not None and self.address:
             raise MessageError("fields", "evidence: it names both a sender and a plain address")
-        for victim in self.victims:
-            address_in(victim, "evidence")
+        for address in (*self.victims, *self.usual_sources):
+            address_in(address, "evidence")
         if self.sender is None and not self.address and not self.victims:
             raise MessageError("fields", "evidence: it names neither a sender nor a victim")
         if self.since > self.event_time:

@@ -25,6 +25,7 @@ from apps.kitsune.reasons import Explanation, reason
 from apps.kitsune.senders import AnomalousSecond, Senders
 from apps.kitsune.threshold import Benign, Calibration
 from apps.kitsune.training_check import TrainingCheck
+from apps.kitsune.victims import UsualTraffic, VictimRates
 from apps.messages import Alert, Sender
 
 TRAIN: Final = 0
@@ -131,6 +132,7 @@ class Detector:
         self._trained_at_us = 0
         self.senders = Senders()
         self.behaviour = Behaviour(settings.fm_grace + settings.ad_grace + 1)
+        self.victims = VictimRates()
         self._evidence: list[Evidence] = []
         self._tail: deque[npt.NDArray[np.float64]] = deque()
         """Features of the last packets of training."""
@@ -183,6 +185,7 @@ class Detector:
             return Explanation(features[row].copy(), errors[row - trained].copy())
 
         hot = self.senders.add(batch, switch, scores=scores, trained=trained, line=line, evidence=explain)
+        self.victims.add(batch, trained)
         findings = self.behaviour.add(
             batch,
             switch,
@@ -245,9 +248,13 @@ class Detector:
         self.drift_changed |= self.drift.add(scores[trained:][chosen], times[chosen])
 
     def _as_evidence(self, finding: Finding) -> Evidence:
-        rate = training_rate = 0
+        rate = training_rate = 0.0
         proven = forged = False
-        if finding.sender is not None:
+        usual: UsualTraffic | None = None
+        if finding.sender is None:
+            usual = self.victims.usual(finding.victim, finding.service)
+            rate, training_rate = usual.rate, usual.training_rate
+        else:
             switch, port, mac, address = finding.sender
             rate, training_rate = self.senders.rates((switch, port, mac, parts_of(address)))
             proven = self.behaviour.contacts.proven(address)
@@ -259,6 +266,7 @@ class Detector:
             forged=forged,
             rate=float(rate),
             training_rate=float(training_rate),
+            usual=usual,
         )
 
     def _to_blocked(self, row: PacketRow) -> bool:
@@ -272,6 +280,7 @@ class Detector:
         return {
             "senders": self.senders.to_state(),
             "behaviour": self.behaviour.to_state(),
+            "victims": self.victims.to_state(),
             "benign": None if benign is None else benign.to_state(),
             "trained_at_us": self._trained_at_us,
             "training_warnings": self.training_warnings,
@@ -296,6 +305,7 @@ class Detector:
             self.senders = Senders.from_state(notes.get("senders"))
             if notes.get("behaviour"):
                 self.behaviour = Behaviour.from_state(notes["behaviour"])
+            self.victims = VictimRates.from_state(notes.get("victims", ()))
             if notes.get("drift"):
                 self.drift = Drift.from_state(notes["drift"])
             self.trained_for = dict(notes.get("trained_for") or {})

@@ -9,6 +9,7 @@ from apps.kitsune.behaviour.contacts import service_text
 from apps.kitsune.behaviour.rows import SenderId, parts_of
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.roles import Roles
+from apps.kitsune.victims import UsualTraffic
 from apps.messages import Sender
 
 KINDS: Final[dict[Statistic, Kind]] = {
@@ -38,7 +39,14 @@ def sender_of(sender: SenderId) -> Sender:
 
 
 def evidence_of(
-    finding: Finding, roles: Roles, *, proven: bool, forged: bool, rate: float, training_rate: float
+    finding: Finding,
+    roles: Roles,
+    *,
+    proven: bool,
+    forged: bool,
+    rate: float,
+    training_rate: float,
+    usual: UsualTraffic | None = None,
 ) -> Evidence:
     """The message of a finding.
 
@@ -49,6 +57,7 @@ def evidence_of(
         forged: whether the address belonged to another in training.
         rate: packets a second of the sender now.
         training_rate: the highest of training.
+        usual: what came to the victim in training, where the finding has no sender.
     """
     sender = finding.sender
     at = round(finding.time * _SECOND)
@@ -73,6 +82,8 @@ def evidence_of(
         first_packet=finding.arrival,
         rate=rate,
         training_rate=training_rate,
+        usual_sources=tuple(map(address_text, usual.sources)) if usual is not None else (),
+        usual_share=min(1.0, usual.share) if usual is not None else 0.0,
         mac_addresses=roles.addresses(mac) if sender is not None else 0,
         role=roles.role(mac, parts) if sender is not None else "host",
         text=_words(finding, victim),

@@ -24,7 +24,9 @@ import numpy.typing as npt
 
 from apps.kitsune.behaviour.baseline import BLOCKS, LEAST_SCALE, WINDOWS_S, Baseline, SlidingSums
 from apps.kitsune.behaviour.contacts import (
+    ANY_UDP,
     ARP,
+    ECHO,
     FROM_UDP,
     STRAY_TCP,
     TCP,
@@ -340,6 +342,7 @@ class Behaviour:
             found += self._ended(ended, block)
         found += self._login(row, block)
         found += self._one_way(row, block)
+        found += self._ping(row, block)
         if row.service == ARP:
             found += self._theft(row, block)
             if row.answer:
@@ -391,17 +394,11 @@ class Behaviour:
 
     def _ended(self, ended: EndedContact, block: int) -> list[Finding]:
         """A contact that came about makes up for one that failed."""
-        sender, target = ended.sender, ended.target
         found: list[Finding] = []
         if not (ended.failed and ended.half_open) and not _is_reflected(ended):
             found = self._contact(ended, block)
-        if ended.failed and (block >= 0 or sender[3] not in self._addresses):
-            key = (target, _flooded(ended))
-            if self._fresh_stranger(sender[3], key):
-                seen = self._counters["strangers"].see(key, key, ended.time, block)
-                if seen is not None:
-                    at = (ended.time, ended.arrival)
-                    found.append(Finding("strangers", None, target, key[1], *seen, *at))
+        if ended.failed:
+            found += self._strange(ended, block)
         return found
 
     def _contact(self, ended: EndedContact, block: int) -> list[Finding]:
@@ -427,6 +424,39 @@ class Behaviour:
             return []
         added = self._failures.added(sender, best.total, time)
         return [replace(best, nats=added)] if added else []
+
+    def _strange(self, ended: EndedContact, block: int) -> list[Finding]:
+        """Unknown sources towards a victim: by what they send, and datagrams to a port each of all ports."""
+        source, target = ended.sender[3], ended.target
+        if block < 0 and source in self._addresses:
+            return []
+        key = (target, _flooded(ended))
+        if not self._fresh_stranger(source, key):
+            return []
+        found = self._stranger(key, ended, block)
+        everywhere = (target, ANY_UDP)
+        if (
+            key[1] & ~0xFFFF == UDP
+            and self._fresh_stranger(source, everywhere)
+            and self._fresh_stranger(-key[1], everywhere)
+        ):
+            found += self._stranger(everywhere, ended, block)
+        return found
+
+    def _stranger(self, key: tuple[int, int], ended: EndedContact, block: int) -> list[Finding]:
+        seen = self._counters["strangers"].see(key, key, ended.time, block)
+        if seen is None:
+            return []
+        return [Finding("strangers", None, key[0], key[1], *seen, ended.time, ended.arrival)]
+
+    def _ping(self, row: PacketRow, block: int) -> list[Finding]:
+        """An echo request: hosts answer those of everybody, so that it does not fail."""
+        if row.service != ECHO or row.answer or row.group or row.quoted or not row.source:
+            return []
+        asked = EndedContact(
+            True, row.time, row.sender, row.target, ECHO, ECHO, False, row.arrival, half_open=False
+        )
+        return self._strange(asked, block)
 
     def _fresh_stranger(self, source: int, victim: tuple[int, int]) -> bool:
         key = (source, hash(victim))

@@ -22,6 +22,8 @@ FROM_UDP: Final = 4 << 24
 """Datagrams from a well-known port, as reflectors send them."""
 STRAY_TCP: Final = 5 << 24
 """Segments of connections that were never opened."""
+ANY_UDP: Final = 6 << 24
+"""Datagrams to many ports."""
 TCP: Final = 6 << 16
 UDP: Final = 17 << 16
 _SYN, _RST, _ACK = 0x02, 0x04, 0x10
@@ -31,7 +33,9 @@ Contact = tuple[int, int, int]
 
 
 def service_text(service: int) -> str:
-    """`tcp/22`, `udp/53`, `icmp`, `arp`; `from-udp/53` and `tcp-ack/80` of floods."""
+    """`tcp/22`, `udp/53`, `icmp`, `arp`; `from-udp/53`, `tcp-ack/80` and `udp` of floods."""
+    if service >= ANY_UDP:
+        return "udp"
     if service >= STRAY_TCP:
         return f"tcp-ack/{service & 0xFFFF}"
     if service >= FROM_UDP:

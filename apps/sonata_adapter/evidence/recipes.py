@@ -44,7 +44,7 @@ _MEANT: Final[dict[str, tuple[AttackKind, str]]] = {
     "syn_flood": ("flood", ""),
     "incomplete_flows": ("flood", ""),
     "slowloris": ("flood", ""),
-    "dns_reflection": ("flood", "udp/53"),
+    "dns_reflection": ("flood", "from-udp/53"),
     "ssh_brute_force": ("guessing", "tcp/22"),
     "zorro": ("guessing", "tcp/23"),
     "dns_tunnel": ("other", "udp/53"),
