@@ -23,6 +23,8 @@ EFFECTIVE_S: Final = 5.0
 _SECOND: Final = 1_000_000_000
 
 Nats = Annotated[float, Meta(ge=0, le=1e12)]
+REMEDY_WORDS: Final = {"meter": "rate limit"}
+"""Remedies that people call by another name than messages do."""
 Change = Literal["opened", "more", "decided", "confirmed", "over"]
 Remedy = Literal["block", "guard", "meter", "alert"]
 ActionState = Literal["decided", "in_force", "over", "failed"]

@@ -16,6 +16,7 @@ from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider, Proposal
 from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.prefix_aggregation import gather_blocks
+from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.syn.syn_defence import UNKNOWN_HISTORY, SynDefence
 from apps.messages import Alert, Decision, Exhibit, FalseAlarm, Sender, Target
 from due import Item
@@ -31,6 +32,7 @@ class EvidenceHandler:
         decider: the rule.
         ledger: blocks in force.
         syn: guards.
+        limits: rate limits in force.
         archive: earlier offences.
         announcer: notices.
         incidents: what belongs together.
@@ -43,6 +45,7 @@ class EvidenceHandler:
         decider: Decider,
         ledger: BlockLifecycle,
         syn: SynDefence,
+        limits: RateLimits,
         archive: Archive,
         announcer: Announcer,
         incidents: IncidentReports,
@@ -52,6 +55,7 @@ class EvidenceHandler:
         self.decider = decider
         self._ledger = ledger
         self._syn = syn
+        self._limits = limits
         self._archive = archive
         self._announcer = announcer
         self._incidents = incidents
@@ -102,6 +106,12 @@ class EvidenceHandler:
             subject = (proposal.service.address, evidence.service)
             for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
                 grounds = self._lessons.book.take(subject, evidence.event_time)
+                self._publish(structs.replace(decision, grounds=grounds))
+            self.decider.settled(proposal)
+        elif proposal.limit is not None:
+            exhibits, victim = (evidence_of(item, evidence.text),), evidence.victims[0]
+            grounds = self._lessons.book.take((victim, evidence.service), evidence.event_time)
+            for decision in self._limits.open(victim, proposal.limit, proposal.reason, exhibits, evidence):
                 self._publish(structs.replace(decision, grounds=grounds))
             self.decider.settled(proposal)
         elif proposal.target is None or evidence.sender is None:

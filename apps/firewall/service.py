@@ -28,6 +28,7 @@ from apps.firewall.enforcement.storing import StoredAnswers
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
+from apps.firewall.evidence.history import FAMILIES
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
 from apps.firewall.evidence.past import ArchivedPast
 from apps.firewall.evidence.recent_rows import AGED_S
@@ -38,6 +39,7 @@ from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider
 from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.instructions import Desk, refused_as_foreign, refused_as_late
+from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
 from apps.firewall.syn.examinations import Examination, Examinations
@@ -83,7 +85,7 @@ ENFORCER_INTERESTS = (Interest(f"{CONFIRMED}.*.*"), Interest(f"{ENFORCED}.*.*"))
 CAPABILITIES = (
     *(
         Capability(f"network.{family}.firewall.{kind}", delivery="reliable", archive="always")
-        for family in ("block", "block_prefix", "protect")
+        for family in ("block", "block_prefix", "protect", "meter")
         for kind in ("ipv4", "ipv6", *(["mac"] if family == "block" else ()))
     ),
     Capability(f"{EVENTS}.*", delivery="reliable", archive="always"),
@@ -131,6 +133,7 @@ class FirewallService:
         self._answers = Answers(settings.syn.sample, AGED_S + after_s)
         allow_list = AllowList.parse(allowed)
         self._syn = SynDefence(settings.syn, services, self._ledger, allow_list, self._known, self._is_silent)
+        self._limits = RateLimits(settings.rules)
         self._allow_entries = AllowEntries()
         self._leftovers: dict[str, list[TableUpdate]] = {}
         self._switches: dict[str, str] = {}
@@ -149,13 +152,14 @@ class FirewallService:
         self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
         self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
         self._lessons = FalseAlarms(settings.rules.false_alarm_days)
-        self._desk = Desk(self._ledger, self._syn, allowed, self._lessons, self._past.decision)
+        self._desk = Desk(self._ledger, self._syn, self._limits, allowed, self._lessons, self._past.decision)
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
             Decider(settings.rules, self._ledger, self._bindings, self._known, lambda: self._desk.allow),
             self._ledger,
             self._syn,
+            self._limits,
             self._archive,
             self._announcer,
             self._incidents,
@@ -230,6 +234,7 @@ class FirewallService:
         standing = self._past.standing()
         self._ledger.restore(standing)
         self._syn.restore(standing)
+        self._limits.restore(standing)
         self._incidents.restore(self._past.incidents())
         self._lessons.restore(self._past.false_alarms())
         self._handler.decider.trained(self._past.training())
@@ -272,6 +277,8 @@ class FirewallService:
             "would_block": sum(each.decision.dry_run for each in self._ledger.blocks.values()),
             "guarded": [str(service) for service in self._syn.guarded],
             "guards": len(self._syn.guarded),
+            "rate_limits": len(self._limits.standing),
+            "rate_limits_refused": self._limits.refused,
             "known_sources": len(self._known),
             "allowed": len(self._desk.entries),
             "false_alarms": len(self._lessons),
@@ -536,6 +543,7 @@ class FirewallService:
         with self._lock:
             if self._enforcers.confirmed(item.app_id, confirmation):
                 self._ledger.confirm(confirmation)
+                self._limits.confirm(confirmation)
             self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
             self._resets.confirm(confirmation.id, confirmation.state, time.monotonic())
         if confirmation.state == "failed":
@@ -552,6 +560,7 @@ class FirewallService:
     def _count(self, enforcer: str, place: str, decision: str, packets: int, now: int) -> None:
         total = self._enforcers.count(decision, enforcer, place, packets)
         self._ledger.count_drops(decision, total, now)
+        self._limits.count_drops(decision, total, now)
         self._incidents.count(decision, total, now)
 
     def _on_switch(self, item: Item, state: SwitchReport) -> None:
@@ -567,7 +576,7 @@ class FirewallService:
                 self._lapse(state.event_time)
 
     def _lapse(self, now: int) -> None:
-        for decision in [*self._ledger.due(now), *self._syn.due(now)]:
+        for decision in [*self._ledger.due(now), *self._syn.due(now), *self._limits.due(now)]:
             self._publish(decision)
         self._incidents.lapse(now)
 
@@ -578,13 +587,15 @@ class FirewallService:
         decision = self._mirrors.marked(decision, self._switches)
         if decision.id in self._ledger.blocks:
             self._ledger.blocks[decision.id].decision = decision
+        if decision.id in self._limits.standing:
+            self._limits.standing[decision.id].decision = decision
         target = decision.target
         kind = ("ipv6" if ":" in target.address else "ipv4") if target.kind == "ip" else "mac"
-        log.warning("%s %s: %s", decision.action, target.address, one_line(decision.reason))
+        log.warning("%s %s: %s", decision.action, decision.what, one_line(decision.reason))
         self._incidents.decided(decision)
         self._lessons.decided(decision)
-        family = "protect" if decision.action in ("protect", "unprotect") else "block"
-        if is_prefix(target):
+        family = FAMILIES[decision.action]
+        if is_prefix(target) and family == "block":
             family = "block_prefix"
             self._carry_out_prefix(decision, self._switches)
         elif resets and decision.action == "block" and target.kind == "ip" and not decision.dry_run:
@@ -615,8 +626,9 @@ class FirewallService:
                     " then no source becomes known, and half-open connections end by the server's own time-out"
                 )
                 self._announcer.say(OperatorNotice("one_direction", text, self._now))
-        while self._ledger.notices:
-            self._announcer.say(self._ledger.notices.popleft(), logging.ERROR)
+        for notices in (self._ledger.notices, self._limits.notices):
+            while notices:
+                self._announcer.say(notices.popleft(), logging.ERROR)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Blocks and guards in Data Archives, read and written without a running pipeline."""
+"""Blocks, guards and rate limits in Data Archives, read and written without a running pipeline."""
 
 import os
 import time
@@ -8,7 +8,7 @@ from urllib.parse import unquote, urlsplit
 from uuid import uuid4
 
 from apps.firewall.enforcement.switch_entries import KEPT, is_prefix, prefix_update
-from apps.firewall.evidence.history import DECISIONS, decisions_in, in_force
+from apps.firewall.evidence.history import DECISIONS, FAMILIES, decisions_in, in_force
 from apps.messages import Decision, Instruction, TableCommand
 from due import DueError, Item
 from due.backends import open_archive
@@ -16,7 +16,7 @@ from sdnator.errors import BadInput
 from sdnator.up import running
 
 INSTRUCTION: Final = "network.instruction.operator.firewall"
-_LIFTS: Final = {"block": "unblock", "protect": "unprotect"}
+_LIFTS: Final = {"block": "unblock", "protect": "unprotect", "meter": "unmeter"}
 
 
 def archive_url(given: str) -> str:
@@ -67,8 +67,8 @@ def all_decisions(archive: str) -> list[Decision]:
 
 def key_of(decision: Decision) -> str:
     """The key that a decision is written under."""
-    family = "protect" if decision.action in ("protect", "unprotect") else "block"
-    if is_prefix(decision.target):
+    family = FAMILIES[decision.action]
+    if is_prefix(decision.target) and family == "block":
         family = "block_prefix"
     kind = "ipv6" if ":" in decision.target.address else "ipv4"
     return f"network.{family}.firewall.{'mac' if decision.target.kind == 'mac' else kind}"

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 
 BLOCK_TABLES: Final = ("ingress.block_src", "ingress.block_mac", "ingress.block")
+LIMIT_TABLES: Final = ("ingress.limit", "ingress.limit_spared", "ingress.limit_over")
 _PROTECT: Final = "ingress.protect"
 _SECONDS: Final = 10.0
 _BATCH: Final = 500
@@ -147,7 +148,9 @@ def _entries(stub: Any, device_id: int, program: "ProgramInfo", guards: Sequence
     from apps.p4runtime_ctrl.state.guard import release
     from p4rt import p4runtime
 
-    for name in BLOCK_TABLES:
+    for name in (*BLOCK_TABLES, *LIMIT_TABLES):
+        if name not in program.names:  # a program of an earlier version
+            continue
         request = p4runtime.ReadRequest(device_id=device_id)
         request.entities.add().table_entry.table_id = program.table(name).id
         for reply in stub.Read(request, timeout=_SECONDS):

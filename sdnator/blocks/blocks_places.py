@@ -4,6 +4,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from msgspec import structs
+
 from apps.enforcement import CONFIRMED, SWITCHES
 from apps.messages import Confirmation, Decision, MessageError, one_line, sender_of
 from due import Item
@@ -67,7 +69,9 @@ def action_word(decision: Decision, answers: Collection[PlaceAnswer]) -> str:
     """The action; `would …` for a dry run, and where no enforcer has it in force."""
     stands = any(answer.stands for answer in answers)
     lifts = decision.action.startswith("un")
-    return decision.action if lifts or (stands and not decision.dry_run) else f"would {decision.action}"
+    if lifts or stands:
+        return decision.doing
+    return structs.replace(decision, dry_run=True).doing
 
 
 def places_words(decision: Decision, answers: Collection[PlaceAnswer]) -> str:

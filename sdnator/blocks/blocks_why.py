@@ -98,7 +98,7 @@ def _stopped(decision_id: str, archive: str) -> dict[str, dict[str, int]]:
 def _readings(item: Item, decision_id: str) -> Iterator[dict[str, int]]:
     for reading in item.value.get("blocks", ()):
         if reading["id"] == decision_id:
-            yield {"packets": int(reading["packets"]), "bytes": int(reading["bytes"])}
+            yield {name: int(reading[name]) for name in ("packets", "bytes", "seen") if name in reading}
 
 
 def as_text(life: dict[str, Any]) -> Iterator[str]:
@@ -126,7 +126,8 @@ def as_text(life: dict[str, Any]) -> Iterator[str]:
         kept = "" if each["archived"] else " (not kept in the archive)"
         yield f"  {time_text(each['timestamp'])} {each['key']}: {each['summary'][:_SHOWN]}{kept}"
     for switch, reading in life["stopped"].items():
-        yield f"stopped by {switch}: {counted(reading['packets'], 'packet')}, {counted(reading['bytes'], 'byte')}"
+        passed = f"; {reading['seen'] - reading['packets']:,} passed" if "seen" in reading else ""
+        yield f"stopped by {switch}: {counted(reading['packets'], 'packet')}, {counted(reading['bytes'], 'byte')}{passed}"
 
 
 def decision_line(decision: Decision, answers: Collection[PlaceAnswer] | None = None) -> str:
@@ -137,13 +138,14 @@ def decision_line(decision: Decision, answers: Collection[PlaceAnswer] | None = 
         answers: what enforcers said of it last; None: that is told elsewhere.
     """
     until = f"until {time_text(decision.expires)}" if decision.expires else "without end"
-    target = decision.target
-    where = f"{target.address} port {target.port}" if target.port is not None else target.address
-    action = f"would {decision.action}" if decision.dry_run else decision.action
     if answers is None:
-        return f"{decision.id} {action} {where} on {decision.switch} {until}: {decision.reason}"
+        return (
+            f"{decision.id} {decision.doing} {decision.what} on {decision.switch} {until}: {decision.reason}"
+        )
     action, places = action_word(decision, answers), places_words(decision, answers)
-    return f"{decision.id} {action} {where} on {decision.switch} {until} ({places}): {decision.reason}"
+    return (
+        f"{decision.id} {action} {decision.what} on {decision.switch} {until} ({places}): {decision.reason}"
+    )
 
 
 def time_text(time_ns: int) -> str:

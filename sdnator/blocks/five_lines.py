@@ -54,16 +54,10 @@ def _contributions(decision: Decision, action: IncidentAction | None) -> str:
 
 
 def _remedy(first: Decision, last: Decision, action: IncidentAction | None) -> str:
-    target = first.target
-    where = f"{target.address} port {target.port}" if target.port is not None else target.address
     switch = "all switches" if first.switch in ("", "*") else first.switch
-    if action is not None:
-        done = action_words(action)
-    else:
-        verb = {"block": "block", "protect": "guard"}.get(first.action, first.action)
-        done = f"would {verb}" if first.dry_run else verb
+    done = action_words(action) if action is not None else first.doing.replace("protect", "guard")
     lifted = f", lifted: {one_line(last.reason)}" if _is_lifted(last) else ""
-    return f"{done} {where} on {switch}{lifted}"
+    return f"{done} {first.what} on {switch}{lifted}"
 
 
 def _until(last: Decision) -> str:

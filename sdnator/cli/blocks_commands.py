@@ -36,7 +36,8 @@ from sdnator.errors import BadInput, PipelineError
 from sdnator.up import running
 
 blocks = typer.Typer(
-    help="Blocks and guards: list, add, remove, explain, false alarms, lift all.", no_args_is_help=True
+    help="Blocks, guards, rate limits: list, add, remove, explain, false alarms, lift all.",
+    no_args_is_help=True,
 )
 allow = typer.Typer(help="Addresses, prefixes and MACs that are never blocked.", no_args_is_help=True)
 
@@ -72,7 +73,7 @@ def list_blocks(
     elif as_json:
         typer.echo(json.dumps([_as_value(decision, answers.get(decision.id, ())) for decision in shown]))
     elif not shown:
-        typer.echo("nothing is blocked or guarded")
+        typer.echo("nothing is blocked, guarded or limited")
     else:
         for decision in shown:
             typer.echo(decision_line(decision, answers.get(decision.id, ())))
@@ -121,7 +122,7 @@ def remove_block(
     updates: UpdatesOption = "",
     archive: ArchiveOption = "",
 ) -> None:
-    """Lift blocks, or guards set because of a flood, by decision id or address.
+    """Lift blocks, or guards and rate limits set because of a flood, by decision id or address.
 
     Example: sdnator blocks remove 192.0.2.66
     """

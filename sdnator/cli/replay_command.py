@@ -224,6 +224,14 @@ def show(found: dict[str, Any]) -> None:
             f"[bold yellow]would guard[/] {guard['address']}:{guard['port']} from packet {guard['packet']:,} on"
         )
         out.print(f"        {escape(guard['reason'])}")
+    for limit in found["limits"]:
+        words = "would limit" if limit["effect"] == "would limit" else "limited"
+        dropped = limit["packets_dropped"] or limit["packets_would_be_dropped"]
+        out.print(
+            f"[bold yellow]{words}[/] {escape(limit['packets'])} towards {limit['address']} to {limit['rate']:,}/s "
+            f"from packet {limit['packet']:,} on: {dropped:,} over it"
+        )
+        out.print(f"        {escape(limit['reason'])}")
     if "report" in found:
         out.print(f"report: {found['report']}")
 
@@ -236,6 +244,10 @@ def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "scored", f"{found['packets_scored']:,}, {found['training_packets']:,} of them for training"
     yield "dropped", f"{found['packets_dropped']:,}"
     yield "not copied", f"{found['packets_not_copied']:,}"
+    if found["packets_limited"]:
+        yield "of these over limits", f"{found['packets_limited']:,}"
+    if found["packets_would_be_limited"]:
+        yield "would limit", f"{found['packets_would_be_limited']:,} packets, which passed"
     if found["guards"]:
         yield "would challenge", f"{found['packets_would_be_challenged']:,} SYNs, which passed"
     yield "lost", f"{found['packets_lost']:,}"
@@ -247,11 +259,14 @@ def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
             f"{found['time_to_block_s']['capture']:.1f} s of capture time after the first attack packet",
         )
     if "attack_dropped" in found:
-        yield (
-            "attack stopped",
-            f"{found['attack_dropped']:,} of {found['attack_after_first_block']:,} attack packets after the first block",
-        )
+        if found["blocks"]:
+            after = f"{found['attack_after_first_block']:,} attack packets after the first block"
+        else:
+            after = f"{found['attack_packets']:,} attack packets"
+        yield "attack stopped", f"{found['attack_dropped']:,} of {after}"
         yield "benign dropped", f"{found['benign_dropped']:,}"
+        if found["benign_limited"]:
+            yield "benign over limits", f"{found['benign_limited']:,}"
         yield "collateral", f"{found['collateral_dropped']:,} benign packets of attacking devices"
     if found["auc"] is not None:
         yield "ROC AUC", f"{found['auc']:.4f} (Kitsune alone)"

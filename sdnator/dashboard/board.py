@@ -21,7 +21,7 @@ NAMES_KEPT: Final = 64
 BINS: Final = 240
 PARTS: Final = ("coordinator", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "dashboard")
 """Apps whose absence is news; others come and go."""
-STANDING: Final = ("block", "protect")
+STANDING: Final = ("block", "protect", "meter")
 EVERY_SWITCH: Final = ("", "*")
 
 

@@ -28,7 +28,7 @@ from sdnator.errors import SdnatorError
 
 ANSWERS = "network.answer.firewall.dashboard"
 INSTRUCTION = "network.instruction.dashboard.firewall"
-DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*")
+DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*", "network.meter.firewall.*")
 CONFIRMATIONS = f"{CONFIRMED}.*.*"
 _STATE = "network.switch.p4runtime_ctrl"
 

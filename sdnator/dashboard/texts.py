@@ -3,8 +3,10 @@
 from datetime import UTC, datetime
 from typing import Any
 
+from msgspec import structs
+
 from apps.incidents import Incident
-from apps.messages import Alert, Decision, Target
+from apps.messages import Alert, Decision
 from sdnator.incidents.incident_rows import row
 
 _STANDING = ("installed", "exists")
@@ -25,11 +27,6 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if value >= 10 or value == int(value) else f"{value:.1f}"
 
 
-def target(one: Target) -> str:
-    """What a decision is about."""
-    return f"{one.address} port {one.port}" if one.port is not None else one.address
-
-
 def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     """A decision for the list."""
     until = f"until {clock(one.expires)}" if one.expires else "without end"
@@ -39,8 +36,8 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     nowhere = bool(answers) and not any(text.startswith(_STANDING) for text in answers.values())
     return {
         "id": one.id,
-        "action": f"would {one.action}" if one.dry_run or nowhere else one.action,
-        "target": target(one.target),
+        "action": structs.replace(one, dry_run=one.dry_run or nowhere).doing,
+        "target": one.what,
         "address": one.target.address,
         "where": f"{where} · {until}",
         "reason": one.reason,

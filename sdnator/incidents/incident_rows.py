@@ -8,7 +8,7 @@ from typing import Any, Final
 from msgspec import structs
 
 from apps.evidence import Kind
-from apps.incidents import Incident, IncidentAction, IncidentCost
+from apps.incidents import REMEDY_WORDS, Incident, IncidentAction, IncidentCost
 from sdnator.counted import counted
 
 KINDS: Final[dict[Kind, str]] = {
@@ -20,7 +20,7 @@ KINDS: Final[dict[Kind, str]] = {
     "offence": "earlier offence",
     "other": "other",
 }
-_DONE: Final = {"block": "blocked", "guard": "guarded", "meter": "metered"}
+_DONE: Final = {"block": "blocked", "guard": "guarded", "meter": "rate limited"}
 _VICTIMS_NAMED: Final = 2
 
 
@@ -134,12 +134,13 @@ def action_words(action: IncidentAction) -> str:
     """An action in words: `blocked`, `blocked, over`, `would block`, `block, refused by the switch`."""
     if action.remedy == "alert":
         return f"alert only: {action.reason}" if action.reason else "alert only"
+    remedy = REMEDY_WORDS.get(action.remedy, action.remedy)
     if action.dry_run:
-        return f"would {action.remedy}"
+        return f"would {remedy}"
     if action.state == "failed":
-        return f"{action.remedy}, refused by the switch"
+        return f"{remedy}, refused by the switch"
     if not action.effective:
-        return f"{action.remedy}, {'not confirmed' if action.state == 'decided' else 'lifted'}"
+        return f"{remedy}, {'not confirmed' if action.state == 'decided' else 'lifted'}"
     return f"{_DONE[action.remedy]}{', over' if action.state == 'over' else ''}"
 
 
@@ -170,5 +171,5 @@ def as_text(incident: Incident) -> Iterator[str]:
         )
     cost = incident.cost
     yield (
-        f"packets stopped: {cost.dropped:,} dropped, {cost.challenged:,} challenged, {cost.metered:,} metered"
+        f"packets stopped: {cost.dropped:,} dropped, {cost.challenged:,} challenged, {cost.metered:,} over rate limits"
     )

@@ -1,4 +1,4 @@
-"""How many packets a switch's block entries have dropped, read through P4Runtime beside its controller.
+"""How many packets a switch's blocks and rate limits have dropped, read through P4Runtime beside its controller.
 
 A switch behind an interface gives no verdicts on frames, but its counters show drops; reading needs no arbitration.
 """
@@ -10,7 +10,7 @@ import grpc
 from p4rt import P4RuntimeStub, p4runtime
 from sdnator.errors import PipelineError
 
-BLOCK_TABLES = ("ingress.block", "ingress.block_src", "ingress.block_mac")
+BLOCK_TABLES = ("ingress.block", "ingress.block_src", "ingress.block_mac", "ingress.limit_over")
 _SECONDS = 10.0
 
 

@@ -100,7 +100,7 @@ def would_challenge(
         known[source] = min(at, known.get(source, at))
     masks = [np.zeros(packets, np.bool_) for _ in guards]
     with Capture(capture) as frames:
-        for first, syns in _syns(islice(iter(frames), packets)):
+        for first, syns in batches(islice(iter(frames), packets)):
             for guard, mask in zip(guards, masks, strict=True):
                 mask[first + _challenged(guard, syns, known)] = True
     for guard, mask in zip(guards, masks, strict=True):
@@ -109,7 +109,7 @@ def would_challenge(
     return found
 
 
-def _syns(frames: Iterator[CapturedFrame]) -> Iterator[tuple[int, RecordBatch]]:
+def batches(frames: Iterator[CapturedFrame]) -> Iterator[tuple[int, RecordBatch]]:
     """Batches of frames, each with the index of its first."""
     first = 0
     while chunk := list(islice(frames, _BATCH)):

@@ -52,7 +52,7 @@ DEATH_SECONDS = 5.0
 """Seconds from a part's closed sockets to the end of its process."""
 COORDINATED = "coordinated"
 """Phase of an engine whose declarations the Coordinator knows."""
-_DECIDED = ("block", "unblock", "protect", "unprotect")
+_DECIDED = ("block", "unblock", "protect", "unprotect", "meter", "unmeter")
 """Actions of confirmed decisions; prefixes are blocked by commands that carry the decision's id."""
 PACKETS = "packets"
 """The controller's name for the request of every packet."""
@@ -62,6 +62,7 @@ INTERESTS = (
     Interest("network.block.firewall.*"),
     Interest("network.block_prefix.firewall.*"),
     Interest("network.protect.firewall.*"),
+    Interest("network.meter.firewall.*"),
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
     Interest(INCIDENTS),
@@ -168,7 +169,7 @@ class _Observer:
     def subscribe(self, engine: Engine) -> None:
         engine.observe("network.anomaly.kitsune.score").subscribe(self._on_score)
         engine.observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
-        for kind in ("block", "block_prefix", "protect"):
+        for kind in ("block", "block_prefix", "protect", "meter"):
             engine.observe(f"network.{kind}.firewall.*").subscribe(self._on_decision)
         engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
         engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)

@@ -13,6 +13,7 @@ from sdnator.capture.labels import Labels, LabelsError, read_labels
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import as_json
 from sdnator.replay.guards import WouldChallenge, would_challenge
+from sdnator.replay.limits import LimitedPackets, limited_packets
 from sdnator.replay.loop import PassResult, Progress, ReplayOptions, ReplayPass, wall_seconds_to_block
 from sdnator.replay.packet_accounting import PacketState
 from sdnator.replay.summary import attack_figures, auc, block_rows
@@ -33,6 +34,8 @@ class ReplayOutcome:
     seconds: float
     challenged: WouldChallenge
     """What the guards of the reported pass would have done."""
+    limited: LimitedPackets
+    """What its rate limits did."""
 
     @property
     def reported(self) -> PassResult:
@@ -107,7 +110,10 @@ def run(
         notes.append(
             "the clients of a capture cannot answer a challenge: guards were decided, not set, and their SYNs passed"
         )
-    return ReplayOutcome(surveyed, labels, alone, blocking, notes, time.monotonic() - begun, challenged)
+    limited = limited_packets(surveyed.path, surveyed.packets, reported.decisions)
+    return ReplayOutcome(
+        surveyed, labels, alone, blocking, notes, time.monotonic() - begun, challenged, limited
+    )
 
 
 def figures(outcome: ReplayOutcome) -> dict[str, Any]:
@@ -117,11 +123,15 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
     trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
     blocks = block_rows(outcome.survey, result.decisions, result.confirmations, flight.first_arrival)
     incidents = result.last_incidents()
-    challenged = outcome.challenged.packets & (flight.state != PacketState.DROPPED)
+    dropped = flight.state == PacketState.DROPPED
+    challenged = outcome.challenged.packets & ~dropped
+    limited = outcome.limited.seen & dropped
     first_attack = None
     attack: dict[str, Any] = {}
     if outcome.labels is not None:
-        attack = attack_figures(outcome.survey, outcome.labels, flight, blocks[0] if blocks else None)
+        attack = attack_figures(
+            outcome.survey, outcome.labels, flight, blocks[0] if blocks else None, limited
+        )
         first_attack = attack["first_attack_packet"]
         attack["attack_would_be_challenged"] = int((challenged & outcome.labels.attack).sum())
     capture_seconds = attack.pop("time_to_block_capture_s", None)
@@ -136,6 +146,8 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "packets_in": flight.sent,
         "packets_scored": trained + scored,
         "packets_dropped": flight.count(PacketState.DROPPED) - result.uncounted_drops,
+        "packets_limited": int(limited.sum()),
+        "packets_would_be_limited": int(outcome.limited.would.sum()),
         "packets_not_copied": flight.count(PacketState.NOT_COPIED),
         "packets_would_be_challenged": int(challenged.sum()),
         "packets_lost": max(flight.in_flight + result.uncounted_drops, result.lost_on_the_way),
@@ -145,6 +157,7 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "incidents": [as_json(each) for each in incidents],
         "incidents_mitigated": sum(each.mitigated for each in incidents),
         "guards": outcome.challenged.rows(outcome.survey.time_ns),
+        "limits": outcome.limited.rows(outcome.survey.time_ns, dropped),
         "first_alert_packet": min((alert.first_packet for alert in result.alerts), default=None),
         "first_block_packet": blocks[0]["packet"] if blocks else None,
         "time_to_block_s": time_to_block,

@@ -77,11 +77,20 @@ def block_rows(
 
 
 def attack_figures(
-    survey: Survey, labels: Labels, flight: PacketAccounting, first_block: dict[str, Any] | None
+    survey: Survey,
+    labels: Labels,
+    flight: PacketAccounting,
+    first_block: dict[str, Any] | None,
+    limited: NDArray[np.bool_] | None = None,
 ) -> dict[str, Any]:
-    """Figures from labels: how much of the attack was stopped, and which benign packets were dropped."""
+    """Figures from labels: how much of the attack was stopped, and which benign packets were dropped.
+
+    Packets that a rate limit dropped (`limited`) are a part of `attack_dropped`; benign ones are counted apart.
+    """
     sent = np.arange(survey.packets) < flight.sent
     dropped = (flight.state == PacketState.DROPPED) & sent
+    over = np.zeros(survey.packets, np.bool_) if limited is None else limited & dropped
+    blocked = dropped & ~over
     attackers = from_attackers(survey, labels)
     first_attack = int(np.argmax(labels.attack)) if bool(labels.attack.any()) else None
     capture_seconds = None
@@ -96,6 +105,8 @@ def attack_figures(
         "attack_packets": int(np.count_nonzero(labels.attack)),
         "attack_dropped": int(np.count_nonzero(dropped & labels.attack)),
         "attack_after_first_block": after,
-        "benign_dropped": int(np.count_nonzero(dropped & ~labels.attack & ~attackers)),
-        "collateral_dropped": int(np.count_nonzero(dropped & ~labels.attack & attackers)),
+        "benign_dropped": int(np.count_nonzero(blocked & ~labels.attack & ~attackers)),
+        "collateral_dropped": int(np.count_nonzero(blocked & ~labels.attack & attackers)),
+        "attack_limited": int(np.count_nonzero(over & labels.attack)),
+        "benign_limited": int(np.count_nonzero(over & ~labels.attack)),
     }

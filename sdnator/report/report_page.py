@@ -58,6 +58,7 @@ def render(
         _incidents(incidents),
         _blocks(summary),
         _guards(summary),
+        _limits(summary),
         _decisions(decisions),
         _figures(summary, extra, passes),
         "<p>Beside this page: <code>scores.csv</code>, <code>decisions.csv</code>, <code>eve.json</code>, ",
@@ -73,6 +74,8 @@ def verdict(summary: Mapping[str, Any]) -> str:
     if blocks:
         senders = len({block["address"] for block in blocks})
         return f"{_count(senders, 'sender')} blocked{_delay(summary)}{_stopped(summary)}"
+    if limits := summary.get("limits"):
+        return _limited(limits)
     if guards := summary.get("guards"):
         syns = _count(int(summary.get("packets_would_be_challenged") or 0), "SYN")
         return f"{_count(len(guards), 'service')} under a SYN flood: a guard would have challenged {syns}"
@@ -83,6 +86,15 @@ def verdict(summary: Mapping[str, Any]) -> str:
             f"The attack was not blocked: {_count(int(attack), 'attack packet')}, {_count(alerts, 'alert')}"
         )
     return f"Nothing to block: {_count(alerts, 'alert')}"
+
+
+def _limited(limits: Sequence[Mapping[str, Any]]) -> str:
+    victims = _count(len({limit["address"] for limit in limits}), "victim")
+    dropped = sum(int(limit["packets_dropped"]) for limit in limits)
+    would = sum(int(limit["packets_would_be_dropped"]) for limit in limits)
+    if would and not dropped:
+        return f"{victims} of a flood: a rate limit would have dropped {_count(would, 'packet')}"
+    return f"{victims} of a flood: {_count(dropped, 'packet')} over the rate limit dropped"
 
 
 def _delay(summary: Mapping[str, Any]) -> str:
@@ -195,6 +207,25 @@ def _guards(summary: Mapping[str, Any]) -> str:
     )
     why = "<p>Clients in a capture cannot answer a challenge, so guards are decided but not set, and SYNs pass.</p>"
     return f"<h2>Guards</h2>{why}<div class='wide'><table>{head}{rows}</table></div>"
+
+
+def _limits(summary: Mapping[str, Any]) -> str:
+    limits = summary.get("limits") or []
+    if not limits:
+        return ""
+    rows = "".join(
+        f"<tr><td><b>{escape(str(limit['address']))}</b> {escape(str(limit['packets']))}</td>"
+        f"<td class='n'>{limit['rate']:,}/s</td><td class='n'>{escape(str(limit['decided']))}</td>"
+        f"<td class='n'>{escape(_number(limit['packet']))}</td><td>{escape(str(limit['reason']))}</td>"
+        f"<td class='n'>{limit['packets_dropped'] or limit['packets_would_be_dropped']:,}"
+        f"{' (would be)' if limit['effect'] == 'would limit' else ''}</td></tr>"
+        for limit in limits
+    )
+    head = (
+        "<tr><th>Limited towards</th><th>Rate</th><th>Capture time</th><th>From packet</th><th>Why</th>"
+        "<th>Packets dropped</th></tr>"
+    )
+    return f"<h2>Rate limits</h2><div class='wide'><table>{head}{rows}</table></div>"
 
 
 def _decisions(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -22,8 +22,8 @@ from typing import Any, Final, Literal
 from apps.evidence import Kind
 from apps.firewall.enforcement.ecs import as_ecs
 from apps.firewall.policy.block_lifecycle import OperatorNotice
-from apps.incidents import Incident, IncidentAction
-from apps.messages import Decision, Sender
+from apps.incidents import REMEDY_WORDS, Incident, IncidentAction
+from apps.messages import Decision, RateLimit, Sender
 
 EveFormat = Literal["eve", "ecs"]
 Event = dict[str, Any]
@@ -47,15 +47,15 @@ SIGNATURES: Final[dict[Kind, tuple[int, str, str, int]]] = {
 DECISION_SIGNATURES: Final = {
     "block": (9_100_201, "SDNATOR block", 1),
     "protect": (9_100_202, "SDNATOR guard", 1),
-    "meter": (9_100_205, "SDNATOR meter", 1),
+    "meter": (9_100_205, "SDNATOR rate limit", 1),
     "unblock": (9_100_203, "SDNATOR block lifted", 3),
     "unprotect": (9_100_204, "SDNATOR guard lifted", 3),
-    "unmeter": (9_100_206, "SDNATOR meter lifted", 3),
+    "unmeter": (9_100_206, "SDNATOR rate limit lifted", 3),
 }
 _OTHER_DECISION: Final = (9_100_200, "SDNATOR decision", 2)
 NOTICE_SIGNATURE: Final = (9_100_301, "SDNATOR notice")
 _STOPPING: Final = ("block", "guard")
-"""Remedies that keep packets from their victims; a meter lets some of them pass."""
+"""Remedies that keep packets from their victims; a rate limit lets some of them pass."""
 
 
 def incident_event(incident: Incident) -> Event:
@@ -117,6 +117,8 @@ def decision_event(decision: Decision, places: Sequence[str] = ()) -> Event:
     event["flow_id"] = flow_id(decision.id)
     if decision.action in ("protect", "unprotect"):
         event |= {"dest_ip": target.address, "dest_port": target.port, "proto": "TCP"}
+    elif decision.limit is not None:
+        event |= {"dest_ip": target.address} | _limited(decision.limit)
     elif target.kind == "mac":
         event["ether"] = {"src_mac": target.address}
         if target.port is not None:
@@ -177,7 +179,8 @@ def line_of(event: Event, form: EveFormat = "eve") -> str:
 
 def remedy_words(action: IncidentAction) -> str:
     """What was done, in words: `block`, `would block`, `guard (failed)`."""
-    words = f"would {action.remedy}" if action.dry_run and action.remedy != "alert" else action.remedy
+    words = REMEDY_WORDS.get(action.remedy, action.remedy)
+    words = f"would {words}" if action.dry_run and action.remedy != "alert" else words
     return f"{words} (failed)" if action.state == "failed" else words
 
 
@@ -209,14 +212,23 @@ def _from(sender: Sender | None) -> Event:
 
 
 def _service(service: str) -> Event:
-    """`tcp/22` as Suricata's fields; a source port is none of an incident, which has many."""
-    proto, _, port = service.partition("/")
-    if not proto:
+    """`tcp/22` as Suricata's fields; the source port of reflectors is all that an incident has of one."""
+    name, _, port = service.partition("/")
+    if not name:
         return {}
+    # floods: datagrams from a port, segments of no connection to one
+    proto = {"from-udp": "udp", "tcp-ack": "tcp"}.get(name, name)
     found: Event = {"proto": proto.upper()}
     if port.isdecimal() and int(port) <= 65_535:
-        found["dest_port"] = int(port)
+        found["src_port" if name == "from-udp" else "dest_port"] = int(port)
     return found
+
+
+def _limited(limit: RateLimit) -> Event:
+    """The packets of a rate limit as Suricata's fields."""
+    proto = "UDP" if limit.kind.startswith("udp") else limit.kind.upper()
+    port = "src_port" if limit.kind == "udp_from" else "dest_port"
+    return {"proto": proto} | ({} if limit.port is None else {port: limit.port})
 
 
 def _alert(

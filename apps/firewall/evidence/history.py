@@ -3,7 +3,7 @@
 from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from apps.messages import Decision, FalseAlarm, Instruction, MessageError, Target
+from apps.messages import Action, Decision, FalseAlarm, FloodKind, Instruction, MessageError, Target
 from due import Item
 
 
@@ -38,7 +38,19 @@ DECISIONS: Final = (
     "network.block.firewall.*",
     "network.block_prefix.firewall.*",
     "network.protect.firewall.*",
+    "network.meter.firewall.*",
 )
+FAMILIES: Final[dict[Action, str]] = {
+    "block": "block",
+    "unblock": "block",
+    "protect": "protect",
+    "unprotect": "protect",
+    "meter": "meter",
+    "unmeter": "meter",
+}
+"""The segment of a decision's key by its action; prefixes are blocked under `block_prefix`."""
+STANDING: Final = ("block", "protect", "meter")
+"""Actions that put something in force; the others lift it."""
 ANSWERS: Final = "network.answer.firewall"
 """`<ANSWERS>.<who asked>`"""
 INSTRUCTIONS: Final = "network.instruction.*.firewall"
@@ -95,11 +107,13 @@ def in_force(decisions: Iterable[Decision]) -> list[Decision]:
 
     Expired ones are included: the firewall decides whether to extend or lift them.
     """
-    latest: dict[tuple[str, Target], Decision] = {}
+    latest: dict[tuple[str, Target, tuple[FloodKind, int | None] | None], Decision] = {}
     for decision in decisions:
-        key = (decision.switch, decision.target)
+        limit = decision.limit
+        packets = None if limit is None else (limit.kind, limit.port)
+        key = (decision.switch, decision.target, packets)
         latest.pop(key, None)
-        if decision.action in ("block", "protect"):
+        if decision.action in STANDING:
             latest[key] = decision
     return list(latest.values())
 

@@ -412,7 +412,6 @@ class IncidentBook:
         return strongest.total, strongest.bound
 
     def _action_of(self, decision: Decision, found: OpenIncident) -> IncidentAction:
-        target = decision.target
         before = found.actions.get(decision.id)
         if before is not None:
             return structs.replace(before, until=decision.expires, state=before.state)
@@ -422,7 +421,7 @@ class IncidentBook:
             decision=decision.id,
             remedy=_REMEDIES[decision.action],
             dry_run=decision.dry_run,
-            target=target.address if target.port is None else f"{target.address} port {target.port}",
+            target=decision.what,
             switch=decision.switch,
             since=decision.event_time,
             until=decision.expires,

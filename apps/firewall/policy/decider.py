@@ -14,10 +14,11 @@ from msgspec import structs
 from apps.evidence import Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
+from apps.firewall.policy.rate_limits import limit_of, limit_words
 from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
 from apps.firewall.policy.sequential_test import LEAST_BOUND, EvidenceSum, SequentialTest
 from apps.firewall.syn.services import TcpService
-from apps.messages import Alert, Sender, Target
+from apps.messages import Alert, RateLimit, Sender, Target
 
 OFFENCE_NATS: Final = 2.0
 """By so much each earlier block lowers the bound ..."""
@@ -35,7 +36,7 @@ Offences = Callable[[Target], int | None]
 
 @dataclass(frozen=True)
 class Proposal:
-    """What evidence calls for; one of `target`, `service` and `refusal` is set."""
+    """What evidence calls for; one of `target`, `service`, `limit` and `refusal` is set."""
 
     evidence: Evidence
     reason: str
@@ -43,6 +44,8 @@ class Proposal:
     """To be blocked."""
     service: TcpService | None = None
     """To be guarded."""
+    limit: RateLimit | None = None
+    """To be set towards the first victim of the evidence."""
     refusal: str = ""
     """Why nothing is done although the bound is crossed."""
     nats: float = 0.0
@@ -209,6 +212,11 @@ class Decider:
         if protocol == "tcp" and port.isdecimal():
             service = TcpService(evidence.victims[0], int(port))
             return Proposal(evidence, reason, service=service, nats=total, bound=bound, tally=tally)
+        limit = limit_of([each.latest for each in tally.contributions.values()])
+        if limit is not None:
+            seen = max(each.latest.training_rate for each in tally.contributions.values())
+            reason = f"{reason}; {limit_words(limit, seen)}"
+            return Proposal(evidence, reason, limit=limit, nats=total, bound=bound, tally=tally)
         refusal = f"there is no remedy for floods of {evidence.service or 'this kind'} from forged addresses"
         return self._refused(evidence, reason, refusal, tally, total, bound)
 

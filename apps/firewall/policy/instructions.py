@@ -7,6 +7,7 @@ from typing import Final
 from apps.firewall.evidence.history import allowed_by
 from apps.firewall.policy.block_lifecycle import BlockLifecycle
 from apps.firewall.policy.false_alarms import FalseAlarms
+from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.policy.rules import AllowList, is_mac
 from apps.firewall.syn.syn_defence import EVERY_SWITCH, SynDefence
 from apps.messages import Answer, Decision, Exhibit, Instruction, Target
@@ -20,11 +21,12 @@ Outcome = tuple[list[Decision], Answer]
 
 
 class Desk:
-    """Applies instructions to blocks, guards, the allow-list and lessons; time is capture time in ns.
+    """Applies instructions to blocks, guards, rate limits, the allow-list and lessons; time is capture time in ns.
 
     Args:
         ledger: blocks in force.
         syn: guards in force.
+        limits: rate limits in force.
         entries: the allow-list of the settings.
         lessons: what was called a false alarm.
         archived: looks a decision up that is not in force; None if there is none.
@@ -34,12 +36,14 @@ class Desk:
         self,
         ledger: BlockLifecycle,
         syn: SynDefence,
+        limits: RateLimits,
         entries: Iterable[str],
         lessons: FalseAlarms,
         archived: Callable[[str], Decision | None] = lambda _: None,
     ) -> None:
         self._ledger = ledger
         self._syn = syn
+        self._limits = limits
         self._lessons = lessons
         self._archived = archived
         self.entries = tuple(entries)
@@ -84,13 +88,14 @@ class Desk:
 
     def _unblock(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
         found = self._ledger.matching(instruction.subject)
-        guards = self._syn.release(instruction.subject, now, "by hand")
-        if not found and not guards:
+        others = self._syn.release(instruction.subject, now, "by hand")
+        others += self._limits.release(instruction.subject, now, "by hand")
+        if not found and not others:
             raise ValueError(
-                f"no block or guard has the id or address {instruction.subject}; see `sdnator blocks list`; "
-                "guards that the settings name stay"
+                f"no block, guard or rate limit has the id or address {instruction.subject}; "
+                "see `sdnator blocks list`; guards that the settings name stay"
             )
-        return self._lift(found, now, "by hand") + guards, f"{len(found) + len(guards)} lifted"
+        return self._lift(found, now, "by hand") + others, f"{len(found) + len(others)} lifted"
 
     def _false_alarm(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
         """Undo a decision, and learn that its evidence means less."""
@@ -99,14 +104,16 @@ class Desk:
         names = [each.id for each in found] or [name]
         if not found and (past := self._archived(name)) is not None:
             self._lessons.decided(past)
-        elif not found and not self._syn.holds(name):
+        elif not found and not self._syn.holds(name) and not self._limits.holds(name):
             raise ValueError(f"no decision has the id {name}; see `sdnator blocks list --all`")
         taught = [
             self._lessons.teach(each, grounds, now, instruction.reason)
             for each in names
             if (grounds := self._lessons.grounds_of(each))
         ]
-        decisions = self._lift(found, now, "a false alarm") + self._syn.release(name, now, "a false alarm")
+        reason = "a false alarm"
+        decisions = self._lift(found, now, reason) + self._syn.release(name, now, reason)
+        decisions += self._limits.release(name, now, reason)
         kinds = sorted({ground.source for lesson in taught for ground in lesson.grounds})
         learnt = (
             f"{', '.join(kinds)} of this sender counts a tenth from now on"
@@ -124,6 +131,7 @@ class Desk:
         blocks = [block.decision for block in self._ledger.blocks.values()]
         decisions = self._lift(blocks, now, "panic: everything is lifted")
         decisions += self._syn.release_all(now, "panic: everything is lifted")
+        decisions += self._limits.release_all(now, "panic: everything is lifted")
         return decisions, f"{len(decisions)} lifted; guards that the settings name stay"
 
     def _allow(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:

@@ -33,6 +33,8 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Addresses, prefixes and MAC addresses that are never blocked."""
     durations_s: tuple[int, ...] = (600, 3600, 86_400, 604_800)
     """Length of a block by offence: first, second, third, fourth and later."""
+    limit_s: int = 60
+    """Seconds for which a rate limit lasts; then it is lifted, unless it still drops a flood."""
     max_blocks: int = 4096
     """Most blocks in force at a time; beyond it the firewall stops blocking and reports that."""
     max_decisions_per_minute: int = 120
@@ -59,6 +61,8 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             )
         if not 1 <= self.false_alarm_days <= 3_650:
             raise ValueError(f"false_alarm_days={self.false_alarm_days}: 1 to 3,650")
+        if not self.limit_s > 0:
+            raise ValueError(f"limit_s={self.limit_s}: must be greater than 0, for instance 60")
 
 
 @dataclass(frozen=True)

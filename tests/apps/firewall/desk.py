@@ -114,7 +114,7 @@ class Desk:
 
     @property
     def decisions(self) -> list[Decision]:
-        families = ("network.block.", "network.block_prefix.", "network.protect.")
+        families = ("network.block.", "network.block_prefix.", "network.protect.", "network.meter.")
         return [Decision.from_value(value) for key, value in self.engine.written if key.startswith(families)]
 
     @property

@@ -1,12 +1,16 @@
 """Evidence leads to a block, a guard, or to a word why not."""
 
+import time
+
 import pytest
 from msgspec import structs
 
 from apps.evidence import TrainingState
 from apps.firewall.policy.rules import Rules
+from apps.messages import RateLimit
+from due import Item
 from tests.apps.firewall.alerts import CAMERA
-from tests.apps.firewall.desk import NOW, Desk
+from tests.apps.firewall.desk import NOW, Desk, FakeEngine
 from tests.apps.firewall.policy.test_sequential_test import evidence
 
 SECOND = 1_000_000_000
@@ -103,13 +107,72 @@ def test_a_flood_with_forged_sources_has_the_service_guarded():
     assert any(key.startswith("network.protect.firewall") for key, _ in on.engine.written)
 
 
+def victims(service, **fields):
+    made = structs.replace(evidence(20.0, AT), sender=None, victims=("10.0.0.1",), service=service)
+    return structs.replace(made, kind="flood", **fields)
+
+
 def test_a_flood_without_a_remedy_is_reported_once():
     on = desk()
-    flood = structs.replace(evidence(20.0, AT), sender=None, victims=("10.0.0.1",), service="from-udp/53")
-    hear(on, flood, flood, flood)
+    hear(on, victims("ip"), victims("ip"), victims("ip"))
     told = [value for key, value in on.engine.written if key.startswith("network.event.")]
     assert len(told) == 1
     assert "no remedy" in told[0]["text"]
+
+
+def test_answers_of_reflectors_are_limited_towards_their_victim():
+    """The limit, its rate and its reason are in the decision; a switch's counters make the incident's cost."""
+    on = desk()
+    hear(on, victims("from-udp/53", training_rate=30.0, usual_sources=("192.0.2.53",), usual_share=0.5))
+    (made,) = on.decisions
+    assert (made.action, made.target.address) == ("meter", "10.0.0.1")
+    assert made.limit == RateLimit(kind="udp_from", port=53, rate=30, spared=("192.0.2.53",), spared_rate=60)
+    assert "limited: UDP from port 53 to 30 packets/s (training saw 30 at most)" in made.reason
+    assert [key for key, _ in on.engine.written if ".meter." in key] == ["network.meter.firewall.ipv4"]
+    on.confirm(made)
+    counted = {"switch": "s1", "primary": True, "event_time": NOW + SECOND}
+    counted["blocks"] = [{"id": made.id, "packets": 900, "seen": 1_000}]
+    on.hand("network.switch.p4runtime_ctrl.s1", counted, pattern="network.switch.p4runtime_ctrl.*")
+    on.service.stop()
+    incident = on.written("network.incident.firewall.flood")[-1]
+    assert (incident["actions"][0]["remedy"], incident["cost"]["metered"]) == ("meter", 900)
+
+
+def test_a_limit_is_lifted_when_the_flood_is_over():
+    on = desk(rules=Rules(limit_s=30))
+    hear(on, victims("tcp-ack/443"))
+    on.switch(at=NOW + 29 * SECOND)
+    assert [each.action for each in on.decisions] == ["meter"]
+    on.switch(at=NOW + 31 * SECOND)
+    assert [each.action for each in on.decisions] == ["meter", "unmeter"]
+    assert on.service.health()["rate_limits"] == 0
+
+
+def test_where_only_copies_are_seen_it_would_limit():
+    on = desk(switches=())
+    on.switch(mirror=True)
+    hear(on, victims("icmp"))
+    (made,) = on.decisions
+    assert made.dry_run
+    assert made.doing == "would rate limit"
+
+
+def test_a_flood_of_syns_is_guarded_not_limited():
+    on = desk()
+    hear(on, victims("tcp/80"))
+    assert [each.action for each in on.decisions] == ["protect"]
+
+
+def test_a_restarted_firewall_lifts_what_it_has_limited():
+    before = desk()
+    hear(before, victims("from-udp/53"))
+    (made,) = before.decisions
+    engine = FakeEngine()
+    at = time.time_ns()
+    engine.archived.append(Item("network.meter.firewall.ipv4", made.to_value(), at, at, "firewall", "i0", 1))
+    on = desk(engine=engine)
+    on.switch(at=made.expires + 1)
+    assert [(each.action, each.id) for each in on.decisions] == [("unmeter", made.id)]
 
 
 def test_the_rule_of_the_paper_blocks_at_the_first_packet_over_the_threshold():

@@ -98,7 +98,7 @@ def firewall_knows(engine) -> None:
         again = Instruction(id=f"again{next(tries)}", verb="unblock", subject="02:00:00:00:00:66")
         engine.write(INSTRUCTION, again.to_value())
         time.sleep(0.2)
-        return any("no block or guard has" in text for text in answers)
+        return any("no block, guard or rate limit has" in text for text in answers)
 
     wait_for(is_lifted, SECONDS, lambda: f"{answers[-3:]}")
 

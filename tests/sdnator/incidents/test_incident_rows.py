@@ -52,7 +52,7 @@ def test_a_row():
         (action(state="failed"), "block, refused by the switch"),
         (action(dry_run=True, effective=6, state="in_force"), "would block"),
         (action(remedy="guard", effective=6, state="in_force"), "guarded"),
-        (action(remedy="meter", effective=6, state="in_force"), "metered"),
+        (action(remedy="meter", effective=6, state="in_force"), "rate limited"),
         (action(remedy="alert", reason="it is the gateway"), "alert only: it is the gateway"),
     ],
     ids=str,

@@ -6,6 +6,7 @@ from apps.firewall.evidence.known_sources import KnownSources
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.instructions import Desk, target_in
+from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.policy.rules import AllowList, Rules
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_defence import Suspicion, SynDefence
@@ -21,7 +22,7 @@ SAID = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary
 def desk(*allowed: str) -> Desk:
     ledger = BlockLifecycle(Rules())
     syn = SynDefence(ledger_rules(), (), ledger, AllowList(), KnownSources(10))
-    return Desk(ledger, syn, allowed, FalseAlarms(90))
+    return Desk(ledger, syn, RateLimits(Rules()), allowed, FalseAlarms(90))
 
 
 def ledger_rules() -> SynRules:
@@ -113,7 +114,7 @@ def test_panic_lifts_blocks_and_guards():
     syn = SynDefence(ledger_rules(), (), ledger, AllowList(), KnownSources(10))
     syn.recent.add(batch(*[(1, f"77.0.{n // 256}.{n % 256}", WEB.address, WEB.port) for n in range(600)]))
     syn.conclude(syn.suspect(Suspicion(WEB.address, SAID, NOW, 0)), {})
-    made = Desk(ledger, syn, (), FalseAlarms(90))
+    made = Desk(ledger, syn, RateLimits(Rules()), (), FalseAlarms(90))
     tell(made, "block", "192.0.2.1")
     decisions, answer = tell(made, "panic")
     assert sorted(each.action for each in decisions) == ["unblock", "unprotect"]
