@@ -272,7 +272,7 @@ def _attack(run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpe
     good = [each for each in run.decided if _helps(each, truth)]
     wrong = [each for each in run.decided if not _helps(each, truth)]
     others = stopped & ~mine & ~_sent_by(traffic, truth, network.gateway.mac)
-    hit = [traffic.columns[name][others].tolist() for name in ("port", "eth_src", "ip_src_lo")]
+    hit = [traffic.columns[name][others & ~run.limited].tolist() for name in ("port", "eth_src", "ip_src_lo")]
     return {
         "attack": spec.name,
         "number": spec.number,
@@ -280,9 +280,11 @@ def _attack(run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpe
         "s_to_decision": min(((each.time_ns - first_ns) / 1e9 for each in good), default=math.inf),
         "packets": int(mine.sum()),
         "stopped_share": float(stopped[mine].mean()) if mine.any() else 0.0,
-        "dropped": int((stopped & ~run.challenges)[mine].sum()),
+        "dropped": int((stopped & ~run.challenges & ~run.limited)[mine].sum()),
         "challenged": int(run.challenges[mine].sum()),
-        "innocent_packets": int(others.sum()),
+        "limited": int(run.limited[mine].sum()),
+        "innocent_packets": int((others & ~run.limited).sum()),
+        "innocent_limited": int((others & run.limited).sum()),
         "innocent_hosts": len(set(zip(*hit, strict=True))),
         "wrong": len(wrong),
         "decisions": [each.reason for each in (*good[:2], *wrong[:3])],
@@ -306,6 +308,9 @@ def _helps(decided: DecidedAction, truth: AttackTruth) -> bool:
     if decided.service is not None:
         victims = {str(ipaddress.IPv4Address(victim)) for victim in truth.victims}
         return "guard" in truth.remedies and decided.service.address in victims
+    if decided.limited:
+        victims = {str(ipaddress.IPv4Address(victim)) for victim in truth.victims}
+        return "meter" in truth.remedies and decided.limited in victims
     target = decided.target
     if target is None:
         return False

@@ -1,6 +1,6 @@
 """Detector and decisions alone, without switch, DUE or archive: what a pipeline would decide about traffic.
 
-    Traffic ─► what blocks leave of it ─► Detector ─► Evidence, Alert ─► Decider ─► blocks, guards
+    Traffic ─► what blocks leave of it ─► Detector ─► Evidence, Alert ─► Decider ─► blocks, guards, rate limits
                       ▲──────────────────────────────────────────────────────┘
 
 A decision is in force for the next rows; within a batch it comes too late, as in a switch.
@@ -18,11 +18,13 @@ from apps.evidence import Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle
 from apps.firewall.policy.decider import Decider
+from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.policy.rules import AllowList, Rules
 from apps.firewall.syn.services import TcpService
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import load_kernel
 from apps.messages import Alert, Decision, Target
+from benchmarks.decision_limits import ModelledLimits
 from benchmarks.decision_traffic.traffic import Traffic
 from due import RecordBatch
 
@@ -33,12 +35,14 @@ ROWS: Final = 128
 
 @dataclass(frozen=True)
 class DecidedAction:
-    """One block or guard."""
+    """One block, guard or rate limit."""
 
     time_ns: int
     reason: str
     target: Target | None = None
     service: TcpService | None = None
+    limited: str = ""
+    """Whose packets are limited."""
 
 
 @dataclass
@@ -60,6 +64,8 @@ class DecisionRun:
     challenged: int = 0
     challenges: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     """Which packets of the last `feed` were challenged; they are among the stopped."""
+    limited: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """Which packets of the last `feed` were over a rate limit."""
 
     def __post_init__(self) -> None:
         self.detector = self.watched or detector_for(self.training_packets)
@@ -74,14 +80,19 @@ class DecisionRun:
         self.decider = Decider(self.rules, self._ledger, bindings, (), AllowList)
         self._told = False
         self._guarded: set[TcpService] = set()
+        self._limits, self._meters = RateLimits(self.rules), ModelledLimits()
 
     def feed(self, traffic: Traffic) -> npt.NDArray[np.bool_]:
         """Take traffic; returns which of its packets were stopped (dropped, or SYNs that were challenged)."""
         stopped = np.zeros(len(traffic), bool)
         self.challenges = np.zeros(len(traffic), bool)
+        self.limited = np.zeros(len(traffic), bool)
         for start in range(0, len(traffic), ROWS):
             columns = {name: column[start : start + ROWS] for name, column in traffic.columns.items()}
             drops = self._drops(columns)
+            over = self._meters.over(columns, drops)
+            self.limited[start : start + ROWS] = over
+            drops |= over
             challenges = self._challenges(columns) & ~drops
             stopped[start : start + ROWS] = drops | challenges
             self.challenges[start : start + ROWS] = challenges
@@ -114,6 +125,9 @@ class DecisionRun:
             )
         for decision in self._ledger.due(now):
             self._tell(decision)
+        for name, packets in self._meters.counters().items():
+            self._limits.count_drops(name, packets, now)
+        self._meters.decide(self._limits.due(now))
         for alert in alerts:
             if self._ledger.covering(alert.sender) is None:
                 verdict = self.decider.alert(alert)
@@ -136,6 +150,12 @@ class DecisionRun:
                 self.decided.append(
                     DecidedAction(evidence.event_time, proposal.reason, service=proposal.service)
                 )
+            self.decider.settled(proposal)
+        elif proposal.limit is not None:
+            victim = evidence.victims[0]
+            made = self._limits.open(victim, proposal.limit, proposal.reason, (), evidence)
+            self._meters.decide(made)
+            self.decided += [DecidedAction(evidence.event_time, each.reason, limited=victim) for each in made]
             self.decider.settled(proposal)
         elif proposal.target is not None:
             self._block(evidence, proposal.target, proposal.reason)
