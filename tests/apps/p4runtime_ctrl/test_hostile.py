@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from apps.messages import TableCommand, TableUpdate
+from apps.messages import Decision, RateLimit, TableCommand, TableUpdate, Target
 from apps.p4runtime_ctrl.service import INTERESTS, P4RuntimeCtrlService
 from apps.p4runtime_ctrl.settings import Settings
 from due import RecordBatch
@@ -19,10 +19,21 @@ from tests.apps.p4runtime_ctrl.fake_switch import FakeSwitch
 UPDATE = TableUpdate(
     kind="insert", table="block_src", match={"is_ipv4": 1, "src": "10.9.9.9"}, action="drop_src"
 )
+METER = Decision(
+    id="m1",
+    action="meter",
+    switch="s1",
+    target=Target(kind="ip", address="10.0.0.1"),
+    reason="a flood",
+    event_time=NOW,
+    expires=0,
+    limit=RateLimit(kind="udp_from", port=53, rate=20, spared=("192.0.2.53",), spared_rate=40),
+)
 COLUMNS = ("id", "query", "src_hi", "src_lo", "dst_hi", "dst_lo", "port", "length", "source_port", "sweep")
 GENUINE = {
     "network.block.firewall.*": ("network.block.firewall.ipv4", block(1, 1).to_value()),
     "network.protect.firewall.*": ("network.protect.firewall.ipv4", block(1, 1).to_value()),
+    "network.meter.firewall.*": ("network.meter.firewall.ipv4", METER.to_value()),
     "network.p4_command.*.*": (
         "network.p4_command.listener.s1",
         TableCommand(id="c", updates=(UPDATE,)).to_value(),
