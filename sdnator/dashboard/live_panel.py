@@ -77,7 +77,7 @@ class LivePanel:
                 buttons = undo + _button("allow", 'label="Allow"', "verified_user", 'v-if="props.row.allow"')
                 wrong = 'v-if="props.row.false_alarm"'
                 buttons += _button("false_alarm", 'label="False alarm"', "school", wrong)
-                self._decisions = self._feed("decisions", buttons, "nothing is blocked or guarded")
+                self._decisions = self._feed("decisions", buttons, "nothing is blocked, guarded or limited")
                 self._decisions.on("undo", self._undo)
                 self._decisions.on("allow", self._allow)
                 self._decisions.on("false_alarm", self._false_alarm)

@@ -200,5 +200,5 @@ def test_archive_of_a_machine_where_nothing_ran(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.delenv("DUE_ARCHIVE", raising=False)
-    assert run(blocks, "list") == "nothing is blocked or guarded\n"
+    assert run(blocks, "list") == "nothing is blocked, guarded or limited\n"
     assert list(tmp_path.iterdir()) == []

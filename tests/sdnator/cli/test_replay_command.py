@@ -23,6 +23,9 @@ FOUND = {
     "incidents": [{}, {}],
     "incidents_mitigated": 1,
     "guards": [],
+    "limits": [],
+    "packets_limited": 0,
+    "packets_would_be_limited": 0,
 }
 
 
@@ -95,6 +98,7 @@ def test_summary_of_a_labelled_replay_with_its_blocks(capsys):
     labelled = {
         "auc": 0.98765, "time_to_block_s": {"capture": 1.25}, "attack_dropped": 900,
         "attack_after_first_block": 950, "benign_dropped": 0, "collateral_dropped": 3,
+        "benign_limited": 0,
         "blocks": [block], "report": "out/index.html",
     }  # fmt: skip
     show({**FOUND, **labelled})
@@ -104,6 +108,22 @@ def test_summary_of_a_labelled_replay_with_its_blocks(capsys):
     assert "0.9877 (Kitsune alone)" in told
     assert "blocked 02:00:00:00:00:01 at packet 56,000 (block[s1]) score 9.1" in told
     assert told.endswith("report: out/index.html")
+
+
+def test_summary_of_a_flood_that_was_limited(capsys):
+    limit = {
+        "address": "10.0.0.1", "packets": "UDP from port 53", "rate": 20, "packet": 900, "effect": "limited",
+        "packets_dropped": 800, "packets_would_be_dropped": 0, "reason": "evidence of 20 nats",
+    }  # fmt: skip
+    labelled = {
+        "limits": [limit], "packets_limited": 800, "attack_packets": 1_000, "attack_dropped": 790,
+        "attack_after_first_block": 0, "benign_dropped": 0, "collateral_dropped": 0, "benign_limited": 10,
+    }  # fmt: skip
+    show({**FOUND, **labelled})
+    told = " ".join(capsys.readouterr().out.split())
+    assert "limited UDP from port 53 towards 10.0.0.1 to 20/s from packet 900 on: 800 over it" in told
+    assert "790 of 1,000 attack packets" in told
+    assert "benign over limits 10" in told
 
 
 def test_demo_names_a_folder_that_cannot_be(tmp_path):
