@@ -1,5 +1,6 @@
 """The embedded switch against the real simple_switch_grpc: the same entries, frames and packet-outs go to
-both, and all that comes out is compared.  Left out: clocks, meters, and programs that multiply for ever.
+both, and all that comes out is compared.  Left out: clocks, meters, and programs that multiply for ever.  Meters with a burst and
+no rate need no clock: tests/contract/test_rate_limits.py has both switches drop the same packets.
 
 SDNATOR_SAMENESS_FRAMES sets the frames per program and seed (default 120); of the hostile case also the
 packet-outs.
