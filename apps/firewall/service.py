@@ -18,7 +18,8 @@ import due.service
 from apps.enforcement import ALLOWED, CONFIRMED, ENFORCED, SWITCHES, EnforcementReport
 from apps.evidence import EVIDENCE, TRAINING, Evidence, TrainingState
 from apps.firewall import arrivals
-from apps.firewall.arp.arp_bindings import ArpBindings, BindingConflict
+from apps.firewall.arp.arp_bindings import ArpBindings
+from apps.firewall.arp.theft_handler import TheftHandler
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
 from apps.firewall.enforcement.announcer import EVENTS, Announcer
 from apps.firewall.enforcement.declared_enforcers import DeclaredEnforcers
@@ -57,7 +58,6 @@ from apps.messages import (
     MessageError,
     TableCommand,
     TableUpdate,
-    Target,
     one_line,
 )
 from apps.packets import SteadyTime
@@ -124,9 +124,7 @@ class FirewallService:
         self._rules = settings.rules
         self._known = KnownSources(settings.known_limit)
         self._ledger = BlockLifecycle(settings.rules, known=self._known)
-        self._counts = dict.fromkeys(
-            ("alerts", "evidence", "handshakes", "syns", "syn_acks", "arp_thefts"), 0
-        )
+        self._counts = dict.fromkeys(("alerts", "evidence", "handshakes", "syns", "syn_acks"), 0)
         services = tuple(TcpService.parse(text) for text in settings.guard)
         allowed = (*settings.rules.allow, *(surroundings() if settings.allow_surroundings else ()))
         after_s = settings.syn.reset_after_ms / 1000
@@ -164,6 +162,15 @@ class FirewallService:
             self._announcer,
             self._incidents,
             self._lessons,
+            self._publish,
+        )
+        self._thefts = TheftHandler(
+            settings.arp,
+            self._bindings,
+            self._ledger,
+            self._announcer,
+            lambda: self._desk.allow,
+            self._switches,
             self._publish,
         )
         self._stored = StoredAnswers(engine)
@@ -273,6 +280,7 @@ class FirewallService:
         """Counters for the operator and for Prometheus."""
         return {
             **self._counts,
+            "arp_thefts": self._thefts.thefts,
             "blocks": sum(not each.decision.dry_run for each in self._ledger.blocks.values()),
             "would_block": sum(each.decision.dry_run for each in self._ledger.blocks.values()),
             "guarded": [str(service) for service in self._syn.guarded],
@@ -449,37 +457,7 @@ class FirewallService:
 
     def _on_arp(self, item: Item, batch: RecordBatch) -> None:
         with self._lock:
-            for theft in self._bindings.add(self._believed(batch)):
-                self._counts["arp_thefts"] += 1
-                self._on_theft(theft, item)
-
-    def _on_theft(self, theft: BindingConflict, item: Item) -> None:
-        thief, owner = theft.thief, theft.owner
-        summary = f"{thief.text} on port {thief.port} claims {theft.address}, which is {owner.text} on port {owner.port}"
-        target = Target(kind="mac", address=thief.text, port=thief.port)
-        spared = self._why_spared(theft, target)
-        if spared:
-            self._announcer.say(OperatorNotice("arp", f"{summary}; not blocked: {spared}", theft.at))
-        elif not any(block.decision.target == target for block in self._ledger.blocks.values()):
-            where, why = next(iter(self._switches)), f"{summary}, and is there"
-            self._publish(self._ledger.open(where, target, why, (evidence_of(item, summary),), theft.at))
-
-    def _why_spared(self, theft: BindingConflict, target: Target) -> str:
-        """Why the claimant of an address is not blocked; empty if it is."""
-        if self._settings.arp == "tell":
-            return 'the setting `arp` is "tell"'
-        if not theft.certain:
-            return "the owner was not present in training, or other hosts share the claimant's port"
-        if len(self._switches) != 1:
-            return f"{len(self._switches)} switches are connected, and records do not say which"
-        allow = self._desk.allow
-        mine = self._bindings.addresses_of(theft.thief)
-        if allow.covers_target(target) or any(allow.covers_address(each) for each in mine):
-            return "it is on the allow-list"
-        cap = self._ledger.cap_reached(theft.at)
-        if cap:
-            self._ledger.refuse(cap, target.address, theft.at)
-        return cap or ""
+            self._thefts.arps(item, self._believed(batch))
 
     # -- anomalies and evidence ---------------------------------------------------------------
 

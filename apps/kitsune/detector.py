@@ -12,8 +12,9 @@ import numpy.typing as npt
 from apps.evidence import Evidence
 from apps.kitsune.accused import LEAST_NATS, Accused
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
-from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS, Behaviour, Finding
+from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS, Behaviour
 from apps.kitsune.behaviour.contacts import PacketRow
+from apps.kitsune.behaviour.findings import Finding
 from apps.kitsune.behaviour.rows import parts_of
 from apps.kitsune.drift import TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
 from apps.kitsune.evidence import evidence_of

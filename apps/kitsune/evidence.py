@@ -4,8 +4,9 @@ import math
 from typing import Final
 
 from apps.evidence import Evidence, Kind
-from apps.kitsune.behaviour.behaviour import CONTACTS, Finding, Statistic
+from apps.kitsune.behaviour.behaviour import CONTACTS
 from apps.kitsune.behaviour.contacts import service_text
+from apps.kitsune.behaviour.findings import Finding, Statistic
 from apps.kitsune.behaviour.rows import SenderId, parts_of
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.roles import Roles

@@ -17,12 +17,12 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.behaviour.baseline import BLOCKS, LEAST_SCALE, WINDOWS_S, Baseline, SlidingSums
+from apps.kitsune.behaviour.baseline import BLOCKS, WINDOWS_S
 from apps.kitsune.behaviour.contacts import (
     ANY_UDP,
     ARP,
@@ -35,22 +35,18 @@ from apps.kitsune.behaviour.contacts import (
     EndedContact,
     PacketRow,
 )
+from apps.kitsune.behaviour.findings import (
+    LEAST_NATS,
+    Finding,
+    FoundSoFar,
+    SeenCount,
+    Statistic,
+    StatisticCounter,
+)
 from apps.kitsune.behaviour.rows import SenderId, packet_rows, parts_of
 from apps.kitsune.kernel import Columns
 from apps.kitsune.roles import is_inside
 
-Statistic = Literal[
-    "contacts",
-    "ports",
-    "targets",
-    "logins",
-    "one_way",
-    "claims",
-    "thefts",
-    "strangers",
-    "scores",
-    "threshold",
-]
 CONTACTS: Final[tuple[Statistic, ...]] = ("contacts", "ports", "targets")
 BURST_WINDOWS_S: Final = WINDOWS_S[1:]
 """Of contacts: a program opens many at once, and how fast it does says nothing."""
@@ -82,17 +78,6 @@ LOGINS: Final = frozenset(
     )
 )
 """TCP ports where passwords are asked for."""
-HALF_LIFE_S: Final = 600.0
-"""After so many seconds without more, half of what was found is forgotten."""
-LEAST_NATS: Final = 1.0
-"""Less is not worth a message ..."""
-LEAST_STEP: Final = 0.5
-"""... nor is less than this beside what was said already ..."""
-LEAST_SHARE: Final = 0.15
-"""... nor, where more than `DECIDING_NATS` were said already, less than this share of it ..."""
-DECIDING_NATS: Final = 20.0
-MOST_NATS: Final = 50.0
-"""... nor anything beyond, since it decides everything."""
 REFUSED_BYTES: Final = 5_000
 """Bytes on the wire that the initiator sends in a login that is refused, at most: the key exchange of SSH and a few
 passwords are 2,000 to 4,000."""
@@ -112,106 +97,6 @@ _PRESENT_S: Final = 60.0
 _THEFT: Final = 5.0
 """Events that a claim of the address of a present host counts as."""
 _AGAIN_S: Final = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """More than training saw; `nats` is what has been added since the last finding about the same subject."""
-
-    statistic: Statistic
-    sender: SenderId | None
-    """None: strangers towards a victim."""
-    victim: int
-    """Address; 0: several."""
-    service: int
-    """As in `contacts`; -1: several."""
-    nats: float
-    total: float
-    """With what was found before."""
-    count: float
-    """In the window that weighs most."""
-    window_s: float
-    usual: float
-    """The highest of training."""
-    time: float
-    arrival: int
-    supporting: bool = False
-    """Alone it proves nothing: a conversation that both sides want, or a sender that training knows."""
-
-
-@dataclass(slots=True)
-class _Reported:
-    nats: float
-    time: float
-
-
-class FoundSoFar:
-    """What was reported about each subject, fading with time."""
-
-    def __init__(self) -> None:
-        self._reported: dict[Any, _Reported] = {}
-
-    def added(self, subject: Any, nats: float, time: float) -> float:
-        """The part that is new, if it is worth a message; else 0."""
-        former = self._reported.get(subject)
-        faded = 0.0
-        if former is not None:
-            faded = former.nats * 0.5 ** (max(0.0, time - former.time) / HALF_LIFE_S)
-        nats = min(nats, MOST_NATS)
-        least = LEAST_SHARE * faded if faded > DECIDING_NATS else LEAST_STEP
-        if nats < LEAST_NATS or nats - faded < least:
-            return 0.0
-        if former is None and len(self._reported) >= _KEPT:
-            del self._reported[next(iter(self._reported))]
-        self._reported[subject] = _Reported(nats, time)
-        return nats - faded
-
-
-class _Seen(NamedTuple):
-    """What a count adds: the part of a finding that comes from its statistic."""
-
-    nats: float
-    total: float
-    events: float
-    window_s: float
-    usual: float
-
-
-class _Counter:
-    """One statistic: sliding sums, their baseline, and what was reported."""
-
-    def __init__(
-        self,
-        least_scale: float = LEAST_SCALE,
-        windows: tuple[float, ...] = WINDOWS_S,
-        *,
-        own: bool = True,
-    ) -> None:
-        self.sums = SlidingSums(windows)
-        self.baseline = Baseline(len(windows), least_scale, own=own)
-        self.found = FoundSoFar()
-
-    def see(
-        self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0, kind: Any = None
-    ) -> _Seen | None:
-        """Count, and weigh the sums."""
-        return self.weigh(whose, self.sums.add(subject, time, weight), time, block, kind)
-
-    def weigh(
-        self, whose: Any, sums: tuple[float, ...], time: float, block: int, kind: Any = None
-    ) -> _Seen | None:
-        """Learn sums within the windows, or weigh them; None if nothing is worth a message."""
-        if block >= 0:
-            self.baseline.learn(whose, block, sums, kind)
-            return None
-        seen = self.measure(whose, sums, kind)
-        added = self.found.added((whose, kind), seen.total, time) if seen.total >= LEAST_NATS else 0.0
-        return seen._replace(nats=added) if added else None
-
-    def measure(self, whose: Any, sums: tuple[float, ...], kind: Any) -> _Seen:
-        """Weigh sums, whatever was found before."""
-        nats, which, usual = self.baseline.nats(whose, sums, kind)
-        return _Seen(0.0, nats, sums[which], self.sums.windows[which], usual)
 
 
 @dataclass(slots=True)
@@ -264,17 +149,17 @@ class Behaviour:
         self._spoke: dict[int, float] = {}
         """When the owner of an address last sent something."""
         self.contacts = ContactTracker()
-        self._counters: dict[Statistic, _Counter] = {
+        self._counters: dict[Statistic, StatisticCounter] = {
             # who was quiet for an hour may do what others do: without the own highest counts
-            "contacts": _Counter(windows=BURST_WINDOWS_S, own=False),
-            "ports": _Counter(windows=BURST_WINDOWS_S),
-            "targets": _Counter(windows=BURST_WINDOWS_S, own=False),
-            "logins": _Counter(0.9, own=False),
-            "one_way": _Counter(8.0, (1.0,), own=False),
-            "claims": _Counter(),
-            "thefts": _Counter(),
-            "strangers": _Counter(1.5, (1.0, 10.0)),
-            "scores": _Counter(),
+            "contacts": StatisticCounter(windows=BURST_WINDOWS_S, own=False),
+            "ports": StatisticCounter(windows=BURST_WINDOWS_S),
+            "targets": StatisticCounter(windows=BURST_WINDOWS_S, own=False),
+            "logins": StatisticCounter(0.9, own=False),
+            "one_way": StatisticCounter(8.0, (1.0,), own=False),
+            "claims": StatisticCounter(),
+            "thefts": StatisticCounter(),
+            "strangers": StatisticCounter(1.5, (1.0, 10.0)),
+            "scores": StatisticCounter(),
         }
         self._failures = FoundSoFar()
         """Of senders: the strongest of `CONTACTS`, which are three views of the same packets."""
@@ -584,7 +469,7 @@ class Behaviour:
         if len(self._told) >= _KEPT:
             self._told.clear()
         self._told[row.sender] = row.time
-        seen = _Seen(0.0, 0.0, score, 0.0, self.line)
+        seen = SeenCount(0.0, 0.0, score, 0.0, self.line)
         return [self._finding("threshold", row, seen, supporting=True)]
 
     def to_state(self) -> dict[str, Any]:
@@ -625,7 +510,7 @@ class Behaviour:
     def _finding(
         statistic: Statistic,
         row: PacketRow,
-        seen: _Seen,
+        seen: SeenCount,
         *,
         supporting: bool = False,
     ) -> Finding:

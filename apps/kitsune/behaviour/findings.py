@@ -1,0 +1,135 @@
+"""Findings: what a statistic counted beyond its baseline, weighed, and told as far as it is new.  Pure.
+
+sliding sums ──► Baseline ──nats──► FoundSoFar ──what is new──► Finding
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple
+
+from apps.kitsune.behaviour.baseline import LEAST_SCALE, WINDOWS_S, Baseline, SlidingSums
+from apps.kitsune.behaviour.rows import SenderId
+
+Statistic = Literal[
+    "contacts",
+    "ports",
+    "targets",
+    "logins",
+    "one_way",
+    "claims",
+    "thefts",
+    "strangers",
+    "scores",
+    "threshold",
+]
+HALF_LIFE_S: Final = 600.0
+"""After so many seconds without more, half of what was found is forgotten."""
+LEAST_NATS: Final = 1.0
+"""Less is not worth a message ..."""
+LEAST_STEP: Final = 0.5
+"""... nor is less than this beside what was said already ..."""
+LEAST_SHARE: Final = 0.15
+"""... nor, where more than `DECIDING_NATS` were said already, less than this share of it ..."""
+DECIDING_NATS: Final = 20.0
+MOST_NATS: Final = 50.0
+"""... nor anything beyond, since it decides everything."""
+_KEPT: Final = 65_536
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """More than training saw; `nats` is what has been added since the last finding about the same subject."""
+
+    statistic: Statistic
+    sender: SenderId | None
+    """None: strangers towards a victim."""
+    victim: int
+    """Address; 0: several."""
+    service: int
+    """As in `contacts`; -1: several."""
+    nats: float
+    total: float
+    """With what was found before."""
+    count: float
+    """In the window that weighs most."""
+    window_s: float
+    usual: float
+    """The highest of training."""
+    time: float
+    arrival: int
+    supporting: bool = False
+    """Alone it proves nothing: a conversation that both sides want, or a sender that training knows."""
+
+
+@dataclass(slots=True)
+class _Reported:
+    nats: float
+    time: float
+
+
+class FoundSoFar:
+    """What was reported about each subject, fading with time."""
+
+    def __init__(self) -> None:
+        self._reported: dict[Any, _Reported] = {}
+
+    def added(self, subject: Any, nats: float, time: float) -> float:
+        """The part that is new, if it is worth a message; else 0."""
+        former = self._reported.get(subject)
+        faded = 0.0
+        if former is not None:
+            faded = former.nats * 0.5 ** (max(0.0, time - former.time) / HALF_LIFE_S)
+        nats = min(nats, MOST_NATS)
+        least = LEAST_SHARE * faded if faded > DECIDING_NATS else LEAST_STEP
+        if nats < LEAST_NATS or nats - faded < least:
+            return 0.0
+        if former is None and len(self._reported) >= _KEPT:
+            del self._reported[next(iter(self._reported))]
+        self._reported[subject] = _Reported(nats, time)
+        return nats - faded
+
+
+class SeenCount(NamedTuple):
+    """What a count adds: the part of a finding that comes from its statistic."""
+
+    nats: float
+    total: float
+    events: float
+    window_s: float
+    usual: float
+
+
+class StatisticCounter:
+    """One statistic: sliding sums, their baseline, and what was reported."""
+
+    def __init__(
+        self,
+        least_scale: float = LEAST_SCALE,
+        windows: tuple[float, ...] = WINDOWS_S,
+        *,
+        own: bool = True,
+    ) -> None:
+        self.sums = SlidingSums(windows)
+        self.baseline = Baseline(len(windows), least_scale, own=own)
+        self.found = FoundSoFar()
+
+    def see(
+        self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0, kind: Any = None
+    ) -> SeenCount | None:
+        """Count, and weigh the sums."""
+        return self.weigh(whose, self.sums.add(subject, time, weight), time, block, kind)
+
+    def weigh(
+        self, whose: Any, sums: tuple[float, ...], time: float, block: int, kind: Any = None
+    ) -> SeenCount | None:
+        """Learn sums within the windows, or weigh them; None if nothing is worth a message."""
+        if block >= 0:
+            self.baseline.learn(whose, block, sums, kind)
+            return None
+        seen = self.measure(whose, sums, kind)
+        added = self.found.added((whose, kind), seen.total, time) if seen.total >= LEAST_NATS else 0.0
+        return seen._replace(nats=added) if added else None
+
+    def measure(self, whose: Any, sums: tuple[float, ...], kind: Any) -> SeenCount:
+        """Weigh sums, whatever was found before."""
+        nats, which, usual = self.baseline.nats(whose, sums, kind)
+        return SeenCount(0.0, nats, sums[which], self.sums.windows[which], usual)
