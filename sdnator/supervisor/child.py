@@ -32,6 +32,15 @@ _COUNT = re.compile(rb"\.([0-9]{1,18});")
 """See `dataplane.heartbeat`."""
 
 
+def suspended(pid: int) -> bool:
+    """Whether the kernel says that a process is stopped by job control; no where it does not tell (no /proc)."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    return fields.rpartition(")")[2].split()[:1] == ["T"]  # the name before may hold anything
+
+
 class Child:
     """A Python program of ours that prints one JSON line when it is ready.
 
@@ -160,6 +169,10 @@ class Child:
                 self.out_of_range = int(told)
             return bool(beats)
         return False
+
+    def suspended(self) -> bool:
+        """Whether a signal such as SIGSTOP keeps it from running."""
+        return suspended(self.pid)
 
     def check(self) -> None:
         """Raise PipelineError if the program has ended."""

@@ -90,6 +90,7 @@ class Part:
         self._since = 0.0
         self._prepare_at = 0.0
         self._silence = Silence(spec.silence_s)
+        self._suspension = Silence(spec.suspended_s)
         self._reason = ""
         self._quiet_until = 0.0
         self._untold = 0
@@ -153,6 +154,7 @@ class Part:
             self.state, self._since, self.said = "running", now, said
             self._prepare_at = now + _PREPARE_AFTER_S
             self._silence = Silence(self.spec.silence_s)
+            self._suspension = Silence(self.spec.suspended_s)
             if self.deaths:
                 self._say(f"{self.spec.name} runs again", now)
             self.was_ready = True
@@ -175,6 +177,13 @@ class Part:
         if self._silence.too_long(now, beaten=process.beaten()):
             self._end(
                 f"{self.spec.name} hung: no heartbeat for {self.spec.silence_s:g} s, so it was killed", now
+            )
+            process.kill()
+            return True
+        if self.spec.suspended_s and self._suspension.too_long(now, beaten=not process.suspended()):
+            self._end(
+                f"{self.spec.name} was suspended for {self.spec.suspended_s:g} s (SIGSTOP?), so it was killed",
+                now,
             )
             process.kill()
             return True

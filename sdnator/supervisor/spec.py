@@ -35,6 +35,10 @@ class PartProcess(Protocol):
         """Whether a heartbeat has come since the last call."""
         ...
 
+    def suspended(self) -> bool:
+        """Whether a signal such as SIGSTOP keeps it from running."""
+        ...
+
     def files(self) -> Sequence[int]:
         """Descriptors that become readable when it is ready or has ended."""
         ...
@@ -116,6 +120,7 @@ class PartSpec:
         restart: None: its death is an error of the whole pipeline (`PipelineError`).
         vital: if it fails to start, the whole start fails.
         silence_s: seconds without a heartbeat after which it counts as hung; 0: it has none.
+        suspended_s: seconds for which it may be suspended; 0: as long as it may be silent.
         inside: entered around its start and what prepares it, such as a network namespace.
         reserve: prepares its next start while it runs.
     """
@@ -128,5 +133,6 @@ class PartSpec:
     restart: RestartPolicy | None = field(default_factory=RestartPolicy)
     vital: bool = True
     silence_s: float = 0.0
+    suspended_s: float = 0.0
     inside: Callable[[], AbstractContextManager[object]] = nullcontext
     reserve: Reserve | None = None

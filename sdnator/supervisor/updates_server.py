@@ -12,7 +12,7 @@ from typing import Any
 from due.drivers.embedded_redis import EmbeddedServer
 from due.errors import UpdatesUnavailable
 from sdnator.errors import PipelineError
-from sdnator.supervisor.child import last_words
+from sdnator.supervisor.child import last_words, suspended
 
 _PING, _PONG = b"PING\r\n", b"+PONG"
 _PING_SECONDS = 1.0
@@ -102,6 +102,10 @@ class UpdatesProcess:
     def beaten(self) -> bool:
         """Whether it has answered since the last call."""
         return self._probe.answered(time.monotonic())
+
+    def suspended(self) -> bool:
+        """Whether a signal such as SIGSTOP keeps it from running."""
+        return suspended(self.pid)
 
     def files(self) -> Sequence[int]:
         """None: it is looked at often enough."""

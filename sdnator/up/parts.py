@@ -35,6 +35,8 @@ from sdnator.up.plan import StandingPlan
 _VITAL = ("coordinator", *OURS)
 """Parts without which the pipeline does not start; other apps are restarted if they fail."""
 _SPARK_SECONDS = 60.0
+_SUSPENDED_S = 0.4
+"""A suspended switch forwards nothing: it is killed, and its spare takes over."""
 _TOKEN = "SDNATOR_DASHBOARD_TOKEN"  # noqa: S105 - a variable's name
 
 
@@ -103,6 +105,7 @@ class UpParts:
                 start=self._programs[switch.name].start,
                 restart=self._restart(at_once=True),
                 silence_s=self.plan.supervisor.hung_s,
+                suspended_s=_SUSPENDED_S,
                 reserve=self._programs[switch.name],
             )
             for switch in self.plan.switches

@@ -84,6 +84,17 @@ def test_a_stopped_part_is_killed_and_started_again(stage):
     assert "no heartbeat for 0.5 s, so it was killed" in report(supervisor, "hung").cause
 
 
+def test_a_suspended_part_that_must_not_stand_still_is_killed_long_before_it_counts_as_hung(stage):
+    supervisor = stage.supervisor(stage.part("switch", silence_s=3_600, suspended_s=0.2))
+    supervisor.start()
+    before = supervisor.pids()["switch"]
+    os.kill(before, signal.SIGSTOP)
+    watch_until(
+        supervisor, lambda: supervisor.pids()["switch"] != before and state(supervisor, "switch") == "running"
+    )
+    assert "was suspended for 0.2 s" in report(supervisor, "switch").cause
+
+
 def test_a_part_that_lives_but_makes_no_progress_is_started_again(stage):
     """Such as one whose dispatching thread has died."""
     supervisor = stage.supervisor(stage.part("silent", "silent", silence_s=0.5))
