@@ -57,7 +57,9 @@ def test_a_spare_that_died_is_no_hindrance(tmp_path):
     switch.prepare()
     switch.prepare()
     assert switch._spare is None, "it is not started again and again"
-    assert not switch.start().waits
+    child = switch.start()
+    assert not child.waits
+    child.close()
     switch.discard()
 
 
