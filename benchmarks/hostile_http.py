@@ -177,7 +177,7 @@ def _shown_seeds() -> tuple[bytes, ...]:
         "network.anomaly.kitsune.score": {"count": 3, "over": 1, "max": 2.5, "score": np.ones(3)},
         "network.anomaly.kitsune.alert": ALERT.to_value(),
         "network.block.firewall.*": DECISION.to_value(),
-        "network.confirmation.p4runtime_ctrl.*": CONFIRMATION.to_value(),
+        "network.confirmation.*.*": CONFIRMATION.to_value(),
         "network.switch.p4runtime_ctrl.*": STATE,
         "network.answer.firewall.dashboard": {"id": "i1", "done": True, "text": "x"},
         "due.health.*": {"engine": {"written": 5, "keys": {"a.b": 3}}, "state": "ok"},

@@ -7,15 +7,21 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from apps.enforcement import AllowedEntries, EnforcementReport, HeldBlock
+from apps.enforcers import arrivals as enforcers
+from apps.enforcers.webhook_enforcer.exchange import answer_in, listing_in
 from apps.evidence import TrainingState
 from apps.firewall import arrivals as firewall
 from apps.kitsune import service as kitsune
+from apps.kitsune.model_orders import ModelOrder, order_in
 from apps.messages import (
     Alert,
     Answer,
     Confirmation,
     Decision,
     Exhibit,
+    FalseAlarm,
+    Ground,
     Instruction,
     MessageError,
     Sender,
@@ -31,7 +37,7 @@ from apps.p4runtime_ctrl.telemetry.demand import Offer
 from apps.packets import read_frames
 from apps.sonata_adapter import arrivals as adapter
 from apps.sonata_adapter.evidence.count_baseline import CountBaseline
-from benchmarks.hostile_mutation import mutate_value
+from benchmarks.hostile_mutation import mutate_text, mutate_value
 from benchmarks.hostile_target import DecoderTarget
 from coordinator.admission import Admission
 from coordinator.checkpoint import checkpoint_in
@@ -109,6 +115,13 @@ _COMMAND = TableCommand(
         ),
     ),
 )
+_REPORT = EnforcementReport(
+    enforcer="nftables", place="h1", working=True, event_time=_NOW, blocks=(HeldBlock(id="d1", target=_TARGET, packets=3),)
+)  # fmt: skip
+_LESSON = FalseAlarm(
+    id="d1", grounds=(Ground(source="kitsune.targets", sender=_SENDER, service="tcp/445", nats=9.0),),
+    event_time=_NOW, expires=_NOW + 1,
+)  # fmt: skip
 _INSTRUCTION = Instruction(id="i1", verb="block", subject="10.0.0.1", reason="mine", seconds=60)
 STATE = {
     "switch": "s1", "primary": True, "event_time": _NOW, "base_us": _NOW // 1000,
@@ -199,6 +212,31 @@ TARGETS = (
         "network.confirmation.p4runtime_ctrl.s1",
         firewall.confirmation_in,
         CONFIRMATION.to_value(),
+    ),
+    _target("firewall", "network.enforced.nftables.h1", firewall.report_in, _REPORT.to_value()),
+    _target("firewall", "network.false_alarm.firewall.taught", firewall.lesson_in, _LESSON.to_value()),
+    _target("enforcers", "network.block.firewall.ipv4", enforcers.decision_in, DECISION.to_value()),
+    _target(
+        "enforcers",
+        "network.allowed.firewall",
+        enforcers.allowed_in,
+        AllowedEntries(entries=("10.0.0.0/8", "aa:bb:cc:dd:ee:ff")).to_value(),
+    ),
+    _target(
+        "kitsune",
+        "network.instruction.operator.kitsune",
+        order_in,
+        ModelOrder(id="o1", verb="retrain").to_value(),
+    ),
+    DecoderTarget(
+        "webhook answer", answer_in, (MessageError,), (b'{"state": "installed", "cause": ""}',), mutate_text
+    ),
+    DecoderTarget(
+        "webhook listing",
+        listing_in,
+        (MessageError,),
+        (b'{"blocks": [{"id": "d1", "packets": 3}]}',),
+        mutate_text,
     ),
     _target("firewall", "network.block.firewall.ipv4", firewall.decision_in, DECISION.to_value()),
     _target("firewall", "network.p4_command.firewall.s1", firewall.command_in, _COMMAND.to_value()),

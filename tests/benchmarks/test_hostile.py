@@ -6,6 +6,7 @@ import threading
 
 import pytest
 
+from apps.enforcers import arrivals as enforcers
 from apps.firewall import arrivals as firewall
 from apps.kitsune import service as kitsune
 from apps.p4runtime_ctrl import arrivals as controller
@@ -80,6 +81,7 @@ def test_every_decoder_of_messages_is_attacked():
         ("kitsune", kitsune),
         ("controller", controller),
         ("sonata", adapter),
+        ("enforcers", enforcers),
     ):
         for name in vars(module):
             if (

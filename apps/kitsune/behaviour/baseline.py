@@ -208,13 +208,13 @@ class Baseline:
 
         Args:
             subject: whose counts these are; unknown ones are compared with the highest of their kind only.
-            counts: by window.
+            counts: by window, those of the shortest ones are enough.
             kind: as in training; of a kind that training does not know the highest count is 0.
         """
         own = self.highest.get(subject)
         best = Weighed(0.0, 0, 0.0)
         shared = self.shared.get(kind) or [0.0] * self._windows
-        for number, (count, most) in enumerate(zip(counts, shared, strict=True)):
+        for number, (count, most) in enumerate(zip(counts, shared, strict=False)):
             if count > most:
                 scale = max(self._least, self._shared_scale * most)
                 best = best.or_more(self.rarity + (count - most) / scale, number, most)

@@ -272,6 +272,7 @@ class Behaviour:
         for name, counter in self._counters.items():
             # at the beginning every contact was new
             counter.baseline.close(BLOCKS // 2 if name in (*CONTACTS, "strangers") else 0)
+            counter.trained(self.seconds)
         baselines = [self._counters[name].baseline for name in WHOLE]
         expected = sum(baseline.exceeded for baseline in baselines)
         for baseline in baselines:
@@ -383,8 +384,13 @@ class Behaviour:
         counter = self._counters["logins"]
         sums = counter.sums.add((row.sender, row.target, row.service), row.time, weight)
         kind = (row.service, is_inside(parts_of(row.source)))
-        seen = counter.weigh((row.sender, row.service), sums, row.time, block, kind)
-        return [] if seen is None else [self._finding("logins", row, seen)]
+        if block >= 0:
+            counter.baseline.learn((row.sender, row.service), block, sums, kind)
+            return []
+        # a client that logs in more often today does so at all of its services: the most counts, not the sum
+        seen = counter.measure((row.sender, row.service), sums, kind)
+        added = counter.found.added(row.sender, seen.total, row.time)
+        return [self._finding("logins", row, seen._replace(nats=added))] if added else []
 
     def _one_way(self, row: PacketRow, block: int) -> list[Finding]:
         if row.group or row.quoted or not row.source or row.service >= ARP:
@@ -504,6 +510,7 @@ class Behaviour:
         self.contacts.close_training()
         for name, counter in self._counters.items():
             counter.baseline.restore(state["baselines"][name])
+            counter.trained(self.seconds)
         return self
 
     @staticmethod

@@ -32,6 +32,8 @@ LEAST_SHARE: Final = 0.15
 DECIDING_NATS: Final = 20.0
 MOST_NATS: Final = 50.0
 """... nor anything beyond, since it decides everything."""
+LONGEST_SHARE: Final = 1 / 3
+"""Of training: a count of ten minutes cannot be compared with five minutes of training."""
 _KEPT: Final = 65_536
 
 
@@ -111,6 +113,11 @@ class StatisticCounter:
         self.sums = SlidingSums(windows)
         self.baseline = Baseline(len(windows), least_scale, own=own)
         self.found = FoundSoFar()
+        self._usable = len(windows)
+
+    def trained(self, seconds: float) -> None:
+        """Training has ended: of a longer window than a third of it too little is known."""
+        self._usable = max(1, sum(window <= seconds * LONGEST_SHARE for window in self.sums.windows))
 
     def see(
         self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0, kind: Any = None
@@ -131,5 +138,5 @@ class StatisticCounter:
 
     def measure(self, whose: Any, sums: tuple[float, ...], kind: Any) -> SeenCount:
         """Weigh sums, whatever was found before."""
-        nats, which, usual = self.baseline.nats(whose, sums, kind)
+        nats, which, usual = self.baseline.nats(whose, sums[: self._usable], kind)
         return SeenCount(0.0, nats, sums[which], self.sums.windows[which], usual)

@@ -140,6 +140,41 @@ def test_logins_that_move_data_are_no_guessing():
     assert total(feed(quiet_network(), rows), "logins") < 3
 
 
+def test_one_client_that_logs_in_at_four_services_counts_once():
+    """A busy day of a mail and file client is as little evidence as one of its services is."""
+
+    def found_at(*ports):
+        rows = [
+            row
+            for n in range(3)
+            for port in ports
+            for row in (
+                *handshake(700 + 10 * n + port / 1000, STRANGER, SERVER, 50_000 + n, port),
+                packet(701 + 10 * n + port / 1000, STRANGER, SERVER, 50_000 + n, port, FIN | ACK),
+            )
+        ]
+        return total(feed(quiet_network(), sorted(rows, key=lambda row: row["time_us"])), "logins")
+
+    assert 0 < found_at(21, 22, 143, 445) == pytest.approx(found_at(22))
+
+
+def test_windows_that_are_long_beside_training_do_not_count():
+    """Ten minutes of training cannot tell what is usual in ten minutes."""
+    rows = [
+        row
+        for n in range(9)
+        for row in (
+            *handshake(700 + 61 * n, STRANGER, SERVER, 50_000 + n, 22),
+            packet(701 + 61 * n, STRANGER, SERVER, 50_000 + n, 22, FIN | ACK),
+        )
+    ]
+    assert {each.window_s for each in feed(quiet_network(), rows) if each.statistic == "logins"} <= {
+        1.0,
+        10.0,
+        60.0,
+    }
+
+
 def test_a_flood_of_answered_pings_is_found():
     """An echo reply does not say that anybody wants the pings."""
     rows = []

@@ -53,7 +53,7 @@ def test_a_modify_without_match_is_the_default_action():
 @pytest.mark.parametrize(
     ("update", "reason"),
     [
-        (insert("ingress.blok", {}, "x"), "no table 'ingress.blok' in the program; it has ingress.allow"),
+        (insert("ingress.blok", {}, "x"), "no table 'ingress.blok' in the program; it has ingress.limit"),
         (insert("block_src", {"src": 1}, "drop_src"), "ingress.block_src is_ipv4: an exact match field needs"),
         (insert("block_src", {"source": 1}, "drop_src"), "no match field 'source'; it has is_ipv4, src"),
         (insert("block_src", {"is_ipv4": 2, "src": 1}, "drop_src"), "is_ipv4: 2 does not fit into 1 bits"),
