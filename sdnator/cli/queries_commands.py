@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.keys import (
@@ -29,7 +27,9 @@ from apps.sonata_adapter.query.text import parse_queries
 from due import DueError
 from sdnator.capture.captures import CaptureError
 from sdnator.cli.due_commands import known_archive
+from sdnator.cli.plain_table import plain_table
 from sdnator.cli.queries_run import PastPackets, archived, as_line, as_text, captured, engine_of
+from sdnator.cli.queries_workbench import fields_text, fields_value, tested, tested_text, tested_value
 from sdnator.errors import BadInput
 
 queries = typer.Typer(
@@ -51,7 +51,7 @@ def templates() -> dict[str, Template]:
 def list_queries(
     *, as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False
 ) -> None:
-    """List all queries with meaning, parameters (default, bounds) and where they run.
+    """List all queries and raw streams, one a line; `queries show NAME` tells more.
 
     Example: sdnator queries list
     """
@@ -59,18 +59,69 @@ def list_queries(
     if as_json:
         typer.echo(json.dumps({"queries": rows, "streams": _streams()}))
         return
-    out = Console(highlight=False)
-    for row in rows:
-        out.print(f"[bold]{row['name']}[/]  {row['meaning']}")
-        table = Table(show_header=False, box=None, padding=(0, 2, 0, 4))
-        for each in row["parameters"]:
-            table.add_row(each["name"], each["default"], each["bounds"], each["meaning"])
-        out.print(table)
-        out.print(f"    results: {row['result']}")
-        out.print(f"    runs: {row['cost']}\n")
-    for name, stream in _streams().items():
-        out.print(f"[bold]{name}[/]  {stream['meaning']}")
-        out.print(f"    {', '.join(stream['parameters'])}\n" if stream["parameters"] else "")
+    lines = [(row["name"], "switch" if row["in_switch"] else "host", row["meaning"]) for row in rows]
+    lines += [(name, "host", stream["meaning"]) for name, stream in _streams().items()]
+    typer.echo(plain_table(("query", "runs", "meaning"), lines))
+
+
+@queries.command("show")
+def show_query(
+    name: Annotated[str, typer.Argument(help="Name of a query, as `queries list` shows it.")],
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Show one query: its text, parameters with defaults and bounds, results and cost.
+
+    Example: sdnator queries show syn_flood
+    """
+    known = templates()
+    stream = _streams().get(name if name.startswith("network.") else f"{CAPTURE_PREFIX}.{name}")
+    if name not in known and stream is not None:
+        lines = [f"  {spec}: {meaning}" for spec, meaning in stream["meanings"].items()]
+        typer.echo(json.dumps(stream) if as_json else "\n".join([stream["meaning"], *lines]))
+        return
+    if name not in known:
+        raise BadInput(f"there is no query {name}; there are {', '.join(known)}")
+    row = _description(known[name])
+    if as_json:
+        typer.echo(json.dumps(row))
+        return
+    names = ("parameter", "default", "bounds", "meaning")
+    table = plain_table(
+        names, ([p[part] for part in ("name", "default", "bounds", "meaning")] for p in row["parameters"])
+    )
+    parts = [f"{row['name']}: {row['meaning']}", row["text"], table]
+    parts += [f"results: {row['result']}", f"runs: {row['cost']}", f"key: {row['key']}"]
+    typer.echo("\n\n".join(parts))
+
+
+@queries.command("fields")
+def list_fields(
+    *, as_json: Annotated[bool, typer.Option("--json", help="One JSON array on standard output.")] = False
+) -> None:
+    """List the fields that a query can use: type, unit, and what the switch can do with each.
+
+    Example: sdnator queries fields
+    """
+    typer.echo(json.dumps(fields_value()) if as_json else fields_text())
+
+
+@queries.command("test")
+def try_queries(
+    file: Annotated[Path, typer.Argument(help="Text file with queries; they are not added.", metavar="FILE")],
+    *,
+    capture: Annotated[
+        list[Path], typer.Option(help="pcap or pcapng; several are read one after the other.")
+    ],
+    most: Annotated[int, typer.Option(help="Most results to show of each query.", min=0, max=100_000)] = 100,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line for each query.")] = False,
+) -> None:
+    """Try the queries of a file over a capture: plan, rows of each operator, cost, results.
+
+    Example: sdnator queries test my_scan.sonata --capture day.pcap
+    """
+    for one in tested(file, capture, most):
+        typer.echo(json.dumps(tested_value(one)) if as_json else tested_text(one) + "\n")
 
 
 @queries.command("explain")
@@ -174,6 +225,8 @@ def _description(template: Template) -> dict[str, Any]:
         "key": request.identity,
         "meaning": template.meaning,
         "result": template.result,
+        "text": request.query.text(),
+        "in_switch": found.in_switch,
         "parameters": [
             {"name": p.name, "default": p.text(p.default), "bounds": p.bounds, "meaning": p.meaning}
             for p in template.parameters
@@ -189,8 +242,9 @@ def _streams() -> dict[str, Any]:
         f"{CAPTURE_PREFIX}.{name}": {
             "meaning": f"{protocol.meaning}, as packets",
             "parameters": sorted(capture_parameters(protocol)),
+            "meanings": capture_parameters(protocol),
         }
         for name, protocol in PROTOCOLS.items()
     }
-    streams[HANDSHAKE] = {"meaning": "completed TCP handshakes", "parameters": []}
+    streams[HANDSHAKE] = {"meaning": "completed TCP handshakes", "parameters": [], "meanings": {}}
     return streams

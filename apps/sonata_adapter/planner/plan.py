@@ -32,6 +32,7 @@ from apps.sonata_adapter.query.dataflow import (
     ReduceNode,
     WindowTable,
     compile_query,
+    conjuncts,
     key_fields,
     sources,
 )
@@ -217,6 +218,14 @@ def _needed(request: QueryRequest) -> list[tuple[Match, bool]]:
         for match in conditions_of(_packets(node).filters).alternatives:
             _want(found, match, payload)
     return found
+
+
+def packet_filters(request: QueryRequest) -> list[tuple[Expression, ...]]:
+    """For each side of a query, the conditions that a packet must meet to be counted there."""
+    return [
+        tuple(part for each in _packets(node).filters for part in conjuncts(each))
+        for node in _nodes(compile_query(request.query))
+    ]
 
 
 def _want(found: list[tuple[Match, bool]], match: Match, payload: bool) -> None:

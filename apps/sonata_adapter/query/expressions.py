@@ -96,6 +96,8 @@ PACKET_FIELDS: Final[dict[str, tuple[Kind, str]]] = {
 }
 """Fields of a packet.  `dns.*` and `payload` need copies of the frame's bytes."""
 
+UNITS: Final = {"length": "bytes"}
+"""Units of those that have one."""
 PAYLOAD_FIELDS: Final = frozenset({"dns.response", "dns.qtype", "dns.name"})
 
 

@@ -1,6 +1,7 @@
 """`sdnator queries`: list, explain, add and run as a user sees them."""
 
 import json
+from collections import Counter
 
 import pytest
 from typer.testing import CliRunner
@@ -9,6 +10,7 @@ from apps.sonata_adapter.query.catalogue import CATALOGUE
 from sdnator.capture.captures import CaptureWriter
 from sdnator.cli.queries_commands import queries
 from sdnator.errors import BadInput
+from sdnator.testing.oracles import sonata as oracle
 from sdnator.testing.query_traffic import mixed
 from tests.apps.sonata_adapter.query.test_catalogue import expect
 
@@ -17,6 +19,15 @@ MINE = """query busy(window=1s, most=3):
     map dst = ip.dst
     reduce by dst: n = count()
     filter n > most
+"""
+JOINED = """query open_ends(window=2s):
+    filter tcp.flags == SYN
+    map dst = ip.dst
+    distinct
+    join anti on dst with:
+        filter tcp.flags == FIN
+        map dst = ip.src
+        distinct
 """
 
 
@@ -31,14 +42,79 @@ def run(*arguments):
     return result.output
 
 
-def test_list_names_all_with_parameters():
-    """As a table for people and as JSON."""
+def test_list_is_one_screen_and_show_has_the_details():
+    """A line a query; parameters, text and cost are in `show` and in the JSON."""
     described = json.loads(run("list", "--json"))["queries"]
     assert [each["name"] for each in described] == list(CATALOGUE)
     assert all(p["default"] and p["bounds"] for each in described for p in each["parameters"])
-    text = run("list")
-    assert "network.traffic_capture.sonata.tcp" in text
+    lines = run("list").splitlines()
+    assert len(lines) <= 24
+    assert [line.split()[0] for line in lines[1 : len(CATALOGUE) + 1]] == list(CATALOGUE)
+    assert any(line.startswith("network.traffic_capture.sonata.tcp ") for line in lines)
+    text = run("show", "new_tcp")
     assert "in the switch, results only" in text
+    assert "reduce by dst: count = count()" in text
+    assert "100ms to 1h" in text
+    assert json.loads(run("show", "ddos", "--json"))["name"] == "ddos"
+    assert "source port" in run("show", "tcp")
+
+
+def test_fields_say_where_they_run():
+    """Filters and keys that the planner accepts are of the switch; payloads are of the host."""
+    fields = {each["name"]: each for each in json.loads(run("fields", "--json"))}
+    assert set(fields["ip.dst"]["switch"]) == {"filter", "key"}
+    assert fields["length"]["unit"] == "bytes"
+    assert fields["tcp.seq"]["switch"] == []
+    assert fields["dns.name"]["payload"]
+    assert len(run("fields").splitlines()) == len(fields) + 1
+
+
+def test_a_query_is_tried_over_a_capture(tmp_path):
+    """Rows of each operator are those that a plain loop counts; the query is not added."""
+    frames = mixed(["new_tcp"], seconds=6)
+    with CaptureWriter(tmp_path / "a.pcap") as writer:
+        for frame in frames:
+            writer.write(frame.time_us * 1000, frame.data, frame.length)
+    (tmp_path / "mine.sonata").write_text(MINE)
+    line = run("test", tmp_path / "mine.sonata", "--capture", tmp_path / "a.pcap", "--json")
+    one = json.loads(line)
+    packets = [oracle.read(*frame) for frame in frames]
+    syns = Counter((p.time_us // 10**6, p.dst) for p in packets if oracle.is_syn(p))
+    over = sum(count > 3 for count in syns.values())
+    assert [(each["rows_in"], each["rows_out"]) for each in one["steps"]] == [
+        (len(frames), syns.total()),
+        (syns.total(), syns.total()),
+        (syns.total(), len(syns)),
+        (len(syns), over),
+    ]
+    assert over == one["found"] == len(one["results"]) > 0
+    assert [each["place"] for each in one["plan"]["operators"]] == ["switch"] * 4
+    assert one["cost"]["packets"] == len(frames)
+    text = run("test", tmp_path / "mine.sonata", "--capture", tmp_path / "a.pcap", "--most", "1")
+    assert f"{over} results" in text
+    assert f"… {over - 1} more" in text
+    assert "busy" not in run("list")
+
+
+def test_both_sides_of_a_join_are_counted(tmp_path):
+    """What the switch would copy is what its classifier can express of either side."""
+    frames = mixed(["syn_flood"], seconds=6)
+    with CaptureWriter(tmp_path / "a.pcap") as writer:
+        for frame in frames:
+            writer.write(frame.time_us * 1000, frame.data, frame.length)
+    (tmp_path / "mine.sonata").write_text(JOINED)
+    one = json.loads(run("test", tmp_path / "mine.sonata", "--capture", tmp_path / "a.pcap", "--json"))
+    packets = [oracle.read(*frame) for frame in frames]
+    window = 2 * 10**6
+    syns = {(p.time_us // window, p.dst) for p in packets if oracle.is_syn(p)}
+    fins = {(p.time_us // window, p.src) for p in packets if oracle.is_fin(p)}
+    steps = {each["operator"].split(" ")[0]: each for each in one["steps"] if "join" in each["operator"]}
+    assert steps["join"]["rows_out"] == len(syns - fins) == one["found"]
+    told = [each["rows_out"] for each in one["steps"] if each["operator"].startswith("distinct")]
+    assert told == [len(syns), len(fins)]
+    both = sum(oracle.is_syn(p) or oracle.is_fin(p) for p in packets)
+    assert one["cost"]["tuples_to_host"] == both < len(frames)
+    assert not one["plan"]["in_switch"]
 
 
 def test_explain_draws_the_plan():
@@ -89,6 +165,8 @@ def test_run_over_a_capture_equals_naive(name, tmp_path):
         (("explain", "network.traffic_query.sonata.ddos:window=*"), "name one query"),
         (("explain", "ddos:window=0s"), "100ms to 1h"),
         (("add", "/nowhere"), "cannot be read"),
+        (("show", "nothing"), "there are new_tcp"),
+        (("test", "/nowhere", "--capture", "x"), "cannot be read"),
     ],
 )
 def test_misuse_is_one_line(arguments, what):
