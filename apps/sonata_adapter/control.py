@@ -19,8 +19,8 @@ from apps.sonata_adapter.host.handshake import Handshakes
 from apps.sonata_adapter.host.merge import Merger, patience
 from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
 from apps.sonata_adapter.planner.placement import StageEntry, SwitchLimits
-from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans
-from apps.sonata_adapter.planner.refinement import Crossings, Refinement
+from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, plan
+from apps.sonata_adapter.planner.refinement import Crossings, Refinement, coarsest
 from apps.sonata_adapter.query.catalogue import Template
 from apps.sonata_adapter.query.dataflow import WindowTable, compile_query
 from apps.sonata_adapter.results import Captured, Output, QueryResult
@@ -336,6 +336,34 @@ class Control:
             "open_windows": sum(each.open for station in stations for each in station.asking),
             "keys": sum(map(len, self._keys.values())),
             "refused": len(self._refused),
+        }
+
+    def plan_beside(self, request: QueryRequest) -> QueryPlans:
+        """The plan if one more request came now; nothing changes."""
+        return plan(
+            [*self._requests.values(), coarsest(request)],
+            self._limits,
+            before=self.plan,
+            generation=self._generation,
+        )
+
+    def came(self, one: QueryPlan) -> dict[str, int]:
+        """What has come from the switches for a query of the plan since it is there: totals."""
+        reports = [
+            station.reports[one.identity]
+            for station in self._stations.values()
+            if one.identity in station.reports
+        ]
+        reported = sum(each.tuples for each in reports)
+        tuples = self._tuples(one)
+        return {
+            "tuples": tuples,
+            "reports": reported,
+            "copies": tuples - reported,
+            "overflow": self._overflow(one),
+            "late_reads": sum(
+                each.missed for each in reports if isinstance(each, (RegisterReads, Differences))
+            ),
         }
 
     def _tuples(self, one: QueryPlan) -> int:

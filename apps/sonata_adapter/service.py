@@ -47,12 +47,13 @@ from apps.sonata_adapter.keys import (
     QueryRequest,
     capture_parameters,
 )
+from apps.sonata_adapter.plan_answer import OF, PLAN, asked_of, plan_answer
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.query.catalogue import CATALOGUE, Template
 from apps.sonata_adapter.query.templates import QueryFolder, own_queries
 from apps.sonata_adapter.results import Captured, QueryResult
 from apps.sonata_adapter.switch.cell_read import CellRead
-from due import NO_WAIT, Assignment, Capability, Engine, Interest, Item, RecordBatch
+from due import NO_WAIT, PUB_ONLY, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
 TELEMETRY: Final = "network.telemetry.sonata"
@@ -91,6 +92,7 @@ CAPABILITIES = (
     Capability(f"{COMMAND}.*", delivery="reliable", archive="always"),
     Capability(f"{CELL_REQUEST}.*", delivery="reliable"),
     Capability(f"{INCOMPATIBLE}.*", archive="always"),
+    Capability(f"{PLAN}:{OF}=*"),
     Capability(f"{EVIDENCE_PREFIX}.*", delivery="reliable", archive="always"),
     Capability(f"{BASELINE}.*", delivery="reliable", archive="always"),
 )
@@ -105,6 +107,9 @@ _STEP_US: Final = 3_600_000_000
 """A longer step of a switch's clock is accepted only after several items agree."""
 _LAST_ANSWERS_S: Final = 1.0
 _LOOK_S: Final = 0.01
+_MOST_PLANS: Final = 64
+"""Plans that are told at a time; more interests in plans get no answer."""
+_PLAN_S: Final = 1.0
 _MY_KEYS: Final = (QUERY_PREFIX, CAPTURE_PREFIX, HANDSHAKE)
 
 
@@ -156,6 +161,11 @@ class SonataAdapterService:
         self._swept: set[str] = set()
         self._active = False
         self._heard: frozenset[str] = frozenset()
+        self._plans: dict[str, str] = {}
+        """Keys of plans that are wanted, and what they ask of."""
+        self._plans_at = 0.0
+        self._results: dict[str, tuple[int, int]] = {}
+        """By key: results written, and capture time of the last, ns."""
         self._commands = count(1)
         self._written = 0
 
@@ -178,6 +188,7 @@ class SonataAdapterService:
             self._read_cells()
             self._refine()
             self._hear()
+            self._tell_plans()
 
     def stop(self) -> None:
         """Report open results, and remove all entries from the switch."""
@@ -230,7 +241,8 @@ class SonataAdapterService:
         keys = frozenset(each.key for each in assignments)
         wanted = frozenset(key for key in keys if key.startswith(_MY_KEYS))
         evidence = frozenset(key for key in keys if key.startswith(f"{EVIDENCE_PREFIX}."))
-        heard = keys - wanted - evidence
+        plans = sorted(key for key in keys if key.startswith(f"{PLAN}:"))
+        heard = keys - wanted - evidence - frozenset(plans)
         with self._lock:
             self._active = bool(assignments)
             self._sweep()
@@ -248,6 +260,27 @@ class SonataAdapterService:
                 # a new controller does not know earlier requests
                 self._apply(self._control.everything())
             self._heard = heard
+            asked = {key: asked_of(key) for key in plans}
+            self._plans = dict([(key, of) for key, of in asked.items() if of][:_MOST_PLANS])
+            self._results = {key: found for key, found in self._results.items() if key in self._served()}
+            self._plans_at = 0.0
+
+    def _served(self) -> set[str]:
+        return {request.output for request in self._control.requests} | self._wanted
+
+    def _tell_plans(self) -> None:
+        """Once a second, tell those who ask what is done for a key."""
+        now = time.monotonic()
+        if not self._plans or now < self._plans_at:
+            return
+        self._plans_at = now + _PLAN_S
+        templates = self._templates()
+        for key, of in self._plans.items():
+            told = plan_answer(of, self._control, templates)
+            written, last = self._results.get(told.get("output", ""), (0, 0))
+            told |= {"results": written, "last_result": last, "monotonic_s": now}
+            told |= {"switches": sorted(self._switches), "adapter_cpu_s": time.process_time()}
+            self._engine.write(key, told, [PUB_ONLY])
 
     def _on_switch(self, item: Item, state: SwitchPrograms) -> None:
         name = item.key.rpartition(".")[2]
@@ -388,6 +421,7 @@ class SonataAdapterService:
                         weighed.append((key, one.switch, output))
                     continue
                 self._written += 1
+                self._results[key] = (self._results.get(key, (0, 0))[0] + 1, at_us * 1000)
                 self._engine.write(key, value, [NO_WAIT], event_time=at_us * 1000)
         if weighed:
             self._say(self._evidence.take(weighed))

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import queue
 import shutil
 import signal
@@ -18,6 +17,8 @@ from urllib.parse import unquote, urlsplit
 import typer
 
 from sdnator.cli.item_rates import SECONDS, Rates, headline
+from sdnator.cli.live_items import live_items
+from sdnator.cli.plan_question import is_asked_of_adapter
 from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
 from sdnator.northbound import latest
@@ -27,8 +28,6 @@ from sdnator.up import running
 if TYPE_CHECKING:
     from due import Item
 
-_WAITING = 10_000
-"""Items that may wait for the terminal; more are counted as missed, since a viewer must not slow down producers."""
 _LOOK_SECONDS = 0.1
 _TEXT_WIDTH = 200
 _PLOTTED = SECONDS
@@ -73,7 +72,8 @@ def observe(
     wanted = typed_key(key)
     seconds = duration_ns(duration, "--for") / 1e9 if duration else math.inf
     url = updates or running.need().updates
-    with _stopping() as stopped, _items(wanted, url) as (waiting, lost):
+    question = _Question(wanted)
+    with _stopping() as stopped, live_items([wanted, *question.keys], url) as (waiting, lost):
         begin = time.monotonic()
         rates = Rates(begin)
         shown = _Shown(as_json, plot, rates)
@@ -87,6 +87,8 @@ def observe(
                 item = waiting.get(timeout=min(begin + seconds - now, _LOOK_SECONDS))
             except queue.Empty:
                 continue
+            if question.is_answered_by(item):
+                continue
             rates.add(item.value)
             shown.item(item, last=waiting.empty())
         shown.end()
@@ -95,6 +97,27 @@ def observe(
     hint = "" if rates.items else "; `sdnator keys` shows what is made"
     rows = f", {rates.records:,} records" if rates.records != rates.items else ""
     print(f"sdnator: {counted(rates.items, 'item')}{rows}, {mean:,.1f} a second{more}{hint}", file=sys.stderr)
+
+
+class _Question:
+    """Asks the Sonata adapter beside the observation whether it serves the key."""
+
+    def __init__(self, key: str) -> None:
+        from due import Key
+
+        self.keys: list[str] = []
+        if is_asked_of_adapter(key) and Key.parse(key).concrete:
+            from apps.sonata_adapter.plan_answer import plan_key
+
+            self.keys = [plan_key(key)]
+
+    def is_answered_by(self, item: "Item") -> bool:
+        """Whether the item is the answer; raises BadInput with what would do if the key is refused."""
+        if item.key not in self.keys:
+            return False
+        if item.value.get("state") == "refused":
+            raise BadInput(f"refused: {item.value['reason']}")
+        return True
 
 
 class _Shown:
@@ -132,38 +155,6 @@ class _Shown:
     def end(self) -> None:
         if self._in_place:
             print()
-
-
-@contextmanager
-def _items(key: str, url: str) -> "Iterator[tuple[queue.Queue[Item], Callable[[], int]]]":
-    """A bounded queue of the items under a key, and the number of items that did not fit."""
-    import tempfile
-
-    from due import CONSUMER, Engine, Options
-    from due.errors import DueError
-
-    waiting: queue.Queue[Item] = queue.Queue(_WAITING)
-    lost = [0]
-
-    def put(item: "Item") -> None:
-        try:
-            waiting.put_nowait(item)
-        except queue.Full:
-            lost[0] += 1
-
-    with tempfile.TemporaryDirectory(prefix="sdnator-observe-") as folder:
-        engine = Engine(
-            Options(updates=url, archive=f"sqlite://{folder}/none.db", directory=folder, spool_bytes=0)
-        )
-        try:
-            # a unique name: instances of one app would share a reliable stream between them
-            engine.init(f"observe-{os.getpid()}-{time.time_ns() % 10**6:06d}", CONSUMER)
-            engine.observe(key).subscribe(put)
-            yield waiting, lambda: lost[0]
-        except DueError as error:
-            raise PipelineError(str(error)) from None
-        finally:
-            engine.close()
 
 
 @contextmanager

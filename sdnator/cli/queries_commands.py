@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from apps.sonata_adapter.errors import SonataError
@@ -19,6 +20,7 @@ from apps.sonata_adapter.keys import (
     request_of,
 )
 from apps.sonata_adapter.planner.explain import explain as explain_plan
+from apps.sonata_adapter.planner.operators import placed_operators
 from apps.sonata_adapter.planner.plan import plan
 from apps.sonata_adapter.planner.refinement import coarsest
 from apps.sonata_adapter.query.catalogue import Template
@@ -26,11 +28,13 @@ from apps.sonata_adapter.query.templates import QueryFolder, own_queries
 from apps.sonata_adapter.query.text import parse_queries
 from due import DueError
 from sdnator.capture.captures import CaptureError
-from sdnator.cli.due_commands import known_archive
+from sdnator.cli.due_commands import Updates, known_archive
 from sdnator.cli.plain_table import plain_table
+from sdnator.cli.plan_question import ask_plan
 from sdnator.cli.queries_run import PastPackets, archived, as_line, as_text, captured, engine_of
 from sdnator.cli.queries_workbench import fields_text, fields_value, tested, tested_text, tested_value
 from sdnator.errors import BadInput
+from sdnator.up import running
 
 queries = typer.Typer(
     help="Telemetry queries: list, explain, add your own, run over captures or the archive.",
@@ -125,15 +129,57 @@ def try_queries(
 
 
 @queries.command("explain")
-def explain_query(key: KeyArgument) -> None:
+def explain_query(
+    key: KeyArgument,
+    *,
+    updates: Updates = "",
+    empty: Annotated[
+        bool,
+        typer.Option("--empty", help="Plan for a switch without other queries, even if a pipeline runs."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
     """Show which operators of a query run in the switch and which on the host.
+
+    Asks the running adapter, which knows what else is in its switches; without one, plans for an empty switch.
 
     Example: sdnator queries explain network.traffic_query.sonata.ddos:window=1s
     """
     known = templates()
     request = _request(key, known)
+    found = None if updates or empty else running.find()
+    url = "" if empty else updates or (found.updates if found is not None else "")
+    if url:
+        (told,) = ask_plan(request.key, url)
+        if told["state"] == "refused":
+            raise BadInput(f"refused: {told['reason']}")
+        source = _SOURCES[told["state"]].format(others=told["others"])
+        shown = {"source": source, **told}
+    else:
+        shown = _planned_alone(request, known)
+    typer.echo(json.dumps(shown) if as_json else f"{shown['text']}\n\n  {shown['source']}")
+
+
+_SOURCES = {
+    "running": "as it runs now, beside {others} other queries",
+    "possible": "as the running adapter would place it now, beside {others} other queries; nobody wants it",
+}
+
+
+def _planned_alone(request: QueryRequest, known: dict[str, Template]) -> dict[str, Any]:
+    first = coarsest(request)
+    plans = plan([first])
+    one = plans.of(first.identity)
     meaning = known[request.name].meaning if request.kind == "query" else ""
-    typer.echo(explain_plan(request, plan([coarsest(request)]), meaning=meaning))
+    return {
+        "source": "as it would be in a switch without other queries; no running adapter was asked",
+        "state": "alone",
+        "identity": request.identity,
+        "in_switch": one.in_switch,
+        "reason": one.reason,
+        "operators": [msgspec.to_builtins(each) for each in placed_operators(first, one)],
+        "text": explain_plan(request, plans, meaning=meaning),
+    }
 
 
 @queries.command("add")

@@ -34,6 +34,8 @@ JOINED = """query open_ends(window=2s):
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("SDNATOR_QUERIES", str(tmp_path / "queries"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.delenv("DUE_UPDATES", raising=False)
 
 
 def run(*arguments):
@@ -120,6 +122,8 @@ def test_both_sides_of_a_join_are_counted(tmp_path):
 def test_explain_draws_the_plan():
     """Also under the short name."""
     assert "stage 0" in run("explain", "ddos")
+    assert "no running adapter was asked" in run("explain", "ddos")
+    assert json.loads(run("explain", "ddos", "--json"))["in_switch"]
     assert "only copies, because" in run("explain", "network.traffic_query.sonata.zorro:similar=3")
 
 
