@@ -60,6 +60,10 @@ COMMANDS = {
         "sdnator.cli.status_command:down",
         "Stop the pipeline of `sdnator up` and wait until it has ended.",
     ),
+    "explain": (
+        "sdnator.cli.explain_command:explain",
+        "Explain a key: who wants it, who makes it at what rate, its plan and cost, its results and their archive.",
+    ),
     "flow": ("sdnator.cli.coordinator_commands:flow", "Draw the data flow: producers, keys, consumers."),
     "get": (
         "sdnator.cli.due_commands:get",

@@ -34,7 +34,7 @@ def tables(
     Example: sdnator tables s1 --table block_mac
     """
     place = place_of(switch, device_id)
-    program, rows = _read(place, table)
+    program, rows = read_tables(place, table)
     if as_json:
         print(json.dumps({"switch": place.name, "address": place.address, "entries": rows}))
     elif table:
@@ -51,14 +51,14 @@ def counters(switch: SwitchArgument = "", *, device_id: DeviceId = 1, as_json: J
     Example: sdnator counters s1
     """
     place = place_of(switch, device_id)
-    counted = [row for row in _read(place, "")[1] if "packets" in row]
+    counted = [row for row in read_tables(place, "")[1] if "packets" in row]
     if as_json:
         print(json.dumps({"switch": place.name, "address": place.address, "counters": counted}))
     else:
         print(plain_table(_ENTRY, map(_entry_cells, counted)))
 
 
-def _read(place: Place, table: str) -> "tuple[ProgramInfo, list[dict[str, Any]]]":
+def read_tables(place: Place, table: str) -> "tuple[ProgramInfo, list[dict[str, Any]]]":
     """The program that runs there and its entries; raises PipelineError, BadInput for a table it lacks."""
     import grpc
 

@@ -177,7 +177,7 @@ def test_observe_shows_what_comes_and_ends_by_count(tmp_path):
 
 def test_a_viewer_that_does_not_keep_up_misses_items_and_holds_nobody_back(tmp_path, monkeypatch):
     """The queue is bounded; what finds no room is counted and told."""
-    monkeypatch.setattr("sdnator.cli.due_commands._WAITING", 1)
+    monkeypatch.setattr("sdnator.cli.live_items._WAITING", 1)
     with EmbeddedServer(tmp_path / "updates") as server:
         producer = Engine(Options(updates=server.url, directory=str(tmp_path / "p"), coordinated=False))
         producer.init("maker", PRODUCER, capabilities=[Capability("a.b.maker", delivery="reliable")])
