@@ -20,7 +20,7 @@ def commands():
 def test_commands_for_a_running_pipeline(tmp_path, monkeypatch):
     """Each runs to a good end; the query that the page spells out is registered on the way."""
     monkeypatch.setenv("SDNATOR_QUERIES", str(tmp_path / "queries"))
-    (query,) = re.findall(r"```text\n(.*?)```", TEXT, re.DOTALL)
+    query, *_ = re.findall(r"```text\n(.*?)```", TEXT, re.DOTALL)
     file = tmp_path / "my_scan.sonata"
     file.write_text(query)
     capture = tmp_path / "capture.pcap"

@@ -56,6 +56,9 @@ _PORTS: Final = {
 _ADDRESSES: Final = {"ip.src": ("ip_src_hi", "ip_src_lo"), "ip.dst": ("ip_dst_hi", "ip_dst_lo")}
 _ARP_ADDRESSES: Final = {"arp.src": "arp_src_ip", "arp.dst": "arp_dst_ip"}
 _DNS: Final = ("dns.response", "dns.qtype", "dns.name")
+_NAMES: Final = ("len(dns.name)", "entropy(dns.name)")
+_PAYLOADS: Final = ("tcp.payload_len", "len(payload)", "entropy(payload)")
+_TRANSPORTS: Final = (6, 17)
 _DNS_PORT: Final = 53
 _NO_PORT: Final = -1
 _NO_PORTS: Final = np.array(_NO_PORT)
@@ -238,6 +241,12 @@ class PacketColumns:
         if name in _DNS:
             self._read_dns()
             return self._columns[name]
+        if name in _NAMES:
+            self._read_names()
+            return self._columns[name]
+        if name in _PAYLOADS:
+            self._read_payloads()
+            return self._columns[name]
         if name in _ARP_ADDRESSES:
             return zeros(self._size), self._raw(_ARP_ADDRESSES[name]).astype(np.uint64)
         return self._address(*_ADDRESSES[name])
@@ -263,13 +272,36 @@ class PacketColumns:
         chosen = self.origin if rows is None else self.origin[rows]
         return FrameBytes(self._batch["frame"][chosen], self._batch["captured"][chosen])
 
+    def _dns_frames(self) -> tuple[NDArray[np.intp], FrameBytes | None]:
+        """Rows of UDP port 53, and their bytes if they were copied."""
+        ports = (self.column("udp.sport")[0], self.column("udp.dport")[0])
+        rows = np.flatnonzero((ports[0] == _DNS_PORT) | (ports[1] == _DNS_PORT))
+        return rows, self._frames(rows) if len(rows) else None
+
+    def _read_names(self) -> None:
+        size = np.full(self._size, -1, dtype=np.int64)
+        entropy = size.copy()
+        rows, frames = self._dns_frames()
+        if frames is not None:
+            size[rows], entropy[rows] = frames.names()
+        self._columns |= dict(zip(_NAMES, ((size,), (entropy,)), strict=True))
+
+    def _read_payloads(self) -> None:
+        size = np.full(self._size, -1, dtype=np.int64)
+        entropy = size.copy()
+        protocol = self._raw("ip_proto")
+        rows = np.flatnonzero(np.isin(protocol, _TRANSPORTS))
+        frames = self._frames(rows) if len(rows) else None
+        if frames is not None:
+            size[rows], entropy[rows] = frames.payloads(self._raw("length")[rows])
+        of_tcp = np.where(protocol == _TRANSPORTS[0], size, -1)
+        self._columns |= dict(zip(_PAYLOADS, ((of_tcp,), (size,), (entropy,)), strict=True))
+
     def _read_dns(self) -> None:
         response = np.full(self._size, -1, dtype=np.int64)
         qtype = response.copy()
         name = np.zeros(self._size, dtype=np.uint64)
-        ports = (self.column("udp.sport")[0], self.column("udp.dport")[0])
-        rows = np.flatnonzero((ports[0] == _DNS_PORT) | (ports[1] == _DNS_PORT))
-        frames = self._frames(rows) if len(rows) else None
+        rows, frames = self._dns_frames()
         if frames is not None:
             response[rows], qtype[rows], name[rows] = frames.dns()
         self._columns |= {"dns.response": (response,), "dns.qtype": (qtype,), "dns.name": (name,)}

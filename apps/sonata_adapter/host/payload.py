@@ -9,9 +9,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.sonata_adapter.host.byte_entropy import byte_entropy
+
 _ETHERNET: Final = 14
 _VLANS: Final = (0x8100, 0x88A8, 0x9100)
 _TCP: Final = 6
+_UDP: Final = 17
+_TCP_HEADER: Final = 20
+_DOT: Final = ord(".")
+_LOWER_BYTES: Final = np.frombuffer(bytes(range(256)).lower(), dtype=np.uint8)
 _UDP_HEADER: Final = 8
 _PLAIN_HEADERS: Final = 34
 _DNS_HEADER: Final = 12
@@ -86,25 +92,89 @@ class FrameBytes:
 
     def dns(self) -> tuple[Numbers, Numbers, NDArray[np.uint64]]:
         """(response, question type, hash of the name) of frames that are known to be UDP port 53."""
-        transport, end = self.transport()
-        start = np.where(transport >= 0, transport + _UDP_HEADER, -1)
+        start, end = self._messages()
         whole = (start >= 0) & (start + _DNS_HEADER <= end)
         response = np.where(whole, self.byte(start + 2) >> 7, -1)
         asked = whole & (self.short(start + 4) > 0)
         name_at = np.where(asked, start + _DNS_HEADER, 0)
-        name_end = self._name_end(name_at, end, asked)
+        name_end, _, _ = self._labels(name_at, end, asked)
         typed = asked & (name_end + 2 <= end)
         qtype = np.where(typed, self.short(name_end), -1)
         return response, qtype, self._name_hash(name_at, np.minimum(name_end, end), asked)
 
-    def _name_end(self, at: Numbers, end: Numbers, asked: NDArray[np.bool_]) -> Numbers:
-        """Offset behind the root label; beyond the captured bytes where the name is cut."""
+    def names(self) -> tuple[Numbers, Numbers]:
+        """(length in bytes, entropy in thousandths of a bit a byte) of the first question's name, -1 for none.
+
+        The name is as people write it: lower case, labels parted by dots, none at its end; as far as it was captured.
+        """
+        start, end = self._messages()
+        asked = (start >= 0) & (start + _DNS_HEADER <= end) & (self.short(start + 4) > 0)
+        name_at = np.where(asked, start + _DNS_HEADER, 0)
+        name_end, closed, sizes_at = self._labels(name_at, end, asked)
+        taken = np.minimum(name_end, end) - name_at
+        size = np.where(asked, np.maximum(taken - 1 - closed, 0), -1)
+        entropy = np.full(len(self._begin), -1, dtype=np.int64)
+        rows = np.flatnonzero(asked)
+        if len(rows):
+            dotted = self._flat.copy()
+            for place in sizes_at:
+                dotted[place] = _DOT
+            text = self._text(_LOWER_BYTES[dotted], rows, name_at[rows] + 1, int(size[rows].max()))
+            entropy[rows] = byte_entropy(text, size[rows])
+        return size, entropy
+
+    def payloads(self, wire: NDArray[Any]) -> tuple[Numbers, Numbers]:
+        """(length in bytes, entropy in thousandths of a bit a byte) of TCP and UDP payloads, -1 for none.
+
+        The length is what the headers say, the entropy that of the bytes that were captured. `wire`: bytes of each
+        frame on the wire, for packets whose header leaves their length open.
+        """
+        at, kind = self._network()
+        transport, end = self.transport()
+        protocol = self._protocol()
+        four = kind == 0x0800
+        lengths = np.where(four, self.short(at + 2), self.short(at + 4) + 40)
+        lengths = np.where(lengths == np.where(four, 0, 40), wire.astype(np.int64) - at, lengths)
+        tcp = protocol == _TCP
+        header = np.where(tcp, (self.byte(transport + 12) >> 4) * 4, _UDP_HEADER)
+        least = np.where(tcp, _TCP_HEADER, _UDP_HEADER)
+        whole = (transport >= 0) & (tcp | (protocol == _UDP)) & (header >= least)
+        whole &= transport + least <= self._captured
+        size = np.where(whole, np.maximum(at + lengths - transport - header, 0), -1)
+        entropy = np.full(len(self._begin), -1, dtype=np.int64)
+        rows = np.flatnonzero(whole)
+        if len(rows):
+            start = (transport + header)[rows]
+            held = np.clip(end[rows] - start, 0, size[rows])
+            entropy[rows] = byte_entropy(self._text(self._flat, rows, start, int(held.max())), held)
+        return size, entropy
+
+    def _messages(self) -> tuple[Numbers, Numbers]:
+        """Where the payloads of UDP datagrams begin, -1 where there is none, and where they end."""
+        transport, end = self.transport()
+        return np.where(transport >= 0, transport + _UDP_HEADER, -1), end
+
+    def _text(self, flat: Bytes, rows: NDArray[np.intp], start: Numbers, size: int) -> Bytes:
+        """`size` bytes of these frames from `start` on, one row for each frame; behind a frame its last byte."""
+        places = np.minimum(start[:, None] + np.arange(size), self._width - 1)
+        return np.asarray(flat[self._begin[rows][:, None] + places])
+
+    def _labels(
+        self, at: Numbers, end: Numbers, asked: NDArray[np.bool_]
+    ) -> tuple[Numbers, NDArray[np.bool_], list[Numbers]]:
+        """Offset behind the root label (beyond the captured bytes where the name is cut), whether the root label
+        was captured, and the places of all labels' sizes among the bytes of all frames."""
         ends = at.copy()
+        closed = np.zeros(len(at), dtype=np.bool_)
+        sizes_at: list[Numbers] = []
         rows = np.flatnonzero(asked)
         place, limit, begin = at[rows], end[rows], self._begin[rows]
         for _ in range(_LABELS):
+            inside = place < limit
             sizes = self._flat[begin + np.minimum(place, self._width - 1)].astype(np.int64)
-            sizes[place >= limit] = 0
+            sizes[~inside] = 0
+            sizes_at.append((begin + place)[inside])
+            closed[rows[inside & (sizes == 0)]] = True
             place = place + sizes + 1
             walking = (sizes > 0) & (place < limit)
             if not walking.all():
@@ -113,7 +183,7 @@ class FrameBytes:
             if not len(rows):
                 break
         ends[rows] = place
-        return ends
+        return ends, closed, sizes_at
 
     def _name_hash(self, start: Numbers, end: Numbers, asked: NDArray[np.bool_]) -> NDArray[np.uint64]:
         """64 bits of the name's captured bytes in lower case; 0 where there is none."""

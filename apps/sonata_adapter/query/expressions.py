@@ -91,14 +91,33 @@ PACKET_FIELDS: Final[dict[str, tuple[Kind, str]]] = {
     "port": ("number", "port of the switch that the frame came in by"),
     "length": ("number", "bytes on the wire"),
     "dns.response": ("number", "1 = DNS answer over UDP, 0 = question, -1 = no DNS"),
-    "dns.qtype": ("number", "record type of the first question, -1 = none"),
+    "dns.qtype": ("number", "record type of the first question, -1 = none; dns.type is the same"),
     "dns.name": ("name", "name of the first question, in lower case"),
+    "len(dns.name)": ("number", "length of that name with its dots, as far as it was copied, -1 = none"),
+    "entropy(dns.name)": ("number", "Shannon entropy of that name's bytes, 0 to 8,000, -1 = none"),
+    "tcp.payload_len": (
+        "number",
+        "TCP payload by the headers; -1 = no TCP, or behind IPv6 extension headers",
+    ),
+    "len(payload)": ("number", "the same for TCP and UDP"),
+    "entropy(payload)": ("number", "Shannon entropy of the payload, as far as it was copied, -1 = none"),
 }
-"""Fields of a packet.  `dns.*` and `payload` need copies of the frame's bytes."""
+"""Fields of a packet.  `dns.*` and those of payloads need copies of the frame's bytes.
 
-UNITS: Final = {"length": "bytes"}
+What a function makes of a packet's text is a field, too: its name is the call."""
+FUNCTIONS: Final = ("len", "entropy")
+OTHER_NAMES: Final = {"dns.type": "dns.qtype"}
+"""Second names of fields."""
+
+_MILLIBITS: Final = "mbit/byte"
+UNITS: Final = {
+    "length": "bytes", "len(dns.name)": "bytes", "tcp.payload_len": "bytes", "len(payload)": "bytes",
+    "entropy(dns.name)": _MILLIBITS, "entropy(payload)": _MILLIBITS,
+}  # fmt: skip
 """Units of those that have one."""
-PAYLOAD_FIELDS: Final = frozenset({"dns.response", "dns.qtype", "dns.name"})
+PAYLOAD_FIELDS: Final = frozenset(
+    name for name in PACKET_FIELDS if name.startswith("dns.") or "payload" in name or "(" in name
+)
 
 
 def fields_of(expression: Expression) -> Iterator[str]:
@@ -234,6 +253,8 @@ def _expect(found: Kind, wanted: Kind, where: str) -> None:
 def _unknown(name: str, kinds: Mapping[str, Kind]) -> str:
     from difflib import get_close_matches
 
+    if name in PACKET_FIELDS and "(" in name:
+        return f"{name} is of packets only: use it before a map, or name it in the map"
     near = get_close_matches(name, kinds, 1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(kinds))}"
     return f"unknown field {name}; {hint}"

@@ -34,7 +34,7 @@ from apps.sonata_adapter.query.expressions import (
     text_of,
 )
 
-__all__ = ["ACK", "ETHERTYPE_ARP", "FIN", "RST", "SYN", "SYN_ACK", "Query", "arp", "count", "dns", "eth", "field", "icmp", "ip", "largest", "length", "payload_contains", "port", "tcp", "total", "udp", "vlan"]  # fmt: skip
+__all__ = ["ACK", "ETHERTYPE_ARP", "FIN", "RST", "SYN", "SYN_ACK", "Query", "arp", "count", "dns", "entropy", "eth", "field", "icmp", "ip", "largest", "length", "length_of", "payload", "payload_contains", "port", "tcp", "total", "udp", "vlan"]  # fmt: skip
 
 JoinKind = Literal["inner", "left", "outer", "anti"]
 Function = Literal["sum", "max"]
@@ -392,6 +392,43 @@ def payload_contains(pattern: bytes) -> Term:
     return Term(Contains(pattern))
 
 
+def entropy(text: Term) -> Term:
+    """Shannon entropy of a packet's text, in thousandths of a bit a byte.
+
+    Args:
+        text: `dns.name` or `payload`.
+
+    Returns:
+        A term for conditions and expressions.
+
+    Raises:
+        QueryError: another field.
+    """
+    return _measured("entropy", text)
+
+
+def length_of(text: Term) -> Term:
+    """Length of a packet's text in bytes; `len(…)` in the text form.
+
+    Args:
+        text: `dns.name` or `payload`.
+
+    Returns:
+        A term for conditions and expressions.
+
+    Raises:
+        QueryError: another field.
+    """
+    return _measured("len", text)
+
+
+def _measured(function: str, text: Term) -> Term:
+    made = f"{function}({text})"
+    if made not in PACKET_FIELDS:
+        raise QueryError(f"{made}: give dns.name or payload")
+    return field(made)
+
+
 class _Ip:
     """Fields of the IP header."""
 
@@ -407,6 +444,7 @@ class _Tcp:
     sport = field("tcp.sport")
     dport = field("tcp.dport")
     flags = field("tcp.flags")
+    payload_len = field("tcp.payload_len")
     seq = field("tcp.seq")
     ack = field("tcp.ack")
 
@@ -446,6 +484,7 @@ class _Dns:
 
     response = field("dns.response")
     qtype = field("dns.qtype")
+    type = qtype
     name = field("dns.name")
 
 
@@ -459,3 +498,5 @@ dns: Final = _Dns
 length: Final = field("length")
 port: Final = field("port")
 vlan: Final = field("vlan")
+payload: Final = field("payload")
+"""For `entropy` and `length_of`; see `payload_contains`, too."""

@@ -16,6 +16,7 @@ other side of a join is indented below it:
             map dst = ip.src
             reduce by dst: fins = count()
 
+`len` and `entropy` measure `dns.name` and `payload` of packets: `filter len(dns.name) >= 50`.
 `join` is `inner`, `left`, `outer` or `anti`.  Aggregates are `count()`, `sum(…)`, `max(…)`.
 Every error names line and column.
 """
@@ -31,6 +32,9 @@ from apps.sonata_adapter.errors import InvalidRequest, QueryError, QueryTextErro
 from apps.sonata_adapter.query.catalogue import Template, Values
 from apps.sonata_adapter.query.expressions import (
     FLAG_PATTERNS,
+    FUNCTIONS,
+    OTHER_NAMES,
+    PACKET_FIELDS,
     BinaryOperation,
     Contains,
     Expression,
@@ -288,6 +292,16 @@ class _Reader:
         self.next()
         return int(digits, base)
 
+    def _call(self, function: str) -> Expression:
+        """The field that a function makes of a packet's text."""
+        made = f"{function}({self.token.text})"
+        if made not in PACKET_FIELDS:
+            known = ", ".join(name for name in PACKET_FIELDS if name.startswith(f"{function}("))
+            self.fail(f"{function} is of a packet's text: {known}")
+        self.next()
+        self.expect(")")
+        return Field(made)
+
     def _plain_atom(self) -> Expression:
         if self.accept("("):
             inner = self.expression()
@@ -300,9 +314,15 @@ class _Reader:
             return Number(self.number())
         if token.kind == "name" and token.text not in ("and", "or", "not", "in", "contains"):
             self.next()
+            if token.text in FUNCTIONS and self.accept("("):
+                return self._call(token.text)
             known = self._parameters.get(token.text)
-            return Field(token.text) if known is None else Number(known)
+            return _field(token.text) if known is None else Number(known)
         return self.fail(f"expected a field or a number, found {token.text}")
+
+
+def _field(name: str) -> Field:
+    return Field(OTHER_NAMES.get(name, name))
 
 
 def _query(where: str, head: _Line, body: list[_Line]) -> Template:

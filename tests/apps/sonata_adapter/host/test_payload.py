@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.sonata_adapter.host.payload import FrameBytes
-from sdnator.testing.oracles import sonata
-from sdnator.testing.query_traffic import dns, tcp, udp
+from sdnator.testing.oracles import sonata, texts
+from sdnator.testing.query_traffic import dns, ethernet, tcp, udp
 
 labels = st.text("abcXYZ019-", min_size=1, max_size=63)
 names = st.lists(labels, min_size=1, max_size=5).map(".".join)
@@ -44,6 +44,56 @@ def test_dns_questions(questions):
             assert (hashes[one] == hashes[other]) == (naive[one][2] == naive[other][2])
 
 
+messages = st.one_of(
+    st.tuples(names, st.integers(0, 65535)).map(lambda one: dns(*one, response=False)),
+    st.binary(max_size=230),
+    # a header that promises a question, and anything in its place
+    st.binary(max_size=230).map(lambda rest: bytes(5) + b"\1" + bytes(6) + rest),
+    st.tuples(names, st.integers(0, 60)).map(lambda one: dns(one[0], response=True)[: 12 + one[1]]),
+)
+
+
+@given(st.lists(st.tuples(messages, st.booleans()), min_size=1, max_size=8))
+def test_names_are_measured_as_people_write_them(given_messages):
+    """Length and entropy of whole, cut and malformed names equal those of a plain reading."""
+    frames = [
+        udp("2001:db8::1", "2001:db8::2", 53, 9, message)
+        if six
+        else udp("10.0.0.1", "10.0.0.2", 9, 53, message)
+        for message, six in given_messages
+    ]
+    sizes, entropies = columns(frames).names()
+    naive = [texts.name_measures(sonata.read(0, len(frame), frame)) for frame in frames]
+    assert list(zip(sizes.tolist(), entropies.tolist(), strict=True)) == naive
+
+
+@given(st.lists(st.tuples(st.binary(max_size=400), st.integers(0, 3)), min_size=1, max_size=8))
+def test_payloads_are_measured(payloads):
+    """The length is the headers', also beyond the copied bytes; the entropy is that of the copied bytes."""
+    frames = []
+    for payload, shape in payloads:
+        source, target = ("2001:db8::1", "2001:db8::2") if shape & 1 else ("10.0.0.1", "10.0.0.2")
+        made = tcp(source, target, 5, 23, 24, payload) if shape & 2 else udp(source, target, 5, 23, payload)
+        frames.append(made)
+    wire = np.array([len(frame) for frame in frames])
+    sizes, entropies = columns(frames).payloads(wire)
+    assert sizes.tolist() == [texts.payload_length(frame) for frame in frames]
+    copied = [sonata.read(0, len(frame), frame).payload for frame in frames]
+    assert entropies.tolist() == [texts.entropy(data) for data in copied]
+
+
+def test_padding_is_no_payload_and_a_tag_is_no_reason():
+    """A padded ACK has an empty payload; other protocols have none at all."""
+    frames = [
+        tcp("10.0.0.1", "10.0.0.2", 5, 23, 16) + bytes(6),
+        tagged(tcp("10.0.0.1", "10.0.0.2", 5, 23, 24, b"abcd")),
+        ethernet("10.0.0.1", "10.0.0.2", 1, b"\x08\x00" + bytes(20)),
+    ]
+    sizes, entropies = columns(frames).payloads(np.array([60, 62, 60]))
+    assert sizes.tolist() == [0, 4, -1]
+    assert entropies.tolist() == [0, 2000, -1]
+
+
 @given(st.lists(st.binary(max_size=120), min_size=1, max_size=8))
 def test_garbage_is_read_without_harm(frames):
     """Whatever the bytes, there is an answer."""
@@ -51,6 +101,11 @@ def test_garbage_is_read_without_harm(frames):
     response, qtype, hashes = columns(frames).dns()
     assert len(response) == len(qtype) == len(hashes) == len(frames)
     assert len(columns(frames).payload_contains(b"zorro")) == len(frames)
+    wire = np.array([len(frame) for frame in frames])
+    for sizes, entropies in (columns(frames).names(), columns(frames).payloads(wire)):
+        assert len(sizes) == len(entropies) == len(frames)
+        assert (sizes >= -1).all()
+        assert ((entropies >= -1) & (entropies <= 8000)).all()
 
 
 def test_pattern_counts_within_the_payload_only():
