@@ -9,6 +9,8 @@
     sdnator.CaptureReplay    what it returns
     sdnator.Kitsune          the anomaly detector alone, to learn from and score packets
     sdnator.Query            a telemetry query, written in Python
+    sdnator.run_query        run a query over captures
+    sdnator.QueryResults     what it returns: for Arrow and pandas
 
 `__all__` is the whole public interface; every other name in this package may change.
 
@@ -23,17 +25,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from apps.kitsune.online import Kitsune
     from apps.sonata_adapter.query.language import Query
+    from sdnator.query_results import QueryResults, run_query
     from sdnator.replay.replay_capture import CaptureReplay, replay_capture
 
 __version__ = "0.1.0"
 
-__all__ = ["CaptureReplay", "Kitsune", "Query", "replay_capture"]
+__all__ = ["CaptureReplay", "Kitsune", "Query", "QueryResults", "replay_capture", "run_query"]
 
 _MODULES = {
     "CaptureReplay": "sdnator.replay.replay_capture",
     "Kitsune": "apps.kitsune.online",
     "Query": "apps.sonata_adapter.query.language",
+    "QueryResults": "sdnator.query_results",
     "replay_capture": "sdnator.replay.replay_capture",
+    "run_query": "sdnator.query_results",
 }
 
 

@@ -20,7 +20,7 @@ DUE = [
     "CONSUMER", "DB_ONLY", "NO_WAIT", "PRODUCER", "PUB_ONLY", "Assignment", "Capability", "DueError", "Engine",
     "Interest", "Item", "Key", "Observation", "Options", "RecordBatch", "Role",
 ]  # fmt: skip
-SDNATOR = ["CaptureReplay", "Kitsune", "Query", "replay_capture"]
+SDNATOR = ["CaptureReplay", "Kitsune", "Query", "QueryResults", "replay_capture", "run_query"]
 FACES = {
     "due": DUE,
     "due.aio": ["items"],
