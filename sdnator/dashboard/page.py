@@ -8,6 +8,7 @@ from sdnator.dashboard.acting import Acting
 from sdnator.dashboard.apps_panel import AppsPanel
 from sdnator.dashboard.archive_panel import ArchivePanel
 from sdnator.dashboard.live_panel import LivePanel
+from sdnator.dashboard.queries_panel import QueriesPanel
 from sdnator.dashboard.style import STYLE
 from sdnator.dashboard.switches_panel import SwitchesPanel
 
@@ -28,7 +29,13 @@ def build(service: "PageBackend") -> None:
         _dark_button()
         acting.sign_in_button()
     with ui.tabs().props("dense align=left no-caps inline-label").classes("w-full") as tabs:
-        names = {"Live": "monitor_heart", "Apps": "hub", "Switches": "lan", "Archive": "manage_search"}
+        names = {
+            "Live": "monitor_heart",
+            "Apps": "hub",
+            "Queries": "functions",
+            "Switches": "lan",
+            "Archive": "manage_search",
+        }
         places = {name: ui.tab(name, icon=icon) for name, icon in names.items()}
     tabs.set_value("Live")
     with ui.tab_panels(tabs, value="Live", animated=False).classes("w-full").props("keep-alive"):
@@ -36,6 +43,8 @@ def build(service: "PageBackend") -> None:
             live = LivePanel(service, acting)
         with ui.tab_panel(places["Apps"]).classes("q-pa-none"):
             apps = AppsPanel(service.board)
+        with ui.tab_panel(places["Queries"]).classes("q-pa-none"):
+            queries = QueriesPanel(service)
         with ui.tab_panel(places["Switches"]).classes("q-pa-none"):
             switches = SwitchesPanel(service)
         with ui.tab_panel(places["Archive"]).classes("q-pa-none"):
@@ -49,6 +58,8 @@ def build(service: "PageBackend") -> None:
             live.refresh()
         elif tabs.value == "Apps":
             apps.refresh()
+        elif tabs.value == "Queries":
+            queries.refresh()
 
     async def refresh_switches() -> None:
         if tabs.value == "Switches":

@@ -1,6 +1,6 @@
 """What the pages may ask of the app that serves them; panels know this and not the app."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from apps.messages import Answer
@@ -29,4 +29,11 @@ class PageBackend(Protocol):
 
     def find(self, key: str, start: int, end: int, limit: int) -> tuple[list[Item], bool]:
         """The latest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
+        ...
+
+    def explain(self, key: str, told: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
+        """Hear once a second what the Sonata adapter does for a key, until what is returned is called.
+
+        Raises DueError; BadInput where too many pages ask.
+        """
         ...

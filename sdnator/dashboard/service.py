@@ -10,7 +10,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -19,12 +19,13 @@ import due.service
 from apps.enforcement import CONFIRMED
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Answer, Confirmation, Decision, Instruction, sender_of
+from apps.sonata_adapter.plan_answer import plan_key
 from due import NO_WAIT, Capability, Engine, Interest, Item
 from due.errors import DueError, InvalidOption
 from sdnator.dashboard.board import Board
 from sdnator.dashboard.settings import Settings
 from sdnator.dashboard.sign_in import Sessions, WeakToken, token_from
-from sdnator.errors import SdnatorError
+from sdnator.errors import BadInput, SdnatorError
 
 ANSWERS = "network.answer.firewall.dashboard"
 INSTRUCTION = "network.instruction.dashboard.firewall"
@@ -47,6 +48,7 @@ CAPABILITIES = (Capability(INSTRUCTION, delivery="reliable", archive="always"),)
 _POLL_SECONDS = 2.0
 _ANSWER_SECONDS = 10.0
 _WAITING = 64
+_EXPLAINED = 16
 _REPORTS = 5_000
 """Archived reports of incidents that are read at the start, the newest."""
 _DAY_NS = 86_400 * 10**9
@@ -64,6 +66,8 @@ class DashboardService:
         self._engine = engine
         self._waiting: dict[str, Callable[[Answer], None]] = {}
         self._misunderstood = 0
+        self._explained = 0
+        """Pages that hear what is done for a key."""
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._socket: socket.socket | None = None
@@ -199,6 +203,21 @@ class DashboardService:
         from sdnator.northbound import latest
 
         return latest(self._engine.get, {"dataKey": key}, start, end, limit)
+
+    def explain(self, key: str, told: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
+        """Hear what the Sonata adapter does for a key, in the engine's thread, until what is returned is called."""
+        if self._explained >= _EXPLAINED:
+            raise BadInput(f"{_EXPLAINED} pages ask already; close one")
+        handler = self._tolerant(lambda item: told(item.value))
+        subscriptions = [self._engine.observe(plan_key(key)).subscribe(handler)]
+        self._explained += 1
+
+        def end() -> None:
+            while subscriptions:
+                subscriptions.pop().dispose()
+                self._explained -= 1
+
+        return end
 
     def _poll(self) -> None:
         from sdnator.northbound import ask

@@ -197,6 +197,15 @@ def look_around(page):
     """The other tabs show the parts, the switch, the archive; nothing comes from elsewhere."""
     page.click(".q-tab", "Apps")
     until(lambda: all(name in page.text() for name in ("kitsune", "sonata_adapter", "active")))
+    page.click(".q-tab", "Queries")
+    # the firewall wants this one from the start
+    page.find(".queries", "network.traffic_query.sonata.syn_flood")
+    page.click(".explain-now")
+    page.find(".plan-said", "this is where it would run")
+    page.find(".operators", "counting stage")
+    until(lambda: page.type_now(".query-key input", "network.traffic_query.sonata.new_tcp:window=1ms"))
+    page.click(".explain-now")
+    page.find(".plan-said", "100ms to 1h")
     page.click(".q-tab", "Switches")
     page.find(".tables", "block_src")
     page.click(".q-tab", "Archive")
