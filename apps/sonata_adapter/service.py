@@ -262,11 +262,9 @@ class SonataAdapterService:
             self._heard = heard
             asked = {key: asked_of(key) for key in plans}
             self._plans = dict([(key, of) for key, of in asked.items() if of][:_MOST_PLANS])
-            self._results = {key: found for key, found in self._results.items() if key in self._served()}
+            served = self._wanted.union(request.output for request in self._control.requests)
+            self._results = {key: found for key, found in self._results.items() if key in served}
             self._plans_at = 0.0
-
-    def _served(self) -> set[str]:
-        return {request.output for request in self._control.requests} | self._wanted
 
     def _tell_plans(self) -> None:
         """Once a second, tell those who ask what is done for a key."""

@@ -8,7 +8,7 @@ from typing import Any, Final
 from sdnator.cli.live_items import live_items
 from sdnator.errors import PipelineError
 
-_SECONDS: Final = 10.0
+_SECONDS: Final = 30.0
 _PREFIXES: Final = (
     "network.traffic_query.sonata.",
     "network.traffic_capture.sonata.",

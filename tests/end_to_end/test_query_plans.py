@@ -36,6 +36,7 @@ def test_explain_tells_the_plan_of_the_running_adapter(stage):
     Heard(engine, f"{PREFIX}.new_tcp:threshold=9")
     wait_for(
         lambda: asked(stage, "queries", "explain", "new_tcp:threshold=9")["state"] == "running",
+        120,
         why=lambda: asked(stage, "queries", "explain", "new_tcp:threshold=9"),
     )
     first = asked(stage, "queries", "explain", "new_tcp:threshold=9")
@@ -78,7 +79,7 @@ def test_explain_follows_a_key_from_the_wish_to_the_archive(stage):
         assert done.returncode == 0, done.stderr[-2000:]
         return done.stdout
 
-    wait_for(lambda: json.loads(explained("--json"))["switches"][0]["entries"][0]["handle"], 60)
+    wait_for(lambda: json.loads(explained("--json"))["switches"][0]["entries"][0]["handle"], 240)
     frames = mixed(["new_tcp"], seconds=6)
     feed = stage.feed()
     feed.send([f.time_us - TRAFFIC_US for f in frames], [f.length for f in frames], [f.data for f in frames])
@@ -91,7 +92,7 @@ def test_explain_follows_a_key_from_the_wish_to_the_archive(stage):
 
     wait_for(processed, 120, stage.log)
     feed.close()
-    wait_for(lambda: json.loads(explained("--json"))["archive"]["last"], 60)
+    wait_for(lambda: json.loads(explained("--json"))["archive"]["last"], 240)
     one = json.loads(explained("--json"))
     assert [each["app_id"] for each in one["coordinator"]["wanted_by"]] == ["observer"]
     assert one["coordinator"]["assigned"][0]["app_id"] == "sonata_adapter"
