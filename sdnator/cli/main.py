@@ -30,7 +30,7 @@ COMMANDS = {
     ),
     "blocks": (
         "sdnator.cli.blocks_commands:blocks",
-        "Blocks and guards: list, add, remove, explain, false alarms, lift all.",
+        "Blocks, guards, rate limits: list, add, remove, explain, false alarms, lift all.",
     ),
     "config": (
         "sdnator.cli.config_commands:config",
