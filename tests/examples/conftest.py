@@ -1,0 +1,7 @@
+"""The example packages lie beside the product, as somebody else's would; tests import them from their folders."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+sys.path.insert(0, str(ROOT / "examples" / "manufacturing"))
