@@ -7,6 +7,7 @@ Faults begin after so many hours of printing, drawn per printer; the clock of a 
 A print that goes on `ruin_s` after the beginning is ruined, and so is every later one until maintenance.
 """
 
+from functools import cache
 from typing import Final, Literal
 
 import msgspec
@@ -48,6 +49,13 @@ def draw(seed: int, machine: int, number: int, printed: float) -> PrinterFault:
     return PrinterFault(_KINDS[int(random.integers(3))], onset, onset + float(random.uniform(*RUIN_S)))
 
 
+@cache
+def _own_errors(seed: int, machine: int) -> tuple[float, float]:
+    """Errors of a printer's two sensors."""
+    found = np.random.default_rng((seed, 4, machine)).normal(0, (1.0, 0.02))
+    return float(found[0]), float(found[1])
+
+
 def readings(
     seed: int, machine: int, step: int, printed: NDArray[np.float64], fault: PrinterFault | None
 ) -> NDArray[np.float64]:
@@ -63,12 +71,14 @@ def readings(
     Returns:
         Both, rounded as the sensors give them, shape (n, 2).
     """
-    own = np.random.default_rng((seed, 4, machine)).normal(0, (1.0, 0.02))
+    if not len(printed):
+        return np.zeros((0, 2))
+    own = _own_errors(seed, machine)
     noise = np.random.default_rng((seed, 5, machine, step)).standard_normal((len(printed), 2))
     temperature = own[0] + _WAVE_C * np.sin(2 * np.pi * printed / _WAVE_S) + TEMPERATURE_SD * noise[:, 0]
     flow_noise = FLOW_SD * noise[:, 1]
     flow = np.full(len(printed), 1 + own[1])
-    if fault is not None and len(printed) and printed[-1] > fault.onset:
+    if fault is not None and printed[-1] > fault.onset:
         minutes = np.maximum(0.0, printed - fault.onset) / 60
         if fault.kind == "heater":
             temperature -= np.minimum(40.0, _HEATER_C_MIN * minutes)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manufacturing.core import faults, process
+from manufacturing.core.faults import PrinterFault
 from manufacturing.core.orders import NOZZLE_C, Task
 
 Status = Literal["idle", "printing", "maintenance"]
@@ -113,7 +114,8 @@ class Printer:
         self._printed = 0.0
         self._fault = faults.draw(seed, number, 0, 0.0) if faulty else None
         self._faults = 0
-        self._readings: NDArray[np.float64] = np.zeros((0, 2))
+        self._measured: tuple[int, NDArray[np.float64], PrinterFault | None] = (0, np.zeros(0), None)
+        self._readings: NDArray[np.float64] | None = None
         self.targets: NDArray[np.float64] = np.zeros(0)
         """Target temperature at each reading, °C."""
         self.reading_times: NDArray[np.float64] = np.zeros(0)
@@ -248,7 +250,8 @@ class Printer:
         # a repair takes longer than a step, so that all readings of one belong to the same fault
         rows = np.concatenate(batches) if batches else np.zeros((0, 3))
         self.targets, self.reading_times = rows[:, 0], rows[:, 2]
-        self._readings = faults.readings(self._seed, self._number, step, rows[:, 1], self._fault)
+        self._measured = (step, rows[:, 1], self._fault)
+        self._readings = None
 
     # what it tells
 
@@ -283,11 +286,14 @@ class Printer:
             return round(process.nozzle_cooled(target, self.time - running.printing_to), 2)
         if self.time < running.printing_from:
             return round(target - (running.printing_from - self.time) * process.HEAT_C_S, 2)
-        return round(target + (float(self._readings[-1, 0]) if len(self._readings) else 0.0), 2)
+        return round(target + (float(self.readings[-1, 0]) if len(self.readings) else 0.0), 2)
 
     @property
     def readings(self) -> NDArray[np.float64]:
         """Readings of the last step, shape (n, 2), see `Report.readings`."""
+        if self._readings is None:  # nobody may want them
+            step, printed, fault = self._measured
+            self._readings = faults.readings(self._seed, self._number, step, printed, fault)
         return self._readings
 
     def running(self) -> RunningPrint | None:
@@ -311,11 +317,19 @@ class Printer:
             round(done / total, 4) if total else 1.0,
         )
 
-    def report(self, step: int) -> Report:
-        """Everything since the report before."""
+    def report(self, step: int, *, sensors: bool = True) -> Report:
+        """Everything since the report before; without `sensors` no readings."""
         ended = tuple(self.history[self._told :])
         self._told = len(self.history)
+        readings = tuple((a, b) for a, b in self.readings.tolist()) if sensors else ()
         return Report(
-            self.machine, step, self.time, self.status, self.loaded, self.running(), tuple(self.queue), ended,
-            tuple((float(a), float(b)) for a, b in self._readings),
-        )  # fmt: skip
+            self.machine,
+            step,
+            self.time,
+            self.status,
+            self.loaded,
+            self.running(),
+            tuple(self.queue),
+            ended,
+            readings,
+        )

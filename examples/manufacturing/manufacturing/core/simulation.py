@@ -81,7 +81,7 @@ def simulate(scenario: Scenario, scheduler: Scheduler) -> Outcome:
         time = step * STEP_S
         for printer in printers:
             printer.advance(time)
-        fleet = twins.update([printer.report(step) for printer in printers])
+        fleet = twins.update([printer.report(step, sensors=scheduler.sensors) for printer in printers])
         if len(fleet.done) == jobs:
             return outcome(book, printers, twins.counts, false_alarms)
         for name in fleet.maintain:

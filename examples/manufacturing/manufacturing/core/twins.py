@@ -83,13 +83,16 @@ class PrinterTwin:
         self._waits: list[float] = []
         self._names: set[str] = set()
         self._serviced = False
-        self._pending = False
+        self._queue: tuple[Task, ...] = ()
+        self._queued: tuple[tuple[Task, ...], int, float] = ((), -1, 0.0)
 
     def update(self, report: Report) -> str:
         """Take a report; returns why the printer must be maintained now, empty for no reason."""
         failed = self._take_history(report)
-        for task in report.queue:
-            self._seen.setdefault(task.name, report.time)
+        if report.queue != self._queue:
+            self._queue = report.queue
+            for task in report.queue:
+                self._seen.setdefault(task.name, report.time)
         if report.running is not None and report.running.task.name in self._seen:
             self._waits.append(max(0.0, report.running.started - self._seen.pop(report.running.task.name)))
         if self.alarm:
@@ -116,15 +119,22 @@ class PrinterTwin:
     def state(self, report: Report) -> MachineState:
         """What it says of the printer now."""
         free = max(report.time, self._expected(report))
-        finish, loaded = free, report.loaded
-        for task in report.queue:
-            finish += process.setup_s(task.kind, loaded) + process.planned_s(task)
-            loaded = task.kind
+        finish = free + self._queue_s(report.queue, report.loaded)
         return MachineState(
             self.machine, report.status, report.loaded, round(free, 3), round(finish, 3),
             report.running.task if report.running else None, report.queue,
             round(sum(self._waits) / len(self._waits), 1) if self._waits else 0.0, len(self.history), self.alarm,
         )  # fmt: skip
+
+    def _queue_s(self, queue: tuple[Task, ...], loaded: int) -> float:
+        """Planned seconds of a queue behind what is loaded."""
+        if self._queued[:2] != (queue, loaded):
+            seconds, kind = 0.0, loaded
+            for task in queue:
+                seconds += process.setup_s(task.kind, kind) + process.planned_s(task)
+                kind = task.kind
+            self._queued = (queue, loaded, seconds)
+        return self._queued[2]
 
     def _expected(self, report: Report) -> float:
         running = report.running
