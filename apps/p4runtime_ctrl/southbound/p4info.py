@@ -96,6 +96,8 @@ class ProgramInfo:
             return cls(text_format.Parse(text, p4info.P4Info()))
         except text_format.ParseError as error:
             raise P4InfoError(f"not a p4info in text format: {error}") from error
+        except KeyError as error:
+            raise P4InfoError(f"not a whole p4info: a table has action {error}, which is not there") from error
 
     def table(self, name: str) -> TableInfo:
         """Raises `EntryError` with the existing names."""

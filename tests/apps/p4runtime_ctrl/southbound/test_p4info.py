@@ -89,3 +89,9 @@ def test_a_foreign_program_is_read_and_its_lacks_are_named():
         small.header("packet_in", ["ingress_port", "timestamp"])
     with pytest.raises(P4InfoError, match="not a p4info"):
         ProgramInfo.from_text("{ not a p4info")
+
+
+def test_a_table_with_an_action_that_is_not_there_is_refused():
+    text = 'tables { preamble { id: 1 name: "t" } action_refs { id: 31829035 } }'
+    with pytest.raises(P4InfoError, match="has action 31829035, which is not there"):
+        ProgramInfo.from_text(text)
