@@ -97,7 +97,9 @@ class ProgramInfo:
         except text_format.ParseError as error:
             raise P4InfoError(f"not a p4info in text format: {error}") from error
         except KeyError as error:
-            raise P4InfoError(f"not a whole p4info: a table has action {error}, which is not there") from error
+            raise P4InfoError(
+                f"not a whole p4info: a table has action {error}, which is not there"
+            ) from error
 
     def table(self, name: str) -> TableInfo:
         """Raises `EntryError` with the existing names."""
