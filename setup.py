@@ -1,7 +1,7 @@
 """Builds what pyproject.toml cannot declare: the optional C kernel and the switch program's place.
 
 The kernel is a plain shared object loaded with cffi (ABI mode): it includes no Python header, so a
-compiler is all it needs.  Without one the installation still succeeds and the Python twin is used.
+compiler is all it needs.  Without one the installation still succeeds, and the first use of Kitsune says so.
 
 The switch program lives in `p4/`, which is no package (a package of that name would hide `p4.v1` of the
 P4Runtime wheel).  In a wheel its sources, artefacts and record are data of `sdnator`, in

@@ -94,7 +94,7 @@ class Stream:
                 self.last = time.monotonic()
 
 
-class Wire:
+class PathThroughSwitch:
     """Frames through a switch: in at one veth, out at another."""
 
     def __init__(self, near: str, far: str) -> None:
@@ -218,7 +218,7 @@ def _switch(folder: Path) -> Iterator[Stage]:
         run.controller()
         made = [Capability("network.block.firewall.*", delivery="reliable", archive="always")]
         engine = run.engine("firewall", capabilities=made)
-        wire = Wire(first.near, second.near)
+        wire = PathThroughSwitch(first.near, second.near)
         stack.callback(wire.close)
 
         def decide(decision: Decision) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.hostile_job import Figures
-from benchmarks.hostile_pool import GUIDED, PLAIN, SANITIZED, Attack, Campaign, Kind, Pool, rate
+from benchmarks.hostile_pool import GUIDED, PLAIN, SANITIZED, Attack, Campaign, Pool, ProcessKind, rate
 from benchmarks.hostile_sanitizers import builds, environment, is_sanitized
 from benchmarks.hostile_worker import targets_of
 from benchmarks.measure import machine, table, write_json
@@ -120,12 +120,12 @@ def attack_all(
     with ThreadPoolExecutor(1) as builder:
         # at once, beside the other targets: it takes longer than most of them
         built = builder.submit(builds) if modules[SANITIZED] else None
-        makers: dict[str, Callable[[], Kind]] = {
-            PLAIN: partial(Kind, modules[PLAIN]),
-            GUIDED: partial(Kind, modules[PLAIN], guided=True),
+        makers: dict[str, Callable[[], ProcessKind]] = {
+            PLAIN: partial(ProcessKind, modules[PLAIN]),
+            GUIDED: partial(ProcessKind, modules[PLAIN], guided=True),
         }
         if built is not None:
-            makers[SANITIZED] = lambda: Kind(modules[SANITIZED], environment(built.result()[0]))
+            makers[SANITIZED] = lambda: ProcessKind(modules[SANITIZED], environment(built.result()[0]))
         pool = Pool(kinds, makers, workers)
         try:
             campaign = Campaign(

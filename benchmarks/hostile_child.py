@@ -38,7 +38,7 @@ _LARGEST_OF_CORPUS = 1 << 14
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
-class Place:
+class SharedProgress:
     """Memory that the child writes and its parent reads, also after the child's death."""
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class Place:
 class Attacker:
     """The loop, in the child."""
 
-    def __init__(self, target: DecoderTarget, job: Job, place: Place, out: IO[bytes]) -> None:
+    def __init__(self, target: DecoderTarget, job: Job, place: SharedProgress, out: IO[bytes]) -> None:
         self._target, self._job, self._place, self._out = target, job, place, out
         self._in_threads: list[BaseException] = []
         self._done = 0

@@ -25,7 +25,7 @@ from sdnator.dashboard.settings import Settings
 _FEW = 64
 
 
-class ServerError(Exception):
+class UnexpectedAnswer(Exception):
     """Answered with 500: an error that nobody expected."""
 
 
@@ -48,7 +48,7 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 def _asked(application: Callable[..., Any], scope: dict[str, Any], messages: list[dict[str, Any]]) -> None:
-    """Raises ServerError where the answer is one."""
+    """Raises UnexpectedAnswer where the answer is one."""
     told: list[dict[str, Any]] = []
     waiting = iter(messages)
 
@@ -61,7 +61,7 @@ def _asked(application: Callable[..., Any], scope: dict[str, Any], messages: lis
     _loop().run_until_complete(application(scope, receive, send))
     for each in told:
         if each.get("status") == 500:
-            raise ServerError(str(told)[:2000])
+            raise UnexpectedAnswer(str(told)[:2000])
 
 
 def _scope(kind: str, path: bytes, question: bytes, headers: list[tuple[bytes, bytes]]) -> dict[str, Any]:

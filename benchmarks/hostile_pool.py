@@ -30,7 +30,7 @@ _ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Kind:
+class ProcessKind:
     """Processes that have imported the same modules in the same way."""
 
     modules: Sequence[str]
@@ -49,7 +49,7 @@ class Attack:
 class _Process:
     """One worker process, started with its first job, and again after its death."""
 
-    def __init__(self, kind: Kind) -> None:
+    def __init__(self, kind: ProcessKind) -> None:
         self._kind = kind
         self._process: subprocess.Popen[str] | None = None
 
@@ -99,10 +99,10 @@ class Pool:
     """
 
     def __init__(
-        self, targets: Mapping[str, str], kinds: Mapping[str, Callable[[], Kind]], workers: int
+        self, targets: Mapping[str, str], kinds: Mapping[str, Callable[[], ProcessKind]], workers: int
     ) -> None:
         self._targets, self._kinds = targets, kinds
-        self._ready: dict[str, Future[Kind]] = {}
+        self._ready: dict[str, Future[ProcessKind]] = {}
         self._lock = threading.Lock()
         self._local = threading.local()
         self._processes: list[_Process] = []
@@ -126,7 +126,7 @@ class Pool:
                 self._processes.append(mine[name])
         return mine[name]
 
-    def _kind(self, name: str) -> Kind:
+    def _kind(self, name: str) -> ProcessKind:
         with self._lock:
             first = name not in self._ready
             ready = self._ready.setdefault(name, Future())

@@ -23,7 +23,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.hostile_child import Attacker, Place
+from benchmarks.hostile_child import Attacker, SharedProgress
 from benchmarks.hostile_job import Figures, Job
 from benchmarks.hostile_target import DecoderTarget
 
@@ -85,7 +85,7 @@ class _Watch:
         return found
 
     def _child(self, job: Job, found: Figures) -> _Ended:
-        place, began = Place(), time.monotonic()
+        place, began = SharedProgress(), time.monotonic()
         with os.fdopen(os.memfd_create("out"), "w+b") as out, os.fdopen(os.memfd_create("err"), "w+b") as err:
             pid = os.fork()
             if not pid:
@@ -112,7 +112,7 @@ class _Watch:
         place.close()
         return _Ended(cause, index, data, words, max(0.0, job.seconds - seconds))
 
-    def _in_child(self, job: Job, place: Place, out: Any, words: int) -> None:
+    def _in_child(self, job: Job, place: SharedProgress, out: Any, words: int) -> None:
         """Never returns."""
         code = 1
         try:
@@ -143,7 +143,7 @@ class _Watch:
         )  # fmt: skip
 
 
-def _waited(pid: int, place: Place, job: Job) -> tuple[str, int, Any]:
+def _waited(pid: int, place: SharedProgress, job: Job) -> tuple[str, int, Any]:
     """Why it was killed (empty where it ended by itself), its exit code, what it used."""
     seen, since, cpu = place.moved(), time.monotonic(), 0.0
     first, parent = True, os.getppid()

@@ -32,7 +32,7 @@ from apps.sonata_adapter.query.catalogue import CATALOGUE, OUR_OWN, PAPER
 from benchmarks import measure
 from benchmarks.data_folder import add_data_option, data_file
 from benchmarks.sonata_stage import QUERIES, SonataStage, equal_to_naive
-from benchmarks.sonata_traffic import ATTACKS, MINUTE_PACKETS, Traffic, traffic
+from benchmarks.sonata_traffic import ATTACKS, MINUTE_PACKETS, FrameColumns, traffic
 from due import RecordBatch
 from sdnator.capture.captures import Capture
 from sdnator.testing.query_traffic import BASE_US, TimedFrame, attack, batch_of, mixed, office, tcp
@@ -224,7 +224,7 @@ def reduction(packets: int) -> dict[str, Any]:
 def _count(
     stage: SonataStage,
     names: list[str],
-    parts: tuple[Traffic, Traffic],
+    parts: tuple[FrameColumns, FrameColumns],
     faster: float,
     figures: dict[str, Any],
 ) -> None:

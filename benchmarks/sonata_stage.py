@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.sonata_adapter.query.catalogue import CATALOGUE
-from benchmarks.sonata_traffic import Traffic
+from benchmarks.sonata_traffic import FrameColumns
 from due import Item
 from sdnator.capture.interfaces import Feed, VethPair, WireFeed
 from sdnator.testing.controller_run import BASE_US, PACKETS, ControllerRun, Heard, end
@@ -97,14 +97,14 @@ class SonataStage(ControllerRun):
         ]
 
     def play(
-        self, frames: Sequence[TimedFrame] | Traffic, *, faster: float = 0.0, zero: int | None = None
+        self, frames: Sequence[TimedFrame] | FrameColumns, *, faster: float = 0.0, zero: int | None = None
     ) -> int:
         """Send all frames; returns their number.
 
         `faster`: so many times as fast as they were captured, 0 = as fast as the switch takes them.
         `zero`: the switch's clock zero, default the first frame's second.
         """
-        traffic = frames if isinstance(frames, Traffic) else Traffic.of(frames)
+        traffic = frames if isinstance(frames, FrameColumns) else FrameColumns.of(frames)
         sent = done = 0
         begin, first = time.monotonic(), int(traffic.times_us[0])
         times_us = traffic.times_us - (first // 10**6 * 10**6 if zero is None else zero)

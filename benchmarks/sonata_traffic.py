@@ -43,7 +43,7 @@ _PAYLOAD = 48
 
 
 @dataclass(frozen=True)
-class Traffic:
+class FrameColumns:
     """Frames in columns."""
 
     times_us: NDArray[np.int64]
@@ -52,13 +52,15 @@ class Traffic:
     data: Sequence[bytes]
 
     @classmethod
-    def of(cls, frames: Sequence[TimedFrame]) -> "Traffic":
+    def of(cls, frames: Sequence[TimedFrame]) -> "FrameColumns":
         """The frames, in their order."""
         times, lengths = ([getattr(frame, name) for frame in frames] for name in ("time_us", "length"))
         return cls(np.array(times), np.array(lengths), [frame.data for frame in frames])
 
     @classmethod
-    def merged(cls, parts: Sequence[tuple[NDArray[np.int64], ...]], contents: Sequence[bytes]) -> "Traffic":
+    def merged(
+        cls, parts: Sequence[tuple[NDArray[np.int64], ...]], contents: Sequence[bytes]
+    ) -> "FrameColumns":
         """Frames in the order of time, from (times, lengths, places in `contents`)."""
         times, lengths, places = (np.concatenate([part[column] for part in parts]) for column in range(3))
         order = np.argsort(times, kind="stable")
@@ -67,13 +69,13 @@ class Traffic:
     def __len__(self) -> int:
         return len(self.data)
 
-    def between(self, first_us: int, end_us: int) -> "Traffic":
+    def between(self, first_us: int, end_us: int) -> "FrameColumns":
         """Of frames in the order of time those from `first_us` on and before `end_us`."""
         span = slice(*np.searchsorted(self.times_us, (first_us, end_us)).tolist())
-        return Traffic(self.times_us[span], self.lengths[span], self.data[span])
+        return FrameColumns(self.times_us[span], self.lengths[span], self.data[span])
 
 
-def traffic(minutes: int, seed: int = 5) -> tuple[Traffic, Traffic]:
+def traffic(minutes: int, seed: int = 5) -> tuple[FrameColumns, FrameColumns]:
     """The part with attacks, one of each kind for each minute, and the rest, twice as long."""
     rng = random.Random(seed)
     seconds = minutes * _MINUTE_S
@@ -97,8 +99,8 @@ class _Made:
         self._parts: list[tuple[NDArray[np.int64], ...]] = []
         self._random = np.random.default_rng(5)
 
-    def traffic(self) -> Traffic:
-        return Traffic.merged(self._parts, self._contents)
+    def traffic(self) -> FrameColumns:
+        return FrameColumns.merged(self._parts, self._contents)
 
     def add(self, frames: Iterable[TimedFrame]) -> None:
         for time_us, length, data in frames:

@@ -80,7 +80,7 @@ _ROUNDS_MOST: Final = 10
 
 
 @dataclass
-class Kind:
+class FloodFigures:
     """What was seen of one kind of flood in one IP version."""
 
     unprotected: float | None = None
@@ -134,7 +134,7 @@ class Bench:
         self._names = names
         self._rounds = {4: rounds, 6: min(rounds, ROUNDS_IPV6)}
         self._capture = str(data / "captures" / "synflood_spoofed.pcap")
-        self.kinds = {(version, name): Kind() for version in PLANS for name in names}
+        self.kinds = {(version, name): FloodFigures() for version in PLANS for name in names}
         self.settled = 0
         """Rounds that began with an idle product."""
         self.looped: TrialOutcome | None = None
@@ -169,7 +169,7 @@ class Bench:
             kind.found.append(self._run(replace(trial, after_rule=after, protection="found")))
             self._count_entries(kind)
 
-    def _each_round(self) -> Iterator[tuple[int, int, str, Kind]]:
+    def _each_round(self) -> Iterator[tuple[int, int, str, FloodFigures]]:
         """The first of every kind, then the second: where time is short the last ones are missing."""
         for number in range(max(self._rounds.values())):
             for (version, name), kind in self.kinds.items():
@@ -230,7 +230,7 @@ class Bench:
         )
         return outcome
 
-    def _count_entries(self, kind: Kind) -> None:
+    def _count_entries(self, kind: FloodFigures) -> None:
         seen = self._field.records.entries()[-20:]
         kind.entries_peak = max([kind.entries_peak, *(sum(each.values()) for each in seen)])
 

@@ -19,7 +19,7 @@ _CLOCKS_DIFFER_NS: Final = 60 * 10**9
 
 
 @dataclass(frozen=True)
-class Question:
+class AppRequest:
     """An instruction and where its answer comes."""
 
     app: str
@@ -31,7 +31,7 @@ class Question:
     value: dict[str, Any]
 
 
-def ask(question: Question, updates: str, archive: str, patience: float) -> str:
+def ask(question: AppRequest, updates: str, archive: str, patience: float) -> str:
     """Write an instruction and wait for its answer.
 
     Args:
@@ -78,7 +78,7 @@ def ask(question: Question, updates: str, archive: str, patience: float) -> str:
 
 def _answer(
     engine: Engine,
-    question: Question,
+    question: AppRequest,
     answers: "queue.SimpleQueue[Answer]",
     look: Callable[[Item], None],
     patience: float,

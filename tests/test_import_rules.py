@@ -180,3 +180,16 @@ def _run_time_imports(path: Path) -> set[str]:
                 for alias in node.names
             }
     return found
+
+
+def test_no_class_name_stands_twice():
+    """A name leads to one class; `Settings` is each app's own, as the entry-point group `sdnator.apps` wants it."""
+    found: dict[str, list[str]] = {}
+    for folder in (*HOUSES, "apps", "sdnator", "benchmarks", "examples"):
+        for path in sources(folder):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    twice = {name: sorted(set(files)) for name, files in found.items() if len(set(files)) > 1}
+    twice.pop("Settings")
+    assert not twice

@@ -24,7 +24,7 @@ from apps.firewall.policy.instructions import target_in
 from apps.firewall.policy.rules import AllowList
 from apps.messages import Decision, Instruction
 from due import DueError
-from sdnator.asking import Question, ask
+from sdnator.asking import AppRequest, ask
 from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
 from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.blocks.blocks_nft import nft_sets
@@ -291,7 +291,7 @@ def _instruct(
         seconds=seconds,
         expires=time.time_ns() + round(patience * 1e9),
     )
-    question = Question("firewall", INSTRUCTION, _ANSWER, instruction.id, instruction.to_value())
+    question = AppRequest("firewall", INSTRUCTION, _ANSWER, instruction.id, instruction.to_value())
     typer.echo(ask(question, updates, archive_url(archive), patience))
 
 

@@ -12,7 +12,7 @@ import typer
 from apps.kitsune.kept_model import models_aside, set_aside
 from apps.kitsune.model_file import ModelFileError, load_model
 from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder
-from sdnator.asking import Question, ask
+from sdnator.asking import AppRequest, ask
 from sdnator.blocks.blocks_archive import archive_url
 from sdnator.errors import BadInput, PipelineError
 from sdnator.model_words import model_lines, model_of
@@ -82,7 +82,7 @@ def retrain() -> None:
     order = ModelOrder(
         id=uuid4().hex[:12], verb="retrain", expires=time.time_ns() + round(_ANSWER_SECONDS * 1e9)
     )
-    question = Question("detector", ORDERS, ANSWER, order.id, order.to_value())
+    question = AppRequest("detector", ORDERS, ANSWER, order.id, order.to_value())
     typer.echo(ask(question, "", archive_url(""), _ANSWER_SECONDS))
 
 

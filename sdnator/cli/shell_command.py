@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from sdnator.cli.switch_place import DeviceId, Place, SwitchArgument, place_of
+from sdnator.cli.switch_place import DeviceId, SwitchAddress, SwitchArgument, place_of
 from sdnator.errors import BadInput, PipelineError
 
 PACKAGE = "p4runtime-shell==0.0.6"
@@ -49,7 +49,7 @@ def shell(
     raise typer.Exit(subprocess.run(_command(python, place), check=False).returncode)
 
 
-def _command(python: Path, place: Place) -> list[str]:
+def _command(python: Path, place: SwitchAddress) -> list[str]:
     # the lowest election id leaves the controller primary; the time tells shells apart
     rank = f"0,{time.time_ns() // 1_000_000}"
     return [
@@ -99,7 +99,7 @@ def _step(command: list[str]) -> None:
         )
 
 
-def _look(place: Place) -> None:
+def _look(place: SwitchAddress) -> None:
     """One line for an unreachable switch; the shell itself prints a page of traceback."""
     import grpc
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sdnator.cli.plain_table import plain_table
-from sdnator.cli.switch_place import DeviceId, Place, SwitchArgument, place_of
+from sdnator.cli.switch_place import DeviceId, SwitchAddress, SwitchArgument, place_of
 from sdnator.errors import BadInput, PipelineError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def counters(switch: SwitchArgument = "", *, device_id: DeviceId = 1, as_json: J
         print(plain_table(_ENTRY, map(_entry_cells, counted)))
 
 
-def read_tables(place: Place, table: str) -> "tuple[ProgramInfo, list[dict[str, Any]]]":
+def read_tables(place: SwitchAddress, table: str) -> "tuple[ProgramInfo, list[dict[str, Any]]]":
     """The program that runs there and its entries; raises PipelineError, BadInput for a table it lacks."""
     import grpc
 

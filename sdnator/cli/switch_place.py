@@ -20,7 +20,7 @@ DeviceId = Annotated[int, typer.Option(help="P4Runtime device id, for HOST:PORT.
 
 
 @dataclass(frozen=True)
-class Place:
+class SwitchAddress:
     """Address at which a switch serves P4Runtime."""
 
     name: str
@@ -28,7 +28,7 @@ class Place:
     device_id: int
 
 
-def place_of(switch: str, device_id: int) -> Place:
+def place_of(switch: str, device_id: int) -> SwitchAddress:
     """The switch that is meant; the pipeline's first if the name is empty.
 
     Raises:
@@ -36,7 +36,7 @@ def place_of(switch: str, device_id: int) -> Place:
         PipelineError: a name is given, or none, and no pipeline runs.
     """
     if is_address(switch):
-        return Place(switch, switch, device_id)
+        return SwitchAddress(switch, switch, device_id)
     found = running.need()
     known = {one["name"]: one for one in (found.switches or [found.switch])}
     if switch and switch not in known:
@@ -44,4 +44,4 @@ def place_of(switch: str, device_id: int) -> Place:
             f"switch {switch}: the running pipeline has {', '.join(known)}; or give HOST:PORT or unix:/PATH"
         )
     chosen = known[switch] if switch else next(iter(known.values()))
-    return Place(chosen["name"], chosen["address"], chosen["device_id"])
+    return SwitchAddress(chosen["name"], chosen["address"], chosen["device_id"])

@@ -1,7 +1,7 @@
 """A capture like the public Mirai set: 50 minutes of benign traffic, then an infection.
 
     benign.traffic ┐
-                   ├─ in order of time ─► Network.carry ─► OUT.pcap + OUT.labels.csv
+                   ├─ in order of time ─► NetworkModel.carry ─► OUT.pcap + OUT.labels.csv
     attack.traffic ┘
 
 Label 1 marks packets that an infected device or the intruder sends for the attack, with the sender's MAC.
@@ -19,7 +19,7 @@ from typing import Final
 from sdnator.capture.captures import CaptureWriter
 from sdnator.capture.labels import Labels, labels_path, write_labels
 from sdnator.datasets import attack, benign
-from sdnator.datasets.network import Network
+from sdnator.datasets.network import NetworkModel
 from sdnator.datasets.traffic import SECOND, Chance, SentPacket, WireFrame
 from sdnator.errors import BadInput
 
@@ -107,4 +107,4 @@ def generate(options: MiraiLikeOptions) -> Iterator[WireFrame]:
     harmless = benign.traffic(options.seed, 0, end, int(onset * _NEWS_AT)) if options.background else []
     hostile = attack.traffic(options.seed, onset, end, options.plan)
     sent: Iterator[SentPacket] = heapq.merge(harmless, hostile, key=lambda packet: packet.time)
-    return Network(Chance(options.seed, 3), SNAP, cookies=options.plan.answer_all).carry(sent)
+    return NetworkModel(Chance(options.seed, 3), SNAP, cookies=options.plan.answer_all).carry(sent)

@@ -1,6 +1,6 @@
 """What the house answers: the gateway, name service, neighbours and the victims of floods.
 
-    Sent … (in order of time) ──► Network.answers ──► Frame …
+    Sent … (in order of time) ──► NetworkModel.answers ──► Frame …
 
 The uplink is dead, as it was in the lab of the original: the gateway answers what goes out with ICMP
 unreachable, at most one a second for each asker.  Victims answer floods; their answers are harmless.
@@ -40,7 +40,7 @@ class _Limit:
         return allowed
 
 
-class Network:
+class NetworkModel:
     """Puts packets on the wire, in order of time, with the answers that they get.
 
     Args:

@@ -13,7 +13,7 @@ from apps.p4runtime_ctrl import arrivals as controller
 from apps.sonata_adapter import arrivals as adapter
 from benchmarks import hostile, hostile_messages
 from benchmarks.hostile import attack_all
-from benchmarks.hostile_child import Attacker, Place
+from benchmarks.hostile_child import Attacker, SharedProgress
 from benchmarks.hostile_job import Figures, Job
 from benchmarks.hostile_mutation import message_fields, mutate_protobuf
 from benchmarks.hostile_pool import Attack, shares
@@ -66,7 +66,7 @@ def test_inputs_of_a_corpus_are_mutated_too(monkeypatch):
         threading, "excepthook", threading.excepthook
     )  # it takes that, in a process of its own
     target = planted.TARGETS[0]._replace(decode=seen.append)
-    place = Place()
+    place = SharedProgress()
     Attacker(target, job, place, io.BytesIO()).run()
     place.close()
     assert len(seen) == 200

@@ -5,7 +5,7 @@ from scapy.layers.l2 import ARP as ARP_LAYER
 from scapy.layers.l2 import Ether
 
 from sdnator.datasets import frames, hosts
-from sdnator.datasets.network import Network
+from sdnator.datasets.network import NetworkModel
 from sdnator.datasets.traffic import ARP, ECHO, SECOND, Chance, SentPacket, WireFrame
 from sdnator.datasets.traffic import TCP as TCP_KIND
 from sdnator.datasets.traffic import UDP as UDP_KIND
@@ -14,7 +14,7 @@ CLOUD = hosts.CLOUD[0]
 
 
 def _carry(*sent: SentPacket, cookies: bool = False) -> list[WireFrame]:
-    found = list(Network(Chance(1), 200, cookies=cookies).carry(sent))
+    found = list(NetworkModel(Chance(1), 200, cookies=cookies).carry(sent))
     assert [frame.time for frame in found] == sorted(frame.time for frame in found)
     return found
 

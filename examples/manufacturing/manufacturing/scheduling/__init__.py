@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Final, Literal, get_args
 
 from manufacturing.core.simulation import Scheduler
-from manufacturing.scheduling.baseline import Baseline
+from manufacturing.scheduling.baseline import BaselineScheduler
 from manufacturing.scheduling.decentralized import Decentralized
 from manufacturing.scheduling.dynamic import Dynamic
 from manufacturing.scheduling.fcfs import FirstComeFirstServed
@@ -22,7 +22,7 @@ SchedulerName = Literal["decentralized", "baseline", "fcfs", "dynamic"]
 SCHEDULERS: Final[tuple[SchedulerName, ...]] = get_args(SchedulerName)
 _MAKERS: Final[Mapping[str, Callable[[], Scheduler]]] = {
     "decentralized": Decentralized,
-    "baseline": Baseline,
+    "baseline": BaselineScheduler,
     "fcfs": FirstComeFirstServed,
     "dynamic": Dynamic,
 }

@@ -7,7 +7,7 @@ from manufacturing.core.twins import FleetState
 from manufacturing.scheduling.backlog import Backlog
 
 
-class Baseline:
+class BaselineScheduler:
     """See the first line; a ruined part is printed again by the same printer."""
 
     sensors = False
