@@ -231,12 +231,13 @@ class Control:
         return written
 
     def counts(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
-        """Process keys whose differences are over the threshold at the end of a window."""
+        """Process keys whose differences are over the threshold at the end of a window.
+
+        Their times move no clock: a report that was asked for carries the time that was asked about.
+        """
         station = self._station(switch)
         bit = int(name[1:])
         written: list[Written] = []
-        if len(batch):
-            station.clock.hear(int(batch["time_us"].max()))
         for identity, report in station.reports.items():
             if isinstance(report, Differences) and self.plan.of(identity).entries[0].bit == bit:
                 written += self._addressed(station, report.counted(batch, now))

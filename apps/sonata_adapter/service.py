@@ -105,7 +105,7 @@ _COMMANDS_READ: Final = 20_000
 _TRAININGS_READ: Final = 100
 _STEP_US: Final = 3_600_000_000
 """A longer step of a switch's clock is accepted only after several items agree."""
-_LAST_ANSWERS_S: Final = 1.0
+_LAST_ANSWERS_S: Final = 3.0
 _LOOK_S: Final = 0.01
 _MOST_PLANS: Final = 64
 """Plans that are told at a time; more interests in plans get no answer."""
@@ -160,6 +160,7 @@ class SonataAdapterService:
         """What runs for evidence."""
         self._swept: set[str] = set()
         self._active = False
+        self._ending = False
         self._heard: frozenset[str] = frozenset()
         self._plans: dict[str, str] = {}
         """Keys of plans that are wanted, and what they ask of."""
@@ -192,6 +193,8 @@ class SonataAdapterService:
 
     def stop(self) -> None:
         """Report open results, and remove all entries from the switch."""
+        with self._lock:
+            self._ending = True
         deadline = time.monotonic() + _LAST_ANSWERS_S
         waits = True
         while waits and time.monotonic() < deadline:
@@ -372,18 +375,29 @@ class SonataAdapterService:
             clock = self._clock(item, switch)
             if clock is None:
                 return
+            if kind == "counts":
+                self._counted(clock, switch, name, batch)
+                return
             rows = clock.believed(batch["time_us"])
             batch = batch if rows is None else batch.take(rows)
             if kind == "digests":
                 self._write(self._control.digests(switch, name, batch))
                 self._refine()
-            elif kind == "counts":
-                self._write(self._control.counts(switch, name, batch, time.monotonic()))
             else:
                 self._write(self._control.packets(switch, name, batch, time.monotonic()))
                 self._control.busy(switch, time.monotonic())
             self._read_cells()
             self._hear()
+
+    def _counted(self, clock: SteadyTime, switch: str, name: str, batch: RecordBatch) -> None:
+        """Differences over their threshold; at the end they carry the far time of our own last questions."""
+        if not self._ending and len(batch):
+            newest_us = int(batch["time_us"].max())
+            if clock.hear(newest_us):
+                self._control.advance(switch, newest_us)
+        self._write(self._control.counts(switch, name, batch, time.monotonic()))
+        self._read_cells()
+        self._hear()
 
     def _on_cells(self, item: Item, answers: tuple[list[int], list[int]]) -> None:
         """Answers of a switch: `id` and `count` of each question."""

@@ -21,6 +21,7 @@ DIGEST: Final = "count_digest_t"
 _NEEDED: Final = frozenset(
     ("query", "window", "count", "src", "dst", "port", "length", "source_port", "timestamp")
 )
+_STEP_US: Final = 3_600_000_000
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,13 @@ class CountReader:
         found, malformed = read_lists(self._layout, lists)
         self._progress.malformed += malformed
         columns = _columns(found, self._base_us)
-        self._progress.passed(columns["time_us"])
+        self._progress.passed(self._near(columns["time_us"]))
         return CountReports(columns, found["query"].astype(np.uint16))
+
+    def _near(self, times_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Times of the switch's own; a report that an app asked for as of a later time carries that time."""
+        reached_us = self._progress.time_us
+        return times_us[times_us <= reached_us + _STEP_US] if reached_us else times_us
 
 
 def _columns(found: NDArray[Any], base_us: int) -> dict[str, NDArray[Any]]:

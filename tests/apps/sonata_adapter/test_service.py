@@ -1,11 +1,12 @@
 """The adapter among real processes: a key is declared, a query runs in the switch, and leaves with the key."""
 
+import time
+from contextlib import closing
 from functools import partial
 
 import pytest
 
 from apps.sonata_adapter.control import Control
-from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from dataplane.ports.capture_port import COPIED
 from sdnator.testing.controller_run import BASE_US, ControllerRun, Heard, end
@@ -30,43 +31,32 @@ def telemetry(states):
     return found[-1]["telemetry"] if found else []
 
 
-def test_keys_become_queries_and_leave_with_them(stage):
-    """All keys of the catalogue: results equal the naive evaluator's; without interest the switch has no request.
-
-    Frames come much faster than they were captured, so no cell could be read in time.
+def test_all_queries_together_find_what_each_finds(stage):
+    """All keys of the catalogue, twice as fast as the traffic came: results equal the naive evaluator's, and the switch has
+    counted what it has room for.
     """
-    adapter = stage.run("apps.sonata_adapter.service", {"limits": {"reads": False}})
+    adapter = stage.run("apps.sonata_adapter.service", {})
     engine = stage.engine("observer")
     states = Heard(engine, "network.switch.p4runtime_ctrl.s1")
     confirmations = Heard(engine, "network.confirmation.p4runtime_ctrl.s1")
+    health = Heard(engine, "due.health.sonata_adapter")
     stage.controller()
     # until it has heard of the Coordinator the controller asks for everything
     wait_for(lambda: states.values("network.switch") and telemetry(states) == [], why=stage.log)
     keys = {name: f"{PREFIX}.{name}:window=2s" for name in CATALOGUE}
-    wanted = Control(CATALOGUE, limits=SwitchLimits(reads=False)).want(keys.values())
+    wanted = Control(CATALOGUE).want(keys.values())
     results = Heard(engine, *keys.values())
     wait_for(
         lambda: is_set_up(wanted, states, confirmations),
         why=lambda: (telemetry(states), stage.log()[-3000:]),
     )
-    frames = mixed(CATALOGUE, seconds=16)
-    feed = stage.feed()
-    for begin in range(0, len(frames), 256):
-        part = frames[begin : begin + 256]
-        feed.send([f.time_us - TRAFFIC_US for f in part], [f.length for f in part], [f.data for f in part])
-    verdicts = b""
-
-    def processed():
-        nonlocal verdicts
-        verdicts += feed.verdicts()
-        return len(verdicts) >= len(frames)
-
-    wait_for(processed)
-    feed.close()
-    copied = sum(verdict & COPIED for verdict in verdicts)
-    wait_for(lambda: states.values("network.switch")[-1]["packet_in"] == copied, why=stage.log)
-    health = Heard(engine, "due.health.sonata_adapter")
+    frames = mixed(CATALOGUE, seconds=8)
+    with closing(stage.feed()) as feed:
+        copied = play(feed, frames)
+    wait_for(lambda: states.values("network.switch")[-1]["packet_in"] >= copied, why=stage.log)
+    health.items.clear()
     wait_for(lambda: quiet(health))
+    app = health.values("health")[-1]["app"]
     end(adapter)
     shifted = [TimedFrame(f.time_us - TRAFFIC_US + BASE_US, f.length, f.data) for f in frames]
     for name in CATALOGUE:
@@ -74,6 +64,30 @@ def test_keys_become_queries_and_leave_with_them(stage):
         wait_for(partial(at_least, results, name, truth), why=partial(found, results, name))
         assert found(results, name) == truth
     results.stop()
+    counted = {
+        key.partition(":")[0].rpartition(".")[2] for key, place in app["queries"].items() if place == "switch"
+    }
+    assert counted >= {"new_tcp", "superspreader", "port_scan", "ddos", "syn_flood", "incomplete_flows"}
+    assert app["reports"] > 0
+
+
+def play(feed, frames):
+    """Feed frames twice as fast as they came; returns how many were copied to the controller."""
+    begin, verdicts = time.monotonic(), b""
+    for first in range(0, len(frames), 32):
+        part = frames[first : first + 32]
+        ahead = (part[-1].time_us - TRAFFIC_US) / 2e6 - (time.monotonic() - begin)
+        time.sleep(max(0.0, ahead))
+        feed.send([f.time_us - TRAFFIC_US for f in part], [f.length for f in part], [f.data for f in part])
+        verdicts += feed.verdicts()
+
+    def processed():
+        nonlocal verdicts
+        verdicts += feed.verdicts()
+        return len(verdicts) >= len(frames)
+
+    wait_for(processed)
+    return sum(verdict & COPIED for verdict in verdicts)
 
 
 def is_set_up(wanted, states, confirmations):

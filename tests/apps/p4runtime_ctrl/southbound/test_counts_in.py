@@ -79,3 +79,12 @@ def test_no_counts_are_no_time():
     progress = LossTracker()
     progress.passed(np.array([], dtype=np.int64))
     assert progress.time_us == 0
+
+
+def test_a_report_about_a_far_time_moves_no_clock():
+    """Who asks what waits as of a far time is told with that time; the switch's own time stays what it was."""
+    made, _ = outbound()
+    made.digests([count_list(HOST)])
+    for _ in range(9):
+        made.digests([count_list({**HOST, "timestamp": 1 << 47})])
+    assert made.second == 1
