@@ -83,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--days", type=int, default=6, help="days of benign traffic, one for each network and seed"
     )
     parser.add_argument("--held-back", action="store_true", help="the attacks that nobody tunes on")
+    parser.add_argument("--only", default="", help="attacks and novelty whose name contains this text")
     add_data_option(parser)
     chosen = parser.parse_args(argv)
     begun = monotonic()
@@ -100,6 +101,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for rule in chosen.rules:
             rows[rule] += attacks[rule]
             novelty[rule] += novelties[rule]
+            _print_attacks(rule, attacks[rule])
+        print(f"{name}: done after {monotonic() - begun:.0f} s", flush=True)
     days = _days(chosen)
     real = _real_benign(chosen)
     for rule, field in RULES.items():
@@ -114,16 +117,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _print(rule: str, found: Figures) -> None:
-    measure.table(
-        ("network", "attack", "seed", "s to decision", "stopped", "wrong"),
-        [
-            tuple(
-                row[key] for key in ("network", "attack", "seed", "s_to_decision", "stopped_share", "wrong")
-            )
-            for row in found["by_attack"]
-        ],
+def _print_attacks(rule: str, rows: list[Figures]) -> None:
+    print(f"rule {rule}")
+    columns = (
+        "network",
+        "attack",
+        "seed",
+        "s_to_decision",
+        "stopped_share",
+        "remedy",
+        "wrong",
+        "innocent_hosts",
     )
+    measure.table(columns, [tuple(row[key] for key in columns) for row in rows])
+    sys.stdout.flush()
+
+
+def _print(rule: str, found: Figures) -> None:
     short = {key: value for key, value in found.items() if not key.startswith("by_")}
     print(json.dumps({"rule": rule} | short))
     for row in (*found["by_novelty"], *found["by_day"]):
@@ -163,8 +173,10 @@ def _network(name: str, chosen: Any) -> tuple[dict[str, list[Figures]], dict[str
     benign = merge(*network.chunks(0, BENIGN_S + NOVELTY_S + 60))
     known = [*ATTACKS, *_captured(chosen.data)]
     specs = [each for each in known if each.held_back == chosen.held_back and each.fits(network)]
+    specs = [each for each in specs if chosen.only in each.name]
     specs = specs[: max(1, round(len(specs) * chosen.scale))]
-    novelties = list(NOVELTIES)[: max(1, round(len(NOVELTIES) * chosen.scale))]
+    novelties = [each for each in NOVELTIES if chosen.only in each]
+    novelties = novelties[: max(1, round(len(novelties) * chosen.scale))]
     run = DecisionRun(len(benign.between(0, TRAINING_S)), _rules(chosen.rules[0]))
     run.feed(benign.between(0, TRAINING_S))
     seeds = range(1, chosen.seeds + 1)
@@ -286,6 +298,7 @@ def _attack(run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpe
         "innocent_packets": int((others & ~run.limited).sum()),
         "innocent_limited": int((others & run.limited).sum()),
         "innocent_hosts": len(set(zip(*hit, strict=True))),
+        "remedy": _remedy(good[0]) if good else "none",
         "wrong": len(wrong),
         "decisions": [each.reason for each in (*good[:2], *wrong[:3])],
         "refused": run.refused[:2],
@@ -321,6 +334,19 @@ def _helps(decided: DecidedAction, truth: AttackTruth) -> bool:
         if target.kind == "ip" and attacker.ip and target.address == str(ipaddress.IPv4Address(attacker.ip)):
             return "block_address" in truth.remedies
     return False
+
+
+def _remedy(decided: DecidedAction) -> str:
+    """What was decided, in a word or two."""
+    if decided.service is not None:
+        return "guard"
+    if decided.limited:
+        return "rate limit"
+    return (
+        "block of an address"
+        if decided.target is not None and decided.target.kind == "ip"
+        else "block of a MAC"
+    )
 
 
 def _novelty(runs: Sequence[DecisionRun], network: Network, benign: Traffic, name: str, seed: int) -> Figures:
@@ -363,7 +389,13 @@ def _day(rules: Sequence[str], name: str, seed: int) -> Figures:
     for part in network.chunks(0, TRAINING_S + 86_400):
         watch(runs, part)
         benign += len(part)
-    return {"shared": {"network": name, "seed": seed, "packets": benign}} | _blocks(runs)
+    found = _blocks(runs)
+    print(
+        f"day of {name}, seed {seed}: {benign:,} packets,",
+        {rule: found[rule]["blocks"] for rule in rules},
+        flush=True,
+    )
+    return {"shared": {"network": name, "seed": seed, "packets": benign}} | found
 
 
 def _real_benign(chosen: Any) -> Figures:

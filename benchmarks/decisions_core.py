@@ -31,6 +31,8 @@ from due import RecordBatch
 SWITCH: Final = "s1"
 ROWS: Final = 128
 """Packets between two looks at decisions."""
+MANY_ROWS: Final = 4_096
+"""The same where no decision can stop anything: in training, and where several runs watch one detector."""
 
 
 @dataclass(frozen=True)
@@ -87,15 +89,19 @@ class DecisionRun:
         stopped = np.zeros(len(traffic), bool)
         self.challenges = np.zeros(len(traffic), bool)
         self.limited = np.zeros(len(traffic), bool)
-        for start in range(0, len(traffic), ROWS):
-            columns = {name: column[start : start + ROWS] for name, column in traffic.columns.items()}
+        start = 0
+        while start < len(traffic):
+            learning = self.training_packets - self.detector.trained
+            part = slice(start, start + (min(MANY_ROWS, learning) if learning > 0 else ROWS))
+            start = part.stop
+            columns = {name: column[part] for name, column in traffic.columns.items()}
             drops = self._drops(columns)
             over = self._meters.over(columns, drops)
-            self.limited[start : start + ROWS] = over
+            self.limited[part] = over
             drops |= over
             challenges = self._challenges(columns) & ~drops
-            stopped[start : start + ROWS] = drops | challenges
-            self.challenges[start : start + ROWS] = challenges
+            stopped[part] = drops | challenges
+            self.challenges[part] = challenges
             self.dropped += int(drops.sum())
             self.challenged += int(challenges.sum())
             left = ~drops
@@ -207,8 +213,8 @@ def detector_for(training_packets: int) -> Detector:
 def watch(runs: Sequence[DecisionRun], traffic: Traffic) -> None:
     """Feed the detector that runs share, and ask each; as with blocking, as long as nobody is blocked."""
     detector = runs[0].detector
-    for start in range(0, len(traffic), ROWS):
-        columns = {name: column[start : start + ROWS] for name, column in traffic.columns.items()}
+    for start in range(0, len(traffic), MANY_ROWS):
+        columns = {name: column[start : start + MANY_ROWS] for name, column in traffic.columns.items()}
         _, alerts = detector.process(RecordBatch(columns), SWITCH)
         heard = detector.take_evidence()
         for run in runs:

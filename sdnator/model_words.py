@@ -32,6 +32,11 @@ def model_lines(model: Mapping[str, Any]) -> Iterator[str]:
         yield f"  on {minutes:,.0f} min of traffic of {senders:,} senders"
     for port in model.get("ports") or ():
         yield f"  {port['name']}: {int(port['packets']):,} packets of training"
+    if beside := model.get("beside"):
+        yield (
+            f"  beside it another one trains: {int(beside['packets']):,} of {int(beside['wanted']):,} packets, then "
+            f"{int(beside['compared']):,} of {int(beside['to_compare']):,} are compared"
+        )
     share, limit = model.get("drift_share"), model.get("drift_limit")
     if share is not None and limit is not None:
         yield (
@@ -39,7 +44,10 @@ def model_lines(model: Mapping[str, Any]) -> Iterator[str]:
             f"{int(model.get('drift_blocks', 0))} half hours; drift from {limit:.0%} on"
         )
     if model.get("drifted"):
-        yield "  the network is not what it was in training: `sdnator model retrain` trains anew"
+        yield (
+            "  the network is not what it was in training: `sdnator model retrain --beside` trains another model, "
+            "which takes over if it is no worse"
+        )
 
 
 def _left(seconds: float | None, packets: int) -> str:

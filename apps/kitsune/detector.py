@@ -167,9 +167,18 @@ class Detector:
         """Packets used for training so far."""
         return self.model.trained
 
-    def process(self, batch: Columns, switch: str = "") -> tuple[Scored, list[Alert]]:
-        """Trains on or scores a batch; alerts are for the seconds that this batch has completed."""
-        features = self.afterimage.update(batch)
+    def process(
+        self, batch: Columns, switch: str = "", features: npt.NDArray[np.float64] | None = None
+    ) -> tuple[Scored, list[Alert]]:
+        """Trains on or scores a batch; alerts are for the seconds that this batch has completed.
+
+        Args:
+            batch: packet columns, in capture order.
+            switch: where they were seen.
+            features: of each packet, where another detector has measured them; its statistics are then in use.
+        """
+        if features is None:
+            features = self.afterimage.update(batch)
         before = self.model.trained
         scores, errors = self.model.process(features)
         trained = self.model.trained - before

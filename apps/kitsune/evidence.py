@@ -18,6 +18,7 @@ KINDS: Final[dict[Statistic, Kind]] = {
     "ports": "scan",
     "targets": "scan",
     "logins": "guessing",
+    "callbacks": "guessing",
     "one_way": "flood",
     "claims": "spoofing",
     "thefts": "spoofing",
@@ -25,6 +26,8 @@ KINDS: Final[dict[Statistic, Kind]] = {
     "scores": "unlike_training",
     "threshold": "unlike_training",
 }
+_SOURCES: Final = {**dict.fromkeys(CONTACTS, "contacts"), "callbacks": "logins"}
+"""Statistics that are one source: views of the same packets; and what only counts on top of another."""
 _SECOND: Final = 1_000_000_000
 
 
@@ -68,7 +71,7 @@ def evidence_of(
     return Evidence(
         id=f"kitsune-{name}" if sender is None else f"kitsune-{name}-{mac:012x}",
         kind=KINDS[finding.statistic],
-        source="contacts" if finding.statistic in CONTACTS else finding.statistic,
+        source=_SOURCES.get(finding.statistic, finding.statistic),
         sender=None if sender is None else sender_of(sender),
         forgeable=not proven,
         forged=forged,
@@ -100,8 +103,11 @@ def _words(finding: Finding, victim: str) -> str:
     texts: dict[Statistic, str] = {
         "contacts": f"{who} failed to reach {count} new hosts or ports {within}; {usual}",
         "ports": f"{who} failed to reach {count} new ports of {victim} {within}; {usual}",
-        "targets": f"{who} failed to reach {service} at {count} new hosts {within}; {usual}",
+        "targets": f"{who} {'pinged' if service == 'icmp' else f'failed to reach {service} at'} {count} new hosts"
+        f" {within}; {usual}",
         "logins": f"{who} opened {count} short connections to {service} of {victim} {within}; {usual}",
+        "callbacks": f"{victim} connected back to {who} {finding.window_s:.1f} s after its login to {service};"
+        f" {finding.usual:.0f} hosts did so in training",
         "one_way": f"{who} sent {count} packets a second to {victim}, which does not answer; {usual}",
         "claims": f"{who} sent {count} ARP replies that nobody had asked for {within}; {usual}",
         "thefts": f"{who} claims the address of {victim}, which is present",

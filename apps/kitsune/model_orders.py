@@ -14,7 +14,8 @@ class ModelOrder(Message, frozen=True, kw_only=True):
     """`network.instruction.operator.kitsune`."""
 
     id: Name
-    verb: Literal["retrain"]
+    verb: Literal["retrain", "renew"]
+    """`retrain` throws the model away; `renew` trains another one beside it."""
     expires: int = 0
     """Wall time, ns since the epoch, after which it must not be carried out any more; 0 = never."""
 

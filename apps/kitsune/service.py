@@ -22,6 +22,7 @@ from apps.kitsune.kept_model import KeptModel, trained_for
 from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
 from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder, late, order_in
+from apps.kitsune.successor import Comparison, Successor
 from apps.kitsune.training_progress import TrainingProgress
 from apps.messages import Alert, Answer, Decision, Intake, Message, Name, Number, Time, sender_of
 from apps.packets import PACKET_COLUMNS, SteadyTime, read_columns
@@ -113,6 +114,8 @@ class KitsuneService:
         self._belongs = trained_for(settings, settings.keep_for)
         self._kept = KeptModel(Path(settings.keep_model), self._belongs) if settings.keep_model else None
         self._detector = self._first_detector()
+        self._successor: Successor | None = None
+        """The model that trains beside the working one."""
         self._told = self._detector.model.is_trained
         self._progress = TrainingProgress(self._detector.model.training_packets)
         self._intake = Intake(_log)
@@ -213,10 +216,23 @@ class KitsuneService:
             "trained_s": detector.behaviour.seconds,
             "senders": len(detector.behaviour.senders),
             "file": self._settings.keep_model or self._settings.save_model or self._settings.load_model,
+            "beside": self._beside(),
             "drifted": drift is not None and drift.drifted,
             "drift_share": None if drift is None else drift.share,
             "drift_limit": None if detector.drift is None else detector.drift.limit,
             "drift_blocks": 0 if drift is None else drift.blocks,
+        }
+
+    def _beside(self) -> dict[str, int] | None:
+        """How far the model is that trains beside the one in use."""
+        if (successor := self._successor) is None:
+            return None
+        model = successor.detector.model
+        return {
+            "packets": model.trained,
+            "wanted": model.training_packets,
+            "compared": successor.compared,
+            "to_compare": successor.wanted,
         }
 
     def _capture_us(self) -> int:
@@ -226,11 +242,39 @@ class KitsuneService:
     def _on_order(self, _: Item, order: ModelOrder) -> None:
         """An operator wants another model."""
         with self._lock:
-            answer = late(order, time.time_ns()) or Answer(id=order.id, done=True, text=self._retrain())
+            train = self._renew if order.verb == "renew" else self._retrain
+            answer = late(order, time.time_ns()) or Answer(id=order.id, done=True, text=train())
         self._engine.write(ANSWER, answer.to_value(), [NO_WAIT])
+
+    def _renew(self) -> str:
+        """Train another model beside the working one; where none works yet, go on."""
+        if not self._detector.model.is_trained:
+            return "a model is being trained already, and none is in use before it"
+        self._successor = Successor(self._settings, self._detector, self._kernel)
+        wanted = self._successor.detector.model.training_packets
+        text = f"another model trains on the next {wanted:,} packets, beside the one in use; it takes over if it is no worse"
+        _log.warning("an operator asked for it: %s", text)
+        return text
+
+    def _take_over(self, found: Comparison) -> None:
+        """The successor is trained and compared: it takes over, or is thrown away."""
+        successor, self._successor = self._successor, None
+        if successor is None:
+            return
+        if not found.no_worse:
+            _log.warning("the model in use stays, the one trained beside it is worse: %s", found.text)
+            return
+        self._write_alerts(self._detector.finish())
+        successor.detector.accused = self._detector.accused
+        self._detector, self._training_step = successor.detector, -1
+        if self._kept is not None:
+            self._kept.set_aside()
+        self._save()
+        _log.warning("the model trained beside the one in use takes over: %s", found.text)
 
     def _retrain(self) -> str:
         """Throw the model away and train on the next packets."""
+        self._successor = None
         aside = self._kept.set_aside() if self._kept is not None else None
         self._write_alerts(self._detector.finish())
         before, self._detector = self._detector, Detector(self._settings, kernel=self._kernel)
@@ -267,6 +311,11 @@ class KitsuneService:
             self._tell_drift(event_time)
             if self._detector.model.is_trained and not self._told:
                 self._end_of_training()
+            if self._successor is not None:
+                found = self._successor.add(batch, switch, self._detector, scored)
+                if found is not None:
+                    self._take_over(found)
+                    self._tell_training(event_time)
 
     def _on_tick(self, _: Item, tick: ClockTick) -> None:
         """Close the open second where capture time has left it, and no packet of it is under way."""
@@ -360,7 +409,7 @@ class KitsuneService:
             f"{reading.share:.1%} of benign packets of the last day score over what 1 % of training did, in "
             f"{reading.blocks} half hours; up to {reading.limit:.0%} would be no drift"
         )
-        text = f"benign scores have drifted: {now}; `sdnator model retrain` trains anew"
+        text = f"benign scores have drifted: {now}; `sdnator model retrain --beside` trains another"
         if not reading.drifted:
             text = f"benign scores are like those of training again: {now}"
         _log.warning("%s", text)

@@ -59,14 +59,25 @@ def show(*, as_json: JsonOption = False) -> None:
 
 
 @model.command("retrain")
-def retrain() -> None:
+def retrain(
+    *,
+    beside: Annotated[
+        bool,
+        typer.Option("--beside", help="Train another model beside it, which takes over if it is no worse."),
+    ] = False,
+) -> None:
     """Throw the model away and train on the next packets; the old file is kept beside.
 
-    A running Kitsune does so at once; until it has trained nobody is blocked anew. Without a pipeline the next
-    `sdnator up` trains.
+    A running Kitsune does so at once; until it has trained nobody is blocked anew. With --beside the model in use goes
+    on until the other is trained and both have scored the same packets. Without a pipeline the next `sdnator up`
+    trains.
 
-    Example: sdnator model retrain
+    Example: sdnator model retrain --beside
     """
+    if running.find() is None and beside:
+        raise BadInput(
+            "no pipeline is running, so there is no model to train beside; start `sdnator up` first"
+        )
     if running.find() is None:
         path = running.model_file(running.state_folder())
         try:
@@ -80,7 +91,9 @@ def retrain() -> None:
         )
         return
     order = ModelOrder(
-        id=uuid4().hex[:12], verb="retrain", expires=time.time_ns() + round(_ANSWER_SECONDS * 1e9)
+        id=uuid4().hex[:12],
+        verb="renew" if beside else "retrain",
+        expires=time.time_ns() + round(_ANSWER_SECONDS * 1e9),
     )
     question = AppRequest("detector", ORDERS, ANSWER, order.id, order.to_value())
     typer.echo(ask(question, "", archive_url(""), _ANSWER_SECONDS))

@@ -2,6 +2,7 @@
 
     contacts that fail     of a sender: in all, by target (port scan), by service (sweep)
     logins                 connections of a sender to one login service
+    callbacks              hosts that connect back to whoever has just logged in
     one-way traffic        packets of a sender to one host that does not take part
     claims                 ARP replies that nobody asked for
     thefts                 ARP packets that claim the address of another, who is present
@@ -23,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.kitsune.behaviour.baseline import BLOCKS, WINDOWS_S
+from apps.kitsune.behaviour.callbacks import Callbacks
 from apps.kitsune.behaviour.contacts import (
     ANY_UDP,
     ARP,
@@ -166,6 +168,8 @@ class Behaviour:
         self._exchanges: dict[tuple[int, int], _Exchange] = {}
         self._asked: dict[tuple[int, int], float] = {}
         self._logins: dict[tuple[int, int, int, int], _Login] = {}
+        self._callbacks = Callbacks()
+        self._called = FoundSoFar()
         self._strangers: dict[tuple[int, int], None] = {}
         self._tail: deque[tuple[SenderId, float]] = deque(maxlen=CALIBRATION_PACKETS)
         """Senders and times of the last packets of training."""
@@ -268,6 +272,7 @@ class Behaviour:
     def _close_training(self, rescored: npt.NDArray[np.float64]) -> None:
         self._learning = False
         self._calibrate(rescored)
+        self._callbacks.learn(filter(self.contacts.came_about, self.contacts.seen()))
         self.contacts.close_training()
         for name, counter in self._counters.items():
             # at the beginning every contact was new
@@ -285,12 +290,25 @@ class Behaviour:
             found = self._contact(ended, block)
         if ended.failed:
             found += self._strange(ended, block)
+        elif block < 0:
+            found += self._callback(ended)
         return found
+
+    def _callback(self, ended: EndedContact) -> list[Finding]:
+        call = self._callbacks.heard(ended)
+        if call is None:
+            return []
+        added = self._called.added(call.sender, self._callbacks.nats, ended.time)
+        seen = SeenCount(added, self._callbacks.nats, 1.0, call.seconds, self._callbacks.back)
+        found = Finding("callbacks", call.sender, call.host, call.service, *seen, ended.time, ended.arrival)
+        return [found] if added else []
 
     def _contact(self, ended: EndedContact, block: int) -> list[Finding]:
         sender, target, service, time = ended.sender, ended.target, ended.service, ended.time
         inside, protocol = is_inside(parts_of(sender[3])), _protocol(service)
         whose = (sender, protocol)
+        # hosts answer echo requests of everybody: that they do makes up for nothing
+        counts = ended.failed or service == ECHO
         views: list[tuple[Statistic, Any, Any, int, int]] = [
             ("contacts", whose, (protocol, inside), 0, -1),
             ("ports", (sender, target), (protocol, inside), target, -1),
@@ -299,12 +317,12 @@ class Behaviour:
         best: Finding | None = None
         for statistic, subject, kind, victim, single in views:
             counter = self._counters[statistic]
-            sums = counter.sums.add(subject, time, 1.0 if ended.failed else -1.0)
+            sums = counter.sums.add(subject, time, 1.0 if counts else -1.0)
             if block >= 0:
                 counter.baseline.learn(whose, block, sums, kind)
-            elif ended.failed:
+            elif counts:
                 seen = counter.measure(whose, sums, kind)
-                if seen.total >= LEAST_NATS and (best is None or seen.total > best.total):
+                if seen.total >= LEAST_NATS and (best is None or seen.total >= best.total):
                     best = Finding(statistic, sender, victim, single, *seen, time, ended.arrival)
         if best is None:
             return []
@@ -389,6 +407,8 @@ class Behaviour:
             return []
         # a client that logs in more often today does so at all of its services: the most counts, not the sum
         seen = counter.measure((row.sender, row.service), sums, kind)
+        if seen.total >= LEAST_NATS:
+            self._callbacks.login(row.sender, row.source, row.target, row.service, row.time)
         added = counter.found.added(row.sender, seen.total, row.time)
         return [self._finding("logins", row, seen._replace(nats=added))] if added else []
 
@@ -486,6 +506,7 @@ class Behaviour:
             "senders": [list(sender) for sender in self.senders],
             "owners": [[address, sorted(macs)] for address, macs in self._owners.items()],
             "contacts": [list(contact) for contact in self.contacts.trained],
+            "callbacks": [self._callbacks.pairs, self._callbacks.back],
             "baselines": {name: counter.baseline.to_state() for name, counter in self._counters.items()},
         }
 
@@ -508,6 +529,7 @@ class Behaviour:
         self._addresses = set(self._owners)
         self.contacts.trained = {(int(one), int(other), int(what)) for one, other, what in state["contacts"]}
         self.contacts.close_training()
+        self._callbacks.pairs, self._callbacks.back = map(int, state.get("callbacks", (0, 0)))
         for name, counter in self._counters.items():
             counter.baseline.restore(state["baselines"][name])
             counter.trained(self.seconds)

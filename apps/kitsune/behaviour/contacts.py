@@ -119,9 +119,13 @@ class ContactTracker:
 
     def close_training(self) -> None:
         """What is known by now is never counted again."""
-        self.trained = self._young | self._old | self.trained
+        self.trained = self.seen()
         self._young, self._old = set(), set()
         self._learning = False
+
+    def seen(self) -> set[Contact]:
+        """All contacts of training and the recent past, failed ones included."""
+        return self._young | self._old | self.trained
 
     def knows(self, contact: Contact) -> bool:
         """Whether training or the recent past have seen it."""

@@ -14,6 +14,7 @@ Statistic = Literal[
     "ports",
     "targets",
     "logins",
+    "callbacks",
     "one_way",
     "claims",
     "thefts",

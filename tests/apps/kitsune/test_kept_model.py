@@ -4,13 +4,14 @@ import json
 import stat
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kept_model import MOST_ASIDE, KeptModel, models_aside, set_aside, trained_for
 from apps.kitsune.model_orders import ANSWER, ORDERS
-from apps.kitsune.service import PACKETS, TRAINING_KEY, KitsuneService, Settings
-from due import Engine
+from apps.kitsune.service import PACKETS, SCORE, TRAINING_KEY, KitsuneService, Settings
+from due import Engine, RecordBatch
 from sdnator.testing.packet_rows import part
 from tests.apps.hostile import Hands
 from tests.apps.kitsune.test_hostile import KEY, mixed
@@ -145,3 +146,43 @@ def test_an_operator_has_it_trained_anew(tmp_path):
     fed(engine, mixed(400))
     assert made.health()["model"]["done"]
     assert json.dumps(made.health()["model"])
+
+
+def test_another_model_trains_beside_the_one_in_use_and_takes_over(tmp_path):
+    """Scores never stop; the old file stays beside, and the new training is told."""
+    engine, whole = Hands(), mixed(900)
+    made = service(tmp_path, engine)
+    fed(engine, part(whole, 0, 400))
+    trained_at = made.health()["model"]["trained_at_us"]
+    engine.hand(ORDERS, ORDERS, {"id": "o1", "verb": "renew"})
+    assert "if it is no worse" in engine.values(ANSWER)[-1]["text"]
+    fed(engine, part(whole, 400, 600))
+    model = made.health()["model"]
+    assert model["beside"] == {"packets": 200, "wanted": 221, "compared": 0, "to_compare": 55}
+    assert model["done"]
+    fed(engine, part(whole, 600, 900))
+    model = made.health()["model"]
+    assert model["done"]
+    assert model["beside"] is None
+    assert model["trained_at_us"] == int(whole["time_us"][620]) > trained_at
+    assert len(models_aside(tmp_path / "model" / "kitsune.npz")) == 1
+    assert [each["done"] for each in engine.values(TRAINING_KEY)].count(True) == 2
+    assert sum(each["count"] for each in engine.values(SCORE)) == 900
+
+
+def test_a_model_that_is_worse_does_not_take_over(tmp_path, caplog):
+    """It learnt from packets of one length, and finds all others odd."""
+    engine, whole = Hands(), mixed(700)
+    made = service(tmp_path, engine)
+    fed(engine, part(whole, 0, 400))
+    before = made.health()["model"]["trained_at_us"]
+    engine.hand(ORDERS, ORDERS, {"id": "o1", "verb": "renew"})
+    alike = part(whole, 400, 621)
+    fed(engine, RecordBatch({**alike, "length": np.full(221, 60)}), 221)
+    # an hour later nothing is left of the statistics of those
+    later = part(whole, 0, 400)
+    fed(engine, RecordBatch({**later, "time_us": later["time_us"] + 3_600_000_000}))
+    assert made.health()["model"]["beside"] is None
+    assert made.health()["model"]["trained_at_us"] == before
+    assert "the model in use stays" in caplog.text
+    assert models_aside(tmp_path / "model" / "kitsune.npz") == []

@@ -185,6 +185,39 @@ def test_a_flood_of_answered_pings_is_found():
     assert total(feed(quiet_network(), rows), "one_way") > 12
 
 
+def test_a_sweep_by_pings_is_found_though_hosts_answer():
+    """Every host answers a ping, so what counts is how many new hosts somebody pings."""
+    rows = []
+    for n in range(16):
+        rows.append(packet(700 + n / 10, STRANGER, 0x0A000010 + n, icmp_type=8, icmp_code=0))
+        rows.append(packet(700.001 + n / 10, 0x0A000010 + n, STRANGER, icmp_type=0, icmp_code=0))
+    found = feed(quiet_network(), rows)
+    assert total(found, *CONTACTS) > 12
+    assert {each.sender[3] for each in found if each.sender} == {STRANGER}
+    assert {each.statistic for each in found if each.sender} == {"targets"}
+
+
+def test_a_host_that_connects_back_after_a_login_speaks_against_who_logged_in():
+    """Data connections of FTP come back by design, and without a login it is nothing."""
+
+    def called(login, back_from, later=2):
+        rows = handshake(700, STRANGER, SERVER, 50_000, login)
+        rows += handshake(700 + later, SERVER, STRANGER, back_from, 8_080)
+        behaviour = quiet_network()
+        found = [each for each in feed(behaviour, rows) if each.statistic == "callbacks"]
+        assert all(each.sender[3] == STRANGER and each.victim == SERVER for each in found)
+        trained = quiet_network()
+        feed(trained, [packet(650, HOST, SERVER, 1, 80, ACK)])
+        again = Behaviour.from_state(json.loads(json.dumps(trained.to_state())))
+        assert total(feed(again, rows), "callbacks") == total(found, "callbacks")
+        return total(found, "callbacks")
+
+    assert called(23, 40_000) > 1
+    assert called(80, 40_000) == 0
+    assert called(21, 20) == 0
+    assert called(23, 40_000, later=100) == 0
+
+
 def test_a_flood_is_found_and_a_transfer_is_not():
     """What the other side acknowledges is wanted."""
     udp = [packet(700 + n / 1000, HOST, STRANGER, udp_sport=5, udp_dport=9) for n in range(300)]
