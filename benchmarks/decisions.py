@@ -14,7 +14,7 @@ of the paper (block at the first score over the threshold) and the rule of secon
     real_benign               the benign part of the real capture: packets behind training, blocks
     by_attack                 with the packets dropped and challenged, and the packets and hosts of others that were hit
     paper_rule, seconds_rule  the same under these rules
-    fastnetmon                why it is not among them
+    fastnetmon                Debian's FastNetMon on the floods (seed 1), with its settings, or why it was not run
 
 Attacks are stopped under each rule for itself.  In days, novelty and the real capture all rules judge what one
 detector says and nothing is stopped, which is the same where a rule blocks nobody, and spares two thirds of the time.
@@ -50,9 +50,10 @@ from benchmarks.decision_traffic.network import Network
 from benchmarks.decision_traffic.networks import NETWORKS
 from benchmarks.decision_traffic.novelty import NOVELTIES
 from benchmarks.decision_traffic.real import real_attacks, real_network
-from benchmarks.decision_traffic.traffic import BASE_US, Traffic, merge, renumbered
+from benchmarks.decision_traffic.traffic import BASE_US, SECOND, Traffic, merge, renumbered
 from benchmarks.decision_traffic.truth import AttackSpec, AttackTruth
 from benchmarks.decisions_core import DecidedAction, DecisionRun, detector_for, watch
+from benchmarks.decisions_fastnetmon import bans, missing, settings, thresholds_of
 
 RULES: Final = {"sequential": "", "paper": "paper_rule", "seconds": "seconds_rule"}
 """Rule of the firewall to the field of its figures; the default's stand at the top."""
@@ -65,10 +66,10 @@ LONGEST_S: Final = 120.0
 NOVELTY_S: Final = 900.0
 REAL_TRAINING: Final = 12_000
 """Packets of the real capture that are training, as in `sdnator replay`."""
-FASTNETMON: Final = (
-    "not run: FastNetMon 1.2.4 of Debian measures rates of an interface by the clock on the wall and reads no captures "
-    "with times of their own; a floods-only comparison would take the captures' own time"
-)
+FLOOD_S: Final = 12.0
+"""Of a flood that FastNetMon gets, behind five seconds of benign traffic."""
+WAITING: Final = 6
+"""FastNetMon takes the captures' own time, so that several hardly need more than one."""
 Figures = dict[str, Any]
 SOON_S: Final = 5.0
 
@@ -84,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--held-back", action="store_true", help="the attacks that nobody tunes on")
     parser.add_argument("--only", default="", help="attacks and novelty whose name contains this text")
+    parser.add_argument("--no-fastnetmon", action="store_true", help="leave FastNetMon out, which needs root")
     add_data_option(parser)
     chosen = parser.parse_args(argv)
     begun = monotonic()
@@ -92,7 +94,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "settings": {
             key: str(value) if isinstance(value, Path) else value for key, value in vars(chosen).items()
         },
-        "fastnetmon": FASTNETMON,
     }
     rows: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
     novelty: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
@@ -104,6 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _print_attacks(rule, attacks[rule])
         print(f"{name}: done after {monotonic() - begun:.0f} s", flush=True)
     days = _days(chosen)
+    figures["fastnetmon"] = "not asked for" if chosen.no_fastnetmon else _fastnetmon(chosen)
     real = _real_benign(chosen)
     for rule, field in RULES.items():
         if rule in chosen.rules:
@@ -170,13 +172,16 @@ def _rules(rule: str) -> Rules:
 def _network(name: str, chosen: Any) -> tuple[dict[str, list[Figures]], dict[str, list[Figures]]]:
     """Train once, and run every attack under each rule, and every novelty, from there."""
     network = NETWORKS[name](1)
-    benign = merge(*network.chunks(0, BENIGN_S + NOVELTY_S + 60))
     known = [*ATTACKS, *_captured(chosen.data)]
     specs = [each for each in known if each.held_back == chosen.held_back and each.fits(network)]
     specs = [each for each in specs if chosen.only in each.name]
     specs = specs[: max(1, round(len(specs) * chosen.scale))]
     novelties = [each for each in NOVELTIES if chosen.only in each]
     novelties = novelties[: max(1, round(len(novelties) * chosen.scale))]
+    if not specs and not novelties:
+        nothing: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
+        return nothing, nothing
+    benign = merge(*network.chunks(0, BENIGN_S + NOVELTY_S + 60))
     run = DecisionRun(len(benign.between(0, TRAINING_S)), _rules(chosen.rules[0]))
     run.feed(benign.between(0, TRAINING_S))
     seeds = range(1, chosen.seeds + 1)
@@ -235,13 +240,13 @@ def _apart(work: Callable[[], Any]) -> Any:
     return _all_apart([work])[0]
 
 
-def _all_apart(works: Sequence[Callable[[], Any]]) -> list[Any]:
-    """Do each in a copy of this process, as many at a time as there are cores."""
+def _all_apart(works: Sequence[Callable[[], Any]], most: int = os.cpu_count() or 1) -> list[Any]:
+    """Do each in a copy of this process, `most` at a time."""
     found: dict[int, Any] = {}
     going: dict[int, tuple[int, int]] = {}
     waiting = list(enumerate(works))[::-1]
     while waiting or going:
-        while waiting and len(going) < (os.cpu_count() or 1):
+        while waiting and len(going) < most:
             number, work = waiting.pop()
             child, pipe = _copied(work)
             going[pipe] = (number, child)
@@ -396,6 +401,55 @@ def _day(rules: Sequence[str], name: str, seed: int) -> Figures:
         flush=True,
     )
     return {"shared": {"network": name, "seed": seed, "packets": benign}} | found
+
+
+def _fastnetmon(chosen: Any) -> Figures | str:
+    """FastNetMon on the floods of each network."""
+    reason = missing()
+    if reason:
+        return reason
+    rows: list[Figures] = []
+    thresholds = {}
+    for name in chosen.networks:
+        network = NETWORKS[name](1)
+        training = merge(*network.chunks(0, TRAINING_S))
+        thresholds[name] = thresholds_of(training, network.prefix)
+        benign = merge(*network.chunks(0, ATTACK_S + LONGEST_S))
+        known = [*ATTACKS, *_captured(chosen.data)]
+        floods = [each for each in known if each.kind == "flood" and chosen.only in each.name]
+        floods = [each for each in floods if each.held_back == chosen.held_back and each.fits(network)]
+        rows += _all_apart(
+            [partial(_banned, network, benign, spec, thresholds[name]) for spec in floods], WAITING
+        )
+    _print_banned(rows)
+    return {"settings": settings({}) | {"thresholds": thresholds}, "by_attack": rows}
+
+
+def _banned(network: Network, benign: Traffic, spec: AttackSpec, thresholds: dict[str, int]) -> Figures:
+    sent, truth = spec.traffic(network, 1, ATTACK_S)
+    begin = (truth.first_us - BASE_US) / SECOND
+    parts = (each.between(begin - 5, begin + FLOOD_S) for each in (benign, sent))
+    found = bans(merge(*parts), f"{ipaddress.IPv4Address(network.prefix)}/24", thresholds)
+    attackers = {str(ipaddress.IPv4Address(each.ip)) for each in truth.attackers if each.ip}
+    victims = {str(ipaddress.IPv4Address(each)) for each in truth.victims}
+    return {
+        "network": network.name,
+        "attack": spec.name,
+        "s_to_ban": min((after for after, _ in found), default=math.inf),
+        "banned": [
+            "attacker" if host in attackers else "victim" if host in victims else "innocent"
+            for _, host in found
+        ],
+    }
+
+
+def _print_banned(rows: list[Figures]) -> None:
+    columns = ("network", "attack", "s_to_ban", "banned")
+    print("FastNetMon")
+    measure.table(
+        columns,
+        [tuple(" ".join(row[key]) if key == "banned" else row[key] for key in columns) for row in rows],
+    )
 
 
 def _real_benign(chosen: Any) -> Figures:
