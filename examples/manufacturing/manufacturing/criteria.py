@@ -4,6 +4,9 @@
     finding 11  anomalies: it stays the best when printers fail
     finding 12  PPE:       urgent orders are done much sooner, and the rest not later
 
+The paper's other schedulers ignore priority, so its PPE ratio measures overtaking above all.  `fairer` compares with a
+first come, first served that lets urgent orders go first, by the same bars; it is reported beside finding 12.
+
 Ratios are taken seed by seed and then averaged; a bar is compared with the mean, and the interval is shown beside it.
 """
 
@@ -96,6 +99,17 @@ def judge(
         _criterion(12, "PPE: urgent makespan, dynamic / best of the others", urgent, PPE_RATIO),
         _criterion(12, "PPE: final makespan, dynamic / best of the others", whole, FINAL_RATIO),
     )
+
+
+def fairer(final: Cells, ppe: Cells, fleets: Sequence[int] = FLEETS) -> tuple[Criterion, ...]:
+    """Finding 12 against the scheduler that knows priority but does not plan; arguments as for `judge`."""
+    found = []
+    for says, cells, bar in (("urgent", ppe, PPE_RATIO), ("final", final, FINAL_RATIO)):
+        figures = {
+            f"{n}": mean_ratio(cells["ppe", "dynamic", n], cells["ppe", "urgent_first", n]) for n in fleets
+        }
+        found.append(_criterion(12, f"PPE: {says} makespan, dynamic / urgent_first", figures, bar))
+    return tuple(found)
 
 
 def _criterion(finding: int, says: str, figures: Mapping[str, MeanRatio], bar: float) -> Criterion:

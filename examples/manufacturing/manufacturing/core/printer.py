@@ -190,7 +190,7 @@ class Printer:
             return False
         if self._wants_maintenance:
             self._wants_maintenance = False
-            self._maintained_at = self.time + faults.MAINTENANCE_S
+            self._maintained_at = round(self.time + faults.MAINTENANCE_S, 3)
             return True
         if self.queue:
             self._begin(self.queue.pop(0))
