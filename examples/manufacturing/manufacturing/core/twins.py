@@ -105,6 +105,11 @@ class PrinterTwin:
         self.alarm = found or ("a part was found ruined" if failed else "")
         return self.alarm
 
+    @property
+    def waits_for_maintenance(self) -> bool:
+        """Whether a maintenance was ordered that has not begun."""
+        return bool(self.alarm) and not self._serviced
+
     def _take_history(self, report: Report) -> bool:
         new = [record for record in report.ended if record.task.name not in self._names]
         self._names.update(record.task.name for record in new)
@@ -174,6 +179,8 @@ class FleetTwin:
         self._done: dict[tuple[int, int], None] = {}
         self._tried: dict[tuple[int, int], tuple[int, str]] = {}
         self._taken = dict.fromkeys(machines, 0)
+        self._overdue: set[str] = set()
+        """Machines whose maintenance may have been ordered by nobody, see `restore`."""
 
     def update(self, reports: Sequence[Report]) -> FleetState:
         """Take the reports of all printers of one step."""
@@ -181,6 +188,8 @@ class FleetTwin:
         for report in reports:
             twin = self._twins[report.machine]
             cause = twin.update(report)
+            if report.machine in self._overdue and twin.waits_for_maintenance:
+                maintain.append(report.machine)
             if cause:
                 maintain.append(report.machine)
                 if cause.startswith("a part"):
@@ -188,6 +197,7 @@ class FleetTwin:
                 else:
                     self.counts.alarms += 1
             self._note(twin)
+        self._overdue.clear()
         self.step = reports[0].step
         return FleetState(
             self.step, reports[0].time, tuple(self._twins[report.machine].state(report) for report in reports),
@@ -206,11 +216,16 @@ class FleetTwin:
         self._taken[twin.machine] = len(twin.history)
 
     def restore(self, reports: Sequence[Report]) -> None:
-        """Take old reports, after a restart: their history and readings count, what they led to was done."""
+        """Take old reports, after a restart, for their history and readings.
+
+        Whether anybody carried out what they led to is not known: a maintenance that is still outstanding afterwards
+        is ordered again by the next `update`, which does no harm to a printer that waits for it already.
+        """
         for report in reports:
             twin = self._twins[report.machine]
             twin.update(report)
             self._note(twin)
+        self._overdue = {name for name, twin in self._twins.items() if twin.waits_for_maintenance}
 
     def history(self, machine: str) -> tuple[PrintRecord, ...]:
         """Prints that ended on a printer, in order."""

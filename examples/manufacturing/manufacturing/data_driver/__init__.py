@@ -1,0 +1,1 @@
+"""Data Driver: assignments become REST calls, printers' data becomes DUE data; it knows no scheduling."""

@@ -1,0 +1,1 @@
+"""Job Creator: orders at set times."""
