@@ -1,8 +1,7 @@
 """os-ken's event API as a peer: one app sends events, another's handler counts them, in one process.
 
-It lives in an environment of its own, so that its pins do not meet ours:
-    python -m venv /tmp/osken && /tmp/osken/bin/pip install os-ken && export OSKEN_PYTHON=/tmp/osken/bin/python
-Without OSKEN_PYTHON it is used where it can be imported, else left out with the reason.
+The extra `peers` brings it: `pip install -e .[peers]`.  OSKEN_PYTHON may name the Python of another environment that has
+it.  Without either it is left out with the reason.
 """
 
 import importlib
@@ -15,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-ABSENT = "os-ken left out: set OSKEN_PYTHON to the Python of an environment with os-ken (pip install os-ken)"
+ABSENT = "os-ken left out: install the extra `peers` (pip install -e .[peers])"
 
 
 def available() -> bool:
@@ -65,7 +64,7 @@ def _run(size: int, count: int, gap: float) -> list[tuple[float, float]]:
     receiver = Receiver()
     receiver.register_handler(Message, receiver.on_message)
     receiver.start()
-    payload = bytes(size)
+    payload = os.urandom(size)
     for _ in range(count):
         receiver._send_event(Message(payload), None)
         hub.sleep(gap) if gap else None
