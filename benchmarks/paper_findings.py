@@ -13,7 +13,7 @@ import msgspec
 Verdict = Literal["yes", "no", "in part", "not measured"]
 
 
-class Criterion(msgspec.Struct, frozen=True):
+class PaperCriterion(msgspec.Struct, frozen=True):
     """A figure and the bar that it is held against."""
 
     figure: str
@@ -25,14 +25,14 @@ class Criterion(msgspec.Struct, frozen=True):
         return value <= self.bar if self.at_most else value >= self.bar
 
 
-class Claim(msgspec.Struct, frozen=True):
+class PaperClaim(msgspec.Struct, frozen=True):
     """What the paper claims, in our words."""
 
     number: int
     says: str
     paper: str
     """The paper's figure, as far as the claim has one."""
-    criteria: tuple[Criterion, ...]
+    criteria: tuple[PaperCriterion, ...]
 
 
 class Measured(msgspec.Struct, frozen=True):
@@ -64,54 +64,54 @@ class JudgedFinding(msgspec.Struct, frozen=True, kw_only=True):
     reproduced: Verdict
     sentence: str
     figures: Mapping[str, Mapping[str, Any]]
-    criteria: Sequence[Criterion]
+    criteria: Sequence[PaperCriterion]
 
 
-def _most(figure: str, bar: float) -> Criterion:
-    return Criterion(figure, at_most=True, bar=bar)
+def _most(figure: str, bar: float) -> PaperCriterion:
+    return PaperCriterion(figure, at_most=True, bar=bar)
 
 
-def _least(figure: str, bar: float) -> Criterion:
-    return Criterion(figure, at_most=False, bar=bar)
+def _least(figure: str, bar: float) -> PaperCriterion:
+    return PaperCriterion(figure, at_most=False, bar=bar)
 
 
 CLAIMS: Final = (
-    Claim(
+    PaperClaim(
         1, "A message of 1 KB arrives sooner than an event of the controller framework Ryu.", "below Ryu's",
         (_most("latency_to_osken", 1.0),),
     ),
-    Claim(
+    PaperClaim(
         2, "Latency is at most a tenth above raw Redis, one by one and in batches of 100.", "at most 10 % more",
         (_most("latency_to_raw_batch1", 1.1), _most("latency_to_raw_batch100", 1.1)),
     ),
-    Claim(3, "Batching multiplies throughput.", "5 times", (_least("batch100_to_batch1", 5.0),)),
-    Claim(4, "One core carries over 100,000 messages a second.", "over 100,000/s", (_least("per_second", 1e5),)),
-    Claim(
+    PaperClaim(3, "Batching multiplies throughput.", "5 times", (_least("batch100_to_batch1", 5.0),)),
+    PaperClaim(4, "One core carries over 100,000 messages a second.", "over 100,000/s", (_least("per_second", 1e5),)),
+    PaperClaim(
         5, "Archiving everything hardly slows the publisher, unthrottled.", "hardly",
         (_least("sqlite_on_to_off", 0.9), _least("mongodb_on_to_off", 0.9)),
     ),
-    Claim(
+    PaperClaim(
         6, "Batches make the archive faster: 1,000 against 1.", "much faster",
         (_least("sqlite_batch1000_to_1", 5.0), _least("mongodb_batch1000_to_1", 5.0)),
     ),
-    Claim(
+    PaperClaim(
         7, "In a star of 60 apps the sum falls by no more than a third at 100 ms.", "a third less",
         (_least("sum_100ms_to_0ms", 0.67),),
     ),
-    Claim(
+    PaperClaim(
         8, "The sum does not fall as pairs are added.", "grows up to the hub's capacity",
         (_least("sum_at_most_pairs_to_best", 0.9),),
     ),
-    Claim(9, "Apps share fairly (Jain's index).", "fair", (_least("jain", 0.95),)),
-    Claim(
+    PaperClaim(9, "Apps share fairly (Jain's index).", "fair", (_least("jain", 0.95),)),
+    PaperClaim(
         10, "Central scheduling on digital twins shortens production.", "shorter",
         (_most("makespan_to_decentralized", 0.7), _most("makespan_to_bound", 1.1)),
     ),
-    Claim(
+    PaperClaim(
         11, "It stays the best when printers fail, at every fleet size.", "best",
         (_most("anomalies_to_best_other", 1.0),),
     ),
-    Claim(
+    PaperClaim(
         12, "Urgent orders are done 50 to 100 % faster, and the rest not later.", "50 to 100 % faster",
         (_most("urgent_to_best_other", 0.67), _most("final_to_best_other", 1.02)),
     ),
@@ -126,7 +126,7 @@ WHY: Final = {
 """What is known of the reason, where a figure needs one."""
 
 
-def judge(claim: Claim, figures: Mapping[str, Measured], missing: str = "") -> JudgedFinding:
+def judge(claim: PaperClaim, figures: Mapping[str, Measured], missing: str = "") -> JudgedFinding:
     """Hold the figures against the criteria; without a figure of a criterion it was not measured, with `missing`."""
     here = [one for one in claim.criteria if one.figure in figures]
     held = [one.holds(figures[one.figure].median) for one in here]

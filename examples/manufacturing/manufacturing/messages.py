@@ -2,7 +2,7 @@
 
     key                                                       written by        value
     manufacturing.inventory.machine_assets                    Machine Assets    Inventory
-    manufacturing.clock.data_driver                           Data Driver       Clock
+    manufacturing.clock.data_driver                           Data Driver       SimulatedClock
     manufacturing.report.data_driver.<machine>                Data Driver       ReportMessage
     manufacturing.order.job_creator.<order>                   Job Creator       OrderMessage
     manufacturing.order_book.job_creator                      Job Creator       OrderBook
@@ -46,7 +46,7 @@ class Inventory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Machine to the base URL of its REST interface."""
 
 
-class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SimulatedClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Simulated time has reached a step."""
 
     run: str

@@ -33,12 +33,12 @@ from manufacturing.messages import (
     INVENTORY,
     PLAN,
     REPORT,
-    Clock,
     FleetMessage,
     Inventory,
     JobAssignment,
     PlanMessage,
     ReportMessage,
+    SimulatedClock,
     from_value,
     to_value,
 )
@@ -164,7 +164,7 @@ class DataDriverService:
             ended = tuple(self._printers[report.machine].history[self._told[report.machine] :])
             message = ReportMessage(run, msgspec.structs.replace(report, ended=ended))
             self._engine.write(f"{REPORT}.{report.machine}", to_value(message), [NO_WAIT])
-        clock = Clock(run, step, step * STEP_S, tuple(self._printers))
+        clock = SimulatedClock(run, step, step * STEP_S, tuple(self._printers))
         self._engine.write(CLOCK, to_value(clock), [NO_WAIT])
 
     # what is to be done

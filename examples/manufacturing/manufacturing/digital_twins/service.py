@@ -24,9 +24,9 @@ from manufacturing.messages import (
     FLEET,
     MACHINE,
     REPORT,
-    Clock,
     FleetMessage,
     ReportMessage,
+    SimulatedClock,
     from_value,
     to_value,
 )
@@ -52,7 +52,7 @@ class DigitalTwinsService:
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine, self._settings = engine, settings
         self._run = ""
-        self._clock: Clock | None = None
+        self._clock: SimulatedClock | None = None
         self._twins: FleetTwin | None = None
         self._reports: dict[str, Report] = {}
         """Of the newest step that was reported, by machine."""
@@ -69,7 +69,7 @@ class DigitalTwinsService:
 
     def _on_clock(self, item: Item) -> None:
         try:
-            clock = from_value(item.value, Clock)
+            clock = from_value(item.value, SimulatedClock)
         except msgspec.ValidationError as error:
             log.warning("%s is not understood: %s", item.key, error)
             return
@@ -92,7 +92,7 @@ class DigitalTwinsService:
         self._reports[report.machine] = report
         self._look()
 
-    def _begin(self, clock: Clock) -> None:
+    def _begin(self, clock: SimulatedClock) -> None:
         self._run, self._told = clock.run, None
         twins = FleetTwin(clock.machines, self._settings.seed, sensors=self._settings.sensors)
         old = self._archived(clock) if clock.step else []
@@ -100,7 +100,7 @@ class DigitalTwinsService:
         self._restored = len(old)
         self._twins = twins
 
-    def _archived(self, clock: Clock) -> list[Report]:
+    def _archived(self, clock: SimulatedClock) -> list[Report]:
         """The reports before this step, each once, by step."""
         try:
             items = self._engine.get(f"{REPORT}.*")

@@ -20,9 +20,9 @@ from manufacturing.messages import (
     CLOCK,
     ORDER,
     ORDER_BOOK,
-    Clock,
     OrderBook,
     OrderMessage,
+    SimulatedClock,
     from_value,
     to_value,
 )
@@ -68,7 +68,7 @@ class JobCreatorService:
 
     def _on_clock(self, item: Item) -> None:
         try:
-            clock = from_value(item.value, Clock)
+            clock = from_value(item.value, SimulatedClock)
         except msgspec.ValidationError as error:
             log.warning("%s is not understood: %s", item.key, error)
             return

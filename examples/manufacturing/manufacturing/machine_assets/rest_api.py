@@ -28,7 +28,7 @@ _MOST_SAMPLES: Final = 1_000
 Handler = Callable[[Request], Awaitable[Response]]
 
 
-class Answer(JSONResponse):
+class PrinterAnswer(JSONResponse):
     """JSON."""
 
     def render(self, content: Any) -> bytes:
@@ -98,47 +98,49 @@ class PrinterApi:
             name, key = self._gates[self._number(request)].register()
         except TooManyUsers as error:
             raise HTTPException(429, str(error)) from None
-        return Answer({"id": name, "key": key})
+        return PrinterAnswer({"id": name, "key": key})
 
     async def _check_credentials(self, request: Request) -> Response:
         known = self._gates[self._number(request)].knows(request.path_params["name"])
-        return Answer({"message": "authorized" if known else "unknown"})
+        return PrinterAnswer({"message": "authorized" if known else "unknown"})
 
     async def _verify(self, request: Request) -> Response:
         self._allowed(request)
-        return Answer({"message": "ok"})
+        return PrinterAnswer({"message": "ok"})
 
     # what is read
 
     async def _system(self, request: Request) -> Response:
         name = self._printer(request).machine
-        return Answer({"name": name, "variant": "Ultimaker 3", "hostname": name, "firmware": "emulated"})
+        return PrinterAnswer(
+            {"name": name, "variant": "Ultimaker 3", "hostname": name, "firmware": "emulated"}
+        )
 
     async def _tree(self, request: Request) -> Response:
         found: Any = printer_view.printer_tree(self._printer(request))
         for part in request.path_params.get("path", "").strip("/").split("/"):
             if part:
                 found = _branch(found, part)
-        return Answer(found)
+        return PrinterAnswer(found)
 
     async def _samples(self, request: Request) -> Response:
         count = min(request.path_params["count"], _MOST_SAMPLES)
-        return Answer(printer_view.temperature_flow(self._printer(request), count))
+        return PrinterAnswer(printer_view.temperature_flow(self._printer(request), count))
 
     async def _job(self, request: Request) -> Response:
         job = printer_view.print_job(self._printer(request))
         if job is None:
             raise HTTPException(404, "no print job is in progress")
         field = request.path_params.get("field")
-        return Answer(job if field is None else _branch(job, field))
+        return PrinterAnswer(job if field is None else _branch(job, field))
 
     async def _history(self, request: Request) -> Response:
         offset = _whole(request.query_params.get("offset", "0"), "offset")
         count = min(_whole(request.query_params.get("count", "50"), "count"), _MOST_HISTORY)
-        return Answer(printer_view.history(self._printer(request), offset, count))
+        return PrinterAnswer(printer_view.history(self._printer(request), offset, count))
 
     async def _queue(self, request: Request) -> Response:
-        return Answer(printer_view.queue(self._printer(request)))
+        return PrinterAnswer(printer_view.queue(self._printer(request)))
 
     # what is changed
 
@@ -162,7 +164,9 @@ class PrinterApi:
             raise HTTPException(400, str(error)) from None
         except QueueFull as error:
             raise HTTPException(405, str(error)) from None
-        return Answer({"message": "job queued", "uuid": printer_view.job_id(printer.machine, name)}, 201)
+        return PrinterAnswer(
+            {"message": "job queued", "uuid": printer_view.job_id(printer.machine, name)}, 201
+        )
 
     async def _withdraw(self, request: Request) -> Response:
         printer = self._allowed(request)
@@ -186,7 +190,7 @@ class PrinterApi:
         return Response(status_code=204)
 
     async def _clock(self, _request: Request) -> Response:
-        return Answer({"step": self._fleet.step})
+        return PrinterAnswer({"step": self._fleet.step})
 
     async def _set_clock(self, request: Request) -> Response:
         self._allowed(request)
@@ -196,13 +200,13 @@ class PrinterApi:
             raise HTTPException(409, str(error)) from None
         except TooEarly as error:
             raise HTTPException(425, str(error)) from None
-        return Answer({"step": self._fleet.step})
+        return PrinterAnswer({"step": self._fleet.step})
 
 
 async def _refuse(_request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
-    return Answer({"message": error.detail}, error.status_code, dict(error.headers or {}))
+    return PrinterAnswer({"message": error.detail}, error.status_code, dict(error.headers or {}))
 
 
 async def _body(request: Request) -> bytes:
