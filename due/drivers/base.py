@@ -27,8 +27,10 @@ class ArchiveDriver(Protocol):
     file locked, disk full), otherwise `BackendError`; `find` also raises `InvalidQuery`.
     """
 
-    damaged: int
-    """Rows that were left out of answers so far because they are damaged."""
+    @property
+    def damaged(self) -> int:
+        """Rows that were left out of answers so far because they are damaged."""
+        ...
 
     def insert(self, items: Sequence[Item]) -> None:
         """Store items.  On return they are committed.  Idempotent on (instance_id, key, sequence)."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from heapq import merge
 from itertools import groupby
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -20,8 +20,8 @@ from due.codec import decode_value, encode_value, unpack
 from due.drivers.latest_items import by_age, latest_items
 from due.drivers.query import ArchiveQuery, parse
 from due.drivers.query_time import in_time, time_left
-from due.drivers.query_tree import Condition
-from due.drivers.sqlite_file import SqliteFile
+from due.drivers.query_tree import INT64, Condition
+from due.drivers.sqlite_file import DamagedCell, SqliteFile, whole_number
 from due.errors import DecodeError, InvalidKey, InvalidOption, Timeout
 from due.messages import Item, PackedFrame
 
@@ -41,9 +41,12 @@ _AMONG = "id IN (SELECT value FROM json_each(?))"
 _OVERLAP = """SELECT first_sequence, last_sequence FROM frames
 WHERE source_id = ? AND key_id = ? AND last_sequence >= ? ORDER BY last_sequence LIMIT 1"""
 _WIDEN = """UPDATE keys SET time_span = max(time_span, ?), event_span = max(event_span, ?) WHERE id = ?"""
-_OLDER = "SELECT id, count FROM frames WHERE key_id = ? AND first_time < ? AND last_time < ? LIMIT ?"
+# casts, because a damaged row is pruned, too
+_OLDER = "SELECT id, coalesce(CAST(count AS INTEGER), 0) FROM frames WHERE key_id = ? AND first_time < ? AND last_time < ? LIMIT ?"
 _DELETE = "DELETE FROM frames WHERE id = ?"
-_OLDEST = """SELECT first_time, id, count, length(payload) FROM frames WHERE key_id = ? ORDER BY first_time"""
+_OLDEST = """SELECT coalesce(CAST(first_time AS INTEGER), 0), id, coalesce(CAST(count AS INTEGER), 0),
+    coalesce(length(payload), 0)
+FROM frames WHERE key_id = ? ORDER BY first_time"""
 
 _by_identity = attrgetter("instance_id", "key", "sequence")
 _by_stream = attrgetter("instance_id", "key")
@@ -79,8 +82,12 @@ class SqliteArchive:
             raise InvalidOption(f"archive URL {url!r}: the only option is synchronous=normal or =full")
         self._file = SqliteFile(path, synchronous)
         self._url = url
-        self.damaged = 0
-        """Rows that could not be decoded and are missing from results."""
+        self._damaged_rows = 0
+
+    @property
+    def damaged(self) -> int:
+        """Rows, keys and sources that could not be decoded and are missing from results."""
+        return self._damaged_rows + len(self._file.keys.unreadable) + len(self._file.sources.unreadable)
 
     def insert(self, items: Sequence[Item]) -> None:
         """Store items, one row each."""
@@ -113,7 +120,7 @@ class SqliteArchive:
                     rows = connection.execute(_SELECT + _AMONG, (f"[{','.join(map(str, numbers))}]",))
                     return (item for row in in_time(rows.fetchall()) for item in self._items(row, parsed))
 
-                return latest_items(heads, read, limit)
+                return latest_items(map(_head, heads), read, limit)
             rows = connection.execute(_SELECT + text, parameters).fetchall()
         items = [item for row in in_time(rows) for item in self._items(row, parsed)]
         items.sort(key=by_age)
@@ -201,9 +208,8 @@ class SqliteArchive:
             f"SELECT max(time_span), max(event_span) FROM keys WHERE id {among}",  # noqa: S608 no text of others
             (ids,),
         ).fetchone()
-        text, parameters = query.to_sql(
-            self._lookup, {"timestamp": spans[0] or 0, "eventTime": spans[1] or 0}
-        )
+        time, event = map(_span, spans)
+        text, parameters = query.to_sql(self._lookup, {"timestamp": time, "eventTime": event})
         # without a key no index would be used
         return (text, parameters) if named else (f"key_id {among} AND {text}", [ids, *parameters])
 
@@ -213,20 +219,21 @@ class SqliteArchive:
 
     def _items(self, row: tuple[Any, ...], query: ArchiveQuery) -> Iterator[Item]:
         try:
+            _check_cells(row)
             if row[2] == _FRAME:
                 yield from _matching(unpack(row[-1]), query)
             else:
                 yield from self._single(row, query)
-        except (DecodeError, InvalidKey) as error:
-            self.damaged += 1
-            if self.damaged == 1:
+        except (DecodeError, InvalidKey, DamagedCell) as error:
+            self._damaged_rows += 1
+            if self._damaged_rows == 1:
                 text = "%s: a row is damaged and left out: %s; further ones are only counted"
                 log.error(text, self._url, error)  # noqa: TRY400
 
     def _single(self, row: tuple[Any, ...], query: ArchiveQuery) -> Iterator[Item]:
         key_id, source_id, _, sequence, time, event, payload = row
         keys, sources = self._file.keys.entries, self._file.sources.entries
-        if key_id not in keys or source_id not in sources:  # pruned while reading
+        if key_id not in keys or source_id not in sources:  # pruned while reading, or unreadable
             return
         (key,), (app, instance) = keys[key_id], sources[source_id]
         item = Item(key, None, time, event, app, instance, sequence)
@@ -234,6 +241,27 @@ class SqliteArchive:
             item = Item(key, decode_value(payload), time, event, app, instance, sequence)
             if not query.uses_value or query.matches(item):
                 yield item
+
+
+def _head(head: tuple[Any, int]) -> tuple[int, int]:
+    """A row whose time is damaged is read with the youngest: reading it finds the damage."""
+    time, number = head
+    return (time if isinstance(time, int) else INT64 - 1), number
+
+
+def _span(cell: object) -> int:
+    """A damaged span keeps no row out."""
+    if cell is None:
+        return 0
+    return cell if isinstance(cell, int) and 0 <= cell <= INT64 else INT64
+
+
+def _check_cells(row: tuple[Any, ...]) -> None:
+    """Raises `DamagedCell`; of a row as `_SELECT` gives it."""
+    for cell in row[:-1]:
+        whole_number(cell)
+    if not isinstance(row[-1], bytes):
+        raise DamagedCell("no payload")
 
 
 @contextmanager
@@ -271,7 +299,8 @@ def _matching(items: list[Item], query: ArchiveQuery) -> Iterator[Item]:
 def _overlap(connection: sqlite3.Connection, row: _Row) -> tuple[int, int] | None:
     """First and last sequence number of a stored row that shares items with this one."""
     found = connection.execute(_OVERLAP, (row.source, row.key, row.first_sequence)).fetchone()
-    return found if found is not None and found[0] <= row.last_sequence else None
+    whole = found is not None and all(isinstance(cell, int) for cell in found)
+    return found if whole and found[0] <= row.last_sequence else None
 
 
 def _prune_older(connection: sqlite3.Connection, before: int) -> int:
@@ -289,7 +318,8 @@ def _prune_larger(connection: sqlite3.Connection, max_bytes: int) -> int:
         return 0
     keys = connection.execute("SELECT id FROM keys").fetchall()
     deleted, ids = 0, []
-    for _, number, count, size in merge(*(connection.execute(_OLDEST, key) for key in keys)):
+    by_time = merge(*(connection.execute(_OLDEST, key) for key in keys), key=itemgetter(0))
+    for _, number, count, size in by_time:
         ids.append((number,))
         deleted += count
         excess -= size + _ROW_OVERHEAD

@@ -48,6 +48,11 @@ PRAGMA user_version = 1;
 COMMIT;
 """
 
+
+class DamagedCell(Exception):
+    """A cell holds what no archive writes there, and the file's own checks let it pass."""
+
+
 # a connection inherited by fork is neither used nor closed: its locks belong to the parent
 _inherited: list[sqlite3.Connection] = []
 
@@ -73,15 +78,20 @@ class Dictionary:
         self._ids: dict[tuple[str, ...], int] = {}
         self._found: dict[Condition, tuple[int, list[int]]] = {}
         self.entries: dict[int, tuple[str, ...]] = {}
+        self.unreadable: set[int] = set()
+        """Ids whose texts are damaged: rows that name them are left out."""
 
     def refresh(self, connection: sqlite3.Connection) -> None:
         with self._lock:
             for number, *texts in connection.execute(self._select, (self._last,)):
-                self.entries[number] = tuple(texts)
-                self._last = number
+                self._last = whole_number(number)
+                try:
+                    self.entries[number] = tuple(map(_decoded, texts))
+                except DamagedCell:
+                    self.unreadable.add(number)
             if time.monotonic() >= self._compare_at:
                 self._compare_at = time.monotonic() + _COMPARE_S
-                self._drop_pruned({number for number, *_ in connection.execute(self._select, (0,))})
+                self._drop_pruned({whole_number(each[0]) for each in connection.execute(self._select, (0,))})
 
     def _drop_pruned(self, there: set[int]) -> None:
         """Forget pruned ids; another reader may see a later state of the file, so newer ids stay."""
@@ -98,7 +108,7 @@ class Dictionary:
         if known is None:
             found = connection.execute(self._known, texts).fetchone()
             found = found or connection.execute(self._insert, texts).fetchone()
-            known = self._ids[texts] = int(found[0])
+            known = self._ids[texts] = whole_number(found[0])
         return known
 
     def forget(self) -> None:
@@ -119,6 +129,22 @@ class Dictionary:
                     self._found.clear()
                 self._found[condition] = (self._last, ids)
             return ids
+
+
+def whole_number(cell: object) -> int:
+    """A cell that was written as a whole number; raises `DamagedCell`."""
+    if not isinstance(cell, int):
+        raise DamagedCell(f"{str(cell)[:40]!r} where a whole number belongs")
+    return cell
+
+
+def _decoded(cell: object) -> str:
+    if not isinstance(cell, bytes):
+        raise DamagedCell(f"{str(cell)[:40]!r} where a text belongs")
+    try:
+        return cell.decode()
+    except UnicodeDecodeError as error:
+        raise DamagedCell(str(error)) from None
 
 
 def _named(texts: tuple[str, ...]) -> Item:
@@ -177,6 +203,8 @@ class SqliteFile:
         connection = sqlite3.connect(
             self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
         )
+        # decoded by us, cell by cell: one that is no UTF-8 would fail the whole query
+        connection.text_factory = bytes
         try:
             self._prepare(connection)
         except BaseException:
@@ -244,18 +272,24 @@ class SqliteFile:
             raise ArchiveUnavailable(f"archive {self._path}: {error}") from error
         except sqlite3.Error as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
-                self._let_go()
-                raise ArchiveUnavailable(
-                    f"archive {self._path} is damaged or not an archive ({error}): move it away, or put a copy there; "
-                    f"until then what is to be archived waits in the spool"
-                ) from error
+                raise self._damaged(error) from error
             raise BackendError(f"archive {self._path}: {error}; is it an archive of SDNator?") from error
+        except (DamagedCell, UnicodeDecodeError) as error:
+            # the latter: what SQLite says of a damaged schema may itself be no text
+            raise self._damaged(error) from error
         except OSError as error:
             raise ArchiveUnavailable(f"archive {self._path}: {error}") from error
         except (OverflowError, UnicodeEncodeError) as error:
             raise BackendError(
                 f"archive {self._path}: a number or text that it cannot hold: {error}"
             ) from error
+
+    def _damaged(self, error: Exception) -> ArchiveUnavailable:
+        self._let_go()
+        return ArchiveUnavailable(
+            f"archive {self._path} is damaged or not an archive ({error}): move it away, or put a copy there; "
+            f"until then what is to be archived waits in the spool"
+        )
 
     def _let_go(self) -> None:
         """Drop connections to a damaged or moved file; the next call reopens it.  Running reads close their own."""

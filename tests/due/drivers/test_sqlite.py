@@ -377,3 +377,67 @@ def test_a_frame_whose_own_key_is_none_costs_that_row_only(tmp_path: Path) -> No
     assert len(archive.find({"dataKey": "a.*", "value": {"$exists": True}})) == 10
     assert archive.damaged == 1
     archive.close()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE keys SET key = CAST(x'ff61' AS TEXT) WHERE key = 'single'",
+        "UPDATE sources SET instance = NULL WHERE instance = 'other'",
+        "UPDATE frames SET first_sequence = 'x' WHERE key_id = 2",
+        "UPDATE frames SET last_time = 'x', payload = NULL WHERE key_id = 2",
+        "UPDATE frames SET first_time = x'00', count = NULL WHERE key_id = 2",
+        "UPDATE keys SET time_span = 'x', event_span = -1",
+    ],
+)
+@pytest.mark.parametrize("limit", [None, 20])
+def test_damaged_cells_cost_their_rows_only(tmp_path: Path, damage: str, limit: int | None) -> None:
+    """Whatever a cell holds, the other rows are read, and the archive is written and pruned."""
+    archive = opened(tmp_path)
+    archive.insert_frames([pack(items(10))])
+    archive.insert(items(1, key="single", instance="other"))
+    file = sqlite3.connect(tmp_path / "archive.db", isolation_level=None)
+    file.execute("PRAGMA writable_schema = ON")
+    file.execute("UPDATE sqlite_schema SET sql = replace(sql, 'NOT NULL', '')")
+    file.close()
+    file = sqlite3.connect(tmp_path / "archive.db", isolation_level=None)
+    file.execute(damage)
+    file.close()
+    archive.close()
+    archive = opened(tmp_path)
+    harmless = "time_span" in damage
+    assert len(archive.find({"timestamp": {"$gte": T0}}, limit=limit)) == 10 + harmless
+    assert (archive.damaged == 0) is harmless
+    archive.insert(items(1, key="single", start=2, instance="other"))
+    assert archive.prune(before=T0 + 10**9) >= 11
+    archive.insert(items(3, start=20))
+    assert archive.prune(max_bytes=1) >= 3
+    archive.close()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"INTEGER PRIMARY KEY, key", b"INTEGER PRIMARY KEX, key"),
+        (b"INTEGER PRIMARY KEY, app", b"INTEGER PRIMARY KEX, app"),
+        (b"frames_timeframes", b"\xfframes_timeframes"),
+        (b"CREATE TABLE frames(", b"CREATE TABLE fr\xffmes("),
+    ],
+)
+def test_a_damaged_schema_is_told_as_damage(tmp_path: Path, old: bytes, new: bytes) -> None:
+    archive = opened(tmp_path)
+    archive.insert(items(3))
+    archive.close()
+    content = (tmp_path / "archive.db").read_bytes()
+    assert old in content
+    (tmp_path / "archive.db").write_bytes(content.replace(old, new))
+    archive = opened(tmp_path)
+
+    def used_twice() -> None:
+        for start in (10, 20):
+            archive.insert(items(3, key="new", start=start))
+            archive.find({"dataKey": "a.*"})
+
+    with pytest.raises(BackendError):
+        used_twice()
+    archive.close()
