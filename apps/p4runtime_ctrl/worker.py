@@ -35,7 +35,7 @@ from apps.p4runtime_ctrl.state.mac_learning import DIGEST
 from apps.p4runtime_ctrl.state.readings import Readings
 from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry.demand import Demand
-from due import NO_WAIT, Engine, Item, RecordBatch
+from due import NO_WAIT, PUB_ONLY, Engine, Item, RecordBatch
 
 _LOG = logging.getLogger(__name__)
 _JOBS: Final = 10_000
@@ -189,8 +189,9 @@ class SwitchWorker:
             self._secret_at = now
             self._put(self._change_secret)
         received, lost, stated_at = self._stated
-        if now - stated_at > 1 and (received, lost) != (self._heard(), self._progress.lost):
-            self._put(self._write_state)
+        if now - stated_at > 1:
+            changed = (received, lost) != (self._heard(), self._progress.lost)
+            self._put(self._write_state if changed else self._repeat_state)
 
     def _settle(self, now: float) -> None:
         """Not while packets are published, which blocks while consumers are behind."""
@@ -449,12 +450,17 @@ class SwitchWorker:
         self._change = change
         self._write_state()
 
-    def _write_state(self) -> None:
+    def _repeat_state(self) -> None:
+        """For apps that came after the last change of a silent switch; the archive has it."""
+        if time.monotonic() - self._stated[-1] > 1:  # meanwhile another job may have written it
+            self._write_state(PUB_ONLY)
+
+    def _write_state(self, *flags: int) -> None:
         self._stated = (self._heard(), self._progress.lost, time.monotonic())
         if not self._switch.blocks:
             self._readings.take([])
         key = f"network.switch.p4runtime_ctrl.{self.name}"
-        self._engine.write(key, self._state(), [NO_WAIT], event_time=self._now()[0] or None)
+        self._engine.write(key, self._state(), [NO_WAIT, *flags], event_time=self._now()[0] or None)
 
     def _heard(self) -> int:
         sent = sum(self._sent.values()) + self._outbound.answers + self._outbound.counts_reported

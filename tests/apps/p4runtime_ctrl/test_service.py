@@ -60,6 +60,22 @@ def test_packets_decisions_and_confirmations(stage):
     assert "ended with exit code 0" in end(controller)
 
 
+def test_the_state_of_a_silent_switch_is_repeated_and_archived_once(stage):
+    """Or apps that subscribe after its last change would know nothing of it."""
+    stage.controller()
+    engine = stage.engine("late")
+    heard = Heard(engine, STATE)
+
+    def same() -> int:
+        values = heard.values("switch")
+        return sum(value == values[-1] for value in values)
+
+    wait_for(lambda: same() >= 3, why=lambda: f"{heard.values('switch')}\n{stage.log()}")
+    archived, before = len(engine.get(STATE)), len(heard.items)
+    wait_for(lambda: len(heard.items) >= before + 3, why=stage.log)
+    assert len(engine.get(STATE)) == archived
+
+
 def test_packets_are_copied_only_while_somebody_wants_them(stage):
     stage.controller()
     engine = stage.engine("listener")
