@@ -244,6 +244,15 @@ class Engine:
         """Whether Data Updates have answered lately, and items of others can arrive."""
         return self._require().connected
 
+    @property
+    def active(self) -> bool:
+        """Whether this instance is known to be one that works for its app.
+
+        False while it is a standby, and until the Coordinator has said who is active; what is written meanwhile may
+        be refused. Right after the death of an instance the Coordinator still names the dead one.
+        """
+        return self._require().active
+
     def observe(
         self, key: str, *, frequency: Frequency = None, since: int | datetime | str | None = None
     ) -> Observation:

@@ -184,7 +184,7 @@ class Session:
 
     def _check_place(self) -> None:
         """Raise `Superseded` if readers may have refused what was written since the last successful flush."""
-        written = self._written() + self.gate.taken_back
+        written = self._written() + self.gate.taken_back + self.gate.not_kept
         since, self._acknowledged = written - self._acknowledged, written
         superseded = self.keeper.superseded
         lost_place, self._superseded = superseded > self._superseded, superseded
@@ -193,6 +193,12 @@ class Session:
                 f"another instance took over from this one: of the last {since} items written readers may have "
                 "refused some"
             )
+
+    @property
+    def active(self) -> bool:
+        """See `Engine.active`."""
+        with self.keeper.lock:
+            return self.keeper.member.reading
 
     @property
     def connected(self) -> bool:
@@ -216,8 +222,9 @@ class Session:
         self.check()
         with self._lock:
             self._observed.append(observation)
-        self._declare_interests()
+        # before: a producer that speaks only when something changes answers the interest once
         self.dispatcher.open(observation)
+        self._declare_interests()
 
     def closed(self, observation: Observation) -> None:
         """An observation lost its last subscriber."""

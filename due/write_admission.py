@@ -36,6 +36,8 @@ class WriteAdmission:
         """Raises if no assignment can ever come; set by the session."""
         self.taken_back = 0
         """Items that `write` took, and that were refused when it was known which instance is active."""
+        self.not_kept = 0
+        """Refused items that were to be archived: more than a word that is repeated anyway."""
         self.lost = 0
         """Best-effort items for which there was no room while Data Updates could not be reached."""
         self.counts = {"unwanted": 0, "refused": 0, "held_for_permission": 0, "replaced": 0}
@@ -70,7 +72,7 @@ class WriteAdmission:
             self._held_bytes -= outlet.held_bytes
             outlet.held_bytes = 0
             if permission.verdict is Verdict.REFUSED:
-                self.taken_back += len(held)
+                self.taken_back += sum(not item[1] & ARCHIVE for item in held)
             for item in held:
                 self._place(outlet, item)
         if permission.verdict is not Verdict.OPEN or outlet.pacer is not None:
@@ -97,6 +99,7 @@ class WriteAdmission:
             return self._hold(outlet, item)
         if verdict is Verdict.REFUSED:
             self.counts["refused"] += 1
+            self.not_kept += bool(item[1] & ARCHIVE)
             return False
         if verdict is Verdict.UNWANTED:
             self.counts["unwanted"] += 1

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -61,7 +62,7 @@ from apps.messages import (
     one_line,
 )
 from apps.packets import SteadyTime
-from due import Capability, Engine, Interest, Item, Key, RecordBatch
+from due import Capability, DueError, Engine, Interest, Item, Key, RecordBatch
 
 KITSUNES_EVIDENCE = f"{EVIDENCE}.kitsune.*"
 
@@ -209,7 +210,7 @@ class FirewallService:
             if enforcer != SWITCHES:
                 self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
-        self._answer_again()
+        self._answer_earlier()
         self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)
         if self._settings.detect:
             self._hear_tcp()
@@ -255,7 +256,6 @@ class FirewallService:
         wanted = self._allow_entries.everything()
         wanted += [prefix_update("insert", target.address) for target in targets if is_prefix(target)]
         self._leftovers = self._past.leftovers(wanted)
-        self._enforcers.tell_allowed(self._desk.entries)
 
     def tick(self) -> None:
         """Examine suspected floods that are due, and write known sources in batches."""
@@ -266,6 +266,7 @@ class FirewallService:
             for switch in self._switches if updates else ():
                 self._command(switch, updates)
             self._say_notices()
+        self._answer_earlier()
         self._read_archived_words()
         self._announcer.check()
 
@@ -313,6 +314,10 @@ class FirewallService:
     # -- instructions -------------------------------------------------------------------------------
 
     def _on_instruction(self, item: Item, instruction: Instruction) -> None:
+        self._answer_earlier()
+        self._answer(item, instruction)
+
+    def _answer(self, item: Item, instruction: Instruction) -> None:
         with self._lock:
             again = instruction.id in self._stored
             answer = self._stored.given(instruction.id) if again else self._carry_out(instruction, item)
@@ -322,12 +327,19 @@ class FirewallService:
             # once this returns, those who sent the instruction need not send it again
             self._stored.keep(answer)
 
-    def _answer_again(self) -> None:
+    def _answer_earlier(self) -> None:
         """What an earlier run received, but did not answer, or answered without being heard."""
-        for key, answer in self._past.recent_answers():
-            self._engine.write(key, answer.to_value(), [due.PUB_ONLY, due.NO_WAIT])
-        for item, instruction in self._past.unanswered(self._stored):
-            self._on_instruction(item, instruction)
+        with self._stored.catching_up() as now:
+            if not now:
+                return
+            with suppress(DueError):
+                self._engine.flush(ARCHIVED_WORD_S)  # what was refused until now was promised to nobody
+            self._enforcers.tell_allowed(self._desk.entries)
+            self._stored.take_up(self._past.answered())
+            for key, answer in self._past.recent_answers():
+                self._engine.write(key, answer.to_value(), [due.PUB_ONLY, due.NO_WAIT])
+            for item, instruction in self._past.unanswered(self._stored):
+                self._answer(item, instruction)
 
     def _carry_out(self, instruction: Instruction, item: Item) -> Answer:
         summary = f"{instruction.verb} {instruction.subject}: {instruction.reason}"

@@ -85,22 +85,29 @@ class ControllerRun:
         self.target.stop()
         self.server.__exit__(None, None, None)
 
-    def run(self, module: str, settings: dict[str, object] | None = None) -> Child:
+    def run(
+        self,
+        module: str,
+        settings: dict[str, object] | None = None,
+        engine: dict[str, object] | None = None,
+    ) -> Child:
         """Start a service and return when it is ready; its log is MODULE.log in the folder.
 
         Args:
             module: behind `python -m`.
             settings: of the service; None: its defaults.
+            engine: options of its engine, as of `due.Options`; None: the defaults.
 
         Raises:
             PipelineError: it ended instead; the text has its last words.
         """
         command = [module, "--updates", self.server.url, "--archive", self.archive]
         command += ["--directory", str(self.folder / "due")]
-        if settings is not None:
-            path = self.folder / f"settings{len(self.processes)}.json"
-            path.write_text(json.dumps(settings), encoding="utf-8")
-            command += ["--settings", str(path)]
+        for name, content in (("settings", settings), ("engine", engine)):
+            if content is not None:
+                path = self.folder / f"{name}{len(self.processes)}.json"
+                path.write_text(json.dumps(content), encoding="utf-8")
+                command += [f"--{name}", str(path)]
         process = Child(module, command, self.folder)
         self.processes.append(process)
         process.wait_ready()

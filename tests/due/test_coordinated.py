@@ -185,6 +185,52 @@ def test_an_instance_that_was_replaced_while_it_was_cut_off_writes_nothing_and_f
     assert 1 not in got
 
 
+def test_what_an_instance_writes_while_another_is_named_is_not_acknowledged(make_engine, script):
+    """Right after a kill the Coordinator still names the dead instance."""
+    init = {"capabilities": [Capability("t.heir.**", delivery="reliable")]}
+    script.assign("heir", active="dead")
+    engine = make_engine("heir", init=init, **FAST)
+    assert not engine.active
+    wait_for(lambda: engine.health()["phase"] == "coordinated")
+    assert not engine.active
+    assert not engine.write("t.heir.x", 1)
+    with pytest.raises(Superseded, match="another instance took over"):
+        engine.flush()
+    script.assign("heir", active=engine.instance_id, assignments=_wants("t.heir.**"), epoch=2)
+    wait_for(lambda: engine.active)
+    assert engine.write("t.heir.x", 2)
+    engine.flush()
+
+
+def test_a_subscription_is_in_force_before_its_interest_is_declared(make_engine, script):
+    """A producer that speaks only when something changes has spoken already where it is the other way round."""
+    producer = make_engine("once", init={"capabilities": [Capability("t.once")]}, **FAST)
+    spoken = threading.Event()
+
+    def answer(item) -> None:
+        """As soon as the interest is there, and never again."""
+        if any(one["key"] == "t.once" for one in item.value["interests"]) and not spoken.is_set():
+            script.assign("once", assignments=_wants("t.once"))
+            wait_for(lambda: producer.wanted("t.once"))
+            producer.write("t.once", 1, [PUB_ONLY, NO_WAIT])
+            producer.flush()
+            spoken.set()
+
+    listener = make_engine("late", **FAST)
+    script.engine.observe("due.registration.late").subscribe(answer)
+    receiver, got = listener._session.dispatcher.receiver, []
+    subscribe = receiver.subscribe
+
+    def slowly(pattern: str) -> None:
+        """Data Updates that answer late."""
+        spoken.wait(1.0)
+        subscribe(pattern)
+
+    receiver.subscribe = slowly
+    listener.observe("t.once").subscribe(lambda item: got.append(item.value))
+    wait_for(lambda: got == [1])
+
+
 def test_interests_are_registered_and_withdrawn(make_engine, script):
     engine = make_engine("curious", init={"interests": [Interest("t.fixed", 2.0)]}, **FAST)
     script.say["curious"] = {}

@@ -1,8 +1,9 @@
 """What operators' programs were answered: `done` of nothing that a restart would forget, and again if they ask again."""
 
+import threading
 from collections import OrderedDict
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Final
 
 from msgspec import structs
@@ -29,6 +30,20 @@ class StoredAnswers:
         self.unstored = 0
         """Answers that said so."""
         self._patience_s = _PATIENCE_S
+        self._catching_up = threading.Lock()
+        self._behind = True
+
+    @contextmanager
+    def catching_up(self) -> Iterator[bool]:
+        """Whether to answer now what earlier runs did not; once, and newer instructions wait until it is done.
+
+        Not before this instance works: after a kill the Coordinator still names the dead one for a while, and the
+        decisions of another are refused.
+        """
+        with self._catching_up:
+            now = self._behind and self._engine.active
+            self._behind = self._behind and not now
+            yield now
 
     def __contains__(self, instruction: object) -> bool:
         return instruction in self._given

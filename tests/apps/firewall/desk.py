@@ -34,6 +34,7 @@ class FakeEngine:
         self.archive_hangs: threading.Event | None = None
         self.archive_away = False
         self.disk_full = False
+        self.active = True
 
     def observe(self, key: str) -> Subject[Item]:
         return self.subjects[key]

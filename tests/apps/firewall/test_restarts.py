@@ -103,6 +103,27 @@ def firewall_knows(engine) -> None:
     wait_for(is_lifted, SECONDS, lambda: f"{answers[-3:]}")
 
 
+def test_what_is_answered_as_done_right_after_a_kill_is_decided(stage):
+    """The Coordinator names the dead firewall for 8 s more: the new one's decisions would be refused until then."""
+    slow = {"heartbeat": 2.0}
+    firewall = stage.run("apps.firewall.service", SETTINGS, slow)
+    told = Capability(INSTRUCTION, delivery="reliable", archive="always")
+    engine = stage.engine("operator", capabilities=[told])
+    answers: list[bool] = []
+    engine.observe("network.answer.firewall.operator").subscribe(
+        lambda item: answers.append(item.value["done"])
+    )
+    stage.kill(firewall)
+    said = Instruction(id="after", verb="block", subject="192.0.2.77", seconds=36_000)
+    engine.write(INSTRUCTION, said.to_value())
+    engine.flush(SECONDS)
+    stage.run("apps.firewall.service", SETTINGS, slow)
+    wait_for(lambda: answers, SECONDS, (stage.folder / "apps.firewall.service.log").read_text)
+    assert answers[0]
+    found = engine.get("network.block.firewall.ipv4")
+    assert [item.value["target"]["address"] for item in found] == ["192.0.2.77"]
+
+
 def test_decisions_survive_and_panic_ends_them_without_redis(stage):
     """kill -9 of each in turn; then Redis goes away, and panic works all the same."""
     controller = stage.controller()
