@@ -108,17 +108,16 @@ class _App:
         )
 
     def claim(self) -> str:
-        """The live instance that a Coordinator made active in the newest epoch, or ""."""
+        """The live instance that a Coordinator made active in the newest epoch, or that works alone, or ""."""
         claims = [
             one.beat
             for one in self.alive
             if one.beat is not None
             and one.beat.active
-            and one.beat.version
             # what an instance said before it was replaced is not its word now
-            and one.beat.epoch >= self.epoch
+            and (one.beat.epoch >= self.epoch or not one.beat.version)
         ]
-        return max(claims, key=lambda beat: beat.epoch).instance_id if claims else ""
+        return max(claims, key=lambda beat: (beat.version > 0, beat.epoch)).instance_id if claims else ""
 
 
 class Registry:

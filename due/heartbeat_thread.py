@@ -15,7 +15,7 @@ import msgspec
 from due.clock import awake_ns
 from due.codec import decode_frame
 from due.dispatcher import Dispatcher
-from due.drivers.base import Publisher, Receiver
+from due.drivers.base import Delivery, Publisher, Receiver
 from due.errors import DueError, RefusedFrame
 from due.logs import LogLimit
 from due.membership import (
@@ -118,7 +118,10 @@ class HeartbeatThread:
     def start(self) -> None:
         """Register and begin."""
         self.alive_until = awake_ns() + int(self._pause * 1e9)
-        self._control.subscribe(f"{ASSIGNMENT}.{self.member.registration.app_id}")
+        me = self.member.registration
+        self._control.subscribe(f"{ASSIGNMENT}.{me.app_id}")
+        if me.instances == "standby" and self.member.announced:
+            self._control.subscribe(f"{HEARTBEAT}.{me.app_id}")
         self._turn()
         self._thread.start()
 
@@ -192,25 +195,41 @@ class HeartbeatThread:
         self._rhythm.got_up(late=time.monotonic() - began - wait > _LATE)
         for delivery in deliveries:
             try:
-                frame = decode_frame(delivery.payload)
-                if frame.key != delivery.path:
-                    raise RefusedFrame("misplaced", f"a frame of {frame.key} arrived under {delivery.path}")
-                message = Assignments.from_value(frame.values[-1])
+                self._understand(delivery)
             except (DueError, msgspec.ValidationError) as error:
                 self.misunderstood += 1
                 if self.misunderstood == 1:
-                    log.warning("an assignment was refused: %s; further ones are only counted", error)
-                continue
+                    log.warning(
+                        "an assignment or heartbeat was refused: %s; further ones are only counted", error
+                    )
+
+    def _understand(self, delivery: Delivery) -> None:
+        """Raises `DueError` or `msgspec.ValidationError` for what is none of our messages."""
+        frame = decode_frame(delivery.payload)
+        if frame.key != delivery.path:
+            raise RefusedFrame("misplaced", f"a frame of {frame.key} arrived under {delivery.path}")
+        if delivery.path.startswith(HEARTBEAT):
+            beat = Heartbeat.from_value(frame.values[-1])
+            if {frame.app_id, beat.app_id} != {self.member.registration.app_id}:
+                raise RefusedFrame(
+                    "foreign", f"a heartbeat under {delivery.path} is from {frame.app_id[:64]!r}"
+                )
             with self.lock:
-                worked = self.member.active or self.member.asking
-                self.member.assigned(message, time.monotonic())
-                self.superseded += worked and not self.member.active
+                self.member.heard(beat, time.monotonic())
+            return
+        message = Assignments.from_value(frame.values[-1])
+        with self.lock:
+            worked = self.member.active or self.member.asking
+            self.member.assigned(message, time.monotonic())
+            self.superseded += worked and not self.member.active
 
     def _turn(self) -> None:
         now = time.monotonic()
         with self.lock:
+            worked = self.member.active
             messages = self.member.tick(now, written=self.written(), received=self._dispatcher.received)
             changes, active, reading = self.member.changes, self.member.active, self.member.reading
+            self.superseded += worked and not active
         probed = awake_ns()
         for message in messages:
             self._send(message)

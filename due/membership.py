@@ -3,6 +3,7 @@
     engine ──Registration──► due.registration.<app>   at init and at every change of its declarations
     engine ──Heartbeat─────► due.heartbeat.<app>      every `heartbeat` seconds; `offline` once at the end
     engine ◄──Assignments─── due.assignment.<app>     its assignments, and which instance is active
+    engine ◄──Heartbeat───── due.heartbeat.<app>      a standby instance also hears the others of its app
 
 All are ordinary best-effort items (PUB_ONLY, NO_WAIT) whose value is `message.to_value()`.
 Rules for the Coordinator:
@@ -15,6 +16,7 @@ Rules for the Coordinator:
    the highest `epoch` in the heartbeats; Assignments with a lower epoch than seen are ignored;
  - `active` is "" for shared apps (every instance works) and while no instance is chosen for a standby app
    that has only consumers' duties it is the instance that reads.
+While no Coordinator answers, the instances of a standby app settle it among themselves by their heartbeats: see `Peers`.
 
 `Member` holds the decisions.  Pure: no socket, no clock, no thread; time is an argument (seconds, monotonic).
 """
@@ -39,6 +41,9 @@ APP_ID = r"[A-Za-z0-9_-]{1,64}"
 _MOST = 16_384
 """Capabilities, interests, assignments or instances in one message."""
 _MOST_TEXT = 2048
+_MOST_PEERS = 1024
+_MISSED = 4.0
+"""Heartbeats after which a silent peer counts as ended; an instance that is cut off stops writing after three."""
 _MOST_COUNT = 2**62
 _CLAIMED_EPOCH = MAX_EPOCH - 2**24
 """The Coordinator continues from the epochs that instances claim, so these must leave it room to count."""
@@ -170,6 +175,58 @@ class Permission(msgspec.Struct, frozen=True):
     """Items a second; None: unpaced."""
 
 
+class Peers:
+    """The other instances of a standby app, by their heartbeats; who works while no Coordinator answers.
+
+    One that works goes on, one that a Coordinator named before all others. Where none works, the one with the smallest
+    id begins; and where two do, which were cut off from each other, it goes on.
+    """
+
+    def __init__(self, registration: Registration) -> None:
+        self._me = registration.instance_id
+        self._standby = registration.instances == "standby"
+        self._beats: dict[str, tuple[float, Heartbeat]] = {}
+        self.patience = _MISSED * registration.heartbeat
+        """A peer silent for so many seconds has ended, or will ask before it writes on."""
+        self.known = False
+        """Whether there has ever been another."""
+
+    def heard(self, message: Heartbeat, now: float) -> bool:
+        """Note a heartbeat; returns whether its instance was not known."""
+        name = message.instance_id
+        if name == self._me or not self._standby:
+            return False
+        if message.state == "offline":
+            self._beats.pop(name, None)
+            return False
+        new = name not in self._beats
+        if new and len(self._beats) >= _MOST_PEERS:
+            return False
+        self._beats[name] = (now, message)
+        self.known = True
+        return new
+
+    def active(self, now: float) -> bool:
+        """Whether another instance works."""
+        return any(beat.active for beat in self._living(now))
+
+    def precede(self, now: float, *, working: bool) -> bool:
+        """Whether another instance works, or is to begin before this one; `working`: this one works already."""
+        for beat in self._living(now):
+            named, first = beat.version > 0, beat.instance_id < self._me
+            if beat.active and (named or first or not working):
+                return True
+            if not (working or named) and first:
+                return True
+        return False
+
+    def _living(self, now: float) -> list[Heartbeat]:
+        self._beats = {
+            name: (at, beat) for name, (at, beat) in self._beats.items() if now - at <= self.patience
+        }
+        return [beat for _, beat in self._beats.values()]
+
+
 class Member:
     """One instance's view of its membership."""
 
@@ -196,11 +253,14 @@ class Member:
         self._fenced = False
         self._unheard = False
         """The question who is active could not be sent."""
+        self._peers = Peers(registration)
+        self._yields = False
+        """No Coordinator answers, and another instance works."""
 
     @property
     def active(self) -> bool:
         """Whether this instance is active: writes and reads for its app."""
-        if self._fenced:
+        if self._fenced or self._yields:
             return False
         return self.current is None or self.current.active in ("", self.registration.instance_id)
 
@@ -244,12 +304,13 @@ class Member:
 
     def tick(self, now: float, *, written: int = 0, received: int = 0) -> list[Registration | Heartbeat]:
         """What to send now.  Call at least once per heartbeat."""
-        if self.phase is Phase.WAITING and now >= self._deadline:
-            self.phase = Phase.ALONE
-            self.changes += 1
+        self._settle(now)
         if self._fenced and now >= self._fenced_until:
-            self._fenced = False
-            self.changes += 1
+            if self._peers.active(now):
+                self._fenced_until = now + self._handshake_timeout
+            else:
+                self._fenced = False
+                self.changes += 1
         if not self._coordinated:
             return []
         messages: list[Registration | Heartbeat] = []
@@ -260,6 +321,24 @@ class Member:
             self._beat_at = max(self._beat_at + self.registration.heartbeat, now)
             messages.append(self.beat(written=written, received=received))
         return messages
+
+    def _settle(self, now: float) -> None:
+        """Without a Coordinator: work alone, unless another instance does or will."""
+        if self.phase is Phase.COORDINATED:
+            return
+        works = self.phase is Phase.ALONE
+        yields = self._peers.precede(now, working=works)
+        if works and yields:
+            self.phase, self._yields, self._deadline = Phase.WAITING, True, now
+            self.changes += 1
+        elif not works and now >= self._deadline and not (yields and self._yields):
+            self.phase, self._yields = (Phase.WAITING, True) if yields else (Phase.ALONE, False)
+            self.changes += 1
+
+    def heard(self, message: Heartbeat, now: float) -> None:
+        """A heartbeat of any instance of this app; a new one is answered at once."""
+        if self._peers.heard(message, now):
+            self._beat_at = now
 
     def next_tick(self) -> float:
         """When `tick` has something to do again."""
@@ -278,7 +357,7 @@ class Member:
             revision=self.registration.revision,
             version=self.current.version if self.current else 0,
             epoch=self.epoch,
-            active=self.active,
+            active=self.reading,
             written=written,
             received=received,
         )
@@ -297,7 +376,7 @@ class Member:
         self.current = message
         self.epoch = message.epoch
         self.phase = Phase.COORDINATED
-        self._fenced = False
+        self._fenced = self._yields = False
         changed = before != (self.phase, self.active, self.assignments, self.epoch)
         self.changes += changed
         return changed
@@ -308,6 +387,11 @@ class Member:
         Writes are buffered until the Coordinator says who is active, or stays silent for the handshake
         time-out.  Returns whether this applies (only the active instance of a standby app).
         """
+        if self.phase is Phase.ALONE and self._peers.known:
+            # one of them may work by now: their heartbeats tell
+            self.phase, self._deadline, self._beat_at = Phase.WAITING, now + self._peers.patience, now
+            self.changes += 1
+            return True
         standby = self.current is not None and self.current.active != ""
         if not standby or not self.active:
             return False
@@ -320,6 +404,8 @@ class Member:
 
     def connection(self, now: float, *, works: bool) -> None:
         """Whether Data Updates answers now: a question that nobody could hear is asked again, and waits anew."""
+        if not works and self.phase is Phase.WAITING and self._peers.known:
+            self._deadline = max(self._deadline, now + self._peers.patience)
         if not self._fenced or (works and not self._unheard):
             return
         self._fenced_until = now + self._handshake_timeout

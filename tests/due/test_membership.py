@@ -71,6 +71,92 @@ def test_without_a_coordinator_it_buffers_then_works_alone():
     assert member.reading
 
 
+class _Instances:
+    """Instances of one app, without a Coordinator; time by hand, heartbeats as Data Updates carry them."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.members: dict[str, Member] = {}
+        self.cut: set[str] = set()
+
+    def start(self, name: str, *, instances: str = "standby") -> None:
+        registration = Registration(
+            app_id="ctrl",
+            instance_id=name,
+            revision=1,
+            capabilities=(PACKETS,),
+            heartbeat=0.5,
+            started=1,
+            instances=instances,  # type: ignore[arg-type]
+        )
+        self.members[name] = Member(registration, now=self.now, handshake_timeout=1.0)
+
+    def run(self, seconds: float) -> set[frozenset[str]]:
+        """Which instances worked at once, at any time."""
+        seen = set()
+        end = self.now + seconds
+        while self.now < end:
+            self.now += 0.1
+            for name, member in self.members.items():
+                member.connection(self.now, works=name not in self.cut)
+                for message in member.tick(self.now):
+                    if isinstance(message, Heartbeat) and name not in self.cut:
+                        for other in self.members.keys() - self.cut:
+                            self.members[other].heard(message, self.now)
+            seen.add(
+                frozenset(n for n, m in self.members.items() if m.permission(KEY).verdict is Verdict.OPEN)
+            )
+        return seen
+
+    def working(self) -> list[str]:
+        return [name for name, member in self.members.items() if member.reading]
+
+
+def test_of_two_standbys_without_a_coordinator_one_works():
+    """Both start while the Coordinator is away; the other takes over when the one is silent."""
+    site = _Instances()
+    site.start("bob")
+    site.start("ann")
+    assert site.run(60.0) == {frozenset(), frozenset({"ann"})}
+    del site.members["ann"]
+    assert site.run(10.0) == {frozenset(), frozenset({"bob"})}
+    site.start("ann")
+    assert site.run(10.0) == {frozenset({"bob"})}, "one that works goes on"
+
+
+def test_a_standby_that_starts_beside_one_that_a_coordinator_named_waits():
+    site = _Instances()
+    site.start("zoe")
+    site.members["zoe"].assigned(
+        _assignments(active="zoe", revisions={"zoe": 1}, assignments=(_wants("n.**"),)), 0.0
+    )
+    site.start("ann")
+    assert site.run(10.0) == {frozenset({"zoe"})}
+
+
+def test_two_that_were_cut_off_from_each_other_do_not_both_go_on():
+    site = _Instances()
+    site.start("ann")
+    site.start("bob")
+    site.run(3.0)
+    assert site.working() == ["ann"]
+    site.cut = {"ann"}
+    assert site.members["ann"].paused(site.now)
+    assert all(len(working) < 2 for working in site.run(10.0))
+    assert site.working() == ["bob"]
+    site.cut = set()
+    assert all(len(working) < 2 for working in site.run(10.0))
+    assert len(site.working()) == 1
+
+
+def test_shared_instances_all_work():
+    site = _Instances()
+    for name in ("ann", "bob"):
+        site.start(name, instances="shared")
+    site.run(3.0)
+    assert site.working() == ["ann", "bob"]
+
+
 def test_undeclared_keys_are_always_open():
     assert _member().permission(Key("other.key")).verdict is Verdict.OPEN
 

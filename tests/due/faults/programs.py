@@ -76,9 +76,9 @@ def consume(url: str, app: str, count: str, delay_ms: str) -> None:
     engine.close()
 
 
-def speak(url: str, name: str, heartbeat: str) -> None:
+def speak(url: str, name: str, heartbeat: str, handshake: str = "20") -> None:
     """One of several standby instances: writes its name and a number every 5 ms, says what came of it."""
-    engine = Engine(Options(heartbeat=float(heartbeat), handshake_timeout=20.0))
+    engine = Engine(Options(heartbeat=float(heartbeat), handshake_timeout=float(handshake)))
     engine.set_pubsub(url)
     engine.init("speaker", PRODUCER, capabilities=[Capability(SPEECH, delivery="reliable")])
     print("instance", engine.instance_id, flush=True)

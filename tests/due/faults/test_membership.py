@@ -110,3 +110,28 @@ def test_data_updates_that_come_back_empty_replace_no_instance_and_lose_no_word(
     assert not _said(listener, standby)
     said = _said(listener, active)
     assert said == list(range(said[0], said[0] + len(said)))
+
+
+def test_of_a_pair_that_starts_without_a_coordinator_one_speaks(programs, own_server, coordinator):
+    """As when the Coordinator is away for minutes; then the other after a kill, and no change when it is back."""
+    listener = programs("listen", own_server.url)
+    listener.wait_for("ready")
+    pair = {name: programs("speak", own_server.url, name, 0.5, 3.0) for name in ("ann", "bob")}
+    _watch(
+        lambda: (
+            {"active", "standby"} <= {_states(program)[-1] for program in pair.values() if _states(program)}
+        )
+    )
+    first = next(name for name in pair if _states(pair[name])[-1] == "active")
+    second = next(name for name in pair if name != first)
+    _watch(lambda: len(_said(listener, first)) > 300)
+    assert not _said(listener, second)
+    pair[first].kill()
+    _watch(lambda: len(_said(listener, second)) > 100)
+    pair[first] = programs("speak", own_server.url, first, 0.5, 3.0)
+    _watch(lambda: _states(pair[first])[-1:] == ["standby"])
+    coordinator()
+    count = len(_said(listener, second))
+    _watch(lambda: len(_said(listener, second)) > count + 300)
+    heard = _heard(listener)
+    assert heard == sorted(heard, key=[first, second].index), "one after the other"
