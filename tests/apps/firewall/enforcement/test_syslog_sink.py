@@ -6,6 +6,7 @@ import socket
 import ssl
 import subprocess
 import threading
+from contextlib import suppress
 from datetime import UTC, datetime
 
 import pytest
@@ -31,6 +32,7 @@ class Collector:
         self.server = socket.create_server(("127.0.0.1", 0))
         self.messages = []
         self.connections = []
+        self._readers = []
         self._tls = tls
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -41,7 +43,8 @@ class Collector:
 
     def hang_up(self):
         for each in self.connections:
-            each.shutdown(socket.SHUT_RDWR)
+            with suppress(OSError):  # its reader may have come to the end and closed it
+                each.shutdown(socket.SHUT_RDWR)
             each.close()
         self.connections.clear()
 
@@ -49,6 +52,10 @@ class Collector:
         self.server.shutdown(socket.SHUT_RDWR)
         self.server.close()
         self._thread.join(10)
+        self.hang_up()
+        for reader in self._readers:
+            reader.join(10)
+            assert not reader.is_alive(), "it reads on at the end of its stream"
 
     def _serve(self):
         while True:
@@ -61,15 +68,26 @@ class Collector:
             except OSError:
                 return
             self.connections.append(opened)
-            threading.Thread(target=self._read, args=(opened,), daemon=True).start()
+            self._readers.append(threading.Thread(target=self._read, args=(opened,), daemon=True))
+            self._readers[-1].start()
 
     def _read(self, opened):
         with opened, opened.makefile("rb") as stream:
             try:
-                while length := b"".join(iter(lambda: stream.read(1), b" ")):
-                    self.messages.append(stream.read(int(length)))
+                while length := _number(stream):
+                    self.messages.append(stream.read(length))
             except (OSError, ValueError):
                 return
+
+
+def _number(stream):
+    """Length of the next message; 0 at the end of the stream."""
+    digits = b""
+    while digit := stream.read(1):
+        if digit == b" ":
+            return int(digits)
+        digits += digit
+    return 0
 
 
 def check(message):
