@@ -5,7 +5,7 @@
 
 Policy: while the archive is away, frames go to disk up to the spool's size, beyond it they are lost and
 counted; without a spool they wait.  Where the spool's disk takes nothing, as where a full disk holds both, they
-wait as long as the queue has room, and are lost and counted then.  Only when the queue is full, because archive
+go into the spool's reserve; without room there they wait as long as the queue has room, and are lost and counted then.  Only when the queue is full, because archive
 and disk are slower than the writers, does `put` wait.  Nothing is lost silently: see `statistics`.
 """
 
@@ -165,6 +165,10 @@ class Archiver:
                 if lost is not None:
                     self._counts["lost"] += lost
                     self._counts["spooled"] += sum(f.count for f in frames) - lost
+                    return
+                if len(frames) > 1:  # some of them may fit into the spool's reserve
+                    self._store(frames[: len(frames) // 2])
+                    self._store(frames[len(frames) // 2 :])
                     return
             elif self._closing:
                 self._counts["lost"] += sum(f.count for f in frames)

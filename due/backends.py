@@ -55,7 +55,7 @@ def open_spool(folder: Path, options: Options) -> Spool | None:
         return None
     from due.drivers.spool_slots import SlottedSpool
 
-    return SlottedSpool(folder, options.spool_bytes)
+    return SlottedSpool(folder, options.spool_bytes, options.spool_reserve_bytes)
 
 
 def default_updates(options: Options) -> str:

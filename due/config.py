@@ -63,6 +63,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     spool_bytes: int = 1 << 30
     """Disk space for frames while the archive cannot be reached; more are lost and counted."""
 
+    spool_reserve_bytes: int = 1 << 20
+    """Disk space allocated at the start by an app that always archives, for frames while its disk is full; 0: none."""
+
     def folder(self) -> Path:
         """The folder for embedded servers and the spool.
 
@@ -83,7 +86,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         """
         least = {
             "frame_bytes": 1, "single_bytes": 1, "window_bytes": 1, "tries": 1, "archive_batch": 1,
-            "heartbeat": 0.01, "handshake_timeout": 0.0, "linger": 0.0,
+            "heartbeat": 0.01, "handshake_timeout": 0.0, "linger": 0.0, "spool_reserve_bytes": 0,
         }  # fmt: skip
         for name, bound in least.items():
             if not getattr(self, name) >= bound:  # not a number is refused too
@@ -93,6 +96,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             "heartbeat": MAX_HEARTBEAT,
             "handshake_timeout": 3600.0,
             "linger": 60.0,
+            "spool_reserve_bytes": 1 << 30,
         }
         for name, limit in most.items():
             if not getattr(self, name) <= limit:

@@ -16,7 +16,7 @@ from due.config import Options
 from due.dispatcher import Dispatcher
 from due.drivers.base import ArchiveDriver
 from due.drivers.embedded_redis import EmbeddedServer, shared_server
-from due.errors import DueError, EngineFailed, Superseded, Timeout, UpdatesUnavailable
+from due.errors import BackendError, DueError, EngineFailed, Superseded, Timeout, UpdatesUnavailable
 from due.heartbeat_thread import HeartbeatThread
 from due.key_writer import ARCHIVE, PUBLISH, KeyWriter, Sent
 from due.keys import Key
@@ -109,8 +109,13 @@ class Session:
         self.sender.start()
         self.keeper.start()
         self.dispatcher.start()
-        if any(self._spool_folder().glob("spool*.db")):
-            self._open_archiver()  # an earlier instance left frames in the spool
+        always = any(each.archive == "always" for each in self.keeper.member.registration.capabilities)
+        if always or any(self._spool_folder().glob("spool*.db")):
+            # at once: an earlier instance left frames in the spool, or a full disk would give no reserve later
+            try:
+                self._open_archiver()
+            except BackendError as error:
+                log.warning("%s; tried again with the first item to be archived", error)
 
     def check(self) -> None:
         """Raise `EngineFailed` if a thread has died."""

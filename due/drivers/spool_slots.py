@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from due.drivers.spool import DiskSpool
+from due.drivers.spool_reserve import ReservedSpool
 from due.errors import BackendError
 from due.messages import PackedFrame
 
@@ -25,11 +25,12 @@ _SLOTS = 1000
 class SlottedSpool:
     """`Spool` of one instance; raises BackendError if no spool can be opened in the folder."""
 
-    def __init__(self, folder: Path, limit: int) -> None:
+    def __init__(self, folder: Path, limit: int, reserve: int = 0) -> None:
         self._folder = folder
         self._limit = limit
+        self._reserve = reserve
         self._adopted: list[_Slot] = []
-        self._taken_from: DiskSpool | None = None
+        self._taken_from: ReservedSpool | None = None
         self._damaged_before = 0
         """Of spools that were adopted and are empty now."""
         self._own = self._first_free()
@@ -51,7 +52,8 @@ class SlottedSpool:
             self._remove(slot)
 
     def adopt(self) -> None:
-        """Take over the spools of instances that have ended."""
+        """Take over the spools of instances that have ended; allocate a reserve that found no room before."""
+        self._own.spool.allocate()
         names = {path.stem for path in self._folder.glob("spool*.db")} - {self._own.name}
         for name in sorted(names - {slot.name for slot in self._adopted}):
             slot = self._try(name)
@@ -99,7 +101,7 @@ class SlottedSpool:
             raise BackendError(f"spool in {self._folder}: {error}; name another folder") from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return _Slot(name, lock, DiskSpool(self._folder, self._limit, name))
+            return _Slot(name, lock, ReservedSpool(self._folder, self._limit, name, self._reserve))
         except BlockingIOError:
             os.close(lock)
             return None
@@ -111,7 +113,7 @@ class SlottedSpool:
 class _Slot:
     """One spool and its lock."""
 
-    def __init__(self, name: str, lock: int, spool: DiskSpool) -> None:
+    def __init__(self, name: str, lock: int, spool: ReservedSpool) -> None:
         self.name = name
         self.spool = spool
         self._lock = lock
@@ -120,7 +122,7 @@ class _Slot:
     def remove(self) -> None:
         """Delete an empty spool.  The lock's file stays; otherwise two could hold locks of one name."""
         self.spool.close()
-        for suffix in (".db", ".db-wal", ".db-shm"):
+        for suffix in (".db", ".db-wal", ".db-shm", ".reserve"):
             with suppress(OSError):
                 self.spool.path.with_suffix(suffix).unlink()
         self.close()
