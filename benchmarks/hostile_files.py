@@ -30,6 +30,7 @@ from due import Item
 from due.codec import encode_value
 from due.config import Options
 from due.drivers.spool import DiskSpool
+from due.drivers.spool_reserve import SpoolReserve
 from due.drivers.sqlite import SqliteArchive
 from due.errors import BackendError, InvalidOption
 from due.messages import PackedFrame
@@ -197,6 +198,24 @@ def _spool_bytes() -> bytes:
     return (folder / "spool.db").read_bytes()
 
 
+def _reserve_file(path: Path) -> None:
+    reserve = SpoolReserve(path, 1 << 12)
+    try:
+        reserve.take(10)
+        reserve.put([_FRAME])
+        reserve.done(len(reserve.take(10)))
+    finally:
+        reserve.close()
+
+
+@cache
+def _reserve_bytes() -> bytes:
+    reserve = SpoolReserve(temporary_folder() / "reserve", 1 << 12)
+    reserve.put([_FRAME] * 3)
+    reserve.close()
+    return (temporary_folder() / "reserve").read_bytes()[:1000]
+
+
 _ITEMS = [Item("a.b.app", {"n": n}, _NOW + n, _NOW + n, "app", "i", n) for n in range(1, 4)]
 
 
@@ -259,6 +278,7 @@ TARGETS = (
     DecoderTarget("kitsune model", in_file("m", load_model), (ModelFileError,), (_model_bytes(),)),
     DecoderTarget("run file", _run_file, (BadInput,), (_run_bytes(),), mutate_json),
     DecoderTarget("spool row", _spool_row, (BackendError,), (_SPOOLED,)),
+    DecoderTarget("spool reserve", in_file("reserve-in", _reserve_file), (), (_reserve_bytes(),)),
     DecoderTarget("spool file", _spool_file, (BackendError,), (_spool_bytes(),)),
     DecoderTarget(
         "archive row",
