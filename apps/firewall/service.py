@@ -174,7 +174,7 @@ class FirewallService:
             self._switches,
             self._publish,
         )
-        self._stored = StoredAnswers(engine)
+        self._stored = StoredAnswers(engine, threading.Lock())
         self._lock = threading.RLock()
         self._stopped = False
         self._panics: deque[str] = deque(maxlen=1000)

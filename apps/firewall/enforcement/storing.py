@@ -1,9 +1,8 @@
 """What operators' programs were answered: `done` of nothing that a restart would forget, and again if they ask again."""
 
-import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Final
 
 from msgspec import structs
@@ -23,14 +22,14 @@ class StoredAnswers:
     An instruction may come again after a restart of the firewall or of Data Updates, which may have lost the answer.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, lock: AbstractContextManager[object]) -> None:
         self._engine = engine
         self._given: OrderedDict[str, Answer | None] = OrderedDict()
         """By the id of the instruction; None: it is being carried out, or its answer cannot be read."""
         self.unstored = 0
         """Answers that said so."""
         self._patience_s = _PATIENCE_S
-        self._catching_up = threading.Lock()
+        self._catching_up = lock
         self._behind = True
 
     @contextmanager
