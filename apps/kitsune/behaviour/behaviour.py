@@ -506,7 +506,7 @@ class Behaviour:
             "senders": [list(sender) for sender in self.senders],
             "owners": [[address, sorted(macs)] for address, macs in self._owners.items()],
             "contacts": [list(contact) for contact in self.contacts.trained],
-            "callbacks": [self._callbacks.pairs, self._callbacks.back],
+            "callbacks": self._callbacks.to_state(),
             "baselines": {name: counter.baseline.to_state() for name, counter in self._counters.items()},
         }
 
@@ -529,7 +529,7 @@ class Behaviour:
         self._addresses = set(self._owners)
         self.contacts.trained = {(int(one), int(other), int(what)) for one, other, what in state["contacts"]}
         self.contacts.close_training()
-        self._callbacks.pairs, self._callbacks.back = map(int, state.get("callbacks", (0, 0)))
+        self._callbacks.restore(state.get("callbacks", (0, 0)))
         for name, counter in self._counters.items():
             counter.baseline.restore(state["baselines"][name])
             counter.trained(self.seconds)

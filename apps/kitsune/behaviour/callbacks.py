@@ -11,7 +11,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from apps.kitsune.behaviour.contacts import OTHER, TCP, Contact, EndedContact
 from apps.kitsune.behaviour.rows import SenderId, parts_of
@@ -65,6 +65,21 @@ class Callbacks:
         opened = {(source, target) for source, target, service in inside if service >> 16 == TCP >> 16}
         self.pairs = len(reached)
         self.back = sum((target, source) in opened for source, target in reached)
+
+    def to_state(self) -> list[int]:
+        """Plain values for the model file."""
+        return [self.pairs, self.back]
+
+    def restore(self, state: Iterable[Any]) -> None:
+        """The inverse of `to_state`.
+
+        Raises:
+            TypeError, ValueError: the state is not one.
+        """
+        pairs, back = map(int, state)
+        if not 0 <= back <= pairs:
+            raise ValueError(f"{back} of {pairs} pairs connected back")
+        self.pairs, self.back = pairs, back
 
     def login(self, sender: SenderId, source: int, host: int, service: int, time: float) -> None:
         """A login that training does not explain."""

@@ -286,3 +286,5 @@ def test_what_was_learnt_survives_the_model_file():
     assert feed(again, rows) == feed(behaviour, rows) != []
     with pytest.raises((KeyError, TypeError, ValueError)):
         Behaviour.from_state({"seconds": -1, "line": 1})
+    with pytest.raises(ValueError, match="connected back"):
+        Behaviour.from_state(behaviour.to_state() | {"callbacks": [1, 5]})
