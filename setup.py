@@ -55,8 +55,17 @@ setup(
     ext_modules=[
         Extension(
             "apps.kitsune._kernel",
-            sources=["apps/kitsune/afterimage.c", "apps/kitsune/kitnet.c"],
-            depends=[f"apps/kitsune/afterimage_{part}.h" for part in ("keys", "pool", "state")],
+            sources=[
+                f"apps/kitsune/{part}.c"
+                for part in ("afterimage", "kitnet", "behaviour", "senders", "victims")
+            ],
+            depends=[
+                *(f"apps/kitsune/afterimage_{part}.h" for part in ("keys", "pool", "state")),
+                *(
+                    f"apps/kitsune/ledger_{part}.h"
+                    for part in ("table", "rows", "counter", "behaviour", "found", "store")
+                ),
+            ],
             # equality with the published features depends on these: see afterimage.c
             extra_compile_args=["-O2", "-ffp-contract=off", "-fno-builtin-pow"],
             libraries=["m"],

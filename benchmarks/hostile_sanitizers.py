@@ -19,7 +19,7 @@ from typing import Any
 
 import cffi
 
-import apps.kitsune
+from apps.kitsune.kernel import SOURCES
 from benchmarks.hostile_switch import PROGRAM
 from dataplane.compiler import c_machine, layout
 from dataplane.compiler.c_build import cache_directory
@@ -27,7 +27,6 @@ from dataplane.compiler.c_code import generate
 from dataplane.v1model.program import load
 from sdnator.p4_program import find
 
-SOURCES = tuple(Path(apps.kitsune.__file__).with_name(name) for name in ("afterimage.c", "kitnet.c"))
 _FLAGS = (
     *("-shared", "-fPIC", "-g", "-O1", "-fno-strict-aliasing", "-fno-omit-frame-pointer", "-w"),
     *("-fsanitize=address,undefined", "-fno-sanitize-recover=all"),

@@ -18,7 +18,10 @@ class Blocked:
 
     def __init__(self) -> None:
         self._by_id: dict[str, tuple[str, str]] = {}
-        self._targets: set[tuple[str, str]] = set()
+        self.targets: frozenset[tuple[str, str]] = frozenset()
+        """Pairs of switch (`*`: all) and address."""
+        self.changes = 0
+        """Number of decisions applied."""
 
     def decide(self, decision: Decision) -> None:
         """Apply a decision of the firewall; dry runs are ignored."""
@@ -30,15 +33,16 @@ class Blocked:
                 del self._by_id[next(iter(self._by_id))]
         else:
             self._by_id.pop(decision.id, None)
-        self._targets = set(self._by_id.values())
+        self.targets = frozenset(self._by_id.values())
+        self.changes += 1
 
     def __len__(self) -> int:
         return len(self._by_id)
 
     def __bool__(self) -> bool:
-        return bool(self._targets)
+        return bool(self.targets)
 
     def covers(self, switch: str, mac: str, address: str) -> bool:
         """Whether a sender with this MAC or address is blocked on the switch."""
         switches = (switch, "*")
-        return any((each, name) in self._targets for each in switches for name in (mac, address))
+        return any((each, name) in self.targets for each in switches for name in (mac, address))

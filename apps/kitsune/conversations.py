@@ -11,7 +11,7 @@ UDP_REPLY_S: Final = 5.0
 TCP_REPLY_S: Final = 65.0
 """A half-open connection repeats its SYN-ACK for up to 63 s."""
 REPLIES_PER_PACKET: Final = 10
-_MOST: Final = 65_536
+MOST: Final = 65_536
 _SYN, _RST, _ACK = 0x02, 0x04, 0x10
 
 Address = tuple[int, int, int]
@@ -64,7 +64,7 @@ class Conversations:
         return entry if entry is not None and abs(time - entry.time) <= within else None
 
     def _begin(self, key: Key, sender: int, time: float) -> None:
-        if not 0 <= time - self._turned <= TCP_REPLY_S or len(self._young) >= _MOST:
+        if not 0 <= time - self._turned <= TCP_REPLY_S or len(self._young) >= MOST:
             self._old, self._young, self._turned = self._young, {}, time
         entry = self._young.get(key)
         if entry is None or entry.sender != sender:

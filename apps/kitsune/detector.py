@@ -12,21 +12,24 @@ import numpy.typing as npt
 from apps.evidence import Evidence
 from apps.kitsune.accused import LEAST_NATS, Accused
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
-from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS, Behaviour
-from apps.kitsune.behaviour.contacts import PacketRow
+from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS
 from apps.kitsune.behaviour.findings import Finding
+from apps.kitsune.behaviour.native import behaviour_of, restored_behaviour
 from apps.kitsune.behaviour.rows import parts_of
 from apps.kitsune.drift import TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
 from apps.kitsune.evidence import evidence_of
 from apps.kitsune.kernel import Columns, Kernel
 from apps.kitsune.kitnet import KitNet
+from apps.kitsune.ledger import KernelRows
 from apps.kitsune.model_file import Model, NotAModelError, save_model
 from apps.kitsune.names import ip_text, mac_text
-from apps.kitsune.reasons import Explanation, reason
-from apps.kitsune.senders import AnomalousSecond, Senders
+from apps.kitsune.native_senders import restored_senders, senders_of
+from apps.kitsune.native_victims import restored_victims, victims_of
+from apps.kitsune.reasons import Explanations, reason
+from apps.kitsune.senders import AnomalousSecond
 from apps.kitsune.threshold import Benign, Calibration
 from apps.kitsune.training_check import TrainingCheck
-from apps.kitsune.victims import UsualTraffic, VictimRates
+from apps.kitsune.victims import UsualTraffic
 from apps.messages import Alert, Sender
 
 TRAIN: Final = 0
@@ -131,9 +134,10 @@ class Detector:
         self.training_warnings: list[str] = []
         self._check = TrainingCheck()
         self._trained_at_us = 0
-        self.senders = Senders()
-        self.behaviour = Behaviour(settings.fm_grace + settings.ad_grace + 1)
-        self.victims = VictimRates()
+        self._kernel = kernel
+        self.senders = senders_of(kernel)
+        self.behaviour = behaviour_of(settings.fm_grace + settings.ad_grace + 1, kernel)
+        self.victims = victims_of(kernel)
         self._evidence: list[Evidence] = []
         self._tail: deque[npt.NDArray[np.float64]] = deque()
         """Features of the last packets of training."""
@@ -177,6 +181,8 @@ class Detector:
             switch: where they were seen.
             features: of each packet, where another detector has measured them; its statistics are then in use.
         """
+        if self._kernel is not None:
+            batch = KernelRows(self._kernel, batch)
         if features is None:
             features = self.afterimage.update(batch)
         before = self.model.trained
@@ -191,8 +197,8 @@ class Detector:
         state[:trained] = TRAIN
         line = self.line
 
-        def explain(row: int) -> Explanation:
-            return Explanation(features[row].copy(), errors[row - trained].copy())
+        def explain(rows: npt.NDArray[np.int32]) -> Explanations:
+            return Explanations(features[rows], errors[rows - trained])
 
         hot = self.senders.add(batch, switch, scores=scores, trained=trained, line=line, evidence=explain)
         self.victims.add(batch, trained)
@@ -203,7 +209,7 @@ class Detector:
             trained,
             self._rescored,
             line,
-            self._to_blocked if self.senders.blocked else None,
+            self.senders.blocked,
         )
         self._evidence += [self._as_evidence(finding) for finding in findings]
         self._follow_drift(batch, scores, trained, findings)
@@ -267,7 +273,7 @@ class Detector:
         else:
             switch, port, mac, address = finding.sender
             rate, training_rate = self.senders.rates((switch, port, mac, parts_of(address)))
-            proven = self.behaviour.contacts.proven(address)
+            proven = self.behaviour.proven(address)
             forged = self.behaviour.forged(finding.sender)
         return evidence_of(
             finding,
@@ -278,11 +284,6 @@ class Detector:
             training_rate=float(training_rate),
             usual=usual,
         )
-
-    def _to_blocked(self, row: PacketRow) -> bool:
-        """Whether a packet goes to a blocked host, whose answers are dropped."""
-        address = ip_text(*parts_of(row.target))
-        return self.senders.blocked.covers(row.sender[0], mac_text(row.to_mac), address)
 
     def notes(self) -> dict[str, Any]:
         """The data that a model file keeps besides the network."""
@@ -312,10 +313,10 @@ class Detector:
         notes = model.notes
         try:
             benign = Benign(**notes["benign"]) if notes.get("benign") else None
-            self.senders = Senders.from_state(notes.get("senders"))
+            self.senders = restored_senders(notes.get("senders"), self._kernel)
             if notes.get("behaviour"):
-                self.behaviour = Behaviour.from_state(notes["behaviour"])
-            self.victims = VictimRates.from_state(notes.get("victims", ()))
+                self.behaviour = restored_behaviour(notes["behaviour"], self._kernel)
+            self.victims = restored_victims(notes.get("victims", ()), self._kernel)
             if notes.get("drift"):
                 self.drift = Drift.from_state(notes["drift"])
             self.trained_for = dict(notes.get("trained_for") or {})

@@ -16,10 +16,16 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
+
+SOURCES: Final = tuple(
+    Path(__file__).with_name(f"{part}.c")
+    for part in ("afterimage", "kitnet", "behaviour", "senders", "victims")
+)
+"""What the library is built from."""
 
 PACKET_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
     ("length", "uint32_t", "u4"),
@@ -41,6 +47,93 @@ PACKET_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
     ("icmp_type", "int32_t", "i4"),
 )
 """Columns from which features are computed: name, C type, numpy type. `time` is in seconds."""
+
+ROW_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
+    ("time", "double", "f8"),
+    ("arrival", "uint64_t", "u8"),
+    ("port", "uint16_t", "u2"),
+    ("length", "uint32_t", "u4"),
+    *PACKET_FIELDS[2:16],
+    ("quoted", "uint8_t", "u1"),
+    ("tcp_flags", "uint8_t", "u1"),
+    ("icmp_type", "int32_t", "i4"),
+    ("icmp6_type", "int32_t", "i4"),
+)
+"""Columns that the ledgers read, in the order of `PacketRows` in C."""
+
+_LEDGERS: Final = (
+    "typedef struct {"
+    + "".join(f"const {c_type} *{name};" for name, c_type, _ in ROW_FIELDS)
+    + """} PacketRows;
+    typedef struct {
+        int32_t most_subjects, kept, most_contacts, calibration;
+        double grace_s, least_nats, most_nats, least_step, least_share, deciding_nats, half_life_s,
+            neighbours_share, least_scale_share, asked_s, present_s, theft, again_s, soon_s;
+        int32_t refused_bytes, replies_count, chosen, blocks, most_logins;
+    } BehaviourLimits;
+    typedef struct { int32_t windows, own; double window[4], least_scale; } CounterSettings;
+    typedef struct {
+        int32_t what, block;
+        uint64_t who[4], victim[2];
+        int64_t service;
+        uint64_t kind;
+        double nats, total, count, window, usual, time;
+        uint64_t arrival;
+        int32_t has_sender, supporting;
+        double sums[4];
+    } BehaviourEvent;
+    typedef struct Behaviour Behaviour;
+    Behaviour *behaviour_new(const BehaviourLimits *, const CounterSettings *, int64_t per_block,
+                             const uint16_t *logins, long n, uint64_t seed);
+    void behaviour_free(Behaviour *);
+    int behaviour_add(Behaviour *, const PacketRows *, long n, long first, long last, uint16_t number,
+                      const double *scores, const double *logs, double threshold);
+    int behaviour_calibrate(Behaviour *, const double *logs, long n, int32_t blocks);
+    const BehaviourEvent *behaviour_events(const Behaviour *, long *count);
+    long behaviour_tail(const Behaviour *);
+    void behaviour_training(const Behaviour *, double *out);
+    void behaviour_close_training(Behaviour *);
+    int behaviour_baseline(Behaviour *, int32_t what, int32_t own, const uint64_t *keys, const double *counts, long n);
+    int behaviour_scales(Behaviour *, int32_t what, int32_t usable, double own, double shared, double rarity);
+    int behaviour_know(Behaviour *, const uint64_t *senders, long n, const uint64_t *owners, long m,
+                       const uint64_t *contacts, long k);
+    long behaviour_contacts(const Behaviour *, int32_t training, uint64_t *out, long room);
+    void behaviour_callbacks(Behaviour *, double nats, double usual);
+    int behaviour_proven(const Behaviour *, int32_t six, uint64_t hi, uint64_t lo);
+    int behaviour_blocks(Behaviour *, const uint64_t *rows, long n);
+    typedef struct {
+        int64_t most_senders;
+        int32_t most_conversations, hot_packets, replies_per_packet;
+        double hot_share;
+    } SenderLimits;
+    typedef struct {
+        int32_t what, kept_in, kept_at, row;
+        uint64_t who[4];
+        int64_t second, packets, over, destinations, first_over, training_rate, training_destinations;
+        double peak;
+    } SenderEvent;
+    typedef struct Senders Senders;
+    Senders *senders_new(const SenderLimits *, int32_t training, uint64_t seed);
+    void senders_free(Senders *);
+    int senders_add(Senders *, const PacketRows *, long n, long trained, uint16_t number, const double *scores,
+                    double line, int32_t *peaks, long *kept);
+    int senders_finish(Senders *);
+    const SenderEvent *senders_events(const Senders *, long *count);
+    int senders_know(Senders *, const uint64_t *who, int64_t rate, int64_t destinations);
+    long senders_known(const Senders *, uint64_t *who, int64_t *numbers, long room);
+    void senders_rates(const Senders *, const uint64_t *who, int64_t *out);
+    long senders_speakers(const Senders *, uint64_t *who, int64_t *numbers, long room);
+    int senders_blocks(Senders *, const uint64_t *rows, long n);
+    typedef struct { int64_t most_kinds, most_sources, most_sources_of_all, back_s; } VictimLimits;
+    typedef struct Victims Victims;
+    Victims *victims_new(const VictimLimits *, uint64_t seed);
+    void victims_free(Victims *);
+    int victims_add(Victims *, const PacketRows *, long n, long trained);
+    int64_t victims_rate(const Victims *, uint64_t kind, int32_t six, uint64_t hi, uint64_t lo);
+    long victims_usual(const Victims *, uint64_t *out, long room);
+    long victims_sources(const Victims *, uint64_t *out, long room);
+    """
+)
 
 _DECLARATIONS: Final = (
     "typedef struct {"
@@ -77,14 +170,14 @@ class Kernel(NamedTuple):
 
     def pointer(self, kind: str, array: npt.NDArray[Any]) -> Any:
         """A C pointer to the array's data; the array must be contiguous and outlive the call."""
-        return self.ffi.cast(f"{kind} *", array.ctypes.data)
+        return self.ffi.cast(f"{kind} *", array.__array_interface__["data"][0])
 
 
 @functools.cache
 def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
     """The kernel, or None with one warning when it was not built (no C compiler at installation)."""
     ffi = cffi.FFI()
-    ffi.cdef(_DECLARATIONS)
+    ffi.cdef(_DECLARATIONS + _LEDGERS)
     try:
         lib: Any = ffi.dlopen(str(path))
         if lib.kitsune_kernel_version() == VERSION:

@@ -1,7 +1,8 @@
 """The reason of an alert as text."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,30 @@ class Explanation:
     errors: npt.NDArray[np.float64]
 
 
+class Explanations(Sequence[Explanation]):
+    """Explanations of several packets of one batch.
+
+    Args:
+        features: their features, row by row.
+        errors: RMSE of each autoencoder.
+    """
+
+    def __init__(self, features: npt.NDArray[np.float64], errors: npt.NDArray[np.float64]) -> None:
+        self._features, self._errors = features, errors
+
+    def __len__(self) -> int:
+        return len(self._features)
+
+    @overload
+    def __getitem__(self, row: int) -> Explanation: ...
+    @overload
+    def __getitem__(self, row: slice) -> "Explanations": ...
+    def __getitem__(self, row: int | slice) -> "Explanation | Explanations":
+        if isinstance(row, slice):
+            return Explanations(self._features[row], self._errors[row])
+        return Explanation(self._features[row], self._errors[row])
+
+
 def feature_words(feature: int) -> str:
     """A feature described in words."""
     start, per_scale, group = max(entry for entry in _GROUPS if entry[0] <= feature)
@@ -52,9 +77,7 @@ def reason(hot: AnomalousSecond, model: KitNet, line: float) -> str:
     tally, record = hot.tally, hot.record
     _, _, mac, address = record.identity
     who = ip_text(*address) or mac_text(mac)
-    parts = _comparisons(
-        who, tally.packets, record.training_rate, len(tally.destinations), record.training_destinations
-    )
+    parts = _comparisons(who, tally.packets, record.training_rate, tally.hosts, record.training_destinations)
     parts.append(
         f"{tally.over} of {tally.packets} packets scored over {line:.3g}, the highest {tally.peak:.3g}"
     )

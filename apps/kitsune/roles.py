@@ -49,6 +49,20 @@ class Roles:
         tally[0] += 1
         tally[1] += to_multicast
 
+    def towards(self, mac: int, address: Address) -> None:
+        """A training packet went to this MAC for this address (once per pair is enough)."""
+        _remember(self._towards, mac, address)
+
+    def spoke(self, address: Address, packets: int, multicast: int, *, dns: bool, dhcp: bool) -> None:
+        """All that an address sent in training: as many packets, so many to groups, some as DNS or DHCP server."""
+        if dns or dhcp:
+            self._serves[address] = "dhcp" if dhcp else "dns"
+        self._multicast[address] = [packets, multicast]
+
+    def is_full(self, mac: int) -> bool:
+        """Whether no more addresses are remembered behind a MAC."""
+        return len(self._behind.get(mac, ())) >= MOST_ADDRESSES
+
     def close_training(self) -> None:
         """End training: roles do not change any more."""
         for mac in self._behind.keys() | self._towards.keys():

@@ -1,12 +1,12 @@
 """From scores to anomalous seconds of senders.
 
-A sender is an ingress port, a MAC and an address.  A second of capture time is anomalous for a sender when
+`native_senders.py` does the same in C.  A sender is an ingress port, a MAC and an address.  A second of capture time is anomalous for a sender when
 at least three, and at least half, of the packets for which it is responsible score above the threshold.
 """
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat, starmap
 from typing import Any, Final, NamedTuple
@@ -31,8 +31,8 @@ _GROUP_BIT: Final = 1 << 40
 
 Identity = tuple[str, int, int, Address]
 """Switch, ingress port, MAC, address."""
-Evidence = Callable[[int], Any]
-"""Row of the batch to the data that explain its score."""
+Evidence = Callable[[npt.NDArray[np.int32]], Sequence[Any]]
+"""Rows of the batch to the data that explain their scores, copied, because the batch is about to be released."""
 
 
 @dataclass(slots=True)
@@ -56,7 +56,14 @@ class Tally:
     peak_row: int = -1
     first_over: int = 0
     destinations: set[Address] = field(default_factory=set)
+    counted: int = 0
+    """Destinations, where they were counted elsewhere."""
     evidence: Any = None
+
+    @property
+    def hosts(self) -> int:
+        """Number of different destinations."""
+        return self.counted or len(self.destinations)
 
     def mark(self, score: float, arrival: int, row: int) -> None:
         """One more packet above the threshold."""
@@ -69,7 +76,7 @@ class Tally:
     def keep(self, evidence: Evidence) -> None:
         """Copy the peak's evidence, because the batch is about to be released."""
         if self.peak_row >= 0:
-            self.evidence, self.peak_row = evidence(self.peak_row), -1
+            self.evidence, self.peak_row = evidence(np.array([self.peak_row], np.int32))[0], -1
 
 
 class Packet(NamedTuple):
@@ -117,7 +124,7 @@ class Senders:
         self._second: int | None = None
         self._training = True
         self._tallies: dict[int, Tally] = {}
-        self._evidence: Evidence = lambda _row: None
+        self._evidence: Evidence = lambda rows: rows.tolist()
 
     def add(
         self,
@@ -292,6 +299,11 @@ class Senders:
         )
 
     def _responsible(self, packet: Packet, sender: int) -> int:
+        charged = self._charged(packet, sender)
+        # who began the conversation may be forgotten
+        return sender if self.records[charged] is None else charged
+
+    def _charged(self, packet: Packet, sender: int) -> int:
         if packet.sport < 0:
             return sender
         if packet.quoted:
@@ -331,6 +343,9 @@ def _packets(batch: Columns, switch: str) -> Iterator[Packet]:
 
 def _addresses(batch: Columns, side: str, is_arp: npt.NDArray[np.bool_]) -> Iterator[Address]:
     """The IP address of each row; for ARP the sender or target address in the message."""
-    version = np.where(is_arp, 4, batch["ip_version"])
-    lo = np.where(is_arp, batch[f"arp_{side}_ip"], batch[f"ip_{side}_lo"])
-    return zip(version.tolist(), batch[f"ip_{side}_hi"].tolist(), lo.tolist(), strict=True)
+    version, low = batch["ip_version"], batch[f"ip_{side}_lo"]
+    # received columns may hold anything: see `behaviour/rows.py`
+    version = np.where(is_arp, 4, np.where((version == 4) | (version == 6), version, 0))
+    short = np.where(is_arp, batch[f"arp_{side}_ip"], np.where(version == 4, low & 0xFFFF_FFFF, 0))
+    high = np.where(version == 6, batch[f"ip_{side}_hi"], 0)
+    return zip(version.tolist(), high.tolist(), np.where(version == 6, low, short).tolist(), strict=True)

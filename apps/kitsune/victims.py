@@ -2,15 +2,14 @@
 
     kind   datagrams from a well-known port, to a port, all of them; TCP segments to a port that are no SYNs; pings
 
-A rate limit towards a victim is set from this.  Pure; bounded in hosts and in sources.
+`native_victims.py` does the same in C.  A rate limit towards a victim is set from this.  Pure; bounded in hosts and in sources.
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from apps.evidence import MOST_USUAL
 from apps.kitsune.afterimage import seconds
@@ -26,7 +25,8 @@ MOST_SOURCES_OF_ALL: Final = 262_144
 """... and of all."""
 _WELL_KNOWN: Final = 1_024
 _SYN: Final = 0x02
-_BACK_S: Final = 60
+_ECHO, _ECHO6 = 8, 128
+BACK_S: Final = 60
 """Ports may be this far behind one another; time that goes back farther was set."""
 
 HostKind = tuple[int, int]
@@ -60,15 +60,17 @@ class VictimRates:
 
     def add(self, batch: Columns, trained: int) -> None:
         """Take a batch of which the first `trained` packets were training."""
-        whole = seconds(batch).astype(np.int64)
-        for training, rows in ((True, slice(0, trained)), (False, slice(trained, None))):
-            for second, kind, source, count in _grouped(batch, whole, rows):
-                if second > self._second or second < self._second - _BACK_S:
-                    self._second, self._last, self._now = second, self._now, Counter()
-                if kind in self._now or len(self._now) < MOST_KINDS:
-                    self._now[kind] += count
-                if training:
-                    self._learn(kind, source, count)
+        for row, (second, source, host, kinds) in enumerate(_packets(batch)):
+            if not kinds:
+                continue
+            if second > self._second or second < self._second - BACK_S:
+                self._second, self._last, self._now = second, self._now, Counter()
+            for kind in kinds:
+                key = host, kind
+                if key in self._now or len(self._now) < MOST_KINDS:
+                    self._now[key] += 1
+                if row < trained:
+                    self._learn(key, source)
 
     def usual(self, victim: int, kind: int) -> UsualTraffic:
         """What came of this kind to a host."""
@@ -103,63 +105,56 @@ class VictimRates:
             TypeError, ValueError: the state is not one.
         """
         self = cls()
+        self.restore(state)
+        return self
+
+    def restore(self, state: Iterable[Any]) -> None:
+        """Add what was learnt before; raises `TypeError` or `ValueError`."""
         for host, kind, highest, packets, sources in state:
             key = int(host), int(kind)
             self._highest[key], self._packets[key] = int(highest), int(packets)
             self._sources[key] = Counter({int(source): int(count) for source, count in sources})
-        return self
 
-    def _learn(self, key: HostKind, source: int, count: int) -> None:
+    def _learn(self, key: HostKind, source: int) -> None:
         if key not in self._highest and len(self._highest) >= MOST_KINDS:
             return
         self._highest[key] = max(self._highest.get(key, 0), self._now[key])
-        self._packets[key] += count
+        self._packets[key] += 1
         sources = self._sources.setdefault(key, Counter())
         if source not in sources:
             if len(sources) >= MOST_SOURCES or self._named >= MOST_SOURCES_OF_ALL:
                 return
             self._named += 1
-        sources[source] += count
+        sources[source] += 1
 
 
-def _grouped(
-    batch: Columns, times: npt.NDArray[np.int64], rows: slice
-) -> Iterable[tuple[int, HostKind, int, int]]:
-    """Second, host and kind, source, and how many packets, in order of time."""
-    columns = {name: batch[name][rows] for name in _COLUMNS}
-    tcp, udp = columns["tcp_sport"] >= 0, columns["udp_sport"] >= 0
-    echo = (columns["icmp_type"] == 8) | (columns["icmp6_type"] == 128)
-    has_address = ((columns["ip_version"] == 4) | (columns["ip_version"] == 6)) & (columns["quoted"] == 0)
-    whole = times[rows]
-    kinds: list[tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]] = [
-        (udp & (columns["udp_sport"] < _WELL_KNOWN), FROM_UDP | columns["udp_sport"].astype(np.int64)),
-        (udp & (columns["udp_sport"] >= _WELL_KNOWN), UDP | columns["udp_dport"].astype(np.int64)),
-        (udp, np.full(len(whole), ANY_UDP)),
-        (tcp & (columns["tcp_flags"] & _SYN == 0), STRAY_TCP | columns["tcp_dport"].astype(np.int64)),
-        (echo & ~tcp & ~udp, np.full(len(whole), ECHO)),
-    ]
-    found: list[tuple[int, HostKind, int, int]] = []
-    for mine, kind in kinds:
-        chosen = mine & has_address
-        if not chosen.any():
+def _packets(batch: Columns) -> Iterator[tuple[int, int, int, list[int]]]:
+    """Second, source, host, and the kinds that a packet belongs to."""
+    names = ("arp_op", "quoted", "ip_version", *_PORTS, "tcp_flags", "icmp_type", "icmp6_type", *_ADDRESSES)
+    whole = seconds(batch).astype(np.int64).tolist()
+    columns = zip(*(batch[name].tolist() for name in names), strict=True)
+    for second, (arp, quoted, version, *ports, flags, icmp, icmp6, to_hi, to_lo, hi, lo) in zip(
+        whole, columns, strict=True
+    ):
+        if arp >= 0 or quoted or version not in (4, 6):
+            yield second, 0, 0, []
             continue
-        table = np.stack(
-            [
-                whole[chosen].astype(np.uint64),
-                kind[chosen].astype(np.uint64),
-                *(columns[name][chosen].astype(np.uint64) for name in _ADDRESSES),
-            ],
-            axis=1,
-        )
-        unique, counts = np.unique(table, axis=0, return_counts=True)
-        for (second, code, version, *ends), count in zip(unique.tolist(), counts.tolist(), strict=True):
-            key = address_of(version, ends[0], ends[1]), code
-            found.append((second, key, address_of(version, ends[2], ends[3]), count))
-    return sorted(found, key=lambda each: each[0])
+        mask = 0xFFFF_FFFF if version == 4 else (1 << 64) - 1
+        source, host = (address_of(version, *end) for end in ((hi, lo & mask), (to_hi, to_lo & mask)))
+        yield second, source, host, _kinds(ports, flags, icmp == _ECHO or icmp6 == _ECHO6)
 
 
-_ADDRESSES: Final = ("ip_version", "ip_dst_hi", "ip_dst_lo", "ip_src_hi", "ip_src_lo")
-_COLUMNS: Final = (
-    *("quoted", "tcp_sport", "tcp_dport", "udp_sport", "udp_dport"),
-    *("tcp_flags", "icmp_type", "icmp6_type", *_ADDRESSES),
-)
+def _kinds(ports: Sequence[int], flags: int, is_ping: bool) -> list[int]:
+    tcp_sport, tcp_dport, udp_sport, udp_dport = ports
+    kinds = []
+    if udp_sport >= 0:
+        kinds += [FROM_UDP | udp_sport if udp_sport < _WELL_KNOWN else UDP | udp_dport & 0xFFFF, ANY_UDP]
+    if tcp_sport >= 0 and not flags & _SYN:
+        kinds.append(STRAY_TCP | tcp_dport & 0xFFFF)
+    if is_ping and tcp_sport < 0 and udp_sport < 0:
+        kinds.append(ECHO)
+    return kinds
+
+
+_PORTS: Final = ("tcp_sport", "tcp_dport", "udp_sport", "udp_dport")
+_ADDRESSES: Final = ("ip_dst_hi", "ip_dst_lo", "ip_src_hi", "ip_src_lo")

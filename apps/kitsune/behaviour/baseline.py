@@ -29,9 +29,9 @@ MOST_EVENTS: Final = 1_024
 MOST_SUBJECTS: Final = 65_536
 LEAST_SCALE: Final = 0.75
 """Events: the scale of the tail where training shows no variation at all."""
-_LEAST_SHARE: Final = 0.25
+LEAST_SHARE: Final = 0.25
 """The scale is at least this share of the highest count of training."""
-_NEIGHBOURS_SHARE: Final = 0.1
+NEIGHBOURS_SHARE: Final = 0.1
 """A subject may do at least this share of what the busiest of all does: a quiet hour of training proves little."""
 
 
@@ -145,15 +145,15 @@ class Baseline:
 
     def __init__(self, windows: int, least_scale: float = LEAST_SCALE, *, own: bool = True) -> None:
         self._windows = windows
-        self._least = least_scale
-        self._own = own
+        self.least_scale = least_scale
+        self.own = own
         self._learning: dict[Any, BlockMaxima] = {}
         self._kinds: dict[Any, BlockMaxima] = {}
         self.highest: dict[Any, list[float]] = {}
         """Highest counts by subject and window."""
         self.shared: dict[Any, list[float]] = {}
         """The same over all subjects, by kind: what somebody unknown may do."""
-        self._own_scale = self._shared_scale = _LEAST_SHARE
+        self._own_scale = self._shared_scale = LEAST_SHARE
         self.exceeded = 0.0
         """How often a block of training was above all others, whoever's counts they were."""
         self.rarity = 0.0
@@ -175,7 +175,7 @@ class Baseline:
             if len(self._kinds) < MOST_SUBJECTS:
                 self._kinds[kind] = kinds
         kinds.see(block, counts)
-        if not self._own:
+        if not self.own:
             return
         maxima = self._learning.get(subject)
         if maxima is None:
@@ -193,13 +193,13 @@ class Baseline:
         """
         self.shared = {kind: maxima.highest(self._windows) for kind, maxima in self._kinds.items()}
         relative, self.exceeded = _excesses(self._kinds.values(), self._windows, early)
-        self._shared_scale = max(relative, _LEAST_SHARE)
+        self._shared_scale = max(relative, LEAST_SHARE)
         late = {
             subject: BlockMaxima({block: counts for block, counts in maxima.blocks.items() if block >= early})
             for subject, maxima in self._learning.items()
         }
         self.highest = {subject: maxima.highest(self._windows) for subject, maxima in late.items()}
-        self._own_scale = max(_excesses(late.values(), self._windows, early)[0], _LEAST_SHARE)
+        self._own_scale = max(_excesses(late.values(), self._windows, early)[0], LEAST_SHARE)
         self._learning.clear()
         self._kinds.clear()
 
@@ -216,15 +216,20 @@ class Baseline:
         shared = self.shared.get(kind) or [0.0] * self._windows
         for number, (count, most) in enumerate(zip(counts, shared, strict=False)):
             if count > most:
-                scale = max(self._least, self._shared_scale * most)
+                scale = max(self.least_scale, self._shared_scale * most)
                 best = best.or_more(self.rarity + (count - most) / scale, number, most)
             if own is not None:
-                usual = max(own[number], _NEIGHBOURS_SHARE * most)
+                usual = max(own[number], NEIGHBOURS_SHARE * most)
                 if count > usual:
                     # who was quiet and becomes busy is so as others are
-                    scale = max(self._least, self._own_scale * usual, _LEAST_SHARE * most)
+                    scale = max(self.least_scale, self._own_scale * usual, LEAST_SHARE * most)
                     best = best.or_more((count - usual) / scale, number, usual)
         return best
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Of the tails beyond a subject's own highest counts, and beyond everybody's, as shares of them."""
+        return self._own_scale, self._shared_scale
 
     def to_state(self) -> dict[str, Any]:
         """Plain values for the model file."""

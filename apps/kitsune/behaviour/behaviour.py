@@ -46,7 +46,9 @@ from apps.kitsune.behaviour.findings import (
     StatisticCounter,
 )
 from apps.kitsune.behaviour.rows import SenderId, packet_rows, parts_of
+from apps.kitsune.blocked import Blocked
 from apps.kitsune.kernel import Columns
+from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.roles import is_inside
 
 CONTACTS: Final[tuple[Statistic, ...]] = ("contacts", "ports", "targets")
@@ -87,18 +89,18 @@ REPLIES_COUNT: Final = 10
 """A reply makes up for so many packets: bulk transfers are acknowledged now and then."""
 CALIBRATION_PACKETS: Final = 5_000
 """Packets at the end of training whose scores say how benign ones lie."""
-_KEPT: Final = 65_536
-_TINY: Final = 1e-300
+KEPT: Final = 65_536
+TINY: Final = 1e-300
 _FIN, _SYN, _RST, _ACK = 0x01, 0x02, 0x04, 0x10
 _WELL_KNOWN: Final = 1_024
-_CHOSEN: Final = 32_768
+CHOSEN: Final = 32_768
 """Clients choose ports from here on by chance (Linux; others from 49,152)."""
-_ASKED_S: Final = 3.0
-_PRESENT_S: Final = 60.0
+ASKED_S: Final = 3.0
+PRESENT_S: Final = 60.0
 """Seconds for which a host that has sent something is present."""
-_THEFT: Final = 5.0
+THEFT: Final = 5.0
 """Events that a claim of the address of a present host counts as."""
-_AGAIN_S: Final = 10.0
+AGAIN_S: Final = 10.0
 
 
 @dataclass(slots=True)
@@ -170,7 +172,7 @@ class Behaviour:
         self._logins: dict[tuple[int, int, int, int], _Login] = {}
         self._callbacks = Callbacks()
         self._called = FoundSoFar()
-        self._strangers: dict[tuple[int, int], None] = {}
+        self._strangers: dict[tuple[int, int, int], None] = {}
         self._tail: deque[tuple[SenderId, float]] = deque(maxlen=CALIBRATION_PACKETS)
         """Senders and times of the last packets of training."""
         self._told: dict[SenderId, float] = {}
@@ -185,7 +187,7 @@ class Behaviour:
         trained: int,
         rescored: Callable[[], npt.NDArray[np.float64]],
         threshold: float = 1.0,
-        cut_off: Callable[[PacketRow], bool] | None = None,
+        blocked: Blocked | None = None,
     ) -> list[Finding]:
         """Takes a batch of which the first `trained` packets were training.
 
@@ -197,7 +199,7 @@ class Behaviour:
             rescored: scores of the last packets of training by the trained model, `CALIBRATION_PACKETS` at most;
                 asked for once, when training ends.
             threshold: Kitsune's.
-            cut_off: whether a packet goes to somebody whose answers a block drops, so that it proves nothing.
+            blocked: blocks in force; a packet to somebody whose answers a block drops proves nothing.
 
         Returns:
             What is worth a message.
@@ -212,7 +214,7 @@ class Behaviour:
             elif self._learning:
                 self._close_training(rescored())
                 logs = self._logs(scores)
-            if cut_off is not None and cut_off(row):
+            if blocked and _is_cut_off(blocked, row):
                 continue
             found += self._row(row, block)
             if block < 0 and logs[number] > 0:
@@ -243,7 +245,7 @@ class Behaviour:
         return found
 
     def _logs(self, scores: npt.NDArray[np.float64]) -> list[float]:
-        logs: list[float] = np.log(np.maximum(scores, _TINY) / self.line).tolist()
+        logs: list[float] = np.log(np.maximum(scores, TINY) / self.line).tolist()
         return logs
 
     def _calibrate(self, scores: npt.NDArray[np.float64]) -> None:
@@ -363,10 +365,10 @@ class Behaviour:
         return self._strange(asked, block)
 
     def _fresh_stranger(self, source: int, victim: tuple[int, int]) -> bool:
-        key = (source, hash(victim))
+        key = (source, *victim)
         if key in self._strangers:
             return False
-        if len(self._strangers) >= _KEPT:
+        if len(self._strangers) >= KEPT:
             self._strangers.clear()
         self._strangers[key] = None
         return True
@@ -390,7 +392,7 @@ class Behaviour:
         if login is None:
             if row.flags & (_SYN | _ACK | _RST | _FIN) != _SYN:
                 return []
-            if len(self._logins) >= _KEPT:
+            if len(self._logins) >= KEPT:
                 self._logins.clear()
             self._logins[key] = _Login(row.sender, row.length)
             weight = 0.5
@@ -429,7 +431,7 @@ class Behaviour:
         key = (row.source, row.target)
         mine = self._exchanges.get(key)
         if mine is None:
-            if len(self._exchanges) >= _KEPT:
+            if len(self._exchanges) >= KEPT:
                 self._exchanges.clear()
             mine = self._exchanges[key] = _Exchange()
         if mine.second != second:
@@ -446,18 +448,22 @@ class Behaviour:
         return [] if seen is None else [self._finding("one_way", row, seen)]
 
     def _ask(self, row: PacketRow) -> None:
-        if len(self._asked) >= _KEPT:
+        if len(self._asked) >= KEPT:
             self._asked.clear()
         self._asked[row.source, row.target] = row.time
 
     def _claim(self, row: PacketRow, block: int) -> list[Finding]:
         """An ARP reply; one that was asked for is none."""
         asked = self._asked.get((row.target, row.source))
-        if asked is not None and row.time - asked <= _ASKED_S:
+        if asked is not None and row.time - asked <= ASKED_S:
             return []
         who: SenderId = (*row.sender[:3], 0)  # it may claim several addresses
         seen = self._counters["claims"].see(who, who, row.time, block)
         return [] if seen is None else [self._finding("claims", row._replace(sender=who), seen)]
+
+    def proven(self, address: int) -> bool:
+        """Whether the address has completed a TCP handshake."""
+        return self.contacts.proven(address)
 
     def forged(self, sender: SenderId) -> bool:
         """Whether the sender's address belonged to another MAC in training."""
@@ -468,10 +474,10 @@ class Behaviour:
         """A claim of an address that belongs to another, who is present."""
         if block >= 0 or not row.source or not self.forged(row.sender):
             return []
-        if row.time - self._spoke.get(row.source, -math.inf) > _PRESENT_S:
+        if row.time - self._spoke.get(row.source, -math.inf) > PRESENT_S:
             return []
         who: SenderId = (*row.sender[:3], 0)
-        seen = self._counters["thefts"].see(who, who, row.time, block, _THEFT)
+        seen = self._counters["thefts"].see(who, who, row.time, block, THEFT)
         return (
             []
             if seen is None
@@ -490,9 +496,9 @@ class Behaviour:
 
     def _over(self, row: PacketRow, score: float) -> list[Finding]:
         """At most once in ten seconds for each sender."""
-        if row.time - self._told.get(row.sender, -math.inf) < _AGAIN_S:
+        if row.time - self._told.get(row.sender, -math.inf) < AGAIN_S:
             return []
-        if len(self._told) >= _KEPT:
+        if len(self._told) >= KEPT:
             self._told.clear()
         self._told[row.sender] = row.time
         seen = SeenCount(0.0, 0.0, score, 0.0, self.line)
@@ -557,6 +563,11 @@ def _flooded(failed: EndedContact) -> int:
     return failed.service
 
 
+def _is_cut_off(blocked: Blocked, row: PacketRow) -> bool:
+    """Whether a packet goes to a blocked host, whose answers are dropped."""
+    return blocked.covers(row.sender[0], mac_text(row.to_mac), ip_text(*parts_of(row.target)))
+
+
 def _protocol(service: int) -> int:
     """The service without its port."""
     return service & ~0xFFFF
@@ -564,7 +575,7 @@ def _protocol(service: int) -> int:
 
 def _named(service: int) -> int:
     """The service; one for all ports that clients choose by chance."""
-    return service if service & 0xFFFF < _CHOSEN else _protocol(service) | _CHOSEN
+    return service if service & 0xFFFF < CHOSEN else _protocol(service) | CHOSEN
 
 
 def _is_reflected(failed: EndedContact) -> bool:

@@ -35,7 +35,7 @@ MOST_NATS: Final = 50.0
 """... nor anything beyond, since it decides everything."""
 LONGEST_SHARE: Final = 1 / 3
 """Of training: a count of ten minutes cannot be compared with five minutes of training."""
-_KEPT: Final = 65_536
+KEPT: Final = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class FoundSoFar:
         least = LEAST_SHARE * faded if faded > DECIDING_NATS else LEAST_STEP
         if nats < LEAST_NATS or nats - faded < least:
             return 0.0
-        if former is None and len(self._reported) >= _KEPT:
+        if former is None and len(self._reported) >= KEPT:
             del self._reported[next(iter(self._reported))]
         self._reported[subject] = _Reported(nats, time)
         return nats - faded
@@ -114,11 +114,11 @@ class StatisticCounter:
         self.sums = SlidingSums(windows)
         self.baseline = Baseline(len(windows), least_scale, own=own)
         self.found = FoundSoFar()
-        self._usable = len(windows)
+        self.usable = len(windows)
 
     def trained(self, seconds: float) -> None:
         """Training has ended: of a longer window than a third of it too little is known."""
-        self._usable = max(1, sum(window <= seconds * LONGEST_SHARE for window in self.sums.windows))
+        self.usable = max(1, sum(window <= seconds * LONGEST_SHARE for window in self.sums.windows))
 
     def see(
         self, subject: Any, whose: Any, time: float, block: int, weight: float = 1.0, kind: Any = None
@@ -139,5 +139,5 @@ class StatisticCounter:
 
     def measure(self, whose: Any, sums: tuple[float, ...], kind: Any) -> SeenCount:
         """Weigh sums, whatever was found before."""
-        nats, which, usual = self.baseline.nats(whose, sums[: self._usable], kind)
+        nats, which, usual = self.baseline.nats(whose, sums[: self.usable], kind)
         return SeenCount(0.0, nats, sums[which], self.sums.windows[which], usual)

@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from apps.kitsune.afterimage import WIDTH, AfterImage, Mode
-from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, Kernel, load_kernel
+from apps.kitsune.behaviour.native import NativeBehaviour
+from apps.kitsune.kernel import PACKET_FIELDS, ROW_FIELDS, ColumnError, Kernel, load_kernel
 from apps.kitsune.kitnet import KitNet, Layer
+from apps.kitsune.native_senders import NativeSenders
+from apps.kitsune.native_victims import NativeVictimRates
 
 EDGES = (0, 1, -1, 4, 6, 255, 65_535, 65_536, 2**31 - 1, -(2**31), 2**32 - 1, 2**48, 2**63 - 1, -(2**63))
 TIMES = (0.0, -1.0, 1e-300, 1e9, -1e18, float(2**63), 1.8e308, math.inf, -math.inf, math.nan)
@@ -79,6 +82,28 @@ def entry(kernel: Kernel, columns: dict[str, np.ndarray]) -> None:
     assert kernel.lib.afterimage_update(state, struct, given, 10, kernel.pointer("double", out), 1000) == 0
 
 
+def ledgers(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
+    """Senders, behaviour and victims: training, blocks, a batch of anything, findings, what a model keeps."""
+    for _ in range(rounds):
+        senders, rates = NativeSenders(kernel), NativeVictimRates(kernel)
+        behaviour = NativeBehaviour(200, kernel)
+        left = 200
+        for step in range(6):
+            rows = int(random.integers(1, 200))
+            found = batch(random, rows)
+            found |= {name: column(random, kind, rows) for name, _, kind in ROW_FIELDS if name not in found}
+            found.pop("time")
+            scores = random.choice([0.1, 2.0, math.nan, math.inf], rows)
+            trained = min(left, rows)
+            left -= trained
+            how = {"scores": scores, "trained": trained, "line": 1.0, "evidence": lambda chosen: chosen}
+            senders.add(found, f"s{step % 2}", **how)
+            rates.add(found, trained)
+            behaviour.add(found, f"s{step % 2}", scores, trained, lambda: np.full(50, 0.5))
+        senders.finish()
+        rates.to_state(), senders.to_state(), behaviour.to_state()
+
+
 def network(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
     for number in range(rounds):
         width = int(random.integers(2, 30))
@@ -108,6 +133,7 @@ def main() -> None:
     with np.errstate(all="ignore"):
         features(kernel, random, int(rounds))
         network(kernel, random, int(rounds))
+        ledgers(kernel, random, int(rounds))
     print("clean")
 
 

@@ -3,12 +3,10 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
-import apps.kitsune
+from apps.kitsune.kernel import SOURCES
 from tests.requirements import require_program
 
-SOURCES = [Path(apps.kitsune.__file__).with_name(name) for name in ("afterimage.c", "kitnet.c")]
 FLAGS = [
     *("-shared", "-fPIC", "-g", "-O1", "-ffp-contract=off", "-fno-builtin-pow"),
     *("-fsanitize=address,undefined", "-fno-sanitize-recover=all"),

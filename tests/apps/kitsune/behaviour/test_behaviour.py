@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from apps.kitsune.behaviour.behaviour import CONTACTS, Behaviour
+from apps.kitsune.blocked import Blocked
+from apps.messages import Target
 from due import RecordBatch
 from sdnator.testing.packet_rows import blank
+from tests.apps.firewall.enforcement.test_eve import decision
 
 HOST, SERVER, STRANGER = 0x0A000005, 0x0A000001, 0x0A0000C8
 FIN, SYN, SYN_ACK, ACK, RST = 0x01, 0x02, 0x12, 0x10, 0x04
@@ -266,7 +269,9 @@ def test_packets_to_a_blocked_host_prove_nothing():
     """Its answers are dropped, so everything towards it fails."""
     behaviour = quiet_network()
     rows = [packet(700 + n / 50, HOST, STRANGER, 50_000, 1_000 + n, SYN) for n in range(60)]
-    assert feed(behaviour, rows, cut_off=lambda row: row.target == STRANGER) == []
+    blocked = Blocked()
+    blocked.decide(decision(switch="s1", target=Target(kind="ip", address="10.0.0.200")))
+    assert feed(behaviour, rows, blocked=blocked) == []
 
 
 def test_only_what_is_new_is_said_again():

@@ -1,0 +1,536 @@
+/* What senders do beyond training: `behaviour/behaviour.py` in C, with equal results.
+ *
+ *     rows ──► contacts, logins, exchanges, ARP, scores ──► Counter ──► BehaviourEvent
+ *
+ * Of training it returns sums, from which Python makes baselines; afterwards findings.
+ */
+
+#include "ledger_found.h"
+
+typedef struct {
+    Behaviour *b;
+    const Row *row;
+    Subject sender;
+    int block;
+} Turn;
+
+/* ---- contacts that ended */
+
+static int64_t flooded(const Ended *ended)
+{
+    if (protocol_of(ended->service) == UDP && ended->reverse - UDP < WELL_KNOWN)
+        return FROM_UDP | (ended->reverse - UDP);
+    if (protocol_of(ended->service) == TCP && !ended->is_syn)
+        return STRAY_TCP | (ended->service - TCP);
+    return ended->service;
+}
+
+static void contact_views(Behaviour *b, const Ended *ended, int block)
+{
+    const Subject *sender = &ended->sender;
+    int inside = is_inside(address_in(sender));
+    int64_t protocol = protocol_of(ended->service);
+    int64_t named = (ended->service & 0xFFFF) < b->limits.chosen ? ended->service : protocol | b->limits.chosen;
+    Subject whose = with_more(*sender, (uint64_t)protocol, NOBODY);
+    struct {
+        Subject subject;
+        uint64_t kind;
+        Address victim;
+        int64_t single;
+    } view[3] = {
+        {whose, kind_of(protocol, inside), NOBODY, NO_SERVICE},
+        {with_more(*sender, 0, ended->target), kind_of(protocol, inside), ended->target, NO_SERVICE},
+        {with_more(*sender, (uint64_t)ended->service, NOBODY), kind_of(named, inside), NOBODY, ended->service},
+    };
+    /* hosts answer echo requests of everybody: that they do makes up for nothing */
+    int counts = ended->failed || ended->service == ECHO, which = NONE;
+    Seen best = {0};
+    for (int what = CONTACTS; what <= TARGETS; what++) {
+        double sums[MOST_WINDOWS];
+        if (count(b, what, &view[what].subject, ended->time, counts ? 1.0 : -1.0, sums))
+            return;
+        if (block >= 0)
+            taught(b, what, block, sender, NOBODY, protocol, view[what].kind, sums);
+        else if (counts) {
+            Seen seen = counter_measure(&b->counter[what], &b->limits, &whose, sums, view[what].kind);
+            if (seen.total >= b->limits.least_nats && (which == NONE || seen.total >= best.total)) {
+                best = seen;
+                which = what;
+            }
+        }
+    }
+    if (which == NONE)
+        return;
+    best.nats = found_added(&b->failures, &b->limits, sender, best.total, ended->time);
+    if (best.nats)
+        found(b, which, sender, view[which].victim, view[which].single, &best, ended->time, ended->arrival);
+}
+
+static void count_stranger(Behaviour *b, Address victim, int64_t what, const Ended *ended, int block)
+{
+    Subject key = pair_of((uint32_t)what, is_six(victim), victim, NOBODY);
+    double sums[MOST_WINDOWS];
+    Seen seen;
+    if (count(b, STRANGERS, &key, ended->time, 1.0, sums))
+        return;
+    if (block >= 0)
+        taught(b, STRANGERS, block, NULL, victim, what, 0, sums);
+    else if (weighed(b, STRANGERS, &key, sums, 0, ended->time, &seen))
+        found(b, STRANGERS, NULL, victim, what, &seen, ended->time, ended->arrival);
+}
+
+static int is_fresh_stranger(Behaviour *b, const Subject *key)
+{
+    if (table_find(&b->strangers, key) != NONE)
+        return 0;
+    if (b->strangers.live >= b->limits.kept)
+        table_clear(&b->strangers);
+    added(b, &b->strangers, key);
+    return 1;
+}
+
+static void strange(Behaviour *b, const Ended *ended, int block)
+{
+    Address source = address_in(&ended->sender), target = ended->target;
+    Subject known = pair_of(is_six(source), 0, source, NOBODY);
+    if (block < 0 && table_find(&b->owners, &known) != NONE)
+        return;
+    int64_t what = flooded(ended);
+    Subject key = pair_of((uint32_t)what, is_six(source), source, target);
+    if (!is_fresh_stranger(b, &key))
+        return;
+    count_stranger(b, target, what, ended, block);
+    if (protocol_of(what) != UDP)
+        return;
+    Subject everywhere = pair_of(ANY_UDP, is_six(source), source, target), port = pair_of(ANY_UDP, 2 | (uint64_t)is_six(target) | (uint64_t)what << 32, NOBODY, target);
+    if (is_fresh_stranger(b, &everywhere) && is_fresh_stranger(b, &port))
+        count_stranger(b, target, ANY_UDP, ended, block);
+}
+
+/* FTP's data connections and ident connect back by design. */
+static int is_by_design(int64_t service)
+{
+    return service == (TCP | 20) || service == (TCP | 113);
+}
+
+static void callback(Behaviour *b, const Ended *ended)
+{
+    if (ended->service >> 16 != TCP >> 16 || is_by_design(ended->service) || is_by_design(ended->reverse))
+        return;
+    Address host = address_in(&ended->sender);
+    Subject key = pair_of(is_six(host), 0, ended->target, host);
+    int32_t at = table_find(&b->visits, &key);
+    if (at == NONE)
+        return;
+    Visit visit = *(Visit *)payload(&b->visits, at);
+    if (ended->time - visit.time > b->limits.soon_s)
+        return;
+    Seen seen = {found_added(&b->called, &b->limits, &visit.sender, b->callback_nats, ended->time), b->callback_nats, 1, ended->time - visit.time, b->callback_usual};
+    if (seen.nats)
+        found(b, CALLBACKS, &visit.sender, host, visit.service, &seen, ended->time, ended->arrival);
+}
+
+static void visited(Behaviour *b, const Subject *sender, Address source, Address host, int64_t service, double time)
+{
+    Subject key = pair_of(is_six(host), 0, source, host);
+    int32_t at = table_find(&b->visits, &key);
+    Visit *visit = at != NONE ? payload(&b->visits, at) : added(b, &b->visits, &key);
+    if (!visit)
+        return;
+    Visit now = {*sender, service, time};
+    *visit = now;
+    if (b->visits.live > b->limits.most_logins)
+        table_drop(&b->visits, b->visits.oldest);
+}
+
+static void contact_ended(Behaviour *b, const Ended *ended, int block)
+{
+    int is_reflected = protocol_of(flooded(ended)) == FROM_UDP && !is_inside(address_in(&ended->sender));
+    if (!(ended->failed && ended->half_open) && !is_reflected)
+        contact_views(b, ended, block);
+    if (ended->failed)
+        strange(b, ended, block);
+    else if (block < 0)
+        callback(b, ended);
+}
+
+static void ping(Turn *t)
+{
+    const Row *row = t->row;
+    if (row->service != ECHO || row->answer || row->group || row->quoted || !is_some(row->source))
+        return;
+    Ended asked = {1, row->time, t->sender, row->source, row->target, ECHO, ECHO, 0, 0, row->arrival};
+    strange(t->b, &asked, t->block);
+}
+
+/* ---- logins */
+
+static int is_login(const Behaviour *b, int64_t service)
+{
+    int64_t port = service - TCP;
+    return port >= 0 && port < 65536 && b->login_ports[port >> 3] >> (port & 7) & 1;
+}
+
+static double login_change(const Behaviour *b, Login *login, const Row *row, uint32_t length)
+{
+    if (login->settled)
+        return 0;
+    login->moved += length;
+    int is_long = login->moved >= b->limits.refused_bytes;
+    login->settled = is_long || row->flags & (RST | FIN);
+    return !login->settled ? 0 : is_long ? -0.5 : 0.5;
+}
+
+static double login_weight(Turn *t, const Subject *key, uint32_t length, Subject *who)
+{
+    Behaviour *b = t->b;
+    int32_t at = table_find(&b->logins, key);
+    if (at != NONE) {
+        Login *login = payload(&b->logins, at);
+        *who = login->sender;
+        return login_change(b, login, t->row, length);
+    }
+    if ((t->row->flags & (SYN | ACK | RST | FIN)) != SYN)
+        return 0;
+    if (b->logins.live >= b->limits.kept)
+        table_clear(&b->logins);
+    Login *login = added(b, &b->logins, key);
+    if (!login)
+        return 0;
+    login->sender = *who = t->sender;
+    login->moved = length;
+    return 0.5;
+}
+
+static void login(Turn *t)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    if (!row->is_tcp || row->quoted)
+        return;
+    int by_server = !is_login(b, row->service);
+    if (by_server && (!(row->flags & (RST | FIN)) || !is_login(b, row->reverse)))
+        return;
+    Address source = by_server ? row->target : row->source, target = by_server ? row->source : row->target;
+    int64_t service = by_server ? row->reverse : row->service, reverse = by_server ? row->service : row->reverse;
+    Subject key = pair_of(join_ports((uint64_t)service, (uint64_t)reverse), is_six(source), source, target), who;
+    double weight = login_weight(t, &key, by_server ? 0 : row->length, &who), sums[MOST_WINDOWS];
+    if (!weight)
+        return;
+    Subject subject = with_more(who, (uint64_t)service, target), whose = with_more(who, (uint64_t)service, NOBODY);
+    uint64_t kind = kind_of(service, is_inside(source));
+    if (count(b, LOGINS, &subject, row->time, weight, sums))
+        return;
+    if (t->block >= 0) {
+        taught(b, LOGINS, t->block, &who, NOBODY, service, kind, sums);
+        return;
+    }
+    Seen seen = counter_measure(&b->counter[LOGINS], &b->limits, &whose, sums, kind);
+    if (seen.total >= b->limits.least_nats)
+        visited(b, &who, source, target, service, row->time);
+    seen.nats = found_added(&b->counter[LOGINS].reported, &b->limits, &who, seen.total, row->time);
+    if (seen.nats)
+        found(b, LOGINS, &who, target, service, &seen, row->time, row->arrival);
+}
+
+/* ---- one-way traffic */
+
+static int comes_first(Address a, Address b)
+{
+    return a.hi != b.hi ? a.hi < b.hi : a.lo <= b.lo;
+}
+
+/* Both directions between the hosts of a packet: the entry, and which half is that of its sender. */
+static Exchanges *exchanges_of(Behaviour *b, const Row *row, int *mine, int make)
+{
+    int first = comes_first(row->source, row->target);
+    Subject key = first ? pair_of(is_six(row->source), 0, row->source, row->target) : pair_of(is_six(row->source), 0, row->target, row->source);
+    int32_t at = table_find(&b->exchanges, &key);
+    *mine = !first;
+    if (at != NONE)
+        return payload(&b->exchanges, at);
+    return make ? added(b, &b->exchanges, &key) : NULL;
+}
+
+static Exchange *begun_exchange(Behaviour *b, const Row *row, Exchange *half, int *mine)
+{
+    if (half->is_there)
+        return half;
+    if (b->exchange_halves >= b->limits.kept) {
+        table_clear(&b->exchanges);
+        b->exchange_halves = 0;
+        Exchanges *both = exchanges_of(b, row, mine, 1);
+        if (!both)
+            return NULL;
+        half = &both->half[*mine];
+    }
+    b->exchange_halves++;
+    half->is_there = 1;
+    half->second = -1;
+    return half;
+}
+
+static void learn_one_way(Turn *t, int64_t kind, int64_t alone)
+{
+    int number = kind == TCP ? 0 : kind == UDP ? 1 : kind == ECHO ? 2 : NONE;
+    double sums[MOST_WINDOWS] = {(double)alone};
+    if (number != NONE) { /* of a block only the highest counts matter */
+        double *most = &t->b->one_way_most[number][t->block];
+        if (!(sums[0] > *most))
+            return;
+        *most = sums[0];
+    }
+    taught(t->b, ONE_WAY, t->block, &t->sender, NOBODY, kind, (uint64_t)kind << 1 | 1, sums);
+}
+
+static void one_way(Turn *t)
+{
+    const Row *row = t->row;
+    Behaviour *b = t->b;
+    if (row->group || row->quoted || !is_some(row->source) || row->service >= ARP)
+        return;
+    int mine, refused = row->answer || (row->is_tcp && is_tcp_reply(row->flags));
+    Exchanges *both = exchanges_of(b, row, &mine, !refused);
+    if (!both)
+        return;
+    Exchange *back = same_address(row->source, row->target) ? &both->half[mine] : &both->half[!mine];
+    if (back->is_there && back->second == row->second && !refused)
+        back->back++;
+    if (refused)
+        return;
+    Exchange *here = begun_exchange(b, row, &both->half[mine], &mine);
+    if (!here)
+        return;
+    if (here->second != row->second) {
+        here->second = row->second;
+        here->out = here->back = here->due = 0;
+    }
+    here->out++;
+    int64_t alone = here->out - b->limits.replies_count * here->back, kind = protocol_of(row->service);
+    if (t->block >= 0) {
+        learn_one_way(t, kind, alone);
+        return;
+    }
+    if (alone < here->due)
+        return;
+    here->due = alone + (alone >= 8 ? alone / 8 : 1);
+    double sums[MOST_WINDOWS] = {(double)alone};
+    Subject whose = with_more(t->sender, (uint64_t)kind, NOBODY);
+    Seen seen;
+    if (weighed(b, ONE_WAY, &whose, sums, (uint64_t)kind << 1 | 1, row->time, &seen))
+        found(b, ONE_WAY, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
+}
+
+/* ---- ARP */
+
+static void count_claim(Turn *t, int what, Address victim, double weight)
+{
+    const Row *row = t->row;
+    Subject who = t->sender;
+    double sums[MOST_WINDOWS];
+    Seen seen;
+    who.word[1] &= 0xFFFF;
+    who.word[2] = who.word[3] = 0; /* it may claim several addresses */
+    if (count(t->b, what, &who, row->time, weight, sums))
+        return;
+    if (t->block >= 0)
+        taught(t->b, what, t->block, &who, NOBODY, NO_SERVICE, 0, sums);
+    else if (weighed(t->b, what, &who, sums, 0, row->time, &seen))
+        found(t->b, what, &who, victim, row->service, &seen, row->time, row->arrival);
+}
+
+static void theft(Turn *t)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    if (t->block >= 0 || !is_some(row->source))
+        return;
+    Subject address = pair_of(0, 0, row->source, NOBODY), owner = pair_of(0, row->mac, row->source, NOBODY);
+    int32_t at = table_find(&b->owners, &address);
+    if (at == NONE || table_find(&b->owner_macs, &owner) != NONE)
+        return;
+    if (row->time - *(double *)payload(&b->owners, at) > b->limits.present_s)
+        return;
+    count_claim(t, THEFTS, row->source, b->limits.theft);
+}
+
+static void arp(Turn *t)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    if (row->service != ARP)
+        return;
+    theft(t);
+    if (row->answer) {
+        Subject key = pair_of(0, 0, row->target, row->source);
+        int32_t at = table_find(&b->asked, &key);
+        if (at == NONE || !(row->time - *(double *)payload(&b->asked, at) <= b->limits.asked_s))
+            count_claim(t, CLAIMS, row->target, 1.0);
+        return;
+    }
+    Subject key = pair_of(0, 0, row->source, row->target);
+    if (b->asked.live >= b->limits.kept)
+        table_clear(&b->asked);
+    int32_t at = table_find(&b->asked, &key);
+    double *time = at != NONE ? payload(&b->asked, at) : added(b, &b->asked, &key);
+    if (time)
+        *time = row->time;
+}
+
+static void spoke(Turn *t)
+{
+    const Row *row = t->row;
+    if (!is_some(row->source))
+        return;
+    Subject owner = pair_of(is_six(row->source), row->mac, row->source, NOBODY);
+    int32_t at = table_find(&t->b->owner_macs, &owner);
+    if (at != NONE)
+        *(double *)payload(&t->b->owners, *(int32_t *)payload(&t->b->owner_macs, at)) = row->time;
+}
+
+/* ---- scores */
+
+static void score(Turn *t, double log)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    double sums[MOST_WINDOWS];
+    Seen seen;
+    if (count(b, SCORES, &t->sender, row->time, log, sums) || !weighed(b, SCORES, &t->sender, sums, 0, row->time, &seen))
+        return;
+    Subject there = contact_of(row->source, row->target, row->service), back = contact_of(row->target, row->source, row->reverse);
+    int supporting = came_about(b, &there) || came_about(b, &back) || row->group || table_find(&b->senders, &t->sender) != NONE;
+    BehaviourEvent *event = found(b, SCORES, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
+    if (event)
+        event->supporting = supporting;
+}
+
+static void over(Turn *t, double score)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    int32_t at = table_find(&b->told, &t->sender);
+    if (at != NONE && row->time - *(double *)payload(&b->told, at) < b->limits.again_s)
+        return;
+    if (b->told.live >= b->limits.kept) {
+        table_clear(&b->told);
+        at = NONE;
+    }
+    double *time = at != NONE ? payload(&b->told, at) : added(b, &b->told, &t->sender);
+    if (!time)
+        return;
+    *time = row->time;
+    Seen seen = {0, 0, score, 0, 0};
+    BehaviourEvent *event = found(b, THRESHOLD, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
+    if (event)
+        event->supporting = 1;
+}
+
+/* ---- training */
+
+static void know_owner(Behaviour *b, Address address, uint64_t mac, const Subject *sender)
+{
+    Subject by_address = pair_of(is_six(address), 0, address, NOBODY), owner = pair_of(is_six(address), mac, address, NOBODY);
+    if (table_find(&b->owner_macs, &owner) != NONE)
+        return;
+    int32_t at = table_find(&b->owners, &by_address);
+    if (at == NONE) {
+        at = table_add(&b->owners, &by_address);
+        if (at == NONE) {
+            b->failed = 1;
+            return;
+        }
+        *(double *)payload(&b->owners, at) = -INFINITY;
+    }
+    int32_t *number = added(b, &b->owner_macs, &owner);
+    if (!number)
+        return;
+    *number = at;
+    BehaviourEvent *event = sender ? new_event(b, NEW_OWNER, -1) : NULL;
+    if (event)
+        set_who(event, sender);
+}
+
+static int train(Turn *t)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    int64_t block = b->packets / b->per_block;
+    if (!b->packets++)
+        b->begun = row->time;
+    b->seconds = fmax(row->time - b->begun, 1.0);
+    if (table_find(&b->senders, &t->sender) == NONE && added(b, &b->senders, &t->sender)) {
+        BehaviourEvent *event = new_event(b, NEW_SENDER, -1);
+        if (event)
+            set_who(event, &t->sender);
+    }
+    if (is_some(row->source))
+        know_owner(b, row->source, row->mac, &t->sender);
+    int64_t most = b->limits.calibration;
+    Trained last = {t->sender, row->time};
+    b->tail[(b->tail_from + b->tail_count) % most] = last;
+    if (b->tail_count < most)
+        b->tail_count++;
+    else
+        b->tail_from = (b->tail_from + 1) % most;
+    return block < b->limits.blocks ? (int)block : b->limits.blocks - 1;
+}
+
+static void follow(Turn *t)
+{
+    Ended ended;
+    while (next_due(t->b, t->row->time, &ended))
+        contact_ended(t->b, &ended, t->block);
+    if (follow_contact(t->b, t->row, &t->sender, &ended))
+        contact_ended(t->b, &ended, t->block);
+    login(t);
+    one_way(t);
+    ping(t);
+    arp(t);
+    spoke(t);
+}
+
+/* ---- the interface */
+
+/* Rows first to last; they train where `logs` is NULL.  -1 when memory is short, -2 for rows out of range. */
+int behaviour_add(Behaviour *b, const PacketRows *rows, long n, long first, long last, uint16_t number, const double *scores, const double *logs, double threshold)
+{
+    if (first < 0 || last < first || last > n)
+        return -2;
+    b->event_count = 0;
+    for (long i = first; i < last && !b->failed; i++) {
+        Row row;
+        read_row(rows, i, &row);
+        Turn turn = {b, &row, sender_of(number, &row, row.source, 0), -1};
+        if (!logs)
+            turn.block = train(&turn);
+        if (is_blocked(&b->blocked, number, row.to_mac, row.target))
+            continue;
+        follow(&turn);
+        if (logs && logs[i] > 0) {
+            score(&turn, logs[i]);
+            if (scores[i] >= threshold)
+                over(&turn, scores[i]);
+        }
+    }
+    return b->failed ? -1 : 0;
+}
+
+/* The scores of the last packets of training; logs[i] is that of the i-th of the last n. */
+int behaviour_calibrate(Behaviour *b, const double *logs, long n, int32_t blocks)
+{
+    b->event_count = 0;
+    if (n > b->tail_count)
+        return -2;
+    long per_block = (n + blocks - 1) / blocks > 1 ? (n + blocks - 1) / blocks : 1;
+    for (long i = 0; i < n && !b->failed; i++) {
+        const Trained *each = &b->tail[(b->tail_from + b->tail_count - n + i) % b->limits.calibration];
+        double sums[MOST_WINDOWS];
+        if (logs[i] > 0 && !count(b, SCORES, &each->sender, each->time, logs[i], sums))
+            taught(b, SCORES, (int)(i / per_block), &each->sender, NOBODY, NO_SERVICE, 0, sums);
+    }
+    b->tail_count = b->tail_from = 0;
+    return b->failed ? -1 : 0;
+}
+
+#include "ledger_store.h"

@@ -1,0 +1,154 @@
+"""What the C ledgers (senders, behaviour, victims) share: packet columns as pointers, numbers of switches, blocks.
+
+A ledger takes a batch in one call and returns events: no Python object a packet.
+"""
+
+import ipaddress
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.afterimage import seconds
+from apps.kitsune.blocked import Blocked
+from apps.kitsune.kernel import ROW_FIELDS, ColumnError, Columns, Kernel, contiguous
+from apps.kitsune.names import ip_text, mac_text
+
+WORDS: Final = 6
+"""Numbers of 64 bits in a key of the tables."""
+_ANY_SWITCH: Final = 0xFFFF
+_LOW: Final = (1 << 64) - 1
+_SIX: Final = 1 << 16
+_VICTIM_SIX: Final = 1 << 17
+Address = tuple[int, int, int]
+
+
+class KernelRows(Mapping[str, npt.NDArray[Any]]):
+    """A batch whose columns the ledgers read; made once and handed to all of them.
+
+    Raises:
+        ColumnError: a column is missing, no number, or of another length.
+    """
+
+    def __init__(self, kernel: Kernel, batch: Columns) -> None:
+        self._batch = batch
+        try:
+            self._kept = {
+                name: contiguous(batch[name], kind) for name, _, kind in ROW_FIELDS if name != "time"
+            }
+        except KeyError as error:
+            raise ColumnError(f"the batch has no column {error}") from None
+        self._kept["time"] = seconds(batch)
+        shapes = {column.shape for column in self._kept.values()}
+        if len(shapes) != 1 or self._kept["time"].ndim != 1:
+            raise ColumnError(f"columns of a batch are one-dimensional and equally long, not {shapes}")
+        self.count = len(self._kept["time"])
+        self.pointer = kernel.ffi.new("PacketRows *")
+        for name, c_type, _ in ROW_FIELDS:
+            setattr(self.pointer, name, kernel.pointer(f"const {c_type}", self._kept[name]))
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        # every reader asks for seconds first
+        return self._kept["time"] if name == "time_s" else self._batch[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._batch)
+
+    def __len__(self) -> int:
+        return len(self._batch)
+
+
+def rows_of(kernel: Kernel, batch: Columns) -> KernelRows:
+    """The batch as it is, if it was made ready before."""
+    return batch if isinstance(batch, KernelRows) else KernelRows(kernel, batch)
+
+
+def check(failed: int, what: str) -> None:
+    """Turn a code of the C interface into an exception."""
+    if failed == -1:
+        raise MemoryError(f"{what}: no memory for another entry")
+    if failed:
+        raise ColumnError(f"{what}: the numbers handed over do not fit each other")
+
+
+def seed() -> int:
+    """For hashing, so that nobody can choose keys that collide."""
+    return int.from_bytes(os.urandom(8), "little")
+
+
+def events_in(kernel: Kernel, dtype: np.dtype[np.void], pointer: Any, count: int) -> list[tuple[Any, ...]]:
+    """Events of a ledger as tuples in the order of the fields."""
+    if not count:
+        return []
+    data = kernel.ffi.buffer(pointer, count * dtype.itemsize)
+    found: list[tuple[Any, ...]] = np.frombuffer(data, dtype).tolist()
+    return found
+
+
+class SwitchNumbers:
+    """Short numbers for the names of switches, and which blocks concern them."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self._numbers: dict[str, int] = {}
+        self._applied = (0, 0)
+
+    def number(self, name: str) -> int:
+        """The number of a switch, a new one for a new name."""
+        found = self._numbers.get(name)
+        if found is None:
+            if len(self.names) >= _ANY_SWITCH:
+                raise ValueError(f"more than {_ANY_SWITCH:,} switches")
+            found = self._numbers[name] = len(self.names)
+            self.names.append(name)
+        return found
+
+    def changed_blocks(self, blocked: Blocked) -> npt.NDArray[np.uint64] | None:
+        """Rows of number, is MAC, version and two halves, if they differ from those of the last call."""
+        state = (blocked.changes, len(self.names))
+        if state == self._applied or (not blocked.changes and not self._applied[0]):
+            return None
+        self._applied = state
+        rows = []
+        for switch, text in blocked.targets:
+            number = _ANY_SWITCH if switch == "*" else self._numbers.get(switch)
+            target = _target(text)
+            if number is not None and target is not None:
+                rows.append((number, *target))
+        return np.array(rows, dtype=np.uint64).reshape(-1, 5)
+
+
+@lru_cache(maxsize=65_536)
+def _target(text: str) -> tuple[int, int, int, int] | None:
+    """Whether it is a MAC, IP version and two halves; None for what is the name of no sender."""
+    try:
+        parsed = ipaddress.ip_address(text)
+    except ValueError:
+        try:
+            mac = int(text.replace(":", ""), 16)
+            return (1, 0, 0, mac) if mac_text(mac) == text else None
+        except (ValueError, OverflowError):
+            return None
+    whole = int(parsed)
+    found = (0, parsed.version, whole >> 64, whole & _LOW)
+    return found if ip_text(*found[1:]) == text else None
+
+
+def sender_words(number: int, port: int, mac: int, address: Address, more: int = 0) -> tuple[int, ...]:
+    """The key of a sender, as `sender_of` in C makes it."""
+    version, hi, lo = address
+    return (mac | port << 48, number | (version == 6) * _SIX | more << 32, hi, lo, 0, 0)
+
+
+def sender_parts(words: Sequence[int]) -> tuple[int, int, int, Address]:
+    """Number of the switch, port, MAC and address (version 4 where there is none); the inverse of `sender_words`."""
+    first, second, hi, lo = words[:4]
+    return second & 0xFFFF, first >> 48, first & (1 << 48) - 1, (6 if second & _SIX else 4, hi, lo)
+
+
+def victim_version(words: Sequence[int]) -> int:
+    """IP version of the victim of an event."""
+    return 6 if words[1] & _VICTIM_SIX else 4

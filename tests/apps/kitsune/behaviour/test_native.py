@@ -1,0 +1,70 @@
+"""The C ledger finds what its Python twin finds, to the last bit."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apps.kitsune.behaviour import behaviour as twin
+from apps.kitsune.behaviour import contacts
+from apps.kitsune.behaviour.behaviour import Behaviour
+from apps.kitsune.behaviour.native import NativeBehaviour
+from apps.kitsune.blocked import Blocked
+from apps.kitsune.kernel import load_kernel
+from apps.messages import Target
+from tests.apps.firewall.enforcement.test_eve import decision
+from tests.apps.kitsune.random_traffic import scores_of, traffic
+
+TRAINING = 900
+
+
+def plain(state):
+    """Order of sets and tables does not matter."""
+    if isinstance(state, dict):
+        return {name: plain(value) for name, value in state.items()}
+    if isinstance(state, list | tuple):
+        return sorted((plain(each) for each in state), key=repr)
+    return state
+
+
+def feed(sides, random, start_s, *, left, blocked=None, count=None):
+    """One batch through both; returns the findings."""
+    count = int(random.integers(1, 400)) if count is None else count
+    batch, scores = traffic(random, count, start_s), scores_of(random, count)
+    trained = min(left, count)
+    rescored = scores_of(np.random.default_rng(count), min(TRAINING, twin.CALIBRATION_PACKETS))
+    found = [
+        side.add(batch, f"s{count % 2}", scores, trained, lambda: rescored, 1.5, blocked) for side in sides
+    ]
+    assert repr(found[0]) == repr(found[1])
+    return trained, found[0]
+
+
+@pytest.mark.parametrize("small", [False, True], ids=["usual limits", "small limits"])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=12, deadline=None)
+def test_findings_and_what_is_learnt_are_equal(small, seed):
+    """Every kind of packet, late ones, floods, scans, blocks in force, limits that are reached, a model file."""
+    random = np.random.default_rng(seed)
+    with pytest.MonkeyPatch.context() as patch:
+        if small:
+            patch.setattr(twin, "KEPT", 20)
+            patch.setattr("apps.kitsune.behaviour.findings.KEPT", 20)
+            patch.setattr(contacts, "MOST_CONTACTS", 30)
+        sides = [Behaviour(TRAINING), NativeBehaviour(TRAINING, load_kernel())]
+        blocked, left, at, findings = Blocked(), TRAINING, 0.0, 0
+        for step in range(12):
+            trained, found = feed(sides, random, at, left=left, blocked=blocked)
+            left, at, findings = left - trained, at + float(random.exponential(30)), findings + len(found)
+            if step == 8:
+                target = Target(kind="ip", address="192.168.2.2")
+                blocked.decide(decision(id="d1", action="block", switch="*", target=target))
+        feed(sides, random, at, left=left, count=left + 50)
+        states = [json.loads(json.dumps(side.to_state())) for side in sides]
+        assert plain(states[0]) == plain(states[1])
+        again = [Behaviour.from_state(states[0]), NativeBehaviour.restored(states[0], load_kernel())]
+        for _ in range(3):
+            feed(again, random, at, left=0)
+        assert plain(again[0].to_state()) == plain(again[1].to_state())

@@ -1,0 +1,113 @@
+"""The C ledgers of senders and victims return what their Python twins return, and the whole detector does."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apps.kitsune import conversations
+from apps.kitsune import senders as twin
+from apps.kitsune import victims as victims_twin
+from apps.kitsune.kernel import ColumnError, load_kernel
+from apps.kitsune.native_senders import NativeSenders
+from apps.kitsune.native_victims import NativeVictimRates
+from apps.kitsune.senders import Senders
+from apps.kitsune.victims import VictimRates
+from apps.messages import Target
+from tests.apps.firewall.enforcement.test_eve import decision
+from tests.apps.kitsune.behaviour.test_native import plain
+from tests.apps.kitsune.random_traffic import scores_of, traffic
+
+TRAINING = 700
+
+
+def seconds_of(found):
+    """What is told of anomalous seconds."""
+    return repr(
+        [(each.second, each.record.identity, each.record.training_rate, *_tally(each)) for each in found]
+    )
+
+
+def _tally(each):
+    tally = each.tally
+    counted = (tally.packets, tally.over, tally.peak, tally.first_over, tally.hosts, tally.evidence)
+    return (*counted, each.anomalous_seconds)
+
+
+def records_of(senders):
+    known = [
+        (record.identity, record.training_rate, record.training_destinations, record.last_second)
+        for record in senders.known()
+    ]
+    return sorted(known)
+
+
+def feed(sides, random, start_s, left, step):
+    count = int(random.integers(1, 400))
+    batch, scores = traffic(random, count, start_s), scores_of(random, count) * 3
+    trained, switch = min(left, count), f"s{count % 2}"
+    how = {"scores": scores, "trained": trained, "line": 1.0, "evidence": lambda rows: rows * 1_000 + step}
+    found = [side.add(batch, switch, **how) for side in sides]
+    assert seconds_of(found[0]) == seconds_of(found[1])
+    assert records_of(sides[0]) == records_of(sides[1])
+    who = (switch, 1, int(batch["eth_src"][-1]), (4, 0, int(batch["ip_src_lo"][-1])))
+    assert sides[0].rates(who) == sides[1].rates(who)
+    return left - trained
+
+
+@pytest.mark.parametrize("small", [False, True], ids=["usual limits", "small limits"])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10, deadline=None)
+def test_anomalous_seconds_roles_and_rates_are_equal(small, seed):
+    """Late packets, clocks set back, conversations, errors that quote, blocks, forgotten senders, a model file."""
+    random = np.random.default_rng(seed)
+    with pytest.MonkeyPatch.context() as patch:
+        if small:
+            patch.setattr(twin, "MOST_SENDERS", 30)
+            patch.setattr(conversations, "MOST", 20)
+        sides, left, at = [Senders(), NativeSenders(load_kernel())], TRAINING, 100.0
+        for step in range(14):
+            left = feed(sides, random, at, left, step)
+            at += float(random.choice([-30, 1, 20, 80]))
+            if step == 6:
+                address = Target(kind="mac", address="00:00:00:00:00:02")
+                for side in sides:
+                    side.blocked.decide(decision(id="d1", action="block", switch="s1", target=address))
+            if random.random() < 0.2:
+                assert seconds_of(sides[0].finish()) == seconds_of(sides[1].finish())
+        assert sides[0].clock_jumps == sides[1].clock_jumps
+        states = [json.loads(json.dumps(side.to_state())) for side in sides]
+        assert plain(states[0]) == plain(states[1])
+        again = [Senders.from_state(states[0]), NativeSenders.restored(states[0], load_kernel())]
+        feed(again, random, at, 0, 99)
+
+
+@given(seed=st.integers(0, 2**32 - 1), most=st.sampled_from([5, 1_000]))
+@settings(max_examples=10, deadline=None)
+def test_usual_traffic_is_equal(seed, most):
+    random = np.random.default_rng(seed)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("MOST_KINDS", "MOST_SOURCES", "MOST_SOURCES_OF_ALL"):
+            patch.setattr(victims_twin, name, most)
+        sides, left, at = [VictimRates(), NativeVictimRates(load_kernel())], TRAINING, 0.0
+        for _ in range(8):
+            count = int(random.integers(1, 300))
+            batch, trained = traffic(random, count, at), min(left, count)
+            for side in sides:
+                side.add(batch, trained)
+            left, at = left - trained, at + float(random.choice([-70, 0.5, 5]))
+        assert sides[0].to_state() == sides[1].to_state()
+        for host, kind, *_ in sides[0].to_state():
+            assert sides[0].usual(host, kind) == sides[1].usual(host, kind)
+
+
+def test_columns_that_do_not_fit_are_refused():
+    """Neither missing ones nor others of another length reach C."""
+    batch = dict(traffic(np.random.default_rng(1), 10, 0.0))
+    rates = NativeVictimRates(load_kernel())
+    with pytest.raises(ColumnError, match="tcp_flags"):
+        rates.add({name: column for name, column in batch.items() if name != "tcp_flags"}, 0)
+    with pytest.raises(ColumnError, match="equally long"):
+        rates.add({**batch, "port": batch["port"][:5]}, 0)
