@@ -32,9 +32,8 @@ function drawMachine(parent, machine, y, x, end) {
     bar(parent, one.from + one.setup, one.to, y, x, good ? { class: kind, fill: colour(one.order) } : { class: kind }, title);
   }
   if (machine.running) {
-    const begun = machine.bars.length ? machine.bars[machine.bars.length - 1].to : 0;
     const kind = `running${machine.running.priority ? " urgent" : ""}`;
-    bar(parent, begun, Math.min(machine.free_at, end), y, x, { class: kind, fill: colour(machine.running.order) },
+    bar(parent, machine.began, Math.min(machine.free_at, end), y, x, { class: kind, fill: colour(machine.running.order) },
       `order ${machine.running.order}, job ${machine.running.number}: in progress, expected to end at ${hours(machine.free_at)}`);
   }
 }

@@ -45,6 +45,8 @@ class Watcher:
         self._prints: dict[str, dict[str, PrintRecord]] = {name: {} for name in scenario.machine_names()}
         self._fleet: FleetState | None = None
         self._orders: dict[int, Order] = {}
+        self._began: dict[str, float] = {}
+        """When the print in progress of each machine began, s."""
 
     def __enter__(self) -> "Watcher":
         self._engine.init("manufacturing_watcher", CONSUMER, interests=INTERESTS)
@@ -60,6 +62,8 @@ class Watcher:
         report = from_value(item.value, ReportMessage).report
         with self._changed:
             of_machine = self._prints.setdefault(report.machine, {})
+            if report.running is not None:
+                self._began[report.machine] = report.running.started
             for record in report.ended:
                 of_machine.setdefault(record.task.name, record)
 
@@ -142,6 +146,7 @@ class Watcher:
                     "status": machines[name].status if name in machines else "unknown",
                     "alarm": machines[name].alarm if name in machines else "",
                     "queue": len(machines[name].queue) if name in machines else 0,
+                    "began": self._began.get(name, 0.0),
                     "free_at": machines[name].free_at if name in machines else 0.0,
                     "running": msgspec.to_builtins(machines[name].running) if name in machines else None,
                 }
