@@ -1,7 +1,8 @@
-"""Builds what pyproject.toml cannot declare: the optional C kernel and the switch program's place.
+"""Builds what pyproject.toml cannot declare: the optional C libraries and the switch program's place.
 
-The kernel is a plain shared object loaded with cffi (ABI mode): it includes no Python header, so a
-compiler is all it needs.  Without one the installation still succeeds, and the first use of Kitsune says so.
+They are plain shared objects loaded with cffi (ABI mode): they include no Python header, so a
+compiler is all they need.  Without one the installation still succeeds: the first use of Kitsune says so, and
+digests are read by protobuf.
 
 The switch program lives in `p4/`, which is no package (a package of that name would hide `p4.v1` of the
 P4Runtime wheel).  In a wheel its sources, artefacts and record are data of `sdnator`, in
@@ -24,7 +25,7 @@ warnings.filterwarnings("ignore", message="Editable installation")
 
 
 class BuildKernel(build_ext):
-    """Names the library as the loader looks for it, whatever the Python version."""
+    """Names a library as the loader looks for it, whatever the Python version."""
 
     def get_ext_filename(self, fullname: str) -> str:
         return str(Path(*fullname.split(".")).with_suffix(".so"))
@@ -71,7 +72,14 @@ setup(
             libraries=["m"],
             py_limited_api=True,
             optional=True,
-        )
+        ),
+        Extension(
+            "apps.p4runtime_ctrl.southbound._digest_rows",
+            sources=["apps/p4runtime_ctrl/southbound/digest_rows.c"],
+            extra_compile_args=["-O2"],
+            py_limited_api=True,
+            optional=True,
+        ),
     ],
     cmdclass={"build_ext": BuildKernel, "build_py": BuildWithProgram},
     options={"bdist_wheel": {"py_limited_api": "cp311"}},

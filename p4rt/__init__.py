@@ -14,7 +14,7 @@ Nothing here is ours but the registering; both ends import it, as both would imp
 
 from p4rt import polling as polling  # isort: skip  # before anything loads gRPC
 from p4rt.messages import p4data, p4info, p4runtime, p4types, status
-from p4rt.service import P4RuntimeStub, add_p4runtime_servicer, or_none
+from p4rt.service import P4RuntimeStub, add_p4runtime_servicer, or_none, stream_of_bytes
 
 __all__ = [
     "P4RuntimeStub",
@@ -25,4 +25,5 @@ __all__ = [
     "p4runtime",
     "p4types",
     "status",
+    "stream_of_bytes",
 ]

@@ -43,6 +43,13 @@ class P4RuntimeStub:
         )
 
 
+def stream_of_bytes(channel: grpc.Channel) -> Any:
+    """StreamChannel whose responses stay serialized: for who reads digest lists without an object a sample."""
+    return channel.stream_stream(
+        f"/{_SERVICE}/StreamChannel", request_serializer=p4runtime.StreamMessageRequest.SerializeToString
+    )
+
+
 class P4RuntimeServicer(Protocol):
     """What a server must offer: the six calls of the service, by their names on the wire."""
 

@@ -10,7 +10,9 @@ import time
 from typing import Any, Final, Protocol
 
 import grpc
+from google.protobuf.message import DecodeError
 
+from apps.p4runtime_ctrl.southbound.digest_rows import ReceivedDigests
 from apps.p4runtime_ctrl.southbound.session import (
     Address,
     CompiledProgram,
@@ -18,11 +20,15 @@ from apps.p4runtime_ctrl.southbound.session import (
     P4RuntimeSession,
     translated,
 )
-from p4rt import P4RuntimeStub, p4runtime
+from p4rt import P4RuntimeStub, p4runtime, stream_of_bytes
 
 _FIRST_PAUSE: Final = 0.05
 _DEPUTY_WAITS_S: Final = 0.5
 _LONGEST_LINGER_S: Final = 0.01
+_LISTS: Final = 64
+"""Most digest lists handed over at once: tens of thousands of frames."""
+_BYTES: Final = 32 << 20
+"""Of digest lists that wait for the listener."""
 _SHARE: Final = 4
 """A list waits this many times as long as the previous one took to handle."""
 _PRIMARY, _NO_PRIMARY = 0, 5
@@ -70,6 +76,8 @@ class Connection:
         self._longest_pause_s = longest_pause_s
         self._closing = threading.Event()
         self._gathered: list[Any] = []
+        self._bytes_in = self._bytes_out = 0
+        """Bytes of digest lists so far, each counted by one thread alone."""
         self._changed = threading.Condition()
         self._call: Any = None
         self._stub: Any = None
@@ -125,16 +133,16 @@ class Connection:
         # cancelled corrupts gRPC's memory once in some eighty times (grpcio 1.85 without EventEngine).
         with self._address.channel() as stream, self._address.channel() as calls:
             self._stub = P4RuntimeStub(calls)
-            self._keep_streaming(P4RuntimeStub(stream))
+            self._keep_streaming(stream_of_bytes(stream))
 
-    def _keep_streaming(self, stub: Any) -> None:
+    def _keep_streaming(self, open_stream: Any) -> None:
         pause = _FIRST_PAUSE
         answered = True
         while not self._closing.is_set():
             opened = time.monotonic()
             # Only a call that waits makes the channel try again as often as its options say; to calls that fail at
             # once, a switch that is back shows itself two seconds later.
-            cause = self._one_stream(stub, waits=not answered)
+            cause = self._one_stream(open_stream, waits=not answered)
             if self._closing.is_set():
                 return
             answered = self._told is not None
@@ -144,17 +152,17 @@ class Connection:
             self._closing.wait(pause)
             pause = min(pause * 2, self._longest_pause_s)
 
-    def _one_stream(self, stub: Any, *, waits: bool) -> str:
+    def _one_stream(self, open_stream: Any, *, waits: bool) -> str:
         """Open the stream, waiting for the switch or not, and read it to its end; returns why it ended."""
         self._requests = Outgoing()
         self._told = None
         self._claim(self._usual_id())
-        self._call = stub.StreamChannel(iter(self._requests), wait_for_ready=waits)
+        self._call = open_stream(iter(self._requests), wait_for_ready=waits)
         if self._closing.is_set():
             self._call.cancel()
         try:
-            for message in self._call:
-                self._take(message)
+            for data in self._call:
+                self._take(data)
         except grpc.RpcError as error:
             return str(translated(error, self._address.target))
         else:
@@ -178,7 +186,19 @@ class Connection:
         request.arbitration.election_id.CopyFrom(self._election_id)
         self._requests.put(request)
 
-    def _take(self, message: Any) -> None:
+    def _take(self, data: bytes) -> None:
+        """One message of the stream; digest lists, which are most of it, stay bytes."""
+        digests = ReceivedDigests.of(data)
+        if digests is not None:
+            self._acknowledge(digests)
+            self._bytes_in += len(data)
+            self._gather(digests)
+            return
+        try:
+            message = p4runtime.StreamMessageResponse.FromString(data)
+        except DecodeError:
+            self._listener.other(p4runtime.StreamMessageResponse())
+            return
         kind = message.WhichOneof("update")
         if kind == "packet":
             self._gather(message.packet)
@@ -233,12 +253,15 @@ class Connection:
         gathered = self._gathered
         gathered.append(message)
         count = len(gathered)
-        if count != 1 and count % self._batch:
+        if count != 1 and count % self._batch and self._bytes_in - self._bytes_out < _BYTES:
             return
         with self._changed:
             self._changed.notify_all()
-            while len(self._gathered) >= 4 * self._batch and not self._closing.is_set():
+            while self._is_behind() and not self._closing.is_set():
                 self._changed.wait(timeout=1)
+
+    def _is_behind(self) -> bool:
+        return len(self._gathered) >= 4 * self._batch or self._bytes_in - self._bytes_out >= _BYTES
 
     def _hand_over(self) -> None:
         spent = 0.0
@@ -253,6 +276,7 @@ class Connection:
                 # appends go to the same list from the other thread; both slices are atomic
                 messages = self._gathered[: self._batch]
                 del self._gathered[: len(messages)]
+                self._bytes_out += sum(each.size for each in messages if type(each) is ReceivedDigests)
                 with self._changed:
                     self._changed.notify_all()
                 self._tell(messages)
@@ -267,7 +291,7 @@ class Connection:
         """
         packets = [each for each in messages if type(each) is p4runtime.PacketIn]
         digests = [each for each in messages if type(each) is not p4runtime.PacketIn]
-        if digests:
-            self._listener.digests(digests)
+        for first in range(0, len(digests), _LISTS):
+            self._listener.digests(digests[first : first + _LISTS])
         if packets:
             self._listener.packets(packets)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.p4runtime_ctrl.errors import P4InfoError
+from apps.p4runtime_ctrl.southbound.digest_rows import read_lists
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
-from apps.p4runtime_ctrl.southbound.rows import RowLayout, read_lists
+from apps.p4runtime_ctrl.southbound.rows import RowLayout
 from due import RecordBatch
 
 DIGEST: Final = "count_digest_t"

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from apps.p4runtime_ctrl.errors import P4InfoError
 from apps.p4runtime_ctrl.southbound.capture_times import CaptureTimes
+from apps.p4runtime_ctrl.southbound.digest_rows import read_lists
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
-from apps.p4runtime_ctrl.southbound.rows import RowLayout, has_bit, read_lists
+from apps.p4runtime_ctrl.southbound.rows import RowLayout, has_bit
 from apps.p4runtime_ctrl.telemetry.coverage import uncovered
 from apps.packets import PACKET_COLUMNS
 from due import RecordBatch

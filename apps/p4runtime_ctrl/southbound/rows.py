@@ -25,8 +25,8 @@ class RowLayout:
 
     def __init__(self, fields: Iterable[tuple[str, int]]) -> None:
         named = list(fields)
-        self._widths = [next(width for width in _WIDTHS if 8 * width >= bits) for _, bits in named]
-        kinds = [_TYPES[width] for width in self._widths]
+        self.widths = [next(width for width in _WIDTHS if 8 * width >= bits) for _, bits in named]
+        kinds = [_TYPES[width] for width in self.widths]
         self.dtype = np.dtype(
             [
                 (name, *(kind if isinstance(kind, tuple) else (kind,)))
@@ -39,7 +39,7 @@ class RowLayout:
 
         Raises `Malformed` where a row has other fields than these, or a value does not fit.
         """
-        if set(map(len, rows)) - {len(self._widths)}:
+        if set(map(len, rows)) - {len(self.widths)}:
             raise Malformed(f"a message has other fields than {', '.join(self.dtype.names or ())}")
         data = self._joined(rows)
         if len(data) != len(rows) * self.dtype.itemsize:  # leading zeros beyond the width
@@ -57,13 +57,13 @@ class RowLayout:
             return self.array([rows[row] for row in sound]), np.array(sound, dtype=np.intp)
 
     def _fits(self, row: Sequence[bytes]) -> bool:
-        pairs = zip(row, self._widths, strict=False)
-        return len(row) == len(self._widths) and all(
+        pairs = zip(row, self.widths, strict=False)
+        return len(row) == len(self.widths) and all(
             len(value.lstrip(b"\0")) <= width for value, width in pairs
         )
 
     def _joined(self, rows: Sequence[Sequence[bytes]]) -> bytes:
-        widths, zeros = self._widths, repeat(b"\0")
+        widths, zeros = self.widths, repeat(b"\0")
         return b"".join(chain.from_iterable(map(bytes.rjust, row, widths, zeros) for row in rows))
 
 
@@ -74,15 +74,6 @@ CLOCK_BITS: Final = 48
 def in_time(found: NDArray[Any]) -> NDArray[np.bool_]:
     """Which records have a time that the switch's clock can show."""
     return np.asarray(found["timestamp"].astype(np.uint64) >> np.uint64(CLOCK_BITS) == 0)
-
-
-def read_lists(layout: RowLayout, lists: Sequence[Any]) -> tuple[NDArray[Any], int]:
-    """Records of digest lists, in order, and how many were left out as malformed."""
-    rows = [[member.bitstring for member in data.struct.members] for each in lists for data in each.data]
-    found, _ = layout.read(rows)
-    sound = in_time(found)
-    found = found if sound.all() else found[sound]
-    return found, len(rows) - len(found)
 
 
 def has_bit(maps: NDArray[np.uint8], bit: int) -> NDArray[np.bool_]:
