@@ -128,7 +128,7 @@ def _blocks(data: bytes) -> None:
     for part in (data[:half], data[half:]):
         reader.feed(part)
         found = reader.take(100)
-        assert len(found.frames) == len(found.times_us)
+        assert len(list(found.frames())) == len(found)
 
 
 def _port(path: Path) -> None:

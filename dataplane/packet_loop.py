@@ -9,15 +9,20 @@ import select
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
+
+from dataplane.compiler.machine import FrameSlices
 from dataplane.errors import DataplaneError
 from dataplane.p4runtime.device import Device
 from dataplane.p4runtime.pipeline import ForwardingPipeline
-from dataplane.ports.port import Port, Wakeup
+from dataplane.ports.port import Arrived, NullPort, Port, Wakeup
 from dataplane.v1model.switch import FrameResult
 
 _CHUNK = 256
+_BLOCK = 1024
+"""Most frames of a capture that are processed before others have their turn."""
 _IDLE_MS = 100
 _PACKET_OUTS = 4096
 
@@ -186,9 +191,9 @@ class PacketLoop:
         for number in ready:
             port = self._ports[number]
             if not port.lossless:
-                frames = port.receive(_CHUNK).frames
-                self.counts["without_pipeline"] += len(frames)
-                port.done(bytes(len(frames)))
+                count = len(port.receive(_CHUNK))
+                self.counts["without_pipeline"] += count
+                port.done(bytes(count))
 
     def _send_packet_outs(self, pipeline: ForwardingPipeline) -> None:
         while self._packet_outs:
@@ -201,25 +206,46 @@ class PacketLoop:
     def _receive(self, pipeline: ForwardingPipeline, number: int, port: Port) -> None:
         limit = _CHUNK
         if port.lossless:
-            limit = min(limit, self._device.room())
+            limit = min(_BLOCK, self._device.room())
             if not limit:
                 return
         arrived = port.receive(limit)
-        frames = arrived.frames
-        if not frames:
+        if not len(arrived):
             return
-        times = arrived.times_us or [self._clock.now()] * len(frames)
-        if arrived.times_us:
-            self._clock.advance(times[-1])
-        result = pipeline.switch.process_many(number, frames, times)
+        result = self._process(pipeline, number, arrived)
         self._hand_out(pipeline, result, lossless=port.lossless)
         port.done(result.verdicts)
 
-    def _hand_out(self, pipeline: ForwardingPipeline, result: FrameResult, *, lossless: bool) -> None:
-        for number, frame in result.outputs:
-            port = self._ports.get(number)
-            if port is None:
-                self.counts["no_such_port"] += 1
+    def _send_slices(self, outputs: FrameSlices) -> None:
+        for number in np.unique(outputs.ports).tolist():
+            of_port, port = outputs.to(number), self._ports.get(number)
+            if isinstance(port, NullPort):
+                port.counters.sent += len(of_port)
             else:
-                port.send(frame)
+                self._send(number, of_port.frames())
+
+    def _send(self, number: int, frames: Sequence[bytes]) -> None:
+        port = self._ports.get(number)
+        if port is None:
+            self.counts["no_such_port"] += len(frames)
+            return
+        for frame in frames:
+            port.send(frame)
+
+    def _process(self, pipeline: ForwardingPipeline, number: int, arrived: Arrived) -> FrameResult:
+        if arrived.block is not None:
+            self._clock.advance(int(arrived.block.times_us[-1]))
+            return pipeline.switch.process_block(number, arrived.block)
+        frames = arrived.frames
+        times = arrived.times_us or [self._clock.now()] * len(frames)
+        if arrived.times_us:
+            self._clock.advance(times[-1])
+        return pipeline.switch.process_many(number, frames, times)
+
+    def _hand_out(self, pipeline: ForwardingPipeline, result: FrameResult, *, lossless: bool) -> None:
+        if isinstance(result.outputs, FrameSlices):
+            self._send_slices(result.outputs)
+        else:
+            for number, frame in result.outputs:
+                self._send(number, (frame,))
         self._device.deliver(pipeline, result, lossless=lossless)

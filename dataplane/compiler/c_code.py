@@ -237,7 +237,7 @@ def _structures(g: CGenerator) -> list[str]:
         "typedef struct {",
         "table t[N_TABLES + 1]; u64 *c[N_COUNTERS + 1]; meter *mt[N_METERS + 1];",
         "u64 *reg[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;",
-        "u64 stats[6], out_used, out_room, seed; u8 *out; u8 verdict; int budget; job *head, **tail;",
+        "u64 stats[6], out_used, out_room, marks_used, marks_room, seed, *marks; u8 *out; u8 verdict; int budget; job *head, **tail;",
         "u64 out_of_range[N_COUNTERS + N_METERS + N_REGISTERS + 1];",
         "} machine;",
         "PLAIN void sample(machine *m, u32 id, const u64 *w, const u8 *limbs, u32 members);",

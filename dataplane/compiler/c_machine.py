@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from itertools import chain
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
 from dataplane.compiler.c_build import compiled_library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
-from dataplane.compiler.machine import BatchResult, Digest, KeyPlace, Replicas, Rule
+from dataplane.compiler.machine import BatchResult, Digest, FrameSlices, KeyPlace, Replicas, Rule
 from dataplane.errors import DataplaneError
 from dataplane.v1model.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
@@ -21,6 +24,7 @@ void dp_free(void *h);
 uint64_t dp_run(void *h, uint32_t port, uint32_t count, const char *data, const uint32_t *lengths,
                 const uint64_t *times, uint8_t *verdicts);
 const uint8_t *dp_output(void *h);
+uint64_t dp_marks(void *h, const uint64_t **to);
 void dp_statistics(void *h, uint64_t *to);
 void dp_out_of_range(void *h, uint64_t *to);
 void dp_ports(void *h, const char *exists);
@@ -245,26 +249,67 @@ class CMachine:
                 table.know_action(number, tuple(words(p.width) for p in params))
 
     def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult:
-        ffi, lib = self._native.ffi, self._native.lib
-        count = len(frames)
+        ffi = self._native.ffi
         lengths = ffi.new("uint32_t[]", [len(f) for f in frames])
         times = ffi.new("uint64_t[]", [t & _WORD for t in times_us])
-        verdicts = ffi.new("uint8_t[]", count)
-        data = frames[0] if count == 1 else b"".join(frames)
-        used = lib.dp_run(self._native.handle, port, count, data, lengths, times, verdicts)
-        batch = BatchResult(verdicts=bytes(ffi.buffer(verdicts, count)))
-        if used:
-            self._collect(batch, bytes(ffi.buffer(lib.dp_output(self._native.handle), used)))
+        data = frames[0] if len(frames) == 1 else b"".join(frames)
+        records, verdicts = self._run(port, data, lengths, times, len(frames))
+        batch = BatchResult(verdicts=verdicts)
+        self._collect(batch, records)
         return batch
+
+    def run_block(
+        self, port: int, data: bytes, lengths: NDArray[np.uint32], times_us: NDArray[np.int64]
+    ) -> BatchResult:
+        ffi, sizes, times = self._native.ffi, np.require(lengths, "u4", "C"), np.require(times_us, "i8", "C")
+        if int(sizes.sum(dtype=np.int64)) > len(data) or len(times) != len(sizes):
+            raise DataplaneError(f"{len(sizes)} frames do not fit into a block of {len(data)} bytes")
+        places = ffi.cast("uint32_t *", sizes.ctypes.data), ffi.cast("uint64_t *", times.ctypes.data)
+        records, verdicts = self._run(port, data, *places, len(sizes))
+        to = ffi.new("const uint64_t **")
+        count = self._native.lib.dp_marks(self._native.handle, to)
+        if not count:
+            return BatchResult(verdicts=verdicts)
+        marks = np.frombuffer(ffi.buffer(to[0], 8 * count), np.uint64).astype(np.int64)
+        return self._sorted_out(records, marks, verdicts)
+
+    def _run(self, port: int, data: bytes, lengths: Any, times: Any, count: int) -> tuple[bytes, bytes]:
+        """Records and verdicts."""
+        ffi, lib = self._native.ffi, self._native.lib
+        verdicts = ffi.new("uint8_t[]", count)
+        used = lib.dp_run(self._native.handle, port, count, data, lengths, times, verdicts)
+        records = bytes(ffi.buffer(lib.dp_output(self._native.handle), used)) if used else b""
+        return records, bytes(ffi.buffer(verdicts, count))
+
+    def _sorted_out(self, records: bytes, marks: NDArray[np.int64], verdicts: bytes) -> BatchResult:
+        """Records by kind, each kind in their order; frames that left stay where they are."""
+        words, at = np.frombuffer(records, "<u4"), marks >> 2
+        kinds, numbers, begins = words[at], words[at + 1].astype(np.int64), marks + _RECORD.size
+        ends = begins + words[at + 2]
+
+        def slices(rows: NDArray[np.bool_]) -> FrameSlices:
+            return FrameSlices(numbers[rows], begins[rows], ends[rows], records)
+
+        reported = kinds == _OUT_DIGEST
+        return BatchResult(
+            outputs=slices(kinds == _OUT_PORT),
+            packet_ins=slices(kinds == _OUT_CPU).frames(),
+            samples={
+                self._digests[number]: slices(reported & (numbers == number)).frames()
+                for number in np.unique(numbers[reported]).tolist()
+            },
+            verdicts=verdicts,
+        )
 
     def _collect(self, batch: BatchResult, records: bytes) -> None:
         at, end = 0, len(records)
-        unpack = _RECORD.unpack_from
+        unpack, outputs = _RECORD.unpack_from, list[tuple[int, bytes]]()
+        batch.outputs = outputs
         while at < end:
             kind, number, length = unpack(records, at)
             at += 16
             if kind == _OUT_PORT:
-                batch.outputs.append((number, records[at : at + length]))
+                outputs.append((number, records[at : at + length]))
             elif kind == _OUT_CPU:
                 batch.packet_ins.append(records[at : at + length])
             else:

@@ -4,9 +4,12 @@ Two make it: `python_machine.PythonMachine` and `c_machine.CMachine`.  Callers h
 have checked every number; tables are addressed by slots that `tables.Table` hands out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dataplane.compiler import samples
 from dataplane.v1model.tree import Program
@@ -27,13 +30,41 @@ class Digest(NamedTuple):
         return samples.decode(self.sample)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSlices:
+    """(port, frame) pairs that stand in one piece of memory: objects of who looks at them only."""
+
+    ports: NDArray[np.int64]
+    begins: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    data: bytes
+
+    def __len__(self) -> int:
+        return len(self.ports)
+
+    def __iter__(self) -> Iterator[tuple[int, bytes]]:
+        return zip(self.ports.tolist(), self.frames(), strict=True)
+
+    def frames(self) -> list[bytes]:
+        """The frames alone."""
+        pairs = zip(self.begins.tolist(), self.ends.tolist(), strict=True)
+        return [self.data[begin:end] for begin, end in pairs]
+
+    def to(self, port: int) -> "FrameSlices":
+        """Those of one port."""
+        rows = self.ports == port
+        return FrameSlices(self.ports[rows], self.begins[rows], self.ends[rows], self.data)
+
+
 @dataclass(slots=True)
 class BatchResult:
     """What a batch of frames led to; `verdicts` has a byte per frame."""
 
-    outputs: list[tuple[int, bytes]] = field(default_factory=list)
+    outputs: list[tuple[int, bytes]] | FrameSlices = field(default_factory=list)
     packet_ins: list[bytes] = field(default_factory=list)
     digests: list[Digest] = field(default_factory=list)
+    samples: Mapping[str, list[bytes]] = field(default_factory=dict)
+    """Digests of a block of frames, by name."""
     verdicts: bytes = b""
 
 
@@ -131,6 +162,12 @@ class Machine(Protocol):
     def registers(self) -> Mapping[str, RegisterStore]: ...
 
     def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult: ...
+
+    def run_block(
+        self, port: int, data: bytes, lengths: NDArray[np.uint32], times_us: NDArray[np.int64]
+    ) -> BatchResult:
+        """As `run`, with the frames end to end."""
+        ...
 
     def set_clone_session(self, session: int, replicas: Replicas | None, packet_length: int) -> None:
         """None removes it."""

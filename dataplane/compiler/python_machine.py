@@ -9,6 +9,9 @@ from random import randint
 from types import CodeType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
 from dataplane.compiler import samples
@@ -107,6 +110,8 @@ class PythonMachine:
 
     def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult:
         batch = self._batch = BatchResult()
+        self._outputs: list[tuple[int, bytes]] = []
+        batch.outputs = self._outputs
         verdicts = bytearray()
         for frame, now in zip(frames, times_us, strict=True):
             self._verdict = 0
@@ -121,6 +126,13 @@ class PythonMachine:
             verdicts.append(self._verdict)
         batch.verdicts = bytes(verdicts)
         return batch
+
+    def run_block(
+        self, port: int, data: bytes, lengths: NDArray[np.uint32], times_us: NDArray[np.int64]
+    ) -> BatchResult:
+        ends = np.cumsum(lengths, dtype=np.int64).tolist()
+        frames = [data[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+        return self.run(port, frames, times_us.tolist())
 
     def _arrive(self, port: int, frame: bytes, now: int) -> None:
         p = self._fresh(frame, now, len(frame), len(frame))
@@ -261,7 +273,7 @@ class PythonMachine:
             self._batch.packet_ins.append(frame)
             self._verdict |= m.COPIED
         elif self._ports is None or port in self._ports:
-            self._batch.outputs.append((port, frame))
+            self._outputs.append((port, frame))
             self._verdict |= m.FORWARDED
         else:
             self._counts["no_such_port"] += 1

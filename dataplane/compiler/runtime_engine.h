@@ -26,6 +26,11 @@ static u8 *arena(machine *m, u64 more) {
 
 static void record(machine *m, u32 kind, u32 id, u64 length) {
     u32 head[4] = {kind, id, (u32)length, 0};
+    if (m->marks_used == m->marks_room) {
+        m->marks_room = 2 * m->marks_room + 1024;
+        m->marks = realloc(m->marks, 8 * m->marks_room);
+    }
+    m->marks[m->marks_used++] = m->out_used;
     memcpy(m->out + m->out_used, head, 16);
     m->out_used += 16 + ((length + 7) & ~7ull);
 }
@@ -284,13 +289,14 @@ void dp_free(void *h) {
     free(m->sessions);
     free(m->groups);
     free(m->out);
+    free(m->marks);
     free(m);
 }
 
 u64 dp_run(void *h, u32 port, u32 count, const u8 *data, const u32 *lengths, const u64 *times, u8 *verdicts) {
     machine *m = h;
     phv p;
-    m->out_used = 0;
+    m->out_used = m->marks_used = 0;
     for (u32 i = 0; i < count; i++) {
         u32 size = lengths[i];
         m->verdict = 0;
@@ -316,6 +322,11 @@ u64 dp_run(void *h, u32 port, u32 count, const u8 *data, const u32 *lengths, con
 }
 
 const u8 *dp_output(void *h) { return ((machine *)h)->out; }
+/* where each record begins */
+u64 dp_marks(void *h, const u64 **to) {
+    *to = ((machine *)h)->marks;
+    return ((machine *)h)->marks_used;
+}
 void dp_statistics(void *h, u64 *to) { memcpy(to, ((machine *)h)->stats, sizeof ((machine *)h)->stats); }
 void dp_out_of_range(void *h, u64 *to) { memcpy(to, ((machine *)h)->out_of_range, sizeof ((machine *)h)->out_of_range); }
 void dp_ports(void *h, const u8 *exists) { memcpy(((machine *)h)->ports, exists, 512); }

@@ -294,6 +294,8 @@ class Device:
             self.counts["packet_in"] += len(ready)
         if result.digests:
             ready += pipeline.digests.add(result.digests, time.monotonic_ns())
+        for name, samples in result.samples.items():
+            ready += pipeline.digests.add_samples(name, samples, time.monotonic_ns())
         if ready:
             self._put(ready, lossless=lossless)
 

@@ -12,7 +12,7 @@ configure in threads of their own, so one lock is held for each of these.
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -138,6 +138,31 @@ class DigestLists:
                 if len(buffer) >= stream.list_size:
                     ready.append(self._list(stream, now_ns))
         return ready
+
+    def add_samples(self, name: str, samples: Sequence[bytes], now_ns: int) -> list[bytes]:
+        """As `add`, of one digest."""
+        with self._lock:
+            stream = self._by_name.get(name)
+            if stream is None:
+                self.unconfigured += len(samples)
+                return []
+            ready, first = list[bytes](), 0
+            while first < len(samples):
+                # so many at most fill the list
+                piece = samples[first : first + stream.list_size - len(stream.buffer)]
+                first += len(piece)
+                ready += self._fill(stream, piece, now_ns)
+            return ready
+
+    def _fill(self, stream: _Stream, samples: Sequence[bytes], now_ns: int) -> list[bytes]:
+        fresh, before = dict.fromkeys(samples), len(stream.buffer)
+        for known in stream.cached.intersection(fresh):
+            del fresh[known]
+        stream.buffer.update(fresh)
+        self.suppressed += len(samples) - (len(stream.buffer) - before)
+        if not before:
+            stream.since_ns = now_ns
+        return [self._list(stream, now_ns)] if len(stream.buffer) >= stream.list_size else []
 
     def due(self, now_ns: int) -> list[bytes]:
         """Lists whose time-out has passed; also forgets what was not acknowledged in time."""

@@ -16,6 +16,7 @@ import select
 import socket
 import struct
 import threading
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
@@ -23,6 +24,7 @@ from typing import Self
 import numpy as np
 
 from dataplane.errors import DataplaneError
+from dataplane.frame_block import FrameBlock
 from dataplane.ports.port import Arrived, PortCounters, PortError, Wakeup
 
 COPIED = 1
@@ -46,14 +48,17 @@ class CapturePortError(DataplaneError):
 
 def pack_block(times_us: Sequence[int], wire_lengths: Sequence[int], frames: Sequence[bytes]) -> bytes:
     """One block; the three sequences have equal lengths."""
-    data = b"".join(frames)
+    return _packed(FrameBlock.of(times_us, wire_lengths, frames))
+
+
+def _packed(block: FrameBlock) -> bytes:
     return b"".join(
         (
-            _HEADER.pack(_MAGIC, len(frames), len(data)),
-            np.asarray(times_us, "<i8").tobytes(),
-            np.asarray(wire_lengths, "<u4").tobytes(),
-            np.fromiter(map(len, frames), "<u4", len(frames)).tobytes(),
-            data,
+            _HEADER.pack(_MAGIC, len(block), len(block.data)),
+            block.times_us.astype("<i8", copy=False).tobytes(),
+            block.lengths.astype("<u4", copy=False).tobytes(),
+            block.captured.astype("<u4", copy=False).tobytes(),
+            block.data,
         )
     )
 
@@ -63,9 +68,10 @@ class BlockReader:
 
     def __init__(self) -> None:
         self._bytes = bytearray()
-        self._frames: list[bytes] = []
-        self._times: list[int] = []
-        self._next = 0
+        self._blocks: deque[FrameBlock] = deque()
+        self._taken = 0
+        """Frames of the first block that were taken."""
+        self._waiting = 0
 
     def feed(self, data: bytes | memoryview) -> None:
         """More bytes.  Raises CaptureError where they are no block."""
@@ -85,41 +91,43 @@ class BlockReader:
         del self._bytes[:start]
 
     def _take(self, block: bytes, count: int, size: int) -> None:
-        # no arrays: of a block of one frame they would take longer than the rest of its way
-        times = struct.unpack_from(f"<{count}q", block)
-        wire = struct.unpack_from(f"<{count}I", block, 8 * count)
-        captured = struct.unpack_from(f"<{count}I", block, 12 * count)
-        if sum(captured) != size:
+        times = np.frombuffer(block, "<i8", count)
+        wire = np.frombuffer(block, "<u4", count, 8 * count)
+        captured = np.frombuffer(block, "<u4", count, 12 * count)
+        if int(captured.sum(dtype=np.int64)) != size:
             raise CapturePortError("the frames' lengths do not add up to the block's")
-        if max(wire, default=0) > MAX_WIRE or sum(wire) > _MAX_BLOCK_BYTES:
+        longest, total = int(wire.max(initial=0)), int(wire.sum(dtype=np.int64))
+        if longest > MAX_WIRE or total > _MAX_BLOCK_BYTES:
             raise CapturePortError(
-                f"frames of up to {max(wire)} and together {sum(wire)} bytes on the wire; at most {MAX_WIRE} and"
+                f"frames of up to {longest} and together {total} bytes on the wire; at most {MAX_WIRE} and"
                 f" {_MAX_BLOCK_BYTES} a block"
             )
-        end = _PER_FRAME * count
-        if self._next:
-            del self._frames[: self._next], self._times[: self._next]
-            self._next = 0
-        self._times += times
-        for length, whole in zip(captured, wire, strict=True):
-            start, end = end, end + length
-            self._frames.append(block[start:end].ljust(whole, b"\0"))
+        if count:
+            found = FrameBlock(times, np.maximum(wire, captured), captured, block[_PER_FRAME * count :])
+            self._blocks.append(found.padded())
+            self._waiting += count
 
     def waiting(self) -> int:
         """Frames not taken yet."""
-        return len(self._frames) - self._next
+        return self._waiting
 
     def unfinished(self) -> int:
         """Bytes of a block that has not come in full."""
         return len(self._bytes)
 
-    def take(self, limit: int) -> Arrived:
-        """At most `limit` frames, in order."""
-        first, self._next = self._next, min(self._next + limit, len(self._frames))
-        arrived = Arrived(self._frames[first : self._next], self._times[first : self._next])
-        if self._next == len(self._frames):
-            self._frames, self._times, self._next = [], [], 0
-        return arrived
+    def take(self, limit: int) -> FrameBlock:
+        """At most `limit` frames, in order: those of one block."""
+        if not self._blocks or limit <= 0:
+            return FrameBlock.of((), (), ())
+        block, first = self._blocks[0], self._taken
+        end = min(first + limit, len(block))
+        if end == len(block):
+            self._blocks.popleft()
+            self._taken = 0
+        else:
+            self._taken = end
+        self._waiting -= end - first
+        return block.part(first, end)
 
 
 class CapturePort:
@@ -163,9 +171,9 @@ class CapturePort:
             return Arrived()
         if len(self._verdicts) > _VERDICTS_WAITING:
             return Arrived()
-        arrived = self._reader.take(limit)
-        self.counters.received += len(arrived.frames)
-        return arrived
+        block = self._reader.take(limit)
+        self.counters.received += len(block)
+        return Arrived(block=block)
 
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -287,7 +295,11 @@ class CaptureFeed:
         """
         for start in range(0, len(frames), _BLOCK_FRAMES):
             end = start + _BLOCK_FRAMES
-            self._send(pack_block(times_us[start:end], wire_lengths[start:end], frames[start:end]))
+            self.send_block(FrameBlock.of(times_us[start:end], wire_lengths[start:end], frames[start:end]))
+
+    def send_block(self, block: FrameBlock) -> None:
+        """Frames in order, at most 65,536 of up to 256 MiB; otherwise as `send`."""
+        self._send(_packed(block))
 
     def _send(self, data: bytes) -> None:
         view = memoryview(data)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from dataplane.errors import DataplaneError
+from dataplane.frame_block import FrameBlock
 
 MAX_FRAME = 9216
 
@@ -41,10 +42,15 @@ class Arrived:
     """Frames in the order of their arrival.
 
     times_us: µs of the capture, one per frame; empty = stamp them with the switch's clock
+    block: frames of a capture, end to end, in place of the other two
     """
 
     frames: Sequence[bytes] = ()
     times_us: Sequence[int] = ()
+    block: FrameBlock | None = None
+
+    def __len__(self) -> int:
+        return len(self.frames) if self.block is None else len(self.block)
 
 
 class Port(Protocol):

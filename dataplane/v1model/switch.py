@@ -15,8 +15,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dataplane.compiler import Backend, build
-from dataplane.compiler.machine import DROP_PORT, BatchResult, Digest, Replicas
+from dataplane.compiler.machine import DROP_PORT, BatchResult, Digest, FrameSlices, Replicas
 from dataplane.errors import DataplaneError
+from dataplane.frame_block import FrameBlock
 from dataplane.v1model.externs import CounterArray, MeterArray, RegisterArray
 from dataplane.v1model.program import Program
 from dataplane.v1model.tables import Table, TableEntry
@@ -32,11 +33,13 @@ _MAX_GROUP = 0xFFFF
 class FrameResult:
     """What one frame, or one batch of frames, led to."""
 
-    outputs: list[tuple[int, bytes]] = field(default_factory=list)
+    outputs: list[tuple[int, bytes]] | FrameSlices = field(default_factory=list)
     """(port, frame) in the order of sending; frames to the CPU port are in `packet_ins` instead."""
     packet_ins: list[bytes] = field(default_factory=list)
     """Payloads as sent to the CPU port: the packet_in header in front, then the frame."""
     digests: list[Digest] = field(default_factory=list)
+    samples: Mapping[str, list[bytes]] = field(default_factory=dict)
+    """In place of `digests`, of a block of frames: by name, in order."""
     verdicts: bytes = b""
     """One byte per frame: bit 0 it made a packet-in, bit 1 it left through a port."""
 
@@ -129,6 +132,12 @@ class Switch:
                 self._now = times_us[-1]
             return _result(self._machine.run(port, frames, times_us))
 
+    def process_block(self, port: int, block: FrameBlock) -> FrameResult:
+        """As `process_many`, of frames that stand end to end, each as long as on the wire."""
+        with self.lock:
+            self._now = int(block.times_us[-1])
+            return _result(self._machine.run_block(port, block.data, block.captured, block.times_us))
+
     def packet_out(self, payload: bytes, now_us: int) -> FrameResult:
         """A packet-out: packet_out header in front, then the frame; enters at the CPU port."""
         return self.process(self.cpu_port, payload, now_us)
@@ -219,4 +228,4 @@ def _pairs(replicas: tuple[Replica, ...]) -> Replicas:
 
 
 def _result(batch: BatchResult) -> FrameResult:
-    return FrameResult(batch.outputs, batch.packet_ins, batch.digests, batch.verdicts)
+    return FrameResult(batch.outputs, batch.packet_ins, batch.digests, batch.samples, batch.verdicts)

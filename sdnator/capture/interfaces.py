@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol, Self
 
+from dataplane.frame_block import FrameBlock
 from sdnator.errors import BadInput, PipelineError
 
 ETH_P_ALL = 3
@@ -28,6 +29,9 @@ class Feed(Protocol):
 
     def send(self, times_us: Sequence[int], wire_lengths: Sequence[int], frames: Sequence[bytes]) -> None:
         """Send frames in order; blocks while the other side is full."""
+
+    def send_block(self, block: FrameBlock) -> None:
+        """As `send`, of frames that stand end to end."""
 
     def verdicts(self) -> bytes:
         """The switch's verdicts on the next frames, in order; none on an interface."""
@@ -76,6 +80,10 @@ class WireFeed:
                         f"a frame of {len(padded)} bytes cannot be sent into {self.interface}: {error.strerror}; "
                         "raise the interface's MTU"
                     ) from None
+
+    def send_block(self, block: FrameBlock) -> None:
+        """As `send`: an interface takes one frame at a time."""
+        self.send((), block.lengths.tolist(), list(block.frames()))
 
     def verdicts(self) -> bytes:
         """None: an interface gives no verdicts."""

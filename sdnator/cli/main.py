@@ -186,10 +186,22 @@ def replay(
     pace: Annotated[
         str, typer.Option(help="Speed: max, or a multiple of real time such as 1x or 10x.")
     ] = "max",
-    window: Annotated[int, typer.Option(help="Most packets in flight.", min=1, max=65_536)] = 128,
+    window: Annotated[
+        int | None,
+        typer.Option(
+            help="Most packets in flight.",
+            min=1,
+            max=65_536,
+            show_default="16384 while nothing can be blocked, else 128",
+        ),
+    ] = None,
     telemetry: Annotated[
-        str, typer.Option(help="How packet headers reach the controller: packet-in or digest.")
-    ] = "packet-in",
+        str | None,
+        typer.Option(
+            help="How packet headers reach the controller: packet-in or digest.",
+            show_default="digest on the embedded switch, else packet-in",
+        ),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for the report.", metavar="DIR")] = None,
     keep: Annotated[
         Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")

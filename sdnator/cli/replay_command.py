@@ -45,8 +45,8 @@ class ReplayRequest:
     fm_grace: int | None
     ad_grace: int | None
     pace: str
-    window: int
-    telemetry: str = "packet-in"
+    window: int | None = None
+    telemetry: str | None = None
     queries: bool = True
     model: Path | None = None
     report: Path | None
@@ -111,7 +111,9 @@ def check_switch(switch: str, inject: str | None) -> None:
         raise BadInput(f"--switch {switch}: add --inject IFACE, the interface through which frames enter it")
 
 
-def _telemetry(text: str) -> Telemetry:
+def _telemetry(text: str | None) -> Telemetry | None:
+    if text is None:
+        return None
     if text not in get_args(Telemetry):
         raise BadInput(f"--telemetry {text}: give {' or '.join(get_args(Telemetry))}")
     return cast("Telemetry", text)
@@ -297,7 +299,7 @@ def run_demo(folder: Path, seed: int, *, as_json: bool) -> None:
             fm_grace=None,
             ad_grace=None,
             pace="max",
-            window=128,
+            window=None,
             report=folder / "report",
             keep=None,
             as_json=as_json,

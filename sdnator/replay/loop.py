@@ -19,9 +19,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Confirmation, Decision
 from apps.sonata_adapter.keys import HANDSHAKE
+from dataplane.frame_block import FrameBlock
 from dataplane.ports.capture_port import CapturePortError
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
 from sdnator.capture.captures import Capture
@@ -36,9 +39,15 @@ from sdnator.replay.survey import Survey
 
 CONFIRM_SECONDS = 5.0
 """Seconds for the confirmation of the last decisions."""
-CHUNK = 64
+CHUNK = 4096
 """Most packets sent at a time."""
-STALL_SECONDS = 30.0
+SHARE = 4
+"""A quarter of the window is free before more is sent, so that every stage gets packets in batches."""
+FREE_WINDOW = 16_384
+"""Most packets in flight while nothing can be blocked."""
+BLOCKING_WINDOW = 128
+"""Most packets in flight while a block may take effect, unless `--window` says otherwise."""
+STALL_SECONDS = 90.0
 """Seconds without any result after which the loop has failed."""
 SETTLE_SECONDS = 0.5
 """Without verdicts: seconds of silence after which packets in flight count as dropped or lost."""
@@ -91,10 +100,10 @@ class ReplayOptions:
     """Packets on which the autoencoders are trained."""
     pace: float | None = None
     """Capture seconds a wall second; None = as fast as the loop goes."""
-    window: int = 128
-    """Most packets in flight."""
-    telemetry: Telemetry = "packet-in"
-    """How headers come from the switch."""
+    window: int | None = None
+    """Most packets in flight; None = many while nothing can be blocked, else few."""
+    telemetry: Telemetry | None = None
+    """How headers come from the switch; None = by digest where the switch sends them in lists."""
     queries: bool = True
     """Run the Sonata adapter, and the parts of the firewall that need it; False: Kitsune alone."""
     model: Path | None = None
@@ -102,10 +111,16 @@ class ReplayOptions:
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
 
+    def in_flight_limit(self, sent: int, *, mitigate: bool) -> int:
+        """Most packets in flight on the chosen switch after `sent` packets: training blocks nobody."""
+        free = not mitigate or sent < self.training_packets
+        window = (FREE_WINDOW if free else BLOCKING_WINDOW) if self.window is None else self.window
+        return window if self.switch == "embedded" else min(window, WIRE_WINDOW)
+
     @property
-    def in_flight_limit(self) -> int:
-        """Most packets in flight on the chosen switch."""
-        return self.window if self.switch == "embedded" else min(self.window, WIRE_WINDOW)
+    def headers(self) -> Telemetry:
+        """How headers come from the chosen switch."""
+        return self.telemetry or ("digest" if self.switch == "embedded" else "packet-in")
 
     @property
     def training_packets(self) -> int:
@@ -243,7 +258,7 @@ class ReplayPass:
         flight = PacketAccounting(
             survey.packets,
             verdicts=options.switch == "embedded",
-            by_digest=options.telemetry == "digest",
+            by_digest=options.headers == "digest",
         )
         self._result = PassResult(flight, mitigate)
         self._observer = _Observer(self._result)
@@ -264,7 +279,7 @@ class ReplayPass:
                 inject=options.inject,
                 base_us=self._survey.base_us,
                 times_us=self._survey.time_ns // 1_000,
-                telemetry=options.telemetry,
+                telemetry=options.headers,
                 first=partial(self._join, engine),
                 kitsune=options.kitsune,
                 queries=options.queries,
@@ -337,23 +352,19 @@ class ReplayPass:
     def _feed(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
         flight = self._result.flight
         begun = time.monotonic()
-        first_ns = int(self._survey.time_ns[0])
         with Capture(self._survey.path) as capture:
             frames = iter(capture)
             while flight.sent < self._survey.packets:
                 room = self._wait_for_room(pipeline, feed, progress)
-                chunk = list(islice(frames, min(room, CHUNK)))
-                self._keep_pace(pipeline, progress, begun, (chunk[0].time_ns - first_ns) / 1e9)
+                count = self._keep_pace(pipeline, progress, begun, min(room, CHUNK))
+                times_ns, lengths, data = zip(*islice(frames, count), strict=True)
                 self._look(pipeline, progress)
                 # Counted first: a verdict or score may come back before `send` returns.
-                self._note_watched(flight.sent, len(chunk))
+                self._note_watched(flight.sent, len(data))
+                times_us = np.array(times_ns, np.int64) // 1_000 - self._survey.base_us
                 with self._observer.moved:
-                    flight.send(len(chunk))
-                feed.send(
-                    [frame.time_ns // 1_000 - self._survey.base_us for frame in chunk],
-                    [frame.length for frame in chunk],
-                    [frame.data for frame in chunk],
-                )
+                    flight.send(len(data))
+                feed.send_block(FrameBlock.of(times_us, lengths, data))
         self._drain(pipeline, feed, progress)
         self._looked = 0.0
         self._look(pipeline, progress)
@@ -406,15 +417,18 @@ class ReplayPass:
         for index in self._watch.intersection(range(first, first + count)):
             self._result.sent_at[index] = time.monotonic()
 
-    def _keep_pace(
-        self, pipeline: ReplayPipeline, progress: Progress | None, begun: float, capture_seconds: float
-    ) -> None:
+    def _keep_pace(self, pipeline: ReplayPipeline, progress: Progress | None, begun: float, most: int) -> int:
+        """Wait for the next packet's time; how many are due then, at least 1 and at most `most`."""
         if self._options.pace is None:
-            return
-        due_at = begun + capture_seconds / self._options.pace
+            return most
+        sent, times_ns = self._result.flight.sent, self._survey.time_ns
+        due_at = begun + float(times_ns[sent] - times_ns[0]) / 1e9 / self._options.pace
         while (ahead := due_at - time.monotonic()) > 0:
             time.sleep(min(ahead, LOOK_SECONDS))
             self._look(pipeline, progress)
+        now_ns = int(times_ns[0]) + int((time.monotonic() - begun) * self._options.pace * 1e9)
+        late = times_ns[sent : sent + most] > now_ns
+        return max(1, int(late.argmax()) if late.any() else len(late))
 
     def _look(self, pipeline: ReplayPipeline, progress: Progress | None) -> None:
         """At intervals: check that every part runs, and report progress."""
@@ -426,8 +440,15 @@ class ReplayPass:
                 progress(self._result.flight, self._observer.blocks)
 
     def _wait_for_room(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> int:
-        self._await(pipeline, feed, progress, lambda flight: flight.in_flight < self._options.in_flight_limit)
-        return self._options.in_flight_limit - self._result.flight.in_flight
+        sent, mitigate = self._result.flight.sent, self._result.mitigate
+        limit = self._options.in_flight_limit(sent, mitigate=mitigate)
+        self._await(
+            pipeline, feed, progress, lambda flight: flight.in_flight <= limit - max(1, limit // SHARE)
+        )
+        room = limit - self._result.flight.in_flight
+        left = self._options.training_packets - sent
+        # behind the last packet of training another window may hold
+        return min(room, left) if mitigate and left > 0 else room
 
     def _drain(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
         self._await(pipeline, feed, progress, lambda flight: flight.in_flight == 0)

@@ -61,7 +61,7 @@ def replay_capture(
     train: Training = None,
     mitigate: bool = True,
     pace: float | None = None,
-    telemetry: Telemetry = "packet-in",
+    telemetry: Telemetry | None = None,
     queries: bool = True,
     report: str | Path | None = None,
     keep: str | Path | None = None,
@@ -80,7 +80,7 @@ def replay_capture(
             autoencoders. None takes what the data set's publication used, otherwise 55,000.
         mitigate: False decides and archives, but blocks nothing.
         pace: capture seconds per wall second; None replays as fast as the pipeline goes.
-        telemetry: "packet-in" or "digest", the way headers come from the switch.
+        telemetry: "packet-in" or "digest", the way headers come from the switch; None takes digests.
         queries: False runs Kitsune alone, without the Sonata adapter and the defence against SYN floods.
         report: folder for the HTML report; None writes none.
         keep: folder for the logs of all parts and the archive; None deletes them.
@@ -97,8 +97,8 @@ def replay_capture(
     fm_grace, ad_grace = _training(train, found)
     if pace is not None and not 0 < pace < 1e6:
         raise BadInput(f"pace={pace}: give None, or capture seconds per wall second between 0 and 1,000,000")
-    if telemetry not in ("packet-in", "digest"):
-        raise BadInput(f'telemetry={telemetry!r}: give "packet-in" or "digest"')
+    if telemetry not in (None, "packet-in", "digest"):
+        raise BadInput(f'telemetry={telemetry!r}: give None, "packet-in" or "digest"')
     if report is not None:
         check_folder(report)
     options = ReplayOptions(

@@ -25,8 +25,8 @@ from p4rt import P4RuntimeStub, p4runtime, stream_of_bytes
 _FIRST_PAUSE: Final = 0.05
 _DEPUTY_WAITS_S: Final = 0.5
 _LONGEST_LINGER_S: Final = 0.01
-_LISTS: Final = 64
-"""Most digest lists handed over at once: tens of thousands of frames."""
+_LISTS: Final = 4
+"""Most digest lists handed over at once: some two thousand frames, so that all parts work at the same time."""
 _BYTES: Final = 32 << 20
 """Of digest lists that wait for the listener."""
 _SHARE: Final = 4

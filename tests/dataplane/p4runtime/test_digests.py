@@ -154,3 +154,19 @@ def test_a_controller_that_acknowledges_nothing_does_not_fill_the_memory():
         assert made.add(samples(*range(30 - most, 30)), 0) == []
         assert made.suppressed == most
         assert firsts(made.add(samples(0, 1, 2), 0)) == [[0, 1, 2]]
+
+
+@given(st.lists(st.lists(st.integers(0, 9), max_size=12)), st.integers(1, 5), st.sampled_from([0, SECOND]))
+def test_samples_of_a_block_are_taken_in_as_digests_one_by_one(batches, size, ack):
+    """The same lists at the same time, and as many suppressed, whatever is acknowledged meanwhile."""
+    single, block = lists(size=size, ack=ack), lists(size=size, ack=ack)
+    for number, values in enumerate(batches):
+        found = samples(*values)
+        ready = single.add(found, number)
+        assert block.add_samples("note", [each.sample for each in found], number) == ready
+        assert (block.suppressed, block.next_due_ns()) == (single.suppressed, single.next_due_ns())
+        if number % 3 == 0:
+            for made in (single, block):
+                made.acknowledge(77, number)
+    assert block.add_samples("unknown", [b"x"], 0) == []
+    assert block.unconfigured == 1

@@ -25,7 +25,7 @@ def test_blocks_survive_any_cutting_into_pieces(frames, cuts, limit):
         reader.feed(sent[position : position + step])
         position, turn = position + step, turn + 1
         arrived = reader.take(limit)
-        got += zip(arrived.times_us, arrived.frames, strict=True)
+        got += zip(arrived.times_us.tolist(), arrived.frames(), strict=True)
     assert got == [(time, data + bytes(more)) for time, data, more in frames] * 2
     assert reader.unfinished() == 0
 
@@ -73,9 +73,9 @@ def drain(port, count):
     while len(frames) < count:
         wait(port)
         arrived = port.receive(7)
-        frames += arrived.frames
-        if arrived.frames:
-            port.done(bytes([3]) * len(arrived.frames))
+        if len(arrived):
+            frames += arrived.block.frames()
+            port.done(bytes([3]) * len(arrived))
     return frames
 
 

@@ -7,7 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apps.p4runtime_ctrl.southbound import digest_rows
-from apps.p4runtime_ctrl.southbound.digest_rows import ReceivedDigests, load_digest_rows, read_lists, sound_rows
+from apps.p4runtime_ctrl.southbound.digest_rows import (
+    ReceivedDigests,
+    load_digest_rows,
+    read_lists,
+    sound_rows,
+)
 from apps.p4runtime_ctrl.southbound.rows import RowLayout
 from p4rt import p4runtime
 

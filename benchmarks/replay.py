@@ -1,0 +1,170 @@
+"""The loop as `sdnator replay` runs it: packets a second, CPU and memory of each process, and whether scores are right.
+
+    python -m benchmarks.replay --json FILE
+
+`default_pps` is `sdnator replay CAPTURE --no-mitigate` with no other option, first frame to last score, training
+included; `blocking_pps` the same with blocking; `packet_in_pps` with packet-ins.  `best_pps` is the best round.
+Rounds take turns; figures are medians.  `--long` adds a capture of 764,137 packets.
+"""
+
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from apps.kitsune.afterimage import AfterImage
+from apps.kitsune.detector import Detector
+from apps.kitsune.kernel import load_kernel
+from apps.kitsune.service import Settings
+from benchmarks.measure import arguments, machine, table, write_json
+from benchmarks.replay_processes import ProcessMeter
+from sdnator.capture.packet_sources import Batch, CaptureSource
+from sdnator.datasets.mirai_like import MiraiLikeOptions, make
+from sdnator.replay import run
+from sdnator.replay.loop import PassResult, ReplayOptions
+from sdnator.replay.packet_accounting import PacketState
+
+PACKETS = 165_118
+LONG_PACKETS = 764_137
+"""Of the published Mirai capture."""
+BENIGN_SHARE = 0.45
+PACKETS_A_SECOND = 28
+ROUNDS = 3
+
+
+def capture_of(folder: Path, packets: int) -> Path:
+    """A home network with an infected camera, of so many packets."""
+    path = folder / f"{packets}.pcap"
+    benign_seconds = BENIGN_SHARE * packets / PACKETS_A_SECOND
+    options = MiraiLikeOptions(
+        seed=7, benign_seconds=benign_seconds, attack_seconds=benign_seconds, max_packets=packets
+    )
+    make(options, path)
+    return path
+
+
+def one_round(capture: Path, options: ReplayOptions, *, mitigate: bool) -> tuple[dict[str, Any], PassResult]:
+    """Figures of one replay, and its result."""
+    surveyed, _ = run.prepare(capture, None, options)
+    with tempfile.TemporaryDirectory(prefix="sdnator-bench-") as kept, ProcessMeter() as meter:
+        outcome = run.run(
+            surveyed,
+            None,
+            replace(options, keep=Path(kept)),
+            mitigate=mitigate,
+            both=False,
+            progress=lambda _: meter.look,
+        )
+        archived = sum(each.stat().st_size for each in Path(kept).glob("*/archive.db*"))
+    figures, packets = run.figures(outcome), surveyed.packets
+    return {
+        "pps": figures["packets_per_second"],
+        "lost": figures["packets_lost"],
+        "cpu_us_per_packet": {name: round(s / packets * 1e6, 2) for name, s in meter.loop_cpu_s().items()},
+        "start_cpu_s": round(sum(meter.start_cpu_s().values()), 2),
+        "rss_mb": meter.peak_mb(),
+        "archived_bytes_per_packet": round(archived / packets, 1),
+    }, outcome.reported
+
+
+def batches_of(capture: Path) -> list[Batch]:
+    """The capture's packets by the parser of frames, which the loop does not use by default."""
+    return list(CaptureSource(capture))
+
+
+def settings(options: ReplayOptions) -> Settings:
+    return Settings(fm_grace=options.fm_grace, ad_grace=options.ad_grace, mode="reference")
+
+
+def scores_equal(batches: Sequence[Batch], result: PassResult, options: ReplayOptions) -> float:
+    """Largest relative difference of the loop's scores to those of one detector over the capture's frames."""
+    detector = Detector(settings(options), kernel=load_kernel())
+    scores = np.concatenate([detector.process(dict(batch), "s1")[0].scores for batch in batches])
+    scored = result.flight.state == PacketState.SCORED
+    wanted: npt.NDArray[np.float64] = scores[scored]
+    return float(np.max(np.abs(result.flight.score[scored] - wanted) / np.maximum(np.abs(wanted), 1e-300)))
+
+
+def detector_vs_kernel(batches: Sequence[Batch], options: ReplayOptions, rounds: int) -> float:
+    """CPU of features and scores alone, by that of `Detector.process` over the same packets after training."""
+    first = sum(np.cumsum([len(batch["length"]) for batch in batches]) <= options.training_packets) + 1
+    ratios = []
+    for _ in range(rounds):
+        detector = Detector(settings(options), kernel=load_kernel())
+        afterimage = AfterImage("reference", kernel=load_kernel())
+        for batch in batches[:first]:
+            detector.process(dict(batch), "s1")
+            afterimage.update(batch)
+        began = time.process_time()
+        for batch in batches[first:]:
+            detector.model.score(afterimage.update(batch))
+        kernel = time.process_time() - began
+        began = time.process_time()
+        for batch in batches[first:]:
+            detector.process(dict(batch), "s1")
+        ratios.append(kernel / (time.process_time() - began))
+    return statistics.median(ratios)
+
+
+def measured(capture: Path, rounds: int) -> dict[str, Any]:
+    """Ways of replaying in turn."""
+    options = ReplayOptions()
+    ways = {
+        "default": (options, False),
+        "blocking": (options, True),
+        "packet_in": (replace(options, telemetry="packet-in"), False),
+    }
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in ways}
+    result = None
+    for _ in range(rounds):
+        for name, (chosen, mitigate) in ways.items():
+            figures, passed = one_round(capture, chosen, mitigate=mitigate)
+            found[name].append(figures)
+            result = passed if name == "default" else result
+    assert result is not None
+    batches = batches_of(capture)
+    default = found["default"]
+    return {
+        **{f"{name}_pps": statistics.median(each["pps"] for each in rows) for name, rows in found.items()},
+        "default_pps_rounds": [each["pps"] for each in default],
+        "best_pps": max(each["pps"] for rows in found.values() for each in rows),
+        "lost": sum(each["lost"] for rows in found.values() for each in rows),
+        "cpu_us_per_packet": _medians([each["cpu_us_per_packet"] for each in default]),
+        "start_cpu_s": statistics.median(each["start_cpu_s"] for each in default),
+        "rss_mb": _medians([each["rss_mb"] for each in default]),
+        "archived_bytes_per_packet": statistics.median(each["archived_bytes_per_packet"] for each in default),
+        "scores_equal": scores_equal(batches, result, options),
+        "detector_vs_kernel": round(detector_vs_kernel(batches, options, rounds), 3),
+    }
+
+
+def _medians(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    names = sorted({name for row in rows for name in row})
+    found = {name: statistics.median(row.get(name, 0.0) for row in rows) for name in names}
+    return found | {"all": round(sum(found.values()), 2)}
+
+
+def main() -> int:
+    parser = arguments("replay", __doc__, rounds=ROUNDS)
+    parser.add_argument("--long", action="store_true", help=f"also a capture of {LONG_PACKETS:,} packets")
+    chosen = parser.parse_args()
+    about = machine()
+    with tempfile.TemporaryDirectory(prefix="sdnator-bench-") as folder:
+        figures = measured(capture_of(Path(folder), max(60_000, int(PACKETS * chosen.scale))), chosen.rounds)
+        if chosen.long:
+            long, _ = one_round(capture_of(Path(folder), LONG_PACKETS), ReplayOptions(), mitigate=False)
+            figures |= {"long": long}
+    table(("figure", "value"), [(name, value) for name, value in figures.items()])
+    write_json(chosen.json, {"machine": about, **figures})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
