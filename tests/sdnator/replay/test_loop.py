@@ -3,7 +3,7 @@
 import pytest
 
 from sdnator.errors import PipelineError
-from sdnator.replay.loop import _name_the_dead
+from sdnator.replay.loop import BLOCKING_WINDOW, FREE_WINDOW, WIRE_WINDOW, ReplayOptions, _name_the_dead
 
 
 class Dying:
@@ -20,3 +20,29 @@ class Dying:
 def test_a_part_that_is_still_dying_is_waited_for():
     with pytest.raises(PipelineError, match="switch was killed"):
         _name_the_dead(Dying())
+
+
+@pytest.mark.parametrize(
+    ("options", "mitigate", "sent", "most"),
+    [
+        ({}, False, 100_000, FREE_WINDOW),
+        ({}, True, 10, FREE_WINDOW),
+        ({}, True, 55_001, BLOCKING_WINDOW),
+        ({"window": 300}, False, 10, 300),
+        ({"window": 300}, True, 55_001, 300),
+        ({"switch": "bmv2"}, False, 10, WIRE_WINDOW),
+        ({"switch": "bmv2", "window": 4}, True, 10, 4),
+    ],
+)
+def test_many_packets_are_in_flight_only_while_nothing_can_be_blocked(options, mitigate, sent, most):
+    """Training blocks nobody; an interface takes few, whatever is asked for."""
+    assert ReplayOptions(**options).in_flight_limit(sent, mitigate=mitigate) == most
+
+
+def test_headers_come_by_digest_where_the_switch_sends_lists():
+    """And as asked for, if it is asked for."""
+    assert [ReplayOptions(switch=switch).headers for switch in ("embedded", "bmv2")] == [
+        "digest",
+        "packet-in",
+    ]
+    assert ReplayOptions(telemetry="packet-in").headers == "packet-in"
