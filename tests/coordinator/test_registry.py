@@ -199,6 +199,18 @@ def test_a_new_coordinator_keeps_who_works(order: tuple[str, str]) -> None:
     assert set(new.told["app"].revisions) == {"i1", "i2"}
 
 
+def test_a_new_coordinator_keeps_the_instance_that_worked_alone() -> None:
+    """Of standbys that never heard of a Coordinator one works; the others wait."""
+    world = World()
+    world.registry.follow()
+    for name in ("m1", "m2"):
+        world.join("m", name)
+        world.beat("m", name, version=0, epoch=0, active=name == "m2")
+    world.registry.lead()
+    world.send()
+    assert world.told["m"].active == "m2"
+
+
 def test_who_follows_listens_and_gives_no_orders() -> None:
     world = World()
     world.registry.follow()
