@@ -87,6 +87,10 @@ class DetectorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 _DEFAULTS: Final = DetectorSettings()
+_SCORES_ONLY: Final = (
+    "the model was saved by version 0.1, which learnt no behaviour: it gives scores and alerts, but no evidence; "
+    "train again to have both"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +155,7 @@ class Detector:
         """Scores have drifted, or no longer do; whoever tells people sets it back."""
         self.trained_for: dict[str, Any] = {}
         """What the model belongs to; kept in its file."""
+        self._knows_behaviour = True
         if model is None:
             self.model = KitNet(
                 fm_grace=settings.fm_grace,
@@ -202,15 +207,17 @@ class Detector:
 
         hot = self.senders.add(batch, switch, scores=scores, trained=trained, line=line, evidence=explain)
         self.victims.add(batch, trained)
-        findings = self.behaviour.add(
-            batch,
-            switch,
-            scores,
-            trained,
-            self._rescored,
-            line,
-            self.senders.blocked,
-        )
+        findings: list[Finding] = []
+        if self._knows_behaviour:
+            findings = self.behaviour.add(
+                batch,
+                switch,
+                scores,
+                trained,
+                self._rescored,
+                line,
+                self.senders.blocked,
+            )
         self._evidence += [self._as_evidence(finding) for finding in findings]
         self._follow_drift(batch, scores, trained, findings)
         over = int(np.count_nonzero(~(scores[trained:] < line)))
@@ -290,7 +297,7 @@ class Detector:
         benign = self.calibration.benign
         return {
             "senders": self.senders.to_state(),
-            "behaviour": self.behaviour.to_state(),
+            "behaviour": self.behaviour.to_state() if self._knows_behaviour else None,
             "victims": self.victims.to_state(),
             "benign": None if benign is None else benign.to_state(),
             "trained_at_us": self._trained_at_us,
@@ -314,7 +321,8 @@ class Detector:
         try:
             benign = Benign(**notes["benign"]) if notes.get("benign") else None
             self.senders = restored_senders(notes.get("senders"), self._kernel)
-            if notes.get("behaviour"):
+            self._knows_behaviour = bool(notes.get("behaviour"))
+            if self._knows_behaviour:
                 self.behaviour = restored_behaviour(notes["behaviour"], self._kernel)
             self.victims = restored_victims(notes.get("victims", ()), self._kernel)
             if notes.get("drift"):
@@ -322,6 +330,8 @@ class Detector:
             self.trained_for = dict(notes.get("trained_for") or {})
             self._trained_at_us = int(notes.get("trained_at_us", 0))
             self.training_warnings = [str(warning) for warning in notes.get("training_warnings", ())]
+            if not self._knows_behaviour and _SCORES_ONLY not in self.training_warnings:
+                self.training_warnings.append(_SCORES_ONLY)
         except (KeyError, TypeError, ValueError) as error:
             raise NotAModelError(
                 f"the model's notes are damaged ({error}); train again and save it anew"

@@ -106,6 +106,22 @@ def test_a_saved_model_needs_no_training_and_knows_the_house(tmp_path, packets, 
     ]
 
 
+def test_a_model_of_version_0_1_gives_scores_and_alerts(tmp_path, packets, outcome):
+    """Its notes hold neither behaviour nor drift: both are left out, and a warning says so once."""
+    detector, scores, _ = outcome
+    of_0_1 = ("senders", "benign", "trained_at_us", "training_warnings")
+    notes = {name: value for name, value in detector.notes().items() if name in of_0_1}
+    save_model(tmp_path / "old.npz", detector.model, notes)
+    for path in (tmp_path / "old.npz", tmp_path / "again.npz"):
+        opened = Detector(SETTINGS, model=load_model(path, kernel=load_kernel()), kernel=load_kernel())
+        again, alerts = run(opened, packets)
+        assert np.array_equal(again[12_001:], scores[12_001:])
+        assert alerts
+        assert not opened.take_evidence()
+        assert sum("version 0.1" in warning for warning in opened.training_warnings) == 1
+        opened.save(tmp_path / "again.npz")
+
+
 def test_retraining_keeps_the_map_and_trains_again(tmp_path, packets, outcome):
     detector, _, _ = outcome
     detector.save(tmp_path / "model.npz")

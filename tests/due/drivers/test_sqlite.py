@@ -440,4 +440,17 @@ def test_a_damaged_schema_is_told_as_damage(tmp_path: Path, old: bytes, new: byt
 
     with pytest.raises(BackendError):
         used_twice()
+
+
+def test_an_archive_of_version_0_1_opens(tmp_path):
+    """Its items are found and more are written; `archive_0_1.sql` is what sqlite3's `.dump` says of a real one."""
+    with sqlite3.connect(tmp_path / "archive.db") as old:
+        old.executescript(Path(__file__).with_name("archive_0_1.sql").read_text(encoding="ascii"))
+        old.execute("PRAGMA user_version = 1")
+    old.close()
+    archive = opened(tmp_path)
+    alerts = archive.find({"dataKey": "network.anomaly.kitsune.alert"})
+    assert alerts[0].value["sender"]["mac"] == "34:c3:d2:e0:fc:c9"
+    archive.insert(items(2))
+    assert len(archive.find({})) == 4 + 2
     archive.close()
