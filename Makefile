@@ -5,6 +5,7 @@
 # make docs   the documentation as a site, in site/
 # make reference   the pages and the picture of the documentation that are made from the code
 # make coverage    the tests, and which lines they do not reach
+# make dist   sdist, wheels, bill of materials and checksums in dist/; runs the demo from the wheel
 # make p4     compile p4/sdnator.p4 again (needs p4c)
 
 PYTHON ?= python3
@@ -20,7 +21,7 @@ BASE := $(VENV)/.set-up
 STAMP := $(BASE)-$(subst $(comma),-,$(EXTRAS))
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: venv demo test check docs reference coverage p4 clean
+.PHONY: venv demo test check docs reference coverage dist p4 clean
 .DEFAULT_GOAL := test
 
 venv: $(STAMP)
@@ -63,6 +64,10 @@ coverage: venv
 	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m coverage run $(PYTEST)
 	$(BIN)/python -m coverage combine --quiet
 	$(BIN)/python -m coverage report --skip-covered
+
+dist: $(BASE)
+	@$(PIP_INSTALL) --editable '.[release]'
+	@$(BIN)/python deploy/make_dist.py
 
 p4: venv
 	$(BIN)/python -m sdnator.p4_program compile

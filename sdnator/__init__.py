@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sdnator.query_results import QueryResults, run_query
     from sdnator.replay.replay_capture import CaptureReplay, replay_capture
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = ["CaptureReplay", "Kitsune", "Query", "QueryResults", "replay_capture", "run_query"]
 

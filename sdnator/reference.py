@@ -1,6 +1,6 @@
 """The reference pages, made from the code: `python -m sdnator.reference docs` writes them.
 
-    the Typer application             ─► reference/cli.md
+    the Typer application             ─► reference/cli.md, reference/sdnator.1
     sdnator.config.config_model, its Structs ─► reference/configuration.md
     INTERESTS, CAPABILITIES, messages ─► reference/keys.md, images/flow.svg
     the Coordinator's OpenAPI         ─► reference/http-api.md
@@ -24,10 +24,12 @@ NOTE = "<!-- made by `python -m sdnator.reference docs`: change the code, not th
 
 def pages() -> dict[str, str]:
     """Path below `docs/` to text, for every generated file."""
+    from sdnator.man_page import man_page
     from sdnator.report.flow_picture import rows, svg
 
     return {
         "reference/cli.md": cli(),
+        "reference/sdnator.1": man_page(),
         "reference/configuration.md": configuration(),
         "reference/keys.md": keys(),
         "reference/http-api.md": http_api(),

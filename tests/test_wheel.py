@@ -24,6 +24,7 @@ from tests.end_to_end.test_up import Operator, until
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("due", "coordinator", "apps", "dataplane", "sdnator", "p4rt")
 REST = ("setup.py", "pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE", "sdnator_due.py")
+MAN_PAGE = "docs/reference/sdnator.1"
 BUILT = ("__pycache__", "*.so", "program")
 SECONDS = 170
 
@@ -48,7 +49,8 @@ def wheel(tmp_path_factory):
     source.mkdir()
     for name in (*PACKAGES, "p4"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns(*BUILT))
-    for name in REST:
+    for name in (*REST, MAN_PAGE):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
     run(*pip, "wheel", "--no-build-isolation", "--no-deps", "--no-index", "--wheel-dir", base, source,
@@ -86,7 +88,8 @@ def test_wheel_holds_every_file_of_the_packages_and_the_switch_program(wheel):
     }
     assert program
     assert not (wanted | program) - held
-    tops = {name.split("/")[0] for name in held if ".dist-info/" not in name}
+    assert any(name.endswith(".data/data/share/man/man1/sdnator.1") for name in held)
+    tops = {name.split("/")[0] for name in held if ".dist-info/" not in name and ".data/" not in name}
     assert tops == {*PACKAGES, "sdnator_due.py"}
 
 
