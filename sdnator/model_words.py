@@ -65,4 +65,4 @@ def _left(seconds: float | None, packets: int) -> str:
 
 
 def _minute(time_us: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%MZ", time.gmtime(time_us / 1e6))
+    return time.strftime("%Y-%m-%d %H:%M %Z", time.localtime(time_us / 1e6))

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from sdnator.errors import BadInput
@@ -46,7 +46,7 @@ def duration_ns(text: str, option: str) -> int:
 
 
 def instant_ns(text: str, now: int, option: str) -> int:
-    """A time ago, or a point in time (UTC unless it says otherwise), as ns since the epoch; raises BadInput."""
+    """A time ago, or a point in time (local unless it names its zone), as ns since the epoch; raises BadInput."""
     if _DURATION.fullmatch(text.strip()):
         return now - duration_ns(text, option)
     try:
@@ -55,8 +55,14 @@ def instant_ns(text: str, now: int, option: str) -> int:
         raise BadInput(
             f"{option} {text}: give a time ago such as 1h, or one such as 2024-05-01T12:00"
         ) from None
-    aware = when if when.tzinfo else when.replace(tzinfo=UTC)
-    return int(aware.timestamp()) * 10**9 + aware.microsecond * 1_000
+    return int(when.timestamp()) * 10**9 + when.microsecond * 1_000
+
+
+def local_time(time_ns: int, *, fraction: bool = False) -> str:
+    """A time in this machine's time zone, which it names; to the second, or to the millisecond."""
+    when = datetime.fromtimestamp(time_ns // 10**9).astimezone()
+    part = f".{time_ns % 10**9 // 10**6:03d}" if fraction else ""
+    return f"{when:%Y-%m-%d %H:%M:%S}{part} {when:%Z}"
 
 
 def brief(value: Any) -> Any:

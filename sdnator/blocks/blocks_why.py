@@ -1,7 +1,6 @@
 """A decision's whole life for people: what led to it, what the archive knew, what the switches did."""
 
 from collections.abc import Collection, Iterator
-from datetime import UTC, datetime
 from typing import Any
 
 from msgspec import structs
@@ -17,6 +16,7 @@ from sdnator.blocks.lessons import ground_words, lesson_lines, lessons_in_force
 from sdnator.counted import counted
 from sdnator.errors import BadInput
 from sdnator.incidents.incidents_archive import incident_of
+from sdnator.notation import local_time
 
 _SHOWN = 200
 
@@ -118,13 +118,13 @@ def as_text(life: dict[str, Any]) -> Iterator[str]:
         where = PlaceAnswer(said["enforcer"], said["switch"], "", "").where()
         events.append((said["written"], f"  {where}: {words}".rstrip()))
     events += [(said["written"], f"  {said['text']}") for said in life["events"]]
-    yield from (f"{time_text(at)} {text}" for at, text in sorted(events, key=lambda event: event[0]))
+    yield from (f"{local_time(at)} {text}" for at, text in sorted(events, key=lambda event: event[0]))
     before = life["offences_before"]
     yield f"blocked before: {counted(before, 'time')}" if before else "blocked before: never"
     yield "evidence:" if life["evidence"] else "evidence: none, the settings name it"
     for each in life["evidence"]:
         kept = "" if each["archived"] else " (not kept in the archive)"
-        yield f"  {time_text(each['timestamp'])} {each['key']}: {each['summary'][:_SHOWN]}{kept}"
+        yield f"  {local_time(each['timestamp'])} {each['key']}: {each['summary'][:_SHOWN]}{kept}"
     for switch, reading in life["stopped"].items():
         passed = f"; {reading['seen'] - reading['packets']:,} passed" if "seen" in reading else ""
         yield f"stopped by {switch}: {counted(reading['packets'], 'packet')}, {counted(reading['bytes'], 'byte')}{passed}"
@@ -137,7 +137,7 @@ def decision_line(decision: Decision, answers: Collection[PlaceAnswer] | None = 
         decision: the decision.
         answers: what enforcers said of it last; None: that is told elsewhere.
     """
-    until = f"until {time_text(decision.expires)}" if decision.expires else "without end"
+    until = f"until {local_time(decision.expires)}" if decision.expires else "without end"
     if answers is None:
         return (
             f"{decision.id} {decision.doing} {decision.what} on {decision.switch} {until}: {decision.reason}"
@@ -146,8 +146,3 @@ def decision_line(decision: Decision, answers: Collection[PlaceAnswer] | None = 
     return (
         f"{decision.id} {action} {decision.what} on {decision.switch} {until} ({places}): {decision.reason}"
     )
-
-
-def time_text(time_ns: int) -> str:
-    """UTC, to the second."""
-    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S}Z"

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 from apps.incidents import Incident, IncidentAction
 from apps.messages import Decision, one_line
-from sdnator.incidents.incident_rows import action_words, local_time
+from sdnator.incidents.incident_rows import action_words
+from sdnator.notation import local_time
 
 _LARGEST = 3
 _WORDS = 100

@@ -31,6 +31,7 @@ from sdnator.blocks.blocks_nft import nft_sets
 from sdnator.blocks.blocks_places import PlaceAnswer, answers_of
 from sdnator.blocks.blocks_why import as_text, decision_line, life_of
 from sdnator.blocks.lessons import lesson_lines, lessons_in_force
+from sdnator.cli.plain_table import fitted
 from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
 from sdnator.up import running
@@ -76,7 +77,7 @@ def list_blocks(
         typer.echo("nothing is blocked, guarded or limited")
     else:
         for decision in shown:
-            typer.echo(decision_line(decision, answers.get(decision.id, ())))
+            typer.echo(fitted(decision_line(decision, answers.get(decision.id, ()))))
 
 
 def _as_value(decision: Decision, answers: Collection[PlaceAnswer]) -> dict[str, Any]:
@@ -95,7 +96,7 @@ def why(
     Example: sdnator blocks why 1f0c2a9be771
     """
     life = life_of(decision, archive)
-    typer.echo(json.dumps(life) if as_json else "\n".join(as_text(life)))
+    typer.echo(json.dumps(life) if as_json else "\n".join(map(fitted, as_text(life))))
 
 
 @blocks.command("add")

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import unquote, urlsplit
@@ -22,7 +21,7 @@ from sdnator.cli.plan_question import is_asked_of_adapter
 from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
 from sdnator.northbound import latest
-from sdnator.notation import brief, duration_ns, instant_ns, typed_key
+from sdnator.notation import brief, duration_ns, instant_ns, local_time, typed_key
 from sdnator.up import running
 
 if TYPE_CHECKING:
@@ -174,7 +173,7 @@ def get(
     key: KeyArgument,
     *,
     since: Annotated[
-        str, typer.Option(help="Start: 1h or 7d ago, or a UTC time such as 2024-05-01T12:00.")
+        str, typer.Option(help="Start: 1h or 7d ago, or a local time such as 2024-05-01T12:00.")
     ] = "",
     until: Annotated[str, typer.Option(help="End, like --since.")] = "",
     limit: Annotated[int, typer.Option(help="Most items to show, the newest.", min=1)] = 1_000,
@@ -236,7 +235,7 @@ def _json_line(item: "Item") -> str:
 
 def text_line(item: "Item") -> str:
     """Time, key and value on one line; of a long value only its size."""
-    when = datetime.fromtimestamp(item.event_time / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+    when = local_time(item.event_time, fraction=True)
     value = brief(item.value)
     shown = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return f"{when}  {item.key}  {shown if len(shown) <= _TEXT_WIDTH else shown[:_TEXT_WIDTH] + '…'}"

@@ -6,7 +6,6 @@ wanted ─► Coordinator ─► adapter: plan ─► switch: entries, counters 
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Annotated, Any, Final
 
 import typer
@@ -17,7 +16,7 @@ from sdnator.cli.plain_table import plain_table
 from sdnator.cli.plan_question import ask_plan, is_asked_of_adapter
 from sdnator.errors import PipelineError
 from sdnator.northbound import ask, latest
-from sdnator.notation import brief, typed_key
+from sdnator.notation import brief, local_time, typed_key
 from sdnator.up import running
 
 _BY_BIT: Final = "@{}"
@@ -275,5 +274,5 @@ def _archive_lines(shown: Section) -> Iterator[str]:
     elif found["last"] is None:
         yield "no result is archived yet"
     else:
-        when = datetime.fromtimestamp(found["last"]["at"] / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+        when = local_time(found["last"]["at"], fraction=True)
         yield f"last: {when}  {json.dumps(found['last']['value'], ensure_ascii=False)}"

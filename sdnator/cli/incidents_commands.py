@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sdnator.cli.plain_table import plain_table
+from sdnator.cli.plain_table import fitted
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import as_json, as_text, row
 from sdnator.incidents.incidents_archive import archived_incidents, incident_of
@@ -23,7 +23,7 @@ def list_incidents(
     *,
     since: Annotated[
         str,
-        typer.Option(help="Reported on since: 1h or 7d ago, or a UTC time such as 2024-05-01T12:00."),
+        typer.Option(help="Reported on since: 1h or 7d ago, or a local time such as 2024-05-01T12:00."),
     ] = "",
     only_open: Annotated[bool, typer.Option("--open", help="Only those that are not over.")] = False,
     archive: ArchiveOption = "",
@@ -41,9 +41,12 @@ def list_incidents(
     elif not found:
         typer.echo("no incident is open" if only_open else "no incidents")
     else:
-        names = ("id", "time", "kind", "attacker", "victims", "state", "stopped", "done")
-        rows = (row(each) for each in found)
-        typer.echo(plain_table(names, [[one[name] for name in names] for one in rows]))
+        for one in map(row, found):
+            typer.echo(
+                fitted(f"{one['id']}  {one['time']}  {one['kind']}: {one['attacker']} → {one['victims']}")
+            )
+            packets = "" if one["stopped"] == "0" else f" ({one['stopped']} packets stopped)"
+            typer.echo(fitted(f"    {one['state']}: {one['done']}{packets}"))
 
 
 @incidents.command("show")
@@ -60,4 +63,4 @@ def show_incident(
     found = incident_of(archive, name)
     if found is None:
         raise BadInput(f"no incident has the id {name}, or a decision with it; see `sdnator incidents list`")
-    typer.echo(json.dumps(as_json(found)) if as_json_object else "\n".join(as_text(found)))
+    typer.echo(json.dumps(as_json(found)) if as_json_object else "\n".join(map(fitted, as_text(found))))

@@ -53,13 +53,13 @@ class LazyGroup(TyperGroup):
             self._listing = False
 
 
-def register(app: typer.Typer, name: str, text: str) -> None:
-    """Make a command known; `text` is the first line of its help (a test compares them)."""
+def register(app: typer.Typer, name: str, text: str, group: str) -> None:
+    """Make a command known; `text` is the first line of its help (a test compares them), `group` its place there."""
 
     def stands_in() -> None:
         """Never called: `LazyGroup.get_command` returns the real one."""
 
-    app.command(name, help=text)(stands_in)
+    app.command(name, help=text, rich_help_panel=group)(stands_in)
 
 
 def _loaded(name: str, place: str) -> Any:

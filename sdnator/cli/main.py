@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 a part of the pipeline failed, 2 bad input or misuse, 130 
 """
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Mapping
@@ -110,6 +111,20 @@ COMMANDS = {
 """Name to module and first line of help."""
 
 
+GROUPS = {
+    "Run": ("up", "down", "demo", "detect", "switch"),
+    "Look": (
+        "status", "incidents", "explain", "observe", "get", "queries", "apps", "keys", "flow", "logs",
+        "tables", "counters",
+    ),
+    "Decide": ("blocks", "allow", "model"),
+    "Data": ("dataset", "backup", "restore"),
+    "Maintain": ("config", "doctor", "program", "shell"),
+}  # fmt: skip
+"""In which order `sdnator --help` shows commands; what stands nowhere is maintenance."""
+_MOST_COLUMNS = 100
+
+
 class _Commands(LazyGroup):
     PLACES: ClassVar[Mapping[str, str]] = {name: place for name, (place, _) in COMMANDS.items()}
 
@@ -122,8 +137,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _name, (_, _text) in COMMANDS.items():
-    register(app, _name, _text)
+_GROUP_OF = {name: group for group, names in GROUPS.items() for name in names}
+for _name in sorted(COMMANDS, key=lambda name: [*_GROUP_OF, name].index(name)):
+    register(app, _name, COMMANDS[_name][1], _GROUP_OF.get(_name, "Maintain"))
 
 
 def _show_version(wanted: bool) -> None:
@@ -142,7 +158,7 @@ def _root(
     pass
 
 
-@app.command()
+@app.command(rich_help_panel="Run")
 def replay(
     capture: Annotated[
         Path, typer.Argument(help="pcap or pcapng, plain or gzipped; or the name of a fetched data set.")
@@ -256,6 +272,8 @@ def main() -> None:
     """Entry point: errors become one line and an exit code, Ctrl-C becomes 130."""
     signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _interrupt)
+    # Typer's help is as wide as the terminal, however wide that is
+    os.environ.setdefault("TERMINAL_WIDTH", str(min(_MOST_COLUMNS, shutil.get_terminal_size().columns)))
     try:
         app()
     except SdnatorError as error:

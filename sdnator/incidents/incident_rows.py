@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from datetime import datetime
 from typing import Any, Final
 
 from msgspec import structs
@@ -10,6 +9,7 @@ from msgspec import structs
 from apps.evidence import Kind
 from apps.incidents import REMEDY_WORDS, Incident, IncidentAction, IncidentCost
 from sdnator.counted import counted
+from sdnator.notation import local_time
 
 KINDS: Final[dict[Kind, str]] = {
     "scan": "scan",
@@ -86,11 +86,6 @@ def row(incident: Incident) -> dict[str, str]:
         "stopped": f"{incident.cost.stopped:,}",
         "state": incident.state,
     }
-
-
-def local_time(time_ns: int) -> str:
-    """A time in this machine's time zone, which it names; to the second."""
-    return f"{datetime.fromtimestamp(time_ns // 1_000_000_000).astimezone():%Y-%m-%d %H:%M:%S %Z}"
 
 
 def short_attacker(incident: Incident) -> str:

@@ -32,7 +32,7 @@ def test_the_time_left_in_words(changes, text):
 
 def test_drift_stands_in_the_first_line_and_says_what_to_do():
     model = {"done": True, "trained_at_us": 1_700_000_000_000_000, "trained_s": 3_600, "senders": 12}
-    assert headline(model) == "trained until 2023-11-14 22:13Z"
+    assert headline(model) == "trained until 2023-11-14 22:13 UTC"
     lines = list(
         model_lines(model | {"drifted": True, "drift_share": 0.2, "drift_limit": 0.05, "drift_blocks": 40})
     )

@@ -40,12 +40,12 @@ def run(group, *words: str) -> str:
     return done.stdout
 
 
-def test_one_row_each(archive):
-    head, first, second = run(incidents, "list", "--archive", archive).splitlines()
-    assert head.split() == ["id", "time", "kind", "attacker", "victims", "state", "stopped", "done"]
-    assert first.startswith(life()[0].id)
-    assert first.endswith("over   70       blocked 5c:cf:7f:05:f2:c6 port 1, over")
-    assert second.startswith("later")
+def test_two_lines_each(archive):
+    lines = run(incidents, "list", "--archive", archive).splitlines()
+    assert max(map(len, lines)) <= 100
+    assert lines[0].startswith(life()[0].id)
+    assert "over: blocked 5c:cf:7f:05:f2:c6 port 1, over (70 packets stopped)" in lines[1]
+    assert any(line.startswith("later") for line in lines)
     (only,) = json.loads(run(incidents, "list", "--open", "--json", "--archive", archive))
     assert (only["id"], only["mitigated"], only["done"]) == ("later", False, "nothing")
 
@@ -67,6 +67,6 @@ def test_one_is_shown_by_its_id_or_by_a_decision(archive):
 def test_why_names_the_sum_and_the_incident(archive):
     """`blocks why` says it in five lines, from the incident's archived reports."""
     five, rest = run(blocks, "why", "d1", "--archive", archive).split("\n\n")
-    assert len(five.splitlines()) == 5
+    assert sum(not line.startswith(" ") for line in five.splitlines()) == 5
     assert "10.0 nats of evidence; the bound was 10.0" in five
     assert rest.startswith(f"part of incident {life()[0].id}")
