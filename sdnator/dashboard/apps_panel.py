@@ -35,7 +35,9 @@ class AppsPanel:
                 ui.label(
                     "▲ items written, ▼ items received a second; point at an arrow for its keys and their rates"
                 ).classes("quiet")
-                self._chart = ui.echart(flow_chart((), (), {}, {})).style("height: 380px; width: 100%")
+                self._chart = ui.echart(flow_chart((), (), {}, {}), renderer="svg").style(
+                    "height: 380px; width: 100%"
+                )
                 self._chart.classes("flow")
             with ui.element("div").classes("panel wide"):
                 ui.label("Instances").classes("panel-title")

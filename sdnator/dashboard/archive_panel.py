@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from due.errors import DueError
+from sdnator.counted import counted
 from sdnator.dashboard.texts import clock
 from sdnator.errors import BadInput
 from sdnator.notation import brief, instant_ns, typed_key
@@ -25,13 +26,16 @@ class ArchivePanel:
 
     def __init__(self, service: "PageBackend") -> None:
         self._service = service
+        self._opened = False
         with ui.element("div").classes("panel"):
             with ui.element("div").classes("form"):
                 self._key = ui.input(
-                    "Key; * is one segment, ** the rest", value="network.anomaly.kitsune.alert"
+                    "Key; * is one segment, ** the rest", value="network.incident.firewall.*"
                 )
                 self._key.props("outlined dense").style("flex: 1 1 280px").classes("search-key")
-                self._since = ui.input("From: 1h ago, or a UTC time", value="1h").props("outlined dense")
+                self._since = ui.input("From: 1h for an hour ago, or a time", value="1d").props(
+                    "outlined dense"
+                )
                 self._until = ui.input("To: empty is now").props("outlined dense")
                 ui.button("Search", icon="search", on_click=self._search).props("unelevated no-caps").classes(
                     "search-now"
@@ -46,6 +50,12 @@ class ArchivePanel:
             self._table.props("flat dense rows-per-page-label=rows").classes("plain found")
             self._table.add_slot("no-data", '<div class="nothing">nothing to show</div>')
 
+    async def open(self) -> None:
+        """The first search, of the incidents of the last day: the page opens with something to see."""
+        if not self._opened:
+            self._opened = True
+            await self._search()
+
     async def _search(self) -> None:
         now = time.time_ns()
         try:
@@ -58,8 +68,8 @@ class ArchivePanel:
             self._table.rows = []
             return
         self._table.rows = [row(place, item) for place, item in enumerate(reversed(items))]
-        older = f"; there are older ones: the {_LIMIT} youngest are shown" if more else ""
-        self._said.set_text(f"{len(items)} items{older}")
+        older = f"; there are older ones: the {_LIMIT} newest are shown" if more else ""
+        self._said.set_text(f"{counted(len(items), 'item')}{older}")
 
 
 def row(place: int, item: "Item") -> dict[str, Any]:

@@ -21,6 +21,10 @@ NAMES_KEPT: Final = 64
 BINS: Final = 240
 PARTS: Final = ("coordinator", "p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "dashboard")
 """Apps whose absence is news; others come and go."""
+OBSERVERS: Final = ("observe-", "operator", "replay")
+"""Beginnings of the ids of commands: they look on, and are no apps of the pipeline."""
+COSTS: Final = ("packet_in", "digests", "counts_reported", "cells_answered")
+_COST_SECONDS: Final = 1.5
 STANDING: Final = ("block", "protect", "meter")
 EVERY_SWITCH: Final = ("", "*")
 
@@ -76,6 +80,8 @@ class Board:
         self.incidents: OrderedDict[str, Incident] = OrderedDict()
         """By id, as last reported, the one heard of last at the end."""
         self.switches: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
+        self.cost: OrderedDict[str, Mapping[str, float]] = OrderedDict()
+        """What each switch sends to its controller a second."""
         self.health: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
         self.apps: list[dict[str, Any]] = []
         self.instances: list[dict[str, Any]] = []
@@ -90,6 +96,7 @@ class Board:
         """Parts that are away or keep dying, as `sdnator up` says; empty: none."""
         self.counts: Counter[str] = Counter()
         self.versions: Counter[str] = Counter()
+        self._asked: OrderedDict[str, tuple[float, Mapping[str, Any]]] = OrderedDict()
         self._written: dict[str, tuple[float, int, int]] = {}
         self._keys: OrderedDict[tuple[str, str], tuple[float, Mapping[str, int]]] = OrderedDict()
 
@@ -147,11 +154,21 @@ class Board:
                 del self.incidents[next(over, next(iter(self.incidents)))]
             self._changed("incidents")
 
-    def switch(self, value: Mapping[str, Any]) -> None:
-        """The state of a switch."""
+    def switch(self, value: Mapping[str, Any], now: float | None = None) -> None:
+        """The state of a switch, come at `now` (s); None: it is an old one."""
+        name = str(value["switch"])
         with self.lock:
-            _keep(self.switches, str(value["switch"]), value)
+            if now is not None:
+                self._note_cost(name, value, now)
+            _keep(self.switches, name, value)
             self._changed("switches")
+
+    def _note_cost(self, name: str, value: Mapping[str, Any], now: float) -> None:
+        then, before = self._asked.get(name, (now, value))
+        if now - then >= _COST_SECONDS:
+            _keep(self.cost, name, _rates(before, value, now - then))
+        if name not in self._asked or now - then >= _COST_SECONDS:
+            _keep(self._asked, name, (now, value))
 
     def knows_switch(self, name: str) -> bool:
         """Whether it has said anything."""
@@ -205,8 +222,13 @@ class Board:
         return sum(one.state == "open" for one in self.incidents.values())
 
     def present(self) -> list[dict[str, Any]]:
-        """Apps that are here, and parts of the product that ought to be."""
-        return [app for app in self.apps if set(app["states"]) != {"offline"} or app["app_id"] in PARTS]
+        """Apps that are here, and parts of the product that ought to be; no commands that look on."""
+        return [
+            app
+            for app in self.apps
+            if not app["app_id"].startswith(OBSERVERS)
+            and (set(app["states"]) != {"offline"} or app["app_id"] in PARTS)
+        ]
 
     def rates_by_key(self) -> dict[str, Counter[str]]:
         """Items written a second by app and key, all instances together."""
@@ -220,7 +242,7 @@ class Board:
         found = self.health.get("kitsune", {}).get("app", {}).get("model")
         return found if isinstance(found, Mapping) else None
 
-    def line(self) -> float | None:
+    def threshold(self) -> float | None:
         """The score from which Kitsune calls a packet anomalous."""
         value = self.health.get("kitsune", {}).get("app", {}).get("line")
         return float(value) if isinstance(value, int | float) else None
@@ -255,6 +277,12 @@ class Board:
     def _changed(self, topic: str) -> None:
         self.versions[topic] += 1
         self.counts[topic] += 1
+
+
+def _rates(before: Mapping[str, Any], now: Mapping[str, Any], seconds: float) -> dict[str, float]:
+    """What has grown a second; a controller that was restarted counts from 0 again."""
+    grown = {name: int(now.get(name, 0)) - int(before.get(name, 0)) for name in COSTS}
+    return {name: max(0, count) / seconds for name, count in grown.items()}
 
 
 def _keep(kept: OrderedDict[Any, Any], name: Any, value: Any) -> None:

@@ -16,6 +16,9 @@ _LEAST_SCORE = 0.001
 _LEAST_SHOWN = 0.05
 _TOLD = 12
 _NO_MARKUP = str.maketrans("{}", "()")
+Point = list[float | None]
+_SILENCE_S = 3.0
+"""Kitsune speaks more often than this while packets come."""
 _GRID = "rgba(128,128,128,0.18)"
 _PLACES = {
     "p4runtime_ctrl": (12, 52),
@@ -30,7 +33,7 @@ _PLACES = {
 def score_chart() -> dict[str, Any]:
     """Highest and mean score over time, and the line between normal and not."""
     axis = {"axisLabel": {"color": GREY, "hideOverlap": True}, "splitLine": {"lineStyle": {"color": _GRID}}}
-    line = {"type": "line", "showSymbol": False, "data": []}
+    line = {"type": "line", "showSymbol": True, "symbolSize": 2, "connectNulls": False, "data": []}
     return {
         "animation": False,
         "grid": {"left": 48, "right": 16, "top": 34, "bottom": 26},
@@ -73,12 +76,23 @@ def top(scores: Iterable[float], line: float | None) -> float:
     return 10.0 ** ceil(log10(min(1e12, max(10.0, line or 0.0, *scores))))
 
 
-def score_points(bins: Iterable[Bin]) -> tuple[list[list[float]], list[list[float]]]:
-    """Points of both series: time in ms, score."""
-    highest, mean = [], []
+def score_points(bins: Iterable[Bin], width: float) -> tuple[list[Point], list[Point]]:
+    """Points of both series: time in ms, score; None between slices where nothing came: silence is a gap.
+
+    Args:
+        bins: slices of time that had packets, in order.
+        width: of a slice, s.
+    """
+    highest: list[Point] = []
+    mean: list[Point] = []
+    last = None
     for each in bins:
         if each.count:
             at = round(each.start * 1e3)
+            if last is not None and each.start - last > max(_SILENCE_S, width):
+                for series in (highest, mean):
+                    series.append([round((last + width) * 1e3), None])
+            last = each.start
             highest.append([at, max(_LEAST_SCORE, round(each.highest, 4))])
             mean.append([at, max(_LEAST_SCORE, round(each.total / each.count, 4))])
     return highest, mean

@@ -7,7 +7,7 @@ from nicegui import app, ui
 from sdnator.dashboard.acting import Acting
 from sdnator.dashboard.apps_panel import AppsPanel
 from sdnator.dashboard.archive_panel import ArchivePanel
-from sdnator.dashboard.live_panel import LivePanel
+from sdnator.dashboard.overview_panel import OverviewPanel
 from sdnator.dashboard.queries_panel import QueriesPanel
 from sdnator.dashboard.style import STYLE
 from sdnator.dashboard.switches_panel import SwitchesPanel
@@ -28,46 +28,56 @@ def build(service: "PageBackend") -> None:
         ui.space()
         _dark_button()
         acting.sign_in_button()
-    with ui.tabs().props("dense align=left no-caps inline-label").classes("w-full") as tabs:
-        names = {
-            "Live": "monitor_heart",
-            "Apps": "hub",
-            "Queries": "functions",
-            "Switches": "lan",
-            "Archive": "manage_search",
-        }
-        places = {name: ui.tab(name, icon=icon) for name, icon in names.items()}
-    tabs.set_value("Live")
-    with ui.tab_panels(tabs, value="Live", animated=False).classes("w-full").props("keep-alive"):
-        with ui.tab_panel(places["Live"]).classes("q-pa-none"):
-            live = LivePanel(service, acting)
-        with ui.tab_panel(places["Apps"]).classes("q-pa-none"):
+    tabs, places = _tabs()
+    with ui.tab_panels(tabs, value="Overview", animated=False).classes("w-full").props("keep-alive"):
+        with ui.tab_panel(places["Overview"]).classes("q-pa-none"):
+            overview = OverviewPanel(service, acting)
+        with ui.tab_panel(places["Machinery"]).classes("q-pa-none"):
             apps = AppsPanel(service.board)
         with ui.tab_panel(places["Queries"]).classes("q-pa-none"):
             queries = QueriesPanel(service)
         with ui.tab_panel(places["Switches"]).classes("q-pa-none"):
             switches = SwitchesPanel(service)
         with ui.tab_panel(places["Archive"]).classes("q-pa-none"):
-            ArchivePanel(service)
+            archive = ArchivePanel(service)
 
     def refresh() -> None:
         """Only what is on show costs anything."""
         if degraded.text != service.board.degraded:
             degraded.set_text(service.board.degraded)
-        if tabs.value == "Live":
-            live.refresh()
-        elif tabs.value == "Apps":
+        if tabs.value == "Overview":
+            overview.refresh()
+        elif tabs.value == "Machinery":
             apps.refresh()
         elif tabs.value == "Queries":
             queries.refresh()
 
-    async def refresh_switches() -> None:
+    async def refresh_slowly() -> None:
+        """What has to be asked for."""
         if tabs.value == "Switches":
             await switches.refresh()
+        elif tabs.value == "Overview":
+            await overview.refresh_traffic()
+        elif tabs.value == "Archive":
+            await archive.open()
 
     ui.timer(1 / service.settings.frames, refresh)
-    ui.timer(3.0, refresh_switches)
-    tabs.on_value_change(refresh_switches)
+    ui.timer(3.0, refresh_slowly)
+    tabs.on_value_change(refresh_slowly)
+
+
+def _tabs() -> tuple[ui.tabs, dict[str, ui.tab]]:
+    names = {
+        "Overview": "monitor_heart",
+        "Machinery": "hub",
+        "Queries": "functions",
+        "Switches": "lan",
+        "Archive": "manage_search",
+    }
+    with ui.tabs().props("dense align=left no-caps inline-label").classes("w-full") as tabs:
+        places = {name: ui.tab(name, icon=icon) for name, icon in names.items()}
+    tabs.set_value("Overview")
+    return tabs, places
 
 
 def _dark_button() -> None:

@@ -128,7 +128,7 @@ class DashboardService:
             **dict.fromkeys(DECISIONS, lambda item: board.decide([Decision.from_value(item.value)])),
             CONFIRMATIONS: lambda item: board.confirm(Confirmation.from_value(item.value), sender_of(item)),
             INCIDENTS: lambda item: board.incident(Incident.from_value(item.value)),
-            f"{_STATE}.*": lambda item: board.switch(item.value),
+            f"{_STATE}.*": lambda item: board.switch(item.value, time.monotonic()),
             "due.health.*": lambda item: board.healthy(item.app_id, item.value, time.monotonic()),
             ANSWERS: self._on_answer,
         }

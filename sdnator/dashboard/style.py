@@ -9,10 +9,18 @@ body { font-variant-numeric: tabular-nums; }
 .nicegui-content { padding: 12px; gap: 12px; max-width: 1500px; margin: 0 auto; width: 100%; }
 .board { display: grid; gap: 12px; width: 100%; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); }
 .board > .wide { grid-column: 1 / -1; }
+.health { border-radius: 8px; padding: 10px 14px; font-size: 1.05rem; font-weight: 500; width: 100%; color: #fff; }
+.health.well { background: #1b6e3a; } .health.notice { background: #8a5200; } .health.trouble { background: #b71c1c; }
+.scores svg text, .flow svg text { fill: currentColor !important; stroke: none !important; }
+.body--dark .text-primary { color: #8dbdf0 !important; }
+summary { cursor: pointer; list-style: none; text-decoration: underline; }
+:focus-visible { outline: 2px solid #2f6fb3; outline-offset: 1px; }
+.body--dark :focus-visible { outline-color: #8dbdf0; }
 .figures { display: grid; gap: 8px; width: 100%; grid-template-columns: repeat(auto-fit, minmax(120px, 1fr)); }
 .figure { border: 1px solid rgba(128, 128, 128, .25); border-radius: 8px; padding: 8px 12px; }
 .figure .number { font-size: 1.45rem; font-weight: 500; line-height: 1.3; }
 .figure .name { font-size: .75rem; opacity: .7; }
+.q-tab-panel > .panel { width: 100%; }
 .panel { border: 1px solid rgba(128, 128, 128, .25); border-radius: 8px; padding: 12px; min-width: 0; }
 .panel-title { font-weight: 500; font-size: .95rem; margin-bottom: 4px; }
 .quiet { opacity: .7; font-size: .8rem; }
@@ -38,7 +46,14 @@ body { font-variant-numeric: tabular-nums; }
 .form { display: flex; gap: 8px; flex-wrap: wrap; align-items: center; width: 100%; }
 @media (max-width: 900px) {
   .board { grid-template-columns: minmax(0, 1fr); }
-  .figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
+  .health { border-radius: 8px; padding: 10px 14px; font-size: 1.05rem; font-weight: 500; width: 100%; color: #fff; }
+.health.well { background: #1b6e3a; } .health.notice { background: #8a5200; } .health.trouble { background: #b71c1c; }
+.scores svg text, .flow svg text { fill: currentColor !important; stroke: none !important; }
+.body--dark .text-primary { color: #8dbdf0 !important; }
+summary { cursor: pointer; list-style: none; text-decoration: underline; }
+:focus-visible { outline: 2px solid #2f6fb3; outline-offset: 1px; }
+.body--dark :focus-visible { outline-color: #8dbdf0; }
+.figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
   .nicegui-content { padding: 8px; gap: 8px; }
   .q-tab__icon { display: none; }
   .entry { flex-wrap: wrap; } .entry .text { flex-basis: 70%; }

@@ -1,6 +1,6 @@
 """How times, rates and things are written on the pages.  Pure."""
 
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from msgspec import structs
@@ -13,10 +13,10 @@ _STANDING = ("installed", "exists")
 
 
 def clock(time_ns: int) -> str:
-    """A UTC time of day, with the date where that is not today's."""
-    when = datetime.fromtimestamp(time_ns / 1e9, UTC)
-    today = datetime.now(UTC).date() == when.date()
-    return f"{when:%H:%M:%S}" if today else f"{when:%Y-%m-%d %H:%M:%S}"
+    """A time of day in the server's time zone, which it names, with the date where that is not today's."""
+    when = datetime.fromtimestamp(time_ns // 10**9).astimezone()
+    today = datetime.now().astimezone().date() == when.date()
+    return f"{when:%H:%M:%S %Z}" if today else f"{when:%Y-%m-%d %H:%M:%S %Z}"
 
 
 def number(value: float) -> str:
@@ -34,9 +34,11 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     where = "all switches" if one.switch in ("", "*") else one.switch
     # without any answer nobody knows: the page may be younger than the block
     nowhere = bool(answers) and not any(text.startswith(_STANDING) for text in answers.values())
+    doing = structs.replace(one, dry_run=one.dry_run or nowhere).doing
     return {
         "id": one.id,
-        "action": structs.replace(one, dry_run=one.dry_run or nowhere).doing,
+        "action": doing,
+        "word": doing.replace("protect", "guard"),
         "target": one.what,
         "address": one.target.address,
         "where": f"{where} · {until}",
@@ -71,9 +73,10 @@ def incident_row(one: Incident) -> dict[str, Any]:
     return {
         "id": one.id,
         "action": "incident",
+        "word": "",
         "target": f"{texts['kind']}: {texts['attacker']}",
         "address": "",
         "where": f"{clock(one.begun)} · against {texts['victims']}{over}",
-        "reason": texts["done"],
+        "reason": "no action" if texts["done"] == "nothing" else texts["done"],
         "said": f"{texts['stopped']} packets stopped" if one.cost.stopped else "",
     }

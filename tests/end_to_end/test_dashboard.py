@@ -175,7 +175,8 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
     try:
         page = Page(driver, said["dashboard"])
         page.find(".decisions", ADDRESS)
-        until(lambda: "1 of 1\nswitches" in page.text())  # it was connected before the page was there
+        page.find(".health", "uarding 1 switch")  # it was connected before the page was there
+        assert unreadable(page) == []
         assert not page.shows(".undo"), "who has not signed in may only look"
         page.sign_in("not the token, but as long", lambda: page.seen(".fault", "not the token"))
         page.sign_in(token, lambda: page.seen(".sign-out"))
@@ -193,9 +194,45 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
         driver.quit()
 
 
+CONTRAST = """
+const parse = (text) => { const n = text.match(/[0-9.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n }
+const over = (top, below) => [0, 1, 2].map((i) => top[i] * top[3] + below[i] * (1 - top[3]))
+const light = (rgb) => rgb.map((v) => v / 255).map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+  .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0)
+const found = []
+const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT)
+while (walker.nextNode()) {
+  const one = walker.currentNode.parentElement, style = getComputedStyle(one)
+  if (!walker.currentNode.nodeValue.trim() || !one.checkVisibility({opacityProperty: true})) continue
+  const layers = []
+  let alpha = 1
+  for (let at = one; at; at = at.parentElement) {
+    layers.unshift(parse(getComputedStyle(at).backgroundColor))
+    alpha *= Number(getComputedStyle(at).opacity)
+  }
+  const ground = layers.reduce((below, top) => over(top, below), [255, 255, 255])
+  const ink = parse(one instanceof SVGElement ? style.fill : style.color)
+  const text = over([...ink.slice(0, 3), ink[3] * alpha], ground)
+  const [high, low] = [light(text), light(ground)].sort((a, b) => b - a)
+  const ratio = (high + 0.05) / (low + 0.05), large = parseFloat(style.fontSize) >= 24
+  if (ratio < (large ? 3 : 4.5)) found.push(`${walker.currentNode.nodeValue.trim()}: ${ratio.toFixed(2)}`)
+}
+return found
+"""
+"""Texts whose contrast with what is behind them is below WCAG's level AA."""
+
+
+def unreadable(page):
+    """Texts that people with weak eyes cannot read, in light and in dark."""
+    found = page.driver.execute_script(CONTRAST)
+    page.click("button[aria-label='light or dark']")
+    until(lambda: page.shows(".body--dark"))
+    return found + page.driver.execute_script(CONTRAST)
+
+
 def look_around(page):
     """The other tabs show the parts, the switch, the archive; nothing comes from elsewhere."""
-    page.click(".q-tab", "Apps")
+    page.click(".q-tab", "Machinery")
     until(lambda: all(name in page.text() for name in ("kitsune", "sonata_adapter", "active")))
     page.click(".q-tab", "Queries")
     # the firewall wants this one from the start
@@ -209,6 +246,7 @@ def look_around(page):
     page.click(".q-tab", "Switches")
     page.find(".tables", "block_src")
     page.click(".q-tab", "Archive")
+    page.find(".said", "item")  # it opens with the incidents of the last day
     until(lambda: page.type_now(".search-key input", "network.block.firewall.*"))
     page.click(".search-now")
     page.find(".found", ADDRESS)

@@ -14,7 +14,7 @@ FLOW = [
 
 
 def test_points_are_highest_and_mean_of_slices_that_have_some():
-    highest, mean = score_points([Bin(1.0, 2, 1, 3.0, 2.5), Bin(2.0), Bin(3.0, 1, 0, 0.0, 0.0)])
+    highest, mean = score_points([Bin(1.0, 2, 1, 3.0, 2.5), Bin(2.0), Bin(3.0, 1, 0, 0.0, 0.0)], 0.5)
     assert highest == [[1000, 2.5], [3000, 0.001]], "a logarithmic axis has no zero"
     assert mean == [[1000, 1.5], [3000, 0.001]]
 
