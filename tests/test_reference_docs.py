@@ -34,6 +34,7 @@ def made():
     "name",
     [
         "reference/cli.md",
+        "reference/sdnator.1",
         "reference/configuration.md",
         "reference/keys.md",
         "reference/http-api.md",

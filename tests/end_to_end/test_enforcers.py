@@ -43,10 +43,10 @@ def test_a_block_by_hand_stands_in_the_switch_and_on_the_host(tmp_path):
                 ("p4runtime_ctrl", "s1"),
                 ("nftables", "gateway"),
             }
-            line = operator.run("blocks", "list").stdout
+            line = " ".join(operator.run("blocks", "list").stdout.split())  # long lines are wrapped
             assert " block 10.77.1.2" in line
             assert "in force: nftables gateway, switch s1" in line
-            why = operator.run("blocks", "why", found["id"]).stdout
+            why = " ".join(operator.run("blocks", "why", found["id"]).stdout.split())
             assert "in force: nftables gateway, switch s1" in why
             assert "nftables gateway: installed" in why
             assert operator.run("blocks", "remove", SENDERS[4]).returncode == 0
