@@ -11,7 +11,7 @@ from sdnator.dashboard.texts import clock, number
 from sdnator.model_words import headline
 
 Level = Literal["well", "notice", "trouble"]
-_LOST: Final = ("lost", "gaps", "dropped_slow", "set_aside")
+_LOST: Final = ("lost", "dropped_slow", "set_aside")
 _ACTION_STATES: Final = {"decided": "decided", "in_force": "in force", "over": "over", "failed": "FAILED"}
 _COSTS: Final = {
     "packet_in": "packet-in",
