@@ -67,8 +67,9 @@ setup(
                     for part in ("table", "rows", "counter", "behaviour", "found", "store")
                 ),
             ],
-            # equality with the published features depends on these: see afterimage.c
-            extra_compile_args=["-O2", "-ffp-contract=off", "-fno-builtin-pow"],
+            # equality with the published features depends on the second and third: see afterimage.c; without the last
+            # comparisons become branches, and the sigmoids of kitnet.c are not computed in vectors
+            extra_compile_args=["-O2", "-ffp-contract=off", "-fno-builtin-pow", "-fno-trapping-math"],
             libraries=["m"],
             py_limited_api=True,
             optional=True,

@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(json.dumps(memory_growth(int(chosen.worker))))
         return 0
     found = figures_of(chosen.data, chosen.rounds, chosen.naive_rounds, chosen.scale)
-    figures = {"machine": measure.machine(), **found}
+    figures = {"machine": measure.machine(), "vectors": vectors(), **found}
     rows = [(name, value) for name, value in figures.items() if isinstance(value, int | float)]
     measure.table(("figure", "value"), rows)
     for name in ("seeds", "modes"):
@@ -85,6 +85,15 @@ def figures_of(data: Path, rounds: int, naive_rounds: int, scale: float) -> dict
     figures["modes"] = compare_modes(batches)
     figures["seeds"] = [look_alike(seed) for seed in SEEDS] if scale >= 1 else []
     return figures
+
+
+def vectors() -> str:
+    """For which vector instructions KitNET's loops in use were compiled."""
+    kernel = load_kernel()
+    if kernel is None:
+        return "no kernel"
+    name: bytes = kernel.ffi.string(kernel.lib.kitnet_vectors())
+    return name.decode()
 
 
 def whole_batches(data: Path) -> list[Batch]:

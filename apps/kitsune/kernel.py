@@ -152,6 +152,7 @@ _DECLARATIONS: Final = (
     } Layer;
     int kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width,
                      double rate, double *scratch);
+    const char *kitnet_vectors(void);
     int kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width,
                      double clip, double *scratch, double *errors, double *scores);
     """
