@@ -43,8 +43,8 @@ CHUNK = 4096
 """Most packets sent at a time."""
 SHARE = 4
 """A quarter of the window is free before more is sent, so that every stage gets packets in batches."""
-FREE_WINDOW = 16_384
-"""Most packets in flight while nothing can be blocked."""
+FREE_WINDOW = {"digest": 16_384, "packet-in": 1_024}
+"""Most packets in flight while nothing can be blocked, by the way in which headers come."""
 BLOCKING_WINDOW = 128
 """Most packets in flight while a block may take effect, unless `--window` says otherwise."""
 STALL_SECONDS = 90.0
@@ -114,7 +114,9 @@ class ReplayOptions:
     def in_flight_limit(self, sent: int, *, mitigate: bool) -> int:
         """Most packets in flight on the chosen switch after `sent` packets: training blocks nobody."""
         free = not mitigate or sent < self.training_packets
-        window = (FREE_WINDOW if free else BLOCKING_WINDOW) if self.window is None else self.window
+        window = (
+            (FREE_WINDOW[self.headers] if free else BLOCKING_WINDOW) if self.window is None else self.window
+        )
         return window if self.switch == "embedded" else min(window, WIRE_WINDOW)
 
     @property

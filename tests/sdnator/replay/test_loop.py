@@ -25,9 +25,10 @@ def test_a_part_that_is_still_dying_is_waited_for():
 @pytest.mark.parametrize(
     ("options", "mitigate", "sent", "most"),
     [
-        ({}, False, 100_000, FREE_WINDOW),
-        ({}, True, 10, FREE_WINDOW),
+        ({}, False, 100_000, FREE_WINDOW["digest"]),
+        ({}, True, 10, FREE_WINDOW["digest"]),
         ({}, True, 55_001, BLOCKING_WINDOW),
+        ({"telemetry": "packet-in"}, True, 10, FREE_WINDOW["packet-in"]),
         ({"window": 300}, False, 10, 300),
         ({"window": 300}, True, 55_001, 300),
         ({"switch": "bmv2"}, False, 10, WIRE_WINDOW),
