@@ -8,10 +8,11 @@ or block.  For each kind of flood and both IP versions
     known_, new_client_success,  the service is guarded beforehand: from the flood's first packet.  Attempts
     new_connect_ms_p50           count that begin 2 s before its end or earlier, as successes only if they
     half_open_peak               connected before its end
-    time_to_mitigate_ms          nobody guards the service: first packet to the rule confirmed by the switch
-                                 (all sources blocked, or the service guarded); a flood that was not
-                                 mitigated counts as endless
-    found                        such a round's success from 2 s after the rule
+    time_to_guard_ms             nobody guards the service: first packet to the guard confirmed by the switch
+    time_to_block_ms             the same, to the block of the last source
+    time_to_mitigate_ms          the first of both; a flood that was not mitigated counts as endless
+    found                        such a round's success from 2 s after the rule; `_worst`: of the worst round
+    host_cpu_s_per_million_syns  processor time of the host while no guard stands (benchmarks.syn_flood_cost)
 
 Medians of the rounds.  real_capture is the capture of the tests' data, re-timed to the same rate and
 looped; `as_recorded` is one run at its own times.  After 555 s no round is begun any more, so that all ends
@@ -25,13 +26,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.data_folder import add_data_option
 from benchmarks.measure import arguments, machine, table, write_json
+from benchmarks.syn_flood_cost import host_cost
 from benchmarks.syn_flood_innocent import decisions_on, generated_day, public_capture
 from sdnator.demos.syn_flood.demo import VOID_FROM, guard, median, named, start_product, terminable
 from sdnator.demos.syn_flood.frames import Sources
@@ -102,17 +104,27 @@ class FloodFigures:
             "known_client_success_worst": min((each.known_success or 0.0 for each in armed), default=None),
             "new_client_success_worst": min((each.new_success or 0.0 for each in armed), default=None),
             "guard_armed_first_challenge_ms": median(each.challenged_ms for each in armed),
+            "time_to_guard_ms": median_or_endless([each.guarded_ms for each in found]),
+            "time_to_guard_ms_worst": max((each.guarded_ms or math.inf for each in found), default=None),
+            "time_to_block_ms": median_or_endless([each.blocked_ms for each in found]),
             "time_to_mitigate_ms_all": [each.mitigated_ms for each in found],
             "found": {
                 "known_client_success": median(each.known_success for each in found),
                 "new_client_success": median(each.new_success for each in found),
                 "half_open_peak": max((each.half_open_peak for each in found), default=None),
+                "known_client_success_worst": _least(each.known_success for each in found),
+                "new_client_success_worst": _least(each.new_success for each in found),
             },
             "attempts": sum(each.tried for each in armed),
             "rounds": len(armed),
             "found_rounds": len(found),
             "syn_late_ms": max((each.latest_ms for each in armed + found), default=None),
         }
+
+
+def _least(shares: Iterable[float | None]) -> float | None:
+    """The worst round's share; rounds in which nothing was tried do not count."""
+    return min((each for each in shares if each is not None), default=None)
 
 
 def median_or_endless(values: Sequence[float | None]) -> float | None:
@@ -224,6 +236,7 @@ class Bench:
         say = f"known {outcome.known_success}, new {outcome.new_success} of {outcome.tried}"
         when = f"challenged {outcome.challenged_ms}, rule {outcome.mitigated_ms} ms"
         backlog = f"half-open {outcome.half_open_peak}, late {outcome.latest_ms} ms"
+        when += f", guard {outcome.guarded_ms}, block {outcome.blocked_ms} ms"
         print(
             f"IPv{trial.version} {trial.sources} {trial.protection}: {say}, {when}, {backlog}",
             file=sys.stderr,
@@ -273,6 +286,7 @@ def measure(names: Sequence[str], rounds: int, data: Path, keep: Path | None) ->
     figures = {version: {name: bench.kinds[version, name].figures() for name in names} for version in PLANS}
     return {
         **figures[4],
+        **host_cost(),
         "ipv6": figures[6],
         "innocent_blocks": sum(innocent.values()),
         "innocent": {**innocent, "flash_crowd_success": crowd_success},

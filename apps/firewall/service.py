@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -47,8 +48,9 @@ from apps.firewall.settings import Settings
 from apps.firewall.syn.examinations import Examination, Examinations
 from apps.firewall.syn.recent_syns import Surges
 from apps.firewall.syn.services import TcpService
+from apps.firewall.syn.suspect_samples import SuspectSamples
 from apps.firewall.syn.syn_ack_buffer import Answers, SynAckBuffer, Wanted, packet_outs
-from apps.firewall.syn.syn_defence import EVERY_SWITCH, Suspicion, SynDefence
+from apps.firewall.syn.syn_defence import EVERY_SWITCH, Suspicion, SynDefence, Watch
 from apps.messages import (
     Alert,
     Answer,
@@ -65,6 +67,8 @@ from apps.packets import SteadyTime
 from due import Capability, DueError, Engine, Interest, Item, Key, RecordBatch
 
 KITSUNES_EVIDENCE = f"{EVIDENCE}.kitsune.*"
+SAMPLES = "network.packets.p4runtime_ctrl.*"
+TELEMETRY = "network.telemetry.firewall"
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
@@ -76,8 +80,10 @@ INTERESTS = (
 )
 SYN_INTERESTS = (
     Interest(HANDSHAKES),
+    Interest("network.traffic_query.sonata.new_tcp"),
     Interest("network.traffic_query.sonata.syn_flood"),
     Interest("network.traffic_capture.sonata.tcp"),
+    *(Interest(f"{SAMPLES}.{name}") for name in SuspectSamples.names()),
     Interest("network.traffic_capture.sonata.arp"),
 )
 """Interests that are observed only if the settings ask for them, with the settings' parameters."""
@@ -93,6 +99,7 @@ CAPABILITIES = (
     INCIDENT_CAPABILITY,
     Capability(ALLOWED, delivery="reliable", archive="always"),
     Capability("network.p4_command.firewall.*", delivery="reliable"),
+    Capability(f"{TELEMETRY}.*", delivery="reliable"),
     Capability(f"{KEPT}.*", delivery="reliable", archive="always"),
     Capability("network.packet_out.firewall.*", delivery="reliable"),
     Capability(f"{history.ANSWERS}.*", delivery="reliable", archive="always"),
@@ -139,6 +146,7 @@ class FirewallService:
         """Connected switches, and the controller instance that reported each."""
         self._surges = Surges(settings.syn.threshold, settings.syn.window_ms)
         self._examinations = Examinations(settings.syn.grace_ms, settings.syn.patience_ms)
+        self._samples = SuspectSamples(settings.syn.sample_most, settings.syn.sample_ms / 1000)
         resets = settings.syn.resets if settings.syn.challenge else 0
         self._resets = SynAckBuffer(self._answers, after_s=after_s, limit=resets)
         self._bindings = ArpBindings(
@@ -223,10 +231,16 @@ class FirewallService:
     def _hear_tcp(self) -> None:
         rules = self._settings.syn
         specs = {"window": f"{rules.window_ms}ms", "threshold": str(rules.threshold)}
-        query = Key("network.traffic_query.sonata.syn_flood").with_specs(**specs).text
         stream = Key("network.traffic_capture.sonata.tcp")
-        self._hear(query, arrivals.flood_in, self._on_flood)
-        self._hear(stream.with_specs(flag="syn").text, arrivals.syns_in, self._on_syns)
+        if rules.copies == "all":
+            query = Key("network.traffic_query.sonata.syn_flood").with_specs(**specs).text
+            self._hear(query, arrivals.flood_in, self._on_flood)
+            self._hear(stream.with_specs(flag="syn").text, arrivals.syns_in, self._on_syns)
+        else:
+            query = Key("network.traffic_query.sonata.new_tcp").with_specs(**specs).text
+            self._hear(query, arrivals.flood_in, self._on_surge)
+            for name in self._samples.names():
+                self._hear(f"{SAMPLES}.{name}", arrivals.syns_in, self._on_syns)
         if rules.resets:
             self._hear(stream.with_specs(flag="syn+ack").text, arrivals.syn_acks_in, self._on_syn_acks)
 
@@ -261,6 +275,7 @@ class FirewallService:
         """Examine suspected floods that are due, and write known sources in batches."""
         with self._lock:
             self._look_at_what_is_due()
+            self._request(self._samples.ended(time.monotonic()))
             self._reset()
             updates = self._known.changes()
             for switch in self._switches if updates else ():
@@ -296,6 +311,7 @@ class FirewallService:
             "blocking_stopped": int(bool(self._ledger.stopped)),
             "stopped_by": self._ledger.stopped,
             "syns_kept": len(self._syn.recent),
+            "syn_samples": len(self._samples),
             "resets": self._resets.sent,
             "resets_spared": self._resets.spared,
             "resets_left_out": self._resets.left_out,
@@ -392,6 +408,18 @@ class FirewallService:
             now = self._time.fit(item.event_time)
             self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
 
+    def _on_surge(self, item: Item, flood: FloodReported) -> None:
+        """The switch has counted the SYNs itself; from now on some of them are copied."""
+        summary = f"{flood.count} SYNs went to {flood.dst} within {self._settings.syn.window_ms} ms"
+        with self._lock:
+            now = self._time.fit(item.event_time)
+            self._request(self._samples.begin(flood.dst, time.monotonic()))
+            self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
+
+    def _request(self, requests: Iterable[dict[str, Any]]) -> None:
+        for request in requests:
+            self._engine.write(f"{TELEMETRY}.{request['name']}", request, [due.NO_WAIT])
+
     def _on_syns(self, item: Item, batch: RecordBatch) -> None:
         rules = self._settings.syn
         with self._lock:
@@ -403,7 +431,10 @@ class FirewallService:
             self._counts["syns"] += len(batch)
             self._syn.recent.add(batch)
             self._examinations.hear(int(batch["time_us"].max()) * 1000, time.monotonic())
-            for surge in self._surges.add(batch):
+            if rules.copies == "suspects":
+                self._samples.taken(item.key.rpartition(".")[2], len(batch), time.monotonic())
+                self._request(self._samples.ended(time.monotonic()))
+            for surge in self._surges.add(batch) if rules.copies == "all" else ():
                 summary = f"{rules.threshold} SYNs went to {surge.host} within {rules.window_ms} ms"
                 self._suspect(Suspicion(surge.host, evidence_of(item, summary), surge.at, surge.window))
             if self._examinations.live:
@@ -431,7 +462,8 @@ class FirewallService:
                 self._look_at_what_is_due()
 
     def _suspect(self, suspicion: Suspicion) -> None:
-        if not len(self._syn.recent):  # SYNs do not come: there is nothing to wait for
+        if self._settings.syn.copies == "all" and not len(self._syn.recent):
+            # SYNs do not come: there is nothing to wait for
             self._look(Examination(suspicion, suspicion.now, sure=False))
         elif (wait := self._examinations.suspect(suspicion, time.monotonic())) is not None:
             self._look_later(wait)
@@ -443,6 +475,12 @@ class FirewallService:
     def _look(self, due: Examination) -> None:
         """Examine the SYNs of a suspected flood, and decide."""
         watch = self._syn.suspect(due.suspicion, due.at)
+        if self._is_too_early(watch, due):
+            again = replace(due.suspicion, now=due.at)
+            wait = self._examinations.suspect(again, time.monotonic())
+            if wait is not None:
+                self._look_later(wait)
+            return
         often = watch.often(self._settings.syn) if due.sure else ()
         offences = self._handler.offences_of_many(often, watch.now)
         for decision in self._syn.conclude(watch, offences, sure=due.sure):
@@ -454,6 +492,13 @@ class FirewallService:
                 self._resets.plan(decision.id, wanted, time.monotonic())
         if watch.unsure:
             self._examinations.doubt(due, time.monotonic())
+
+    def _is_too_early(self, watch: Watch, due: Examination) -> bool:
+        """Whether the sample, which began with the report, is still too small to tell."""
+        rules = self._settings.syn
+        patience = rules.patience_ms * 1_000_000
+        waited = due.at - due.suspicion.since
+        return rules.copies == "suspects" and not due.sure and watch.total < rules.least and waited < patience
 
     def _reset(self) -> None:
         halves = self._resets.due(time.monotonic(), sorted(self._switches), self._syn.spared)

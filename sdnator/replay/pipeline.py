@@ -126,7 +126,7 @@ class ReplayPipeline:
             "p4runtime_ctrl": self._controller_settings(),
             "kitsune": self._plan.kitsune,
             _ADAPTER: self._adapter_settings(),
-            "firewall": self._plan.firewall,
+            "firewall": self._firewall_settings(),
         }
         for name in OURS:
             if self._plan.queries or name != _ADAPTER:
@@ -218,6 +218,13 @@ class ReplayPipeline:
         windows of a switch with a clock of its own are not the capture's, so there the host counts everything.
         """
         return {"limits": {"reads": False} if self._plan.switch == "embedded" else {"stages": 0}}
+
+    def _firewall_settings(self) -> dict[str, Any]:
+        """All SYNs are copied: a flood may be over in a replay before a sample of it could be asked for."""
+        return {
+            **self._plan.firewall,
+            "syn": {"copies": "all", "grace_ms": 100, **self._plan.firewall.get("syn", {})},
+        }
 
     def _app(self, name: str, settings: Mapping[str, Any]) -> Child:
         backends = Backends(updates=self.updates, archive=self.archive)

@@ -50,6 +50,7 @@ SHARED_VICTIM: Final = ("flood", "guessing")
 _REMEDIES: Final[dict[str, Remedy]] = {"block": "block", "protect": "guard", "meter": "meter"}
 _KINDS: Final[tuple[tuple[str, Kind], ...]] = (
     ("sonata.syn_flood", "flood"),
+    ("sonata.new_tcp", "flood"),
     ("sonata.tcp", "flood"),
     ("sonata.arp", "spoofing"),
     ("kitsune.", "unlike_training"),

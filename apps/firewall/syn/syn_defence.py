@@ -149,7 +149,8 @@ class SynDefence:
         Unless handshakes had time to complete (`sure`) nobody is blocked: the service is guarded, and
         the watch is marked as unsure.
         """
-        if not len(self.recent):  # the stream of SYNs does not reach us
+        sampled = self.rules.copies == "suspects"
+        if not len(self.recent) or (sampled and not watch.total):  # the stream of SYNs does not reach us
             return self._guard_known_services(watch)
         by_port: dict[int, dict[str, int]] = {}
         for (port, source), count in watch.syns.items():

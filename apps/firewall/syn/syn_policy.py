@@ -21,11 +21,15 @@ from apps.firewall.syn.services import TcpService
 class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of the defence against SYN floods."""
 
+    copies: Literal["suspects", "all"] = "suspects"
+    """Which SYNs the switch copies: samples of those towards hosts that it reports, or all of them, as replays need,
+    where a flood may be over before a sample is asked for."""
     threshold: int = 100
-    """SYNs, or new half-open connections, towards one host within a window from which a flood is suspected."""
+    """SYNs towards one host within a window from which a flood is suspected; with all copies new half-open
+    connections count, too."""
     window_ms: int = 200
     """Length of that window."""
-    grace_ms: int = 100
+    grace_ms: int = 60
     """Capture time that handshakes get to complete before the service is guarded."""
     patience_ms: int = 1000
     """Capture time that a source gets to complete its handshakes before it is blocked."""
@@ -35,6 +39,10 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Most resets for one decision; 0: none, the connections stay until the server's own time-out."""
     sample: int = 20_000
     """SYNs kept in memory for the case that a flood is suspected."""
+    sample_most: int = 500
+    """SYNs that are copied of one suspected flood."""
+    sample_ms: int = 1500
+    """Longest time for which they are copied."""
     least: int = 50
     """Least number of SYNs without a handshake in a sample that counts as a flood."""
     repeats: int = 4

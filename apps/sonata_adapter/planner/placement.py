@@ -35,8 +35,9 @@ _DIFFERENCE_ZERO: Final = 1 << 31
 class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Capacity of the switch program, and the share that queries may use."""
 
-    bits: int = 200
-    """Classifier bits from 0 on; the controller uses the others for ports and the whole stream."""
+    bits: int = 196
+    """Classifier bits from 0 on; the firewall uses four for samples, the controller the others for ports and the
+    whole stream."""
     stages: int = 8
     entries: int = 32
     """Entries of a stage."""

@@ -281,16 +281,16 @@ def _entries(request: QueryRequest, space: Space, limits: SwitchLimits) -> list[
         return _count_entries(request, outcome.node, space, limits, outcome.threshold)
     if not isinstance(outcome, WindowTable) or not limits.reads:
         raise NotPlaced("its result is known at the window's end only, and the values of cells are not read")
-    if request.query.window_ms < limits.read_window_ms:
-        raise NotPlaced(
-            f"its result is known at the window's end only, and cells of windows shorter than "
-            f"{duration_text(limits.read_window_ms)} are not read: they would come late"
-        )
     nodes = sources(outcome)
     signed = difference(outcome)
     if signed is not None:
         with suppress(NotPlaced):  # then it is counted apart, if there is room for that
             return _difference_entries(request, outcome, signed, space)
+    if request.query.window_ms < limits.read_window_ms:
+        raise NotPlaced(
+            f"its result is known at the window's end only, and cells of windows shorter than "
+            f"{duration_text(limits.read_window_ms)} are not read: they would come late"
+        )
     found: list[StageEntry] = [space.clock()]
     for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):
         found += _count_entries(request, node, space, limits, threshold, source=place)

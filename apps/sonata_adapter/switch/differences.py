@@ -9,7 +9,7 @@ Every frame of the query makes the switch look at one key that waits for the end
 network needs no sweeps.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final, Literal
 
 import numpy as np
@@ -28,7 +28,9 @@ from due import RecordBatch
 
 SETTLE_S: Final = 0.05
 """Reports of frames without a cell may come so long after those of the window's end: they come in lists."""
-_SHORTEST_S: Final = 1.0
+_SETTLED_FROM_US: Final = 1_000_000
+"""Shorter windows do not wait for them: who asks for such windows wants results soon."""
+_SHORTEST_S: Final = 0.2
 _LONGEST_S: Final = 5.0
 """Bounds of how often the switch is asked to sweep; in between it is once in a window."""
 _AT_ONCE: Final = 64
@@ -47,6 +49,7 @@ class Differences:
         self, query: Query, found: QueryPlan, *, base_us: int = 0, since_us: int | None = None
     ) -> None:
         self._query = query
+        self._settle_s = SETTLE_S if query.window_us >= _SETTLED_FROM_US else 0.0
         self._tables = RegisterTables(query)
         self._base_us = base_us
         self._ends = WindowEnds(query, base_us, since_us)
@@ -95,8 +98,16 @@ class Differences:
                 self.missed += 1
             else:
                 window.told[key] = counted
-                window.ready = now + SETTLE_S
-        return []
+                window.ready = now + self._settle_s
+        return [] if self._settle_s else self._decided(batch["window"].tolist())
+
+    def _decided(self, numbers: Iterable[int]) -> list[QueryResult]:
+        """Results of keys that the switch alone has counted, of windows that wait for nothing."""
+        found: list[QueryResult] = []
+        for number in dict.fromkeys(numbers):
+            window = self._windows[number]
+            found += self._results(number, window, sorted(window.whole()))
+        return found
 
     def due(self, clock: Clock, now: float) -> list[CellRead]:
         """Questions about windows that are over, and sweeps while the switch has nothing to do."""

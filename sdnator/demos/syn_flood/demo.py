@@ -25,8 +25,6 @@ from sdnator.demos.syn_flood.trial import BUDGET_S, Trial, TrialHosts, TrialOutc
 
 VOID_FROM: Final = 0.1
 """Without the product the flood must leave fewer than this share of the attempts."""
-LATENESS_US: Final = 20_000
-"""One switch's packets come in order: windows need not wait long for late ones."""
 _LINEAR: Final = 3
 _LEARNING, _UNPROTECTED, _PROTECTED = 1, 2, 3
 """Services of the victim."""
@@ -148,8 +146,7 @@ def terminable() -> Iterator[None]:
 
 def start_product(stage: FloodStage, guarded: list[str], **firewall: Any) -> None:
     """Start adapter and firewall; services as ADDRESS:PORT are guarded from the start."""
-    adapter = {"lateness_us": LATENESS_US}
-    stage.start_apps({"sonata_adapter": adapter, "firewall": {"guard": guarded, **firewall}})
+    stage.start_apps({"sonata_adapter": {}, "firewall": {"guard": guarded, **firewall}})
 
 
 def named(address: str) -> str:

@@ -226,6 +226,10 @@ class FloodStage:
         """Resident memory of each part of the product, MB."""
         return {name: _resident(pid) for name, pid in self._product().items()}
 
+    def cpu_seconds(self) -> dict[str, float]:
+        """Processor time of each part of the product since its start, s."""
+        return {name: _used(pid) for name, pid in self._product().items()}
+
     def _product(self) -> dict[str, int]:
         """Process ids of the product's own parts; BMv2 is none."""
         ours = [name for name in PARTS if name != "switch" or self._kind == "embedded"]

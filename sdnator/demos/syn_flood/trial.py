@@ -103,6 +103,10 @@ class TrialOutcome:
     mitigated_ms: float | None
     """From the first SYN to the rule in the switch; None for a guard that was there before."""
     tried: int
+    guarded_ms: float | None = None
+    """From the first SYN to the service's guard."""
+    blocked_ms: float | None = None
+    """From the first SYN to the block of the last source."""
 
     @property
     def new_connect_ms_p50(self) -> float | None:
@@ -212,6 +216,8 @@ class TrialHosts:
             challenged_ms=_since(first, challenged),
             mitigated_ms=_since(first, mitigated),
             tried=len(counted),
+            guarded_ms=_since(first, mitigation(_of(self.stage.confirmed, "protect"), trial, first)),
+            blocked_ms=_since(first, mitigation(_of(self.stage.confirmed, "block"), trial, first)),
         )
 
     def _counted(self, trial: Trial, first: float, end: float, mitigated: float | None) -> list[Attempt]:
@@ -221,6 +227,10 @@ class TrialHosts:
         )
         until = end - (BUDGET_S if trial.protection == "none" else NEEDED_S)
         return [each for each in self.records.towards(trial.address) if begin <= each.at <= until]
+
+
+def _of(confirmed: Iterable[tuple[float, Confirmation]], action: str) -> list[tuple[float, Confirmation]]:
+    return [each for each in confirmed if each[1].action == action]
 
 
 def mitigation(confirmed: Iterable[tuple[float, Confirmation]], trial: Trial, first: float) -> float | None:

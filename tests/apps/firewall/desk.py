@@ -11,6 +11,7 @@ from reactivex import Subject
 from apps.firewall.policy.rules import Rules
 from apps.firewall.service import FirewallService
 from apps.firewall.settings import Settings
+from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Confirmation, Decision
 from due import Item, Key
 from due.errors import ArchiveUnavailable, Timeout
@@ -72,9 +73,11 @@ class Desk:
         switches: tuple[str, ...] = ("s1",),
         engine: FakeEngine | None = None,
         rule: str = "seconds",
+        copies: str = "all",
         **settings: Any,
     ):
         self.engine = engine or FakeEngine()
+        settings["syn"] = structs.replace(settings.get("syn", SynRules()), copies=copies)
         settings["rules"] = structs.replace(settings.get("rules", Rules()), rule=rule)
         self.service = FirewallService(self.engine, Settings(**settings))  # type: ignore[arg-type]
         self.service.start()

@@ -6,6 +6,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as examples
 
 from apps.firewall.service import INTERESTS, SYN_INTERESTS
+from apps.firewall.syn.suspect_samples import SuspectSamples
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Instruction
 from due import Item
@@ -19,6 +20,11 @@ from tests.apps.hostile import carried, mutations, values
 
 INSTRUCTION = "network.instruction.operator.firewall"
 FLOOD = "network.traffic_query.sonata.syn_flood:threshold=100,window=200ms"
+SURGE = "network.traffic_query.sonata.new_tcp:threshold=100,window=200ms"
+SUSPECTS = {
+    f"network.packets.p4runtime_ctrl.s1.{name}": f"network.packets.p4runtime_ctrl.*.{name}"
+    for name in SuspectSamples.names()
+}
 CONFIRMATION = "network.confirmation.p4runtime_ctrl.s1"
 SPOKEN = "network.evidence.kitsune.ports"
 TRAINED = "network.training.kitsune"
@@ -29,6 +35,7 @@ PATTERNS = {
     CONFIRMATION: "network.confirmation.p4runtime_ctrl.*",
     SPOKEN: "network.evidence.kitsune.*",
     TRAINED: "network.training.*",
+    **SUSPECTS,
 }
 GENUINE = {
     ALERT: alert(NOW // SECOND).to_value(),
@@ -40,6 +47,8 @@ GENUINE = {
     HANDSHAKE: {"source": "10.0.0.1", "service": "10.0.0.2", "port": 80, "at": NOW},
     FLOOD: {"dst": "10.0.0.1", "count": 5, "window_start": NOW},
     SYNS: batch(*[(NOW // 1000, "10.1.0.1", "10.0.0.1", 80)] * 3),
+    SURGE: {"dst": "10.0.0.1", "count": 5, "window_start": NOW},
+    **{key: batch((NOW // 1000, "10.1.0.1", "10.0.0.1", 80)) for key in SUSPECTS},
     SYN_ACKS: records([syn_ack("77.0.0.1", 1, "10.0.0.1", 8, time_us=NOW // 1000)]),
     SPOKEN: evidence(4.0, NOW // SECOND).to_value(),
     TRAINED: {"packets": 9, "wanted": 9, "done": True, "seconds": 60.0, "senders": 5, "event_time": NOW},
@@ -52,6 +61,11 @@ def hand(desk, key, value, *, app="", event=NOW):
     writer = app or ("sonata_adapter" if named == "sonata" else named)
     item = Item(key, carried(value), NOW, event, writer, "i1", 1)
     desk.engine.subjects[PATTERNS.get(key, key)].on_next(item)
+
+
+def copies_for(key):
+    """The setting with which the firewall listens to a key."""
+    return "suspects" if key in (SURGE, *SUSPECTS) else "all"
 
 
 def still_works(desk, number=99):
@@ -71,7 +85,7 @@ def test_all_interests_are_tried():
 @pytest.mark.parametrize("key", GENUINE)
 def test_hostile_values_are_refused_and_counted(key, caplog):
     """Every wrong value under every key leaves the firewall alive; the log stays short."""
-    desk = Desk(syn=SynRules(grace_ms=0, patience_ms=0))
+    desk = Desk(syn=SynRules(grace_ms=0, patience_ms=0), copies=copies_for(key))
     number = 0
     for number, value in enumerate(mutations(GENUINE[key]), start=1):  # noqa: B007 - the last one is used
         hand(desk, key, value)
@@ -85,7 +99,7 @@ def test_hostile_values_are_refused_and_counted(key, caplog):
 @pytest.mark.parametrize("key", GENUINE)
 def test_nobody_speaks_for_another_app(key):
     """A genuine message under another app's key does nothing, and is counted."""
-    desk = Desk(switches=())
+    desk = Desk(switches=(), copies=copies_for(key))
     hand(desk, key, GENUINE[key], app="intruder")
     assert desk.service.health()["refused_by_cause"] == {"sender": 1}
     assert desk.engine.written == []
@@ -95,12 +109,13 @@ def test_nobody_speaks_for_another_app(key):
 @given(values)
 def test_any_plain_value_under_any_key(value):
     """Whatever values hypothesis makes, no callback raises."""
-    desk = Desk()
-    for key, genuine in GENUINE.items():
-        hand(desk, key, value)
-        if isinstance(genuine, dict) and isinstance(value, dict):
-            hand(desk, key, {**genuine, **value})
-    still_works(desk)
+    for copies in ("all", "suspects"):
+        desk = Desk(copies=copies)
+        for key, genuine in GENUINE.items():
+            hand(desk, key, value)
+            if isinstance(genuine, dict) and isinstance(value, dict):
+                hand(desk, key, {**genuine, **value})
+        still_works(desk)
 
 
 def test_a_time_far_ahead_ends_no_block():

@@ -22,11 +22,11 @@ def segments(second, number, target="10.1.1.1", flags=SYN):
 class Network:
     """A switch under one adapter."""
 
-    def __init__(self, **model):
+    def __init__(self, key=SYN_FLOOD, **model):
         self.control = Control(CATALOGUE)
         self.switch = SwitchModel(base_us=BASE_US, **model)
         self.control.switch("s1", BASE_US)
-        self.switch.change(self.control.want([SYN_FLOOD]))
+        self.switch.change(self.control.want([key]))
         self.written = []
 
     def play(self, frames, now, *, deaf=False):
@@ -130,3 +130,18 @@ def test_a_report_that_comes_twice_makes_one_result():
         network.look(now + 0.5)
     assert network.results == [(7, {"dst": "10.1.1.1", "count": 5}, True)]
     assert network.control.health()["late_reads"] == 1
+
+
+def test_short_windows_are_counted_in_the_switch_and_told_at_once():
+    """Windows of 100 ms: the result comes with the report, without a look or a tick."""
+    network = Network(f"{SYN_FLOOD}:window=100ms")
+    assert network.control.plan.queries[0].in_switch
+    network.play(segments(0.02, 4), 0.0)
+    assert network.written == []
+    network.play(segments(0.12, 1, "10.1.1.9"), 0.1)
+    (one,) = network.written
+    assert (one.output.fields, one.output.length_us, one.output.exact) == (
+        {"dst": "10.1.1.1", "count": 4},
+        100_000,
+        True,
+    )
