@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.kitsune.afterimage import AfterImage, Mode
+from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import load_kernel
 from apps.kitsune.kitnet import KitNet
 from apps.packets import PACKET_COLUMNS
@@ -80,6 +81,7 @@ def figures_of(data: Path, rounds: int, naive_rounds: int, scale: float) -> dict
     for prefix in ("", f"snap{SNAP}_"):
         figures[f"{prefix}ratio_features"] = figures[f"{prefix}features_pps"] / naive["naive_features_pps"]
         figures[f"{prefix}ratio_total"] = figures[f"{prefix}total_pps"] / naive["naive_total_pps"]
+    figures |= detector_speeds(batches, rounds)
     figures |= hub_speeds(batches, rounds)
     figures["rss_growth_mb"] = grown(int(FLAT_PACKETS * scale))
     figures["modes"] = compare_modes(batches)
@@ -167,6 +169,33 @@ def speeds(batches: Sequence[Batch], rounds: int, data: Path) -> dict[str, Any]:
     )
     scores = network.score(features[first:])[0]
     return figures | accuracy(data, features, network.feature_map, scores)
+
+
+def detector_speeds(batches: Sequence[Batch], rounds: int) -> dict[str, float]:
+    """What the app calls (`Detector.process`, with senders, behaviour and evidence) beside features and scores alone.
+
+    Training included on both sides; they take turns at each batch, so that a busy machine slows both.
+    """
+    ratios, speeds_found = [], []
+    for _ in range(rounds):
+        settings = DetectorSettings(fm_grace=FM_GRACE, ad_grace=AD_GRACE, mode="reference")
+        detector = Detector(settings, kernel=load_kernel())
+        afterimage = AfterImage("reference", kernel=load_kernel())
+        network = KitNet(fm_grace=FM_GRACE, ad_grace=AD_GRACE, kernel=load_kernel())
+        alone = whole = 0.0
+        for batch in batches:
+            begun = time.process_time()
+            network.process(afterimage.update(batch))
+            between = time.process_time()
+            detector.process(batch, "s1")
+            detector.take_evidence()
+            alone, whole = alone + between - begun, whole + time.process_time() - between
+        ratios.append(alone / whole)
+        speeds_found.append(sum(len(batch["length"]) for batch in batches) / whole)
+    return {
+        "detector_pps": statistics.median(speeds_found),
+        "detector_vs_kernel": statistics.median(ratios),
+    }
 
 
 def accuracy(
