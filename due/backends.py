@@ -21,6 +21,18 @@ def open_updates(url: str, options: Options) -> UpdatesDriver:
             group_timeout=options.group_timeout,
             backlog=options.backlog_bytes,
         )
+    if url.startswith("kafka:"):
+        try:
+            from due.drivers.kafka import KafkaUpdates
+        except ImportError:
+            raise InvalidOption(f"URL {url!r} needs Kafka's client: pip install 'sdnator[kafka]'") from None
+
+        return KafkaUpdates(
+            url,
+            window=options.window_bytes,
+            group_timeout=options.group_timeout,
+            backlog=options.backlog_bytes,
+        )
     return RedisUpdates(
         url,
         window=options.window_bytes,

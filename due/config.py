@@ -16,7 +16,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of one engine; all have defaults."""
 
     updates: str = ""
-    """Data Updates URL: redis://, rediss://, unix://; empty: $DUE_UPDATES, else an embedded server."""
+    """Data Updates URL: redis://, rediss://, unix://, kafka://; empty: $DUE_UPDATES, else an embedded server."""
     archive: str = ""
     """Data Archives URL: sqlite:///file, mongodb://; empty: $DUE_ARCHIVE, else a file in `directory`."""
     directory: str = ""

@@ -106,7 +106,7 @@ class Engine:
         """Choose the Data Updates server; call it before `init`.
 
         Args:
-            url: redis://, rediss://, unix:// or memory://.
+            url: redis://, rediss://, unix://, kafka:// or memory://.
 
         Raises:
             InvalidOption: the engine is already initialised.

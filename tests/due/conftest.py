@@ -8,6 +8,8 @@ import pytest
 
 from due import CONSUMER, PRODUCER, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
+from sdnator.testing.kafka_servers import KafkaMissing, KafkaServers
+from tests.requirements import missing
 
 
 @pytest.fixture(scope="session")
@@ -15,6 +17,17 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedServer]
     """One server for all tests of a session; tests use keys of their own."""
     with EmbeddedServer(tmp_path_factory.mktemp("updates")) as running:
         yield running
+
+
+@pytest.fixture(scope="session")
+def kafka_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KafkaServers]:
+    """One real broker for all tests of a session; tests use keys and groups of their own."""
+    try:
+        servers = KafkaServers(tmp_path_factory.mktemp("kafka")).start()
+    except KafkaMissing as reason:
+        missing(str(reason))
+    yield servers
+    servers.stop()
 
 
 @pytest.fixture

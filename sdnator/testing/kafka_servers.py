@@ -1,0 +1,229 @@
+"""Real Kafka brokers (KRaft) on loopback, from Kafka's own jars.
+
+The jars are those of `$KAFKA_HOME/libs`; without it, Maven copies them once into a cache folder.
+"""
+
+import base64
+import fcntl
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+import uuid
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from confluent_kafka import KafkaException
+from confluent_kafka.admin import AdminClient
+
+KAFKA_VERSION = "3.9.1"
+_COPY_SECONDS = 600
+_START_SECONDS = 120
+_STOP_SECONDS = 20
+_HEAP = "-Xmx256m"
+_QUICK_START = ("-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xshare:auto")
+_POM = """<project xmlns="http://maven.apache.org/POM/4.0.0">
+  <modelVersion>4.0.0</modelVersion>
+  <groupId>org.sdnator</groupId><artifactId>kafka-for-tests</artifactId><version>1</version>
+  <dependencies><dependency>
+    <groupId>org.apache.kafka</groupId><artifactId>kafka_2.13</artifactId><version>{version}</version>
+  </dependency></dependencies>
+</project>
+"""
+
+
+class KafkaMissing(RuntimeError):
+    """Kafka cannot be started on this machine; the text says what is missing."""
+
+
+def kafka_jars() -> Path:
+    """The folder that holds Kafka's jars; copies them with Maven where there are none yet.
+
+    Returns:
+        `$KAFKA_HOME/libs`, or a folder under `$XDG_CACHE_HOME` (default: ~/.cache).
+
+    Raises:
+        KafkaMissing: Java or Maven is not installed, or Maven cannot reach its repository.
+    """
+    if shutil.which("java") is None:
+        raise KafkaMissing("Kafka needs Java (on Debian: openjdk-17-jre-headless)")
+    if os.environ.get("KAFKA_HOME"):
+        return Path(os.environ["KAFKA_HOME"]) / "libs"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache / "sdnator" / f"kafka-{KAFKA_VERSION}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # two test workers copy once
+        if not (folder / "complete").exists():
+            _copy_jars(folder)
+            (folder / "complete").touch()
+    return folder / "libs"
+
+
+def _copy_jars(folder: Path) -> None:
+    maven = shutil.which("mvn")
+    if maven is None:
+        raise KafkaMissing("Kafka's jars are copied by Maven (on Debian: maven), or set $KAFKA_HOME")
+    (folder / "pom.xml").write_text(_POM.format(version=KAFKA_VERSION))
+    copied = subprocess.run(
+        [
+            maven,
+            "--quiet",
+            "--batch-mode",
+            "dependency:copy-dependencies",
+            "-DincludeScope=runtime",
+            f"-DoutputDirectory={folder / 'libs'}",
+        ],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=_COPY_SECONDS,
+        check=False,
+    )
+    if copied.returncode != 0:
+        raise KafkaMissing(f"Maven could not copy Kafka's jars: {(copied.stdout + copied.stderr)[-500:]}")
+
+
+class KafkaServers:
+    """A cluster of brokers, each a process that is broker and controller.
+
+    Args:
+        folder: for settings, logs and data.
+        brokers: how many, 1 to 5.
+    """
+
+    def __init__(self, folder: Path, brokers: int = 1) -> None:
+        self._folder = folder
+        self._jars = kafka_jars()
+        self._cluster = base64.urlsafe_b64encode(uuid.uuid4().bytes).decode().rstrip("=")
+        self._ports = [(_free_port(), _free_port()) for _ in range(brokers)]
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
+
+    @property
+    def servers(self) -> str:
+        """HOST:PORT of all brokers, separated by commas."""
+        return ",".join(f"127.0.0.1:{port}" for port, _ in self._ports)
+
+    @property
+    def url(self) -> str:
+        """For `set_pubsub`."""
+        return f"kafka://{self.servers}"
+
+    def start(self) -> Self:
+        """Format the brokers' folders, start them all and wait until each answers.
+
+        Raises:
+            KafkaMissing: a broker ended, or did not answer in time; the text has its last words.
+        """
+        for number in range(len(self._ports)):
+            self._prepare(number)
+            self.start_broker(number)
+        self.wait(len(self._ports))
+        return self
+
+    def start_broker(self, number: int) -> None:
+        """Start one broker, as after `kill`; returns at once."""
+        home = self._home(number)
+        with (home / "log").open("ab") as log:
+            self._processes[number] = subprocess.Popen(
+                self._java("kafka.Kafka", home / "server.properties"),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=home,
+            )
+
+    def wait(self, brokers: int) -> None:
+        """Return when so many brokers are in the cluster."""
+        admin = AdminClient({"bootstrap.servers": self.servers, "log_level": 0})
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline:
+            ended = [number for number, process in self._processes.items() if process.poll() is not None]
+            if ended:
+                break
+            try:
+                if len(admin.list_topics(timeout=1).brokers) >= brokers:
+                    return
+            except KafkaException:
+                time.sleep(0.1)
+        said = [(self._home(n) / "log").read_text(errors="replace")[-500:] for n in self._processes]
+        self.stop()
+        raise KafkaMissing(f"Kafka did not start: {said}")
+
+    def kill(self, number: int) -> None:
+        """kill -9 of one broker."""
+        process = self._processes.pop(number)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+    def stop(self) -> None:
+        """End all brokers; the folder stays."""
+        for process in self._processes.values():
+            process.terminate()
+        for process in self._processes.values():
+            try:
+                process.wait(_STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._processes.clear()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _home(self, number: int) -> Path:
+        return self._folder / f"broker-{number}"
+
+    def _prepare(self, number: int) -> None:
+        home = self._home(number)
+        home.mkdir(parents=True, exist_ok=True)
+        port, controller_port = self._ports[number]
+        copies = min(3, len(self._ports))
+        voters = ",".join(f"{at}@127.0.0.1:{own}" for at, (_, own) in enumerate(self._ports))
+        settings = {
+            "process.roles": "broker,controller",
+            "node.id": number,
+            "listeners": f"PLAINTEXT://127.0.0.1:{port},CONTROLLER://127.0.0.1:{controller_port}",
+            "advertised.listeners": f"PLAINTEXT://127.0.0.1:{port}",
+            "controller.listener.names": "CONTROLLER",
+            "listener.security.protocol.map": "PLAINTEXT:PLAINTEXT,CONTROLLER:PLAINTEXT",
+            "controller.quorum.voters": voters,
+            "log.dirs": home / "data",
+            "offsets.topic.replication.factor": copies,
+            "offsets.topic.num.partitions": 4,
+            "transaction.state.log.replication.factor": copies,
+            "transaction.state.log.min.isr": 1,
+            # a dead broker is noticed after 2 s instead of 9
+            "broker.session.timeout.ms": 2000,
+            "broker.heartbeat.interval.ms": 500,
+            "controller.quorum.election.timeout.ms": 500,
+            "controller.quorum.fetch.timeout.ms": 1000,
+            "log.cleaner.dedupe.buffer.size": 4 << 20,
+            "num.network.threads": 2,
+            "num.io.threads": 2,
+        }
+        path = home / "server.properties"
+        path.write_text("".join(f"{name}={value}\n" for name, value in settings.items()))
+        subprocess.run(
+            self._java("kafka.tools.StorageTool", "format", "-t", self._cluster, "-c", path),
+            check=True,
+            capture_output=True,
+            timeout=_START_SECONDS,
+        )
+
+    def _java(self, program: str, *arguments: object) -> list[str]:
+        return ["java", _HEAP, *_QUICK_START, "-cp", f"{self._jars}/*", program, *map(str, arguments)]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
