@@ -163,7 +163,7 @@ def _shown(data: bytes) -> None:
     key, handle = handlers[data[0] % len(handlers)]
     handle(Item(key.replace("*", "s1"), value, _NOW, _NOW, key.split(".")[2], "i1", 1))
     board = dashboard.board
-    board.standing(), board.present(), board.rates_by_key(), board.line(), board.scores.rate(1.0)
+    board.standing(), board.present(), board.rates_by_key(), board.open_incidents(), board.scores.rate(1.0)
 
 
 def _mutate_shown(chance: random.Random, seeds: Sequence[bytes]) -> bytes:
