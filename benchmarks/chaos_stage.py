@@ -18,7 +18,7 @@ from benchmarks.chaos_schedule import APPS, CONTROLLERS
 from sdnator.capture.interfaces import VethPair
 from sdnator.config.planned_switches import PlannedSwitch
 from sdnator.supervisor import Child, Supervisor
-from sdnator.supervisor.app_command import Backends, app_command
+from sdnator.supervisor.app_command import app_command
 from sdnator.supervisor.spec import PartProcess, PartSpec
 from sdnator.up.parts import UpParts
 from sdnator.up.plan import StandingPlan
@@ -55,9 +55,9 @@ class _RelayedParts(UpParts):
         """Start the second controller, which `sdnator up` has not."""
         name, folder = CONTROLLERS[1], self.plan.state / "standby"
         folder.mkdir(exist_ok=True)
-        backends = Backends(updates=self.updates, archive=self.plan.archive, options=self.plan.engine)
         directory = self.plan.state / "due" / name
-        command = app_command(CONTROLLERS[0], folder, backends, self.settings(name), directory=directory)
+        backends, settings = self.backends(CONTROLLERS[0]), self.settings(name)
+        command = app_command(CONTROLLERS[0], folder, backends, settings, directory=directory)
         return Child(name, [*command, "--log", self.plan.log_level], self.logs, heartbeat=True)
 
 
@@ -191,7 +191,7 @@ class ChaosStage:
         )
 
     def _link(self, name: str) -> UnixLink:
-        server = Path(self.parts.updates.removeprefix("unix://"))
+        server = Path(self.parts.updates.removeprefix("unix://").rpartition("@")[2])
         link = UnixLink(self.folder / f"{name}.sock", server)
         self._stack.callback(link.close)
         return link

@@ -181,7 +181,7 @@ class _Crowd:
 
     def __init__(self, url: str, members: list[Member]) -> None:
         driver = RedisUpdates(url)
-        self._publisher = driver.publisher()
+        self._publisher = driver.publisher("crowd")
         self._receiver = driver.receiver("crowd", "crowd")
         self._receiver.subscribe("due.assignment.*")
         self._members = {member.registration.app_id: member for member in members}

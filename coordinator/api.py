@@ -5,11 +5,13 @@
     GET /get?key=…                  items from the archive
     WebSocket /observe?key=…        live items; a slow reader misses some and is told how many
 
-Requests with the Host or Origin of another site are refused, so that web pages cannot read the API.
+Requests with the Host or Origin of another site are refused, so that web pages cannot read the API. Where there is
+a token, every request but that of /metrics brings it as `Authorization: Bearer …`.
 At most two archive queries run at a time, for at most 10 s each; an answer has at most 10,000 items or 16 MiB.
 """
 
 import asyncio
+import hmac
 import socket
 import threading
 import time
@@ -59,6 +61,7 @@ _TRY_AGAIN_LATER = 1013
 _INT64_DIGITS = 20
 _JSON = {True: b"true", False: b"false"}
 _TYPE = "application/json"
+_NO_TOKEN = "bring the Coordinator's token: Authorization: Bearer …"  # noqa: S105 - no token
 
 
 @dataclass(frozen=True)
@@ -77,13 +80,15 @@ class Northbound:
 class Api:
     """The server, in a thread of its own.  Raises OSError if it cannot listen on the address."""
 
-    def __init__(self, northbound: Northbound, host: str, port: int) -> None:
+    def __init__(self, northbound: Northbound, host: str, port: int, *, token: str = "") -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.create_server((host, port), family=family)
         bound = self._socket.getsockname()[1]
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
+        place = f"{f'[{host}]' if ':' in host else host}:{bound}"
+        self.url = f"http://{place}"
+        self.url_with_token = f"http://viewer:{token}@{place}" if token else self.url
         config = uvicorn.Config(
-            application(northbound, host),
+            application(northbound, host, token),
             log_level="warning",
             lifespan="off",
             access_log=False,
@@ -108,13 +113,40 @@ class Api:
         self._server.run(sockets=[self._socket])
 
 
-def application(northbound: Northbound, host: str = "127.0.0.1") -> Starlette:
-    """The ASGI application."""
+class TokenGate:
+    """ASGI: refuses whoever does not bring the token; metrics are free for those who reach the port."""
+
+    def __init__(self, app: Any, token: str) -> None:
+        self._app = app
+        self._wanted = f"Bearer {token}".encode()
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """ASGI."""
+        if scope["type"] not in ("http", "websocket") or self._admits(scope):
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": _NO_TOKEN})
+        else:
+            answer = JSONResponse(
+                {"error": "Unauthorized", "detail": _NO_TOKEN}, 401, {"WWW-Authenticate": "Bearer"}
+            )
+            await answer(scope, receive, send)
+
+    def _admits(self, scope: Any) -> bool:
+        if scope["path"] == "/metrics":
+            return True
+        given = next((value for name, value in scope["headers"] if name == b"authorization"), b"")
+        return hmac.compare_digest(given, self._wanted)
+
+
+def application(northbound: Northbound, host: str = "127.0.0.1", token: str = "") -> Starlette:
+    """The ASGI application; an empty token lets everybody read."""
     handlers = _Handlers(northbound)
     hosts = sorted({"127.0.0.1", "localhost", "[::1]", host})
+    gates = [Middleware(TrustedHostMiddleware, allowed_hosts=hosts)]
     return Starlette(
         routes=handlers.routes(),
-        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=hosts)],
+        middleware=[*gates, Middleware(TokenGate, token=token)] if token else gates,
         exception_handlers={DueError: _explain, ValueError: _explain},
     )
 

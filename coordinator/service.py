@@ -10,6 +10,7 @@ Run it with `python -m coordinator.service`; like any app it registers, with its
 """
 
 import logging
+import os
 import sys
 import threading
 import time
@@ -58,11 +59,13 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     http: bool = True
     """Serve the HTTP API."""
     http_host: str = "127.0.0.1"
-    """Address to listen on; the API has no log-in, so keep it on loopback."""
+    """Address to listen on; there is no TLS, so keep it on loopback."""
     http_port: int = 0
     """0 takes a free port; `health` and the log name it."""
+    token: str = ""
+    """What requests bring as `Authorization: Bearer …`, those of /metrics excepted; empty: everybody may read."""
     address_file: str = ""
-    """Where to write the API's URL once it listens; empty: nowhere."""
+    """Where to write the API's URL, with the token, once it listens; empty: nowhere."""
     selection: str = "random"
     """How the working instance of a standby app is chosen: random, oldest, least_busy or `module:function`."""
     missed_heartbeats: float = 4.0
@@ -208,7 +211,9 @@ class CoordinatorService:
             events_key=EVENTS,
         )
         try:
-            self._api = Api(northbound, self._settings.http_host, self._settings.http_port)
+            self._api = Api(
+                northbound, self._settings.http_host, self._settings.http_port, token=self._settings.token
+            )
         except OSError as error:
             where = f"{self._settings.http_host}:{self._settings.http_port}"
             raise InvalidOption(
@@ -217,7 +222,7 @@ class CoordinatorService:
         self._api.start()
         log.info("HTTP API at %s", self._api.url)
         if self._settings.address_file:
-            Path(self._settings.address_file).write_text(self._api.url)
+            _write_private(Path(self._settings.address_file), self._api.url_with_token)
 
     def _obey(self, led: bool) -> None:
         """Apply a change of leadership to the registry."""
@@ -300,6 +305,13 @@ def _fits(value: Any) -> bool:
         return len(encode_value(value)) <= _HEALTH_BYTES
     except DueError:
         return False
+
+
+def _write_private(path: Path, text: str) -> None:
+    path.unlink(missing_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        file.write(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -39,6 +39,7 @@ def open_updates(url: str, options: Options) -> UpdatesDriver:
         retain=options.retain_bytes,
         group_timeout=options.group_timeout,
         backlog=options.backlog_bytes,
+        observable=options.observable,
     )
 
 

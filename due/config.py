@@ -10,6 +10,7 @@ from due.errors import InvalidOption
 _MOST_FRAME_BYTES = 8 << 20
 """Keeps a frame of the smallest items below `due.codec.MAX_ITEMS`."""
 MAX_HEARTBEAT = 3600.0
+_CREDENTIAL_BYTES = 1 << 20
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -17,6 +18,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     updates: str = ""
     """Data Updates URL: redis://, rediss://, unix://, kafka://; empty: $DUE_UPDATES, else an embedded server."""
+    observable: tuple[str, ...] = ()
+    """Key patterns that this app's user of Data Updates may observe; empty: the server restricts nothing."""
     archive: str = ""
     """Data Archives URL: sqlite:///file, mongodb://; empty: $DUE_ARCHIVE, else a file in `directory`."""
     directory: str = ""
@@ -74,6 +77,27 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         """
         text = self.directory or os.environ.get("DUE_DIRECTORY", "")
         return Path(text) if text else Path.home() / ".local" / "state" / "due"
+
+    def with_credential(self) -> "Options":
+        """These options with what the file that $DUE_CREDENTIAL names says of Data Updates, unless they name it.
+
+        Raises:
+            InvalidOption: the file cannot be read, is malformed, or others than its owner can read it.
+        """
+        path = os.environ.get("DUE_CREDENTIAL", "")
+        if not path or self.updates or os.environ.get("DUE_UPDATES"):
+            return self
+        try:
+            with Path(path).open("rb") as file:
+                mode, text = os.fstat(file.fileno()).st_mode, file.read(_CREDENTIAL_BYTES)
+            said = msgspec.json.decode(text, type=Options)
+        except OSError as error:
+            raise InvalidOption(f"$DUE_CREDENTIAL {path}: {error.strerror}") from None
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise InvalidOption(f"$DUE_CREDENTIAL {path}: {error}; enrol the app again") from None
+        if mode & 0o077:
+            raise InvalidOption(f"$DUE_CREDENTIAL {path}: others can read it; chmod 600 {path}")
+        return msgspec.structs.replace(self, updates=said.updates, observable=said.observable)
 
     def checked(self) -> "Options":
         """Check the numbers.

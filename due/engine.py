@@ -69,7 +69,7 @@ class Engine:
     """
 
     def __init__(self, options: Options | None = None) -> None:
-        self.options = (options or Options()).checked()
+        self.options = (options or Options()).with_credential().checked()
         self._updates_url = default_updates(self.options)
         self._archive_url = default_archive(self.options)
         self._registration: Registration | None = None

@@ -21,6 +21,7 @@ from due.heartbeat_thread import HeartbeatThread
 from due.key_writer import ARCHIVE, PUBLISH, KeyWriter, Sent
 from due.keys import Key
 from due.liveness import Liveness
+from due.logs import without_passwords
 from due.membership import Member, Registration
 from due.messages import Assignment, AssignmentCallback, Interest
 from due.observation import Observation
@@ -55,8 +56,8 @@ class Session:
         if not updates_url:
             updates_url, self._server = shared_server(options.folder())
         self._driver = open_updates(updates_url, options)
-        self.publisher = self._driver.publisher()
         app, me = registration.app_id, registration.instance_id
+        self.publisher = self._driver.publisher(app)
         shared = registration.instances == "shared"
         receiver = self._driver.receiver(app, me, shared=shared)
         self.dispatcher = Dispatcher(receiver, shared=shared, tries=options.tries, failed=self._died)
@@ -103,7 +104,7 @@ class Session:
         except Timeout:
             self.publisher.close()
             raise UpdatesUnavailable(
-                f"Data Updates at {self._driver.url} could not be reached within "
+                f"Data Updates at {without_passwords(self._driver.url)} could not be reached within "
                 f"{self._options.connect_timeout:g} s: start the server, or give another URL"
             ) from None
         self.sender.start()

@@ -14,22 +14,41 @@ _WINDOWS_NS = (60 * 10**9, 3_600 * 10**9, 86_400 * 10**9)
 
 
 def ask(url: str, path: str) -> Any:
-    """The JSON answer of the API.  Raises BadInput for a malformed URL, PipelineError without an answer."""
+    """The JSON answer of the API.
+
+    Args:
+        url: http://HOST:PORT, with `viewer:TOKEN@` before the host where the Coordinator wants a token.
+        path: of the API.
+
+    Raises:
+        BadInput: the URL is malformed.
+        PipelineError: there is no answer.
+    """
     import http.client
     from urllib.error import URLError
-    from urllib.request import ProxyHandler, build_opener
+    from urllib.request import ProxyHandler, Request, build_opener
 
     if not url.startswith(("http://", "https://")):
-        raise BadInput(f"--url {url}: give http://HOST:PORT of a Coordinator")
+        raise BadInput(f"--url {without_user(url)}: give http://HOST:PORT of a Coordinator")
+    scheme, _, rest = url.rstrip("/").partition("://")
+    user, _, place = rest.rpartition("@")
+    url = f"{scheme}://{place}"
+    headers = {"Authorization": f"Bearer {user.partition(':')[2]}"} if user else {}
     opener = build_opener(ProxyHandler({}))  # it is on loopback: a proxy would connect to the wrong machine
     try:
-        with opener.open(url.rstrip("/") + path, timeout=_SECONDS) as answer:
+        with opener.open(Request(url + path, headers=headers), timeout=_SECONDS) as answer:  # noqa: S310 - checked
             return json.load(answer)
     except (URLError, OSError, ValueError, RecursionError, http.client.HTTPException) as error:
         cause = getattr(error, "reason", None) or error
         raise PipelineError(
             f"no Coordinator answers at {url}{path} ({cause}); see `sdnator status`"
         ) from None
+
+
+def without_user(url: str) -> str:
+    """A URL without user and password, for people."""
+    scheme, _, rest = url.partition("://")
+    return f"{scheme}://{rest.rpartition('@')[2]}"
 
 
 def latest(

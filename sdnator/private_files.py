@@ -2,6 +2,7 @@
 
 import json
 import os
+import secrets
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,6 +35,25 @@ def _holds(path: Path, text: str) -> bool:
         )
     except OSError:
         return False
+
+
+def kept_secret(path: Path) -> str:
+    """The secret in a file of mode 0600; made at the first call, and anew where others can read the file.
+
+    Raises OSError.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        if (
+            stat.S_IMODE(path.lstat().st_mode) == 0o600
+            and len(found := path.read_text("ascii").strip()) >= 16
+        ):
+            return found
+    except (OSError, ValueError):
+        pass
+    made = secrets.token_urlsafe(24)
+    write_private(path, made + "\n")
+    return made
 
 
 def write_private_json(path: Path, values: Mapping[str, Any]) -> str:

@@ -257,8 +257,8 @@ class UpdatesDriver(Protocol):
 
     url: str
 
-    def publisher(self) -> Publisher:
-        """A new sending half."""
+    def publisher(self, app: str) -> Publisher:
+        """A new sending half, which announces its streams as those of `app`."""
         ...
 
     def receiver(self, group: str, consumer: str, *, shared: bool = False) -> Receiver:

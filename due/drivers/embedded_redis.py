@@ -14,11 +14,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from due.drivers.redis_wire import Wire
+from due.drivers.redis_wire import Wire, as_user
 from due.errors import UpdatesUnavailable
 
 _PR_SET_PDEATHSIG = 1
@@ -31,6 +32,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 _START_TIMEOUT = 30.0
 _LONGEST_SOCKET_PATH = 100
+_USERS = "users.acl"
 _SUBSCRIBER_LIMIT = ("128mb", "64mb", "20")
 """The server drops a subscriber with more output pending, or with this much for this many seconds."""
 
@@ -57,11 +59,21 @@ class EmbeddedServer:
     `durable=True` keeps an append-only file with `always` in the directory: what `flush` covered
     survives kill -9 of the server.  Without it nothing is written, and producers re-send what
     their readers have not acknowledged.  `tcp=True` also listens on a free port of 127.0.0.1.
+    `users` gives the text of an ACL file, asked for at each start; `admin` is then the user and password of an
+    administrator in it. Without it every program of this Unix user may do everything.
     """
 
     def __init__(
-        self, directory: str | Path | None = None, *, durable: bool = False, tcp: bool = False
+        self,
+        directory: str | Path | None = None,
+        *,
+        durable: bool = False,
+        tcp: bool = False,
+        users: Callable[[], str] | None = None,
+        admin: tuple[str, str] | None = None,
     ) -> None:
+        self._users = users
+        self._admin = admin
         self._owns_directory = directory is None
         self._directory = Path(directory or tempfile.mkdtemp(prefix="due-"))
         self._durable = durable
@@ -77,6 +89,11 @@ class EmbeddedServer:
     def url(self) -> str:
         """For `set_pubsub`."""
         return f"unix://{self.socket}"
+
+    @property
+    def admin_url(self) -> str:
+        """For whoever makes users; `url` where there are none."""
+        return as_user(self.url, *self._admin) if self._admin is not None else self.url
 
     @property
     def tcp_url(self) -> str:
@@ -106,7 +123,7 @@ class EmbeddedServer:
         without bound; counted, the subscriber is dropped at the limit, comes back, and reports its gap.
         """
         try:
-            wire = Wire(self.url)
+            wire = Wire(self.admin_url)
             answer = wire.call("PING")
             wire.call("CONFIG", "SET", "min-string-size-avoid-copy-reply", 1 << 30)
             wire.close()
@@ -124,6 +141,8 @@ class EmbeddedServer:
         """Start and return at once; the server is ready when `answers` is True."""
         self._directory.mkdir(parents=True, exist_ok=True)
         self.socket.unlink(missing_ok=True)
+        if self._users is not None:
+            self._write_users(self._users())
         log = self.log.open("ab")
         with log:
             self._process = subprocess.Popen(
@@ -171,6 +190,13 @@ class EmbeddedServer:
     ) -> None:
         self.stop()
 
+    def _write_users(self, text: str) -> None:
+        path = self._directory / _USERS
+        path.unlink(missing_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            file.write(text)
+
     def _arguments(self) -> list[str]:
         arguments = {
             "port": str(self._port),
@@ -182,6 +208,7 @@ class EmbeddedServer:
             "dir": str(self._directory),
             "appendonly": "yes" if self._durable else "no",
             "appendfsync": "always",
+            **({"aclfile": str(self._directory / _USERS)} if self._users is not None else {}),
         }
         limit = ["--client-output-buffer-limit", "pubsub", *_SUBSCRIBER_LIMIT]
         return [part for name, value in arguments.items() for part in (f"--{name}", value)] + limit

@@ -60,7 +60,7 @@ class MemoryUpdates:
         with _spaces_lock:
             self._space = _spaces.setdefault(memory_name(url), MemorySpace())
 
-    def publisher(self) -> "MemoryPublisher":
+    def publisher(self, app: str) -> "MemoryPublisher":  # noqa: ARG002 - nobody else is in this process
         """A new sending half."""
         return MemoryPublisher(self._space, self._limits)
 

@@ -2,6 +2,8 @@
 
 publish ──PUBLISH due:<path>──►                 pipelined: replies are read later
 append  ──XADD due:stream:<path>──►             pipelined, kept until readers have acknowledged
+
+A stream is announced after its first entry, by its producer's app: so an announced path has a stream.
 """
 
 import logging
@@ -21,15 +23,17 @@ from due.drivers.redis_streams import (
     CARE_SECONDS,
     LEAST_PAUSE,
     LIFETIME_S,
-    STREAMS,
+    PRODUCERS,
     StreamEntry,
     StreamLedger,
+    announced_name,
     next_pause,
     parse_id,
     stream_name,
 )
 from due.drivers.redis_wire import Wire, client
 from due.errors import Timeout, UpdatesUnavailable
+from due.logs import without_passwords
 
 log = logging.getLogger("due.updates")
 
@@ -42,6 +46,8 @@ _LONG_WAIT_SHARE = 0.25
 _POLL_SECONDS = 0.5
 _CHANNELS = 65536
 _RECONNECT_SECONDS = 0.05
+_DENIED_TOLD = 64
+"""Distinct refusals that are logged."""
 
 
 _MESSAGE = "message"
@@ -63,21 +69,25 @@ class RedisUpdates:
         retain: int = 16 << 20,
         group_timeout: float = 30.0,
         backlog: int = 32 << 20,
+        observable: tuple[str, ...] = (),
     ) -> None:
         self.url = url
+        self._observable = observable
         self._window = window
         self._retain = retain
         self._group_timeout = group_timeout
         self._backlog = backlog
         client(url).close()  # report a wrong URL now
 
-    def publisher(self) -> "RedisPublisher":
+    def publisher(self, app: str) -> "RedisPublisher":
         """A new sending half."""
-        return RedisPublisher(self.url, self._window, self._retain, self._group_timeout)
+        return RedisPublisher(self.url, app, self._window, self._retain, self._group_timeout)
 
     def receiver(self, group: str, consumer: str, *, shared: bool = False) -> RedisReceiver:
         """A new receiving half."""
-        return RedisReceiver(self.url, group, consumer, shared=shared, backlog=self._backlog)
+        return RedisReceiver(
+            self.url, group, consumer, shared=shared, backlog=self._backlog, observable=self._observable
+        )
 
     def close(self) -> None:
         """Nothing is shared between the halves."""
@@ -86,8 +96,10 @@ class RedisUpdates:
 class RedisPublisher:
     """One pipelined connection; see `due.drivers.base.Publisher`."""
 
-    def __init__(self, url: str, window: int, retain: int, group_timeout: float) -> None:
-        self._url = url
+    def __init__(self, url: str, app: str, window: int, retain: int, group_timeout: float) -> None:
+        self._url, self._place = url, without_passwords(url)
+        self._app = app
+        self._announced = announced_name(app)
         self._limits = (window, retain, group_timeout)
         self._lock = threading.RLock()
         self._wire: Wire | None = None
@@ -104,7 +116,15 @@ class RedisPublisher:
         """See `Publisher.answered`."""
         self._probing = False
         self._connecting = False
-        self._counts = {"refused": 0, "lost_disconnected": 0, "reconnects": 0, "held_back": 0, "resent": 0}
+        self._denied: set[str] = set()
+        self._counts = {
+            "refused": 0,
+            "denied": 0,
+            "lost_disconnected": 0,
+            "reconnects": 0,
+            "held_back": 0,
+            "resent": 0,
+        }
         self._connect()
 
     def publish(self, path: str, *payloads: bytes) -> None:
@@ -112,7 +132,7 @@ class RedisPublisher:
         with self._lock:
             if self._wire is None:
                 self._counts["lost_disconnected"] += len(payloads)
-                raise UpdatesUnavailable(f"no connection to {self._url}")
+                raise UpdatesUnavailable(f"no connection to {self._place}")
             channel = self._channels.get(path) or self._channel(path)
             try:
                 self._wire.send_all([(b"PUBLISH", channel, payload) for payload in payloads])
@@ -151,7 +171,7 @@ class RedisPublisher:
                     continue
             self.poll()
             if deadline is not None and time.monotonic() > deadline:
-                raise Timeout(f"{self._url} did not acknowledge within {timeout} s")
+                raise Timeout(f"{self._place} did not acknowledge within {timeout} s")
             time.sleep(0.01)
 
     def poll(self) -> float:
@@ -226,18 +246,14 @@ class RedisPublisher:
             if ledger is None:
                 ledger = self._ledgers[path] = StreamLedger(path, *self._limits)
                 if self._wire is not None:
-                    try:
-                        self._send_announcement(ledger)
-                    except UpdatesUnavailable as error:
-                        self._lose(error)
+                    self._wire.make_room()
             return ledger
 
-    def _send_announcement(self, ledger: StreamLedger) -> None:
+    def _command(self, *arguments: bytes | str | int) -> None:
+        """Send a command of our own; its reply is taken later."""
         assert self._wire is not None  # noqa: S101 - callers checked
-        self._wire.make_room()
-        self._wire.send(b"SADD", STREAMS, ledger.path)
-        self._wire.send(b"PUBLISH", STREAMS, ledger.path)
-        self._outstanding.extend((_COMMAND, _COMMAND))
+        self._wire.send(*arguments)
+        self._outstanding.append(_COMMAND)
 
     def _care(self, now: float) -> None:
         """Renew the expiry of streams in use; the others are announced again at their next use."""
@@ -254,12 +270,16 @@ class RedisPublisher:
             if self._wire is None:
                 return
             try:
-                self._wire.send(b"SADD", STREAMS, ledger.path)
-                self._wire.send(b"EXPIRE", stream_name(ledger.path), LIFETIME_S)
+                self._command(b"SADD", PRODUCERS, self._app)
+                now = int(time.time())
+                self._command(b"ZADD", self._announced, now, ledger.path)
+                self._command(b"ZREMRANGEBYSCORE", self._announced, b"-inf", now - LIFETIME_S)
+                self._command(b"PUBLISH", self._announced, ledger.path)
+                self._command(b"EXPIRE", self._announced, LIFETIME_S)
+                self._command(b"EXPIRE", stream_name(ledger.path), LIFETIME_S)
             except UpdatesUnavailable as error:
                 self._lose(error)
                 return
-            self._outstanding.extend((_COMMAND, _COMMAND))
             ledger.lasting = True
 
     def _send_entry(self, entry: StreamEntry) -> None:
@@ -349,6 +369,8 @@ class RedisPublisher:
         ledger = question.ledger
         ledger.asked = False
         ledger.acknowledged(question.answer())
+        if question.surprised:
+            self._ask(ledger)
         point = ledger.trim_point(len(self._ledgers))
         if point is not None and self._wire is not None:
             command = (b"XTRIM", stream_name(ledger.path), b"MINID", b"~", f"{point[0]}-{point[1]}")
@@ -394,10 +416,25 @@ class RedisPublisher:
 
     def _refused(self, reply: Exception, awaited: _Awaited) -> None:
         self._counts["refused"] += 1
-        if self._counts["refused"] == 1:
+        if str(reply).startswith("NOPERM"):
+            self._deny(reply, awaited)
+            return
+        if self._counts["refused"] == self._counts["denied"] + 1:
             log.error("Data Updates refused a message: %s", reply)
         if isinstance(awaited, StreamEntry):  # kept, and sent again on the next connection
             raise UpdatesUnavailable(f"the server refused an entry of {awaited.path}: {reply}")
+
+    def _deny(self, reply: Exception, awaited: _Awaited) -> None:
+        """A right is missing: what was to be said is lost, and everything else goes on."""
+        self._counts["denied"] += 1
+        what = f"an entry of {awaited.path}" if isinstance(awaited, StreamEntry) else "a message"
+        if isinstance(awaited, StreamEntry):
+            self._ledgers[awaited.path].discard(awaited)
+        if what not in self._denied and len(self._denied) < _DENIED_TOLD:
+            self._denied.add(what)
+            log.error(
+                "%s has no right to %s: %s; grant its key in [grants.%s]", self._app, what, reply, self._app
+            )
 
     def _lose(self, error: Exception) -> None:
         if self._wire is None:
@@ -410,7 +447,7 @@ class RedisPublisher:
         for ledger in self._ledgers.values():
             ledger.asked = False
         delay = self._backoff.failed(time.monotonic())
-        log.warning("lost Data Updates at %s: %s; retrying in %.2f s", self._url, error, delay)
+        log.warning("lost Data Updates at %s: %s; retrying in %.2f s", self._place, error, delay)
 
     def _connect(self) -> None:
         """Without the lock until the server has answered: nobody waits for one that does not."""
@@ -432,7 +469,7 @@ class RedisPublisher:
         self._wire = wire
         if self._run_id:
             self._counts["reconnects"] += 1
-            log.warning("reconnected to Data Updates at %s", self._url)
+            log.warning("reconnected to Data Updates at %s", self._place)
         try:
             for ledger in self._ledgers.values():
                 self._restore(wire, ledger, restarted=run_id != self._run_id)
@@ -443,8 +480,8 @@ class RedisPublisher:
     def _restore(self, wire: Wire, ledger: StreamLedger, *, restarted: bool) -> None:
         """Resend what the server may not have; readers recognise repeats."""
         self._guarded_settle(wire)
+        wire.make_room()
         ledger.lasting = False
-        self._send_announcement(ledger)
         if restarted:
             ledger.forget_ids()
             empty = not self._called(wire, "EXISTS", stream_name(ledger.path))
@@ -452,6 +489,8 @@ class RedisPublisher:
             self._resend(wire, retained)
             self._restore_groups(wire, ledger, len(retained))
         self._resend(wire, [entry for entry in ledger.kept if entry.id is None])
+        if ledger.kept or ledger.retained:
+            self._put_off(ledger)
 
     def _restore_groups(self, wire: Wire, ledger: StreamLedger, done: int) -> None:
         """The groups that lived go on behind what they had all done, whether or not a member of them still lives.

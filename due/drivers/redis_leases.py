@@ -1,6 +1,6 @@
 """Leases of readers: which members of a group are alive, without comparing the clocks of two machines.
 
-    member ──every second──► hash due:readers:<path>, field <group>/<instance>, another value each time, 0: left
+    member ──every second──► hash due:lease:<group>:<path>, field <instance>, another value each time, 0: left
     anyone ──looks now and then──► LeaseWatch: seconds, by the watcher's own monotonic clock, without a change
 
 A lease is judged by how long its watcher has seen it unchanged, never by what its value says. So wall clocks
@@ -18,19 +18,19 @@ MOST_PER_LOOK_S = 1.0
 _GONE = float("inf")
 
 
-def readers_name(path: str) -> str:
-    """The Redis hash of a stream's leases."""
-    return f"due:readers:{path}"
+def lease_name(group: str, path: str) -> str:
+    """The Redis hash of a group's leases of one stream: a key for each group, so that no other app can write it."""
+    return f"due:lease:{group}:{path}"
 
 
-def lease_field(group: str, consumer: str) -> bytes:
-    """Names a member's lease in the hash."""
-    return f"{group}/{consumer}".encode()
+def lease_field(group: bytes, consumer: bytes) -> bytes:
+    """Names a lease where those of several groups are watched."""
+    return group + b"/" + consumer
 
 
 def group_of(field: bytes) -> bytes:
-    """The group of a lease."""
-    return field.rpartition(b"/")[0]
+    """The group of such a lease."""
+    return field.partition(b"/")[0]
 
 
 class LeaseValue:

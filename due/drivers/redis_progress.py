@@ -1,9 +1,9 @@
 """The progress of a stream's readers, requested on the producer's own pipelined connection.
 
-    HGETALL leases │ XINFO GROUPS │ XPENDING of each group known     one question, no waiting for the answer
+    HGETALL leases of each group known │ XINFO GROUPS │ XPENDING of each that lives     one question, no waiting
 
 The commands are not one transaction: what is delivered or acknowledged between them only makes the answer
-more careful.
+more careful. So does a group that nobody had asked about: its leases come with the next answer.
 """
 
 import time
@@ -11,12 +11,15 @@ from typing import Any
 
 import hiredis
 
-from due.drivers.redis_leases import readers_name
+from due.drivers.redis_leases import lease_field, lease_name
 from due.drivers.redis_streams import StreamLedger, parse_id, stream_name
 from due.drivers.redis_wire import pack, understood
 
 NOBODY = (2**63, 0)
 """Position if no live group reads: everything may be forgotten."""
+_NOTHING = (0, 0)
+_MOST_GROUPS = 1024
+"""Whoever may read a stream may make groups of it."""
 
 
 class Question:
@@ -24,21 +27,30 @@ class Question:
 
     def __init__(self, ledger: StreamLedger) -> None:
         self.ledger = ledger
-        self._groups = ledger.groups
+        self._known, self._groups = ledger.known, ledger.groups
         self._replies: list[Any] = []
-        self.size = 2 + len(self._groups)
+        self.size = len(self._known) + 1 + len(self._groups)
         """Replies to come."""
 
     def command(self) -> bytes:
         """What to send."""
-        name = stream_name(self.ledger.path)
-        parts = [pack((b"HGETALL", readers_name(self.ledger.path))), pack((b"XINFO", b"GROUPS", name))]
-        return b"".join((*parts, *(pack((b"XPENDING", name, group)) for group in self._groups)))
+        path = self.ledger.path
+        name = stream_name(path)
+        leases = [
+            pack((b"HGETALL", lease_name(group.decode("ascii", "replace"), path))) for group in self._known
+        ]
+        pendings = [pack((b"XPENDING", name, group)) for group in self._groups]
+        return b"".join((*leases, pack((b"XINFO", b"GROUPS", name)), *pendings))
 
     def take(self, reply: Any) -> bool:
         """Take the next reply; returns whether it was the last."""
         self._replies.append(reply)
         return len(self._replies) == self.size
+
+    @property
+    def surprised(self) -> bool:
+        """Whether the answer named groups whose leases it did not bring."""
+        return not set(self.ledger.known) <= set(self._known)
 
     def answer(self) -> tuple[int, int]:
         """The id up to which every live group has acknowledged; `NOBODY` where there is none.
@@ -49,15 +61,23 @@ class Question:
             return self._answer()
 
     def _answer(self) -> tuple[int, int]:
-        leases, groups, *pendings = self._replies
-        if isinstance(leases, hiredis.ReplyError):
-            return (0, 0)
+        count = len(self._known)
+        replies, groups, pendings = self._replies[:count], self._replies[count], self._replies[count + 1 :]
+        if any(isinstance(reply, hiredis.ReplyError) for reply in replies):
+            return _NOTHING
+        leases = {
+            lease_field(group, consumer): value
+            for group, reply in zip(self._known, replies, strict=True)
+            for consumer, value in _map(reply).items()
+        }
         # asked_at: the answer may have lain in the socket while this process was stopped
-        live = self.ledger.live_groups(_map(leases), self.ledger.asked_at, time.monotonic())
+        live = self.ledger.live_groups(leases, self.ledger.asked_at, time.monotonic())
         found = [] if isinstance(groups, hiredis.ReplyError) else [_map(group) for group in groups]
-        self.ledger.groups = tuple(g[b"name"] for g in found if g[b"name"] in live)
-        if len(self.ledger.groups) < len(live):
-            return (0, 0)
+        names = [group[b"name"] for group in found]
+        self.ledger.groups = tuple(name for name in names if name in live)
+        self.ledger.known = tuple(dict.fromkeys((*sorted(live), *names)))[:_MOST_GROUPS]
+        if len(self.ledger.groups) < len(live) or self.surprised:
+            return _NOTHING
         pending = dict(zip(self._groups, pendings, strict=True))
         return min((_position(g, pending) for g in found if g[b"name"] in self.ledger.groups), default=NOBODY)
 
@@ -71,7 +91,7 @@ def _position(group: dict[bytes, Any], pending: dict[bytes, Any]) -> tuple[int, 
         return parse_id(group[b"last-delivered-id"])
     summary = pending.get(group[b"name"])
     if summary is None or isinstance(summary, hiredis.ReplyError):
-        return (0, 0)
+        return _NOTHING
     if summary[1] is None:  # acknowledged meanwhile
         return parse_id(group[b"last-delivered-id"])
     ms, number = parse_id(summary[1])

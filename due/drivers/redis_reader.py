@@ -19,11 +19,12 @@ import redis
 from due.backoff import Backoff
 from due.drivers.base import Delivery
 from due.drivers.redis_aside import Aside
-from due.drivers.redis_leases import LEFT, LeaseValue, LeaseWatch, lease_field, readers_name
-from due.drivers.redis_streams import STREAMS, stream_name
+from due.drivers.redis_leases import LEFT, LeaseValue, LeaseWatch, lease_name
+from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
 from due.drivers.redis_upkeep import Upkeep
 from due.drivers.redis_wire import Wire, pack, understood
 from due.errors import UpdatesUnavailable
+from due.logs import without_passwords
 
 log = logging.getLogger("due.updates")
 
@@ -34,6 +35,8 @@ _SILENT_SECONDS = 3.0
 _LOOK_SECONDS = 1.0
 """Seconds between two checks of the other members; a single member checks less often."""
 _HOLD_SECONDS = 0.2
+_MOST_PRODUCERS = 4096
+"""Most apps whose announcements are read, because any program may name one."""
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
 _TRIES = 3
@@ -45,7 +48,7 @@ class StreamReader:
     """A member of a group of readers.  `read`, `acknowledge` and `care` belong to one thread."""
 
     def __init__(self, url: str, commands: Any, group: str, consumer: str, *, shared: bool) -> None:
-        self._url = url
+        self._url, self._place = url, without_passwords(url)
         self._commands = commands  # Any: redis-py types an answer by options it cannot see
         self._group = group
         self._consumer = consumer
@@ -79,19 +82,27 @@ class StreamReader:
         self._take_over = False
         self._stale = False
         self._connected_before = False
-        self._counts = {"claimed": 0, "paths_refused": 0}
+        self._denied: set[str] = set()
+        """Paths without a right to read them."""
+        self._counts = {"claimed": 0, "paths_refused": 0, "paths_denied": 0}
 
     def known(self) -> list[str]:
         """Paths of all streams that producers announced."""
         try:
-            return sorted(path.decode("ascii", "replace") for path in self._commands.smembers(STREAMS))
+            apps = sorted(self._commands.smembers(PRODUCERS))[:_MOST_PRODUCERS]
+            pipe = self._commands.pipeline(transaction=False)
+            for app in apps:
+                pipe.zrange(announced_name(app.decode("ascii", "replace")), 0, -1)
+            found = pipe.execute(raise_on_error=False)
+            paths = {path for one in found if isinstance(one, list) for path in one}
+            return sorted(path.decode("ascii", "replace") for path in paths)
         except (redis.RedisError, OSError) as error:
             raise UpdatesUnavailable(str(error)) from None
 
     def add(self, path: str, start: str, *, reset: bool = False) -> None:
         """Read this stream too; `start` counts if the group is new to it, or `reset`."""
         with self._lock:
-            if path in self._paths and not reset:
+            if path in self._denied or (path in self._paths and not reset):
                 return
             if len(self._paths) >= _MOST_PATHS and path not in self._paths:
                 self._refuse(path)
@@ -220,13 +231,29 @@ class StreamReader:
                 path,
             )
 
+    def _deny(self, path: str, error: Exception) -> None:
+        """A right is missing: this path is left out, and the others are read on."""
+        with self._lock:
+            self._paths.pop(path, None)
+            self._held.discard(path)
+            if len(self._denied) < _MOST_PATHS:
+                self._denied.add(path)
+        self._counts["paths_denied"] += 1
+        log.error(
+            "%s has no right to read %s: %s; grant its key in [grants.%s]",
+            self._group,
+            path,
+            error,
+            self._group,
+        )
+
     def _write_leases(self, paths: list[str], value: bytes) -> None:
         if not paths:
             return
         try:
             pipe = self._commands.pipeline(transaction=False)
             for path in paths:
-                pipe.hset(readers_name(path), lease_field(self._group, self._consumer), value)
+                pipe.hset(lease_name(self._group, path), self._consumer, value)
             pipe.execute()
         except (redis.RedisError, OSError) as error:
             log.debug("leases could not be written: %s", error)
@@ -242,6 +269,8 @@ class StreamReader:
             except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
                 failed = error
                 continue
+            except redis.exceptions.NoPermissionError as error:
+                self._deny(path, error)
             self._unmade.pop(path, None)
             return
         log.warning("group %s of %s cannot be created now: %s", self._group, path, failed)
@@ -285,7 +314,7 @@ class StreamReader:
             self._wire.close()
             self._wire = None
         delay = self._backoff.failed(time.monotonic())
-        log.warning("streams at %s: %s; retrying in %.2f s", self._url, error, delay)
+        log.warning("streams at %s: %s; retrying in %.2f s", self._place, error, delay)
 
     def _request(self, wire: Wire) -> None:
         with self._lock:
@@ -359,7 +388,20 @@ class StreamReader:
             self.renew()
             self._catch_up.clear()
             return
+        if str(error).startswith("NOPERM"):
+            self._drop_denied()
+            return
         raise UpdatesUnavailable(f"reading streams was refused: {error}")
+
+    def _drop_denied(self) -> None:
+        """Rights were taken away from one of the paths of a request: find it."""
+        for path in self._requested:
+            try:
+                self._commands.xinfo_consumers(stream_name(path), self._group)
+            except redis.exceptions.NoPermissionError as error:
+                self._deny(path, error)
+            except (redis.RedisError, OSError) as error:
+                log.debug("%s: %s", path, error)
 
     def _look_after_the_dead(self) -> None:
         with self._lock:
@@ -382,22 +424,21 @@ class StreamReader:
 
     def _claim(self, path: str) -> bool:
         """Take the pending entries of dead members; returns whether a live one has some."""
-        name = stream_name(path)
-        consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(name, self._group)
+        consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(stream_name(path), self._group)
         others = [c for c in consumers if c["name"] != self._consumer.encode()]
         self._alone = self._alone and not others
         others = [c for c in others if c["pending"]]
         if not others:
             return False
-        fields = {c["name"]: self._group.encode() + b"/" + c["name"] for c in others}
+        names = [c["name"] for c in others]
         watch = self._watches.setdefault(path, LeaseWatch(_SILENT_SECONDS))
         asked = time.monotonic()
-        leases = self._commands.hgetall(readers_name(path))
+        leases = self._commands.hgetall(lease_name(self._group, path))
         # a missing lease is treated like an unchanged one
-        watch.look({field: leases.get(field, b"") for field in fields.values()}, asked, time.monotonic())
+        watch.look({name: leases.get(name, b"") for name in names}, asked, time.monotonic())
         waits = False
-        for name, field in fields.items():
-            if not self._take_over and watch.silent(field) < _SILENT_SECONDS:
+        for name in names:
+            if not self._take_over and watch.silent(name) < _SILENT_SECONDS:
                 waits = True
             else:
                 self._claim_from(path, name)

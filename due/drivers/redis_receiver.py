@@ -15,15 +15,21 @@ from typing import Any
 from due.backoff import Backoff
 from due.drivers.base import Delivery
 from due.drivers.redis_reader import StreamReader
-from due.drivers.redis_streams import STREAMS
-from due.drivers.redis_wire import Wire, client, glob
+from due.drivers.redis_rights import channel_globs, granted_for
+from due.drivers.redis_streams import announced_name
+from due.drivers.redis_wire import Wire, client
 from due.errors import InvalidKey, UpdatesUnavailable
 from due.keys import Key
+from due.logs import without_passwords
 
 log = logging.getLogger("due.updates")
 
 _PREFIX = b"due:"
-_STREAMS = STREAMS.encode()
+_ANNOUNCED = announced_name("").encode()
+_ANNOUNCEMENTS = announced_name("*").encode()
+_CONFIRM_SECONDS = 5.0
+_REFUSED = b"refused"
+"""The kind of an answer that is an error."""
 
 
 def channel_name(path: str) -> bytes:
@@ -34,17 +40,30 @@ def channel_name(path: str) -> bytes:
 class RedisReceiver:
     """See `due.drivers.base.Receiver`."""
 
-    def __init__(self, url: str, group: str, consumer: str, *, shared: bool, backlog: int) -> None:
-        self._url = url
+    def __init__(
+        self,
+        url: str,
+        group: str,
+        consumer: str,
+        *,
+        shared: bool,
+        backlog: int,
+        observable: tuple[str, ...] = (),
+    ) -> None:
+        self._url, self._place = url, without_passwords(url)
+        self._group = group
+        self._observable = observable
         self._backlog_limit = backlog
         self._lock = threading.RLock()
-        self._patterns: dict[str, int] = {}
+        self._channels: dict[bytes, int] = {}
+        """Channels and patterns of channels, with the number of their users here."""
         self._bus: Wire | None = None
         self._backoff = Backoff()
         self._backlog: deque[Delivery] = deque()
         self._backlog_bytes = 0
         self._dropped = 0
         self._reconnects = 0
+        self._denied = 0
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._closed = False
         self._client = client(url)
@@ -54,24 +73,25 @@ class RedisReceiver:
     def subscribe(self, pattern: str) -> None:
         """See `Receiver.subscribe`; on return the server has confirmed it."""
         with self._lock:
-            self._patterns[pattern] = self._patterns.get(pattern, 0) + 1
-            if self._patterns[pattern] == 1:
-                self._change(b"SUBSCRIBE", pattern)
+            self._take(self._channels_of(pattern))
         self.wake()
 
     def unsubscribe(self, pattern: str) -> None:
         """See `Receiver.unsubscribe`."""
         with self._lock:
-            self._patterns[pattern] -= 1
-            if not self._patterns[pattern]:
-                del self._patterns[pattern]
-                self._change(b"UNSUBSCRIBE", pattern)
+            gone = self._channels_of(pattern)
+            for channel in gone:
+                self._channels[channel] -= 1
+            gone = [channel for channel in gone if not self._channels[channel]]
+            for channel in gone:
+                del self._channels[channel]
+            self._change(b"UNSUBSCRIBE", gone)
 
     def follow(self, pattern: str, *, start: str = "") -> None:
         """See `Receiver.follow`."""
         with self._lock:
-            if not self._followed:
-                self._subscribe_announcements()
+            if _ANNOUNCEMENTS not in self._channels:
+                self._take([_ANNOUNCEMENTS])
             self._followed[pattern] = start
         self._adopt(pattern, start or "$", reset=bool(start))
         self.wake()
@@ -91,7 +111,7 @@ class RedisReceiver:
     @property
     def connected(self) -> bool:
         """See `Receiver.connected`."""
-        return self._bus is not None or not self._patterns
+        return self._bus is not None or not self._channels
 
     def receive(self, timeout: float) -> list[Delivery]:
         """See `Receiver.receive`."""
@@ -139,7 +159,7 @@ class RedisReceiver:
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
-        counts = {"dropped_slow": self._dropped, "reconnects": self._reconnects}
+        counts = {"dropped_slow": self._dropped, "reconnects": self._reconnects, "denied": self._denied}
         return {**counts, **self._reader.statistics()}
 
     def close(self) -> None:
@@ -154,9 +174,14 @@ class RedisReceiver:
             os.close(self._wake_write)
         self._client.close()
 
-    def _subscribe_announcements(self) -> None:
-        self._patterns[STREAMS] = 1
-        self._change(b"SUBSCRIBE", STREAMS)
+    def _channels_of(self, pattern: str) -> list[bytes]:
+        globs = (glob for one in granted_for(pattern, self._observable) for glob in channel_globs(one))
+        return [channel_name(glob) for glob in dict.fromkeys(globs)]
+
+    def _take(self, channels: list[bytes]) -> None:
+        for channel in channels:
+            self._channels[channel] = self._channels.get(channel, 0) + 1
+        self._change(b"SUBSCRIBE", [channel for channel in channels if self._channels[channel] == 1])
 
     def _adopt(self, pattern: str, start: str, *, reset: bool = False) -> None:
         """Read the streams that exist now and match."""
@@ -172,35 +197,32 @@ class RedisReceiver:
         if any(Key.parse(p).matches_path(path) for p in self._followed) and _is_path(path):
             self._reader.add(path, "0")
 
-    def _change(self, verb: bytes, pattern: str) -> None:
-        """Send (UN)SUBSCRIBE and read on until it is confirmed."""
-        if self._bus is None and not self._open():
+    def _change(self, verb: bytes, channels: list[bytes]) -> None:
+        """Send (UN)SUBSCRIBE and read on until each is confirmed or refused."""
+        if not channels or (self._bus is None and not self._open()):
             return
         assert self._bus is not None  # noqa: S101 - just opened
         try:
-            self._send_change(self._bus, verb, pattern)
-            deadline = time.monotonic() + 5
-            confirmed = verb.lower() if pattern == STREAMS or glob(pattern) is None else b"p" + verb.lower()
-            while time.monotonic() < deadline:
-                if any([self._sort(reply) == confirmed for reply in self._bus.wait(1.0)]):  # noqa: C419 - all
-                    return
+            for channel in channels:
+                _send_change(self._bus, verb, channel)
+            waiting, refused, deadline = set(channels), 0, time.monotonic() + _CONFIRM_SECONDS
+            answers = (verb.lower(), b"p" + verb.lower())
+            while len(waiting) > refused and time.monotonic() < deadline:
+                for reply in self._bus.wait(1.0):
+                    kind = self._sort(reply)
+                    refused += kind == _REFUSED
+                    if kind in answers:
+                        waiting.discard(reply[1])
         except UpdatesUnavailable as error:
             self._lose(error)
-
-    def _send_change(self, bus: Wire, verb: bytes, pattern: str) -> None:
-        wild = None if pattern == STREAMS else glob(pattern)
-        if wild is not None:
-            bus.send(b"P" + verb, channel_name(wild))
-        else:
-            bus.send(verb, STREAMS if pattern == STREAMS else channel_name(pattern))
 
     def _open(self) -> bool:
         if not self._backoff.due(time.monotonic()):
             return False
         try:
             bus = Wire(self._url)
-            for pattern in self._patterns:
-                self._send_change(bus, b"SUBSCRIBE", pattern)
+            for channel in self._channels:
+                _send_change(bus, b"SUBSCRIBE", channel)
         except UpdatesUnavailable as error:
             self._lose(error)
             return False
@@ -215,15 +237,15 @@ class RedisReceiver:
             self._reconnects += 1
         delay = self._backoff.failed(time.monotonic())
         if not self._closed:
-            log.warning("subscriptions at %s: %s; retrying in %.2f s", self._url, error, delay)
+            log.warning("subscriptions at %s: %s; retrying in %.2f s", self._place, error, delay)
 
     def _care(self) -> None:
         """Reconnect lost connections, and look for streams announced meanwhile."""
-        if self._bus is None and self._patterns and not self._closed:
+        if self._bus is None and self._channels and not self._closed:
             with self._lock:
                 opened = self._bus is None and self._open()
             if opened:
-                log.warning("resubscribed at %s", self._url) if self._reconnects else None
+                log.warning("resubscribed at %s", self._place) if self._reconnects else None
                 for pattern in list(self._followed):
                     self._adopt(pattern, "0")
         self._reader.care()
@@ -234,7 +256,7 @@ class RedisReceiver:
         bus = self._bus
         if bus is not None:
             poll.register(bus.fileno(), select.POLLIN)
-        elif self._patterns:
+        elif self._channels:
             timeout = min(timeout, 0.05)
         timeout = min(timeout, self._reader.patience())
         stream = self._reader.fileno()
@@ -270,12 +292,14 @@ class RedisReceiver:
         kind: bytes = reply[0] if isinstance(reply, list) else b""
         if kind not in (b"message", b"pmessage"):
             if isinstance(reply, Exception):
-                log.error("subscription refused: %s", reply)
+                self._denied += 1
+                log.error("a subscription of %s was refused: %s", self._group, reply)
+                return _REFUSED
             return kind
         if len(reply) < 3 or not (isinstance(reply[-2], bytes) and isinstance(reply[-1], bytes)):
             raise UpdatesUnavailable("the server sent a message without channel or content")
         channel, payload = reply[-2], reply[-1]
-        if channel == _STREAMS:
+        if channel.startswith(_ANNOUNCED):
             self._announced(payload.decode("ascii", "replace"))
         elif self._backlog_bytes > self._backlog_limit:
             self._dropped += 1
@@ -283,6 +307,10 @@ class RedisReceiver:
             self._backlog.append(Delivery(channel[len(_PREFIX) :].decode("ascii", "replace"), payload))
             self._backlog_bytes += len(payload)
         return kind
+
+
+def _send_change(bus: Wire, verb: bytes, channel: bytes) -> None:
+    bus.send(b"P" + verb if b"*" in channel else verb, channel)
 
 
 def _is_path(text: str) -> bool:

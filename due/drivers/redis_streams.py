@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from due.drivers.redis_leases import LeaseWatch, group_of
 from due.errors import UpdatesUnavailable
 
-STREAMS = "due:streams"
-"""Set of the paths that are streams, and the channel on which new ones are announced."""
+PRODUCERS = "due:producers"
+"""Set of the apps that have announced streams."""
 _OVERHEAD = 200
 LIFETIME_S = 86_400
 """Streams and leases expire after this long without a producer and a reader, seconds."""
@@ -30,6 +30,11 @@ LEAST_PAUSE = 0.0025
 def stream_name(path: str) -> str:
     """The Redis key of a stream."""
     return f"due:stream:{path}"
+
+
+def announced_name(app: str) -> str:
+    """Paths that are streams of an app, sorted by last use (unix s), and the channel where it announces them."""
+    return f"due:streams:{app}"
 
 
 class StreamEntry:
@@ -67,6 +72,8 @@ class StreamLedger:
         """Written to since its expiry was renewed."""
         self.groups: tuple[bytes, ...] = ()
         """Live groups of readers, as of the last answer."""
+        self.known: tuple[bytes, ...] = ()
+        """Groups whose leases are asked for: those of the stream, and those that lived."""
         self.asked = False
         """A question about the readers is on its way."""
         self.asked_at = 0.0
@@ -93,6 +100,12 @@ class StreamLedger:
     def excess(self, share: float) -> int:
         """Bytes that are kept beyond this share of the window."""
         return max(0, self.kept_bytes - int(share * self._window)) if self.kept else 0
+
+    def discard(self, entry: StreamEntry) -> None:
+        """Forget an entry that the server refuses for good."""
+        if entry in self.kept:
+            self.kept.remove(entry)
+            self.kept_bytes -= entry.size
 
     @property
     def half_full(self) -> bool:

@@ -1,22 +1,22 @@
 """Housekeeping by readers on the server, so that nothing there grows without bound.
 
-    every minute   the end of the streams read here is put off        (streams expire LIFETIME_S after that)
+    every minute   the end of the group's leases is put off           (they expire LIFETIME_S after that)
                    leases of members that are gone, and their consumers in the group, are removed
-                   paths whose stream has expired leave `due:streams`
     a withdrawn    path's group is destroyed, unless another member of the group lives
 
-Belongs to the thread that renews leases. Each removal is one script on the server that looks again before it acts.
+Belongs to the thread that renews leases. Each removal watches the keys, looks again and acts in one transaction: no
+script, for whoever may run scripts can stop the server with one.
 """
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import redis
 
-from due.drivers.redis_leases import LEFT, LeaseWatch, group_of, lease_field, readers_name
-from due.drivers.redis_streams import CARE_SECONDS, LIFETIME_S, STREAMS, stream_name
+from due.drivers.redis_leases import LEFT, LeaseWatch, lease_name
+from due.drivers.redis_streams import CARE_SECONDS, LIFETIME_S, stream_name
 
 log = logging.getLogger("due.updates")
 
@@ -25,18 +25,8 @@ _GONE_SECONDS = 30.0
 """A member without a renewed lease for this long does not keep its group alive."""
 _FORGET_SECONDS = 120.0
 """A lease unchanged for this long is removed; a member that returns writes it again."""
-_SCANNED = 200
-_MOST_CANDIDATES = 10_000
-_FORGET_LEASE = (
-    "return redis.call('HGET',KEYS[1],ARGV[1])==ARGV[2] and redis.call('HDEL',KEYS[1],ARGV[1]) or 0"
-)
-_FORGET_PATH = "return redis.call('EXISTS',KEYS[1])==0 and redis.call('SREM',KEYS[2],ARGV[1]) or 0"
-_FORGET_CONSUMER = """
-local pending = redis.call('XPENDING', KEYS[1], ARGV[1], '-', '+', 1, ARGV[2])
-if #pending > 0 or redis.call('HEXISTS', KEYS[2], ARGV[3]) == 1 then return 0 end
-redis.call('XGROUP', 'DELCONSUMER', KEYS[1], ARGV[1], ARGV[2])
-return 1
-"""
+_ATTEMPTS = 5
+"""Of a transaction whose keys others change meanwhile."""
 
 
 class Upkeep:
@@ -49,12 +39,10 @@ class Upkeep:
         self._watches: dict[str, LeaseWatch] = {}
         self._withdrawn: dict[str, tuple[float, LeaseWatch]] = {}
         self._care_at = 0.0
-        self._cursor = 0
-        self._missing: dict[bytes, float] = {}
-        self.counts = {"forgotten_leases": 0, "forgotten_paths": 0, "announced_paths": 0}
+        self.counts = {"forgotten_leases": 0}
 
     def added(self, path: str) -> None:
-        """A path is read from now on: renew the expiry of its stream."""
+        """A path is read from now on: renew the expiry of its leases."""
         self._withdrawn.pop(path, None)
         self._care_at = 0.0
 
@@ -70,11 +58,10 @@ class Upkeep:
             for path, (at, watch) in list(self._withdrawn.items()):
                 if now - at > _WITHDRAWN_SECONDS and self._drop_group(path, watch):
                     self._withdrawn.pop(path, None)
-            if now >= self._care_at and (paths or self._missing):
+            if now >= self._care_at and paths:
                 self._care_at = now + CARE_SECONDS
                 self._put_off(paths)
                 self._tidy(paths)
-                self._forget_paths(now)
         except (redis.RedisError, OSError) as error:
             log.debug("housekeeping for the streams of %s failed: %s", self._group, error)
 
@@ -82,7 +69,7 @@ class Upkeep:
         """Remove a group; True if it is gone or another living member keeps it."""
         asked = time.monotonic()
         before = {field: watch.value(field) for field in watch.fields()}
-        watch.look(self._ours(self._commands.hgetall(readers_name(path))), asked, time.monotonic())
+        watch.look(self._leases(path), asked, time.monotonic())
         others = [field for field in watch.fields() if watch.silent(field) < _GONE_SECONDS]
         if not others:
             self._commands.xgroup_destroy(stream_name(path), self._group)
@@ -92,22 +79,19 @@ class Upkeep:
     def _put_off(self, paths: Sequence[str]) -> None:
         pipe = self._commands.pipeline(transaction=False)
         for path in paths:
-            pipe.expire(stream_name(path), LIFETIME_S)
-            pipe.expire(readers_name(path), LIFETIME_S)
+            pipe.expire(lease_name(self._group, path), LIFETIME_S)
         pipe.execute()
 
     def _tidy(self, paths: Sequence[str]) -> None:
         self._watches = {path: self._watches.get(path) or self._new_watch() for path in paths}
         for path, watch in self._watches.items():
             asked = time.monotonic()
-            leases = self._ours(self._commands.hgetall(readers_name(path)))
+            leases = self._leases(path)
             given_up = {field for field in leases if watch.value(field) == LEFT}
             watch.look(leases, asked, time.monotonic())
             for field, value in leases.items():
                 if field in given_up or _FORGET_SECONDS < watch.silent(field) < float("inf"):
-                    self.counts["forgotten_leases"] += int(
-                        self._commands.eval(_FORGET_LEASE, 1, readers_name(path), field, value)
-                    )
+                    self.counts["forgotten_leases"] += self._forget_lease(path, field, value)
             self._forget_consumers(path, watch)
 
     def _new_watch(self) -> LeaseWatch:
@@ -121,32 +105,44 @@ class Upkeep:
         except redis.ResponseError:  # the stream or group is being created again
             return
         for one in consumers:
-            field = self._group.encode() + b"/" + one["name"]
-            if one["pending"] or field in known or field == lease_field(self._group, self._consumer):
-                continue
-            names = (stream_name(path), readers_name(path))
-            self._commands.eval(_FORGET_CONSUMER, 2, *names, self._group, one["name"], field)
+            name = one["name"]
+            if not (one["pending"] or name in known or name == self._consumer.encode()):
+                self._forget_consumer(path, name)
 
-    def _forget_paths(self, now: float) -> None:
-        """Paths that were found without a stream at two looks: a producer announces before it appends."""
-        self._cursor, paths = self._commands.sscan(STREAMS, self._cursor, count=_SCANNED)
-        pipe = self._commands.pipeline(transaction=False)
-        looked = list(dict.fromkeys((*paths, *self._missing)))
-        for path in looked:
-            pipe.exists(b"due:stream:" + path)
-        pipe.scard(STREAMS)
-        *there, self.counts["announced_paths"] = pipe.execute()
-        for path, exists in zip(looked, there, strict=True):
-            if exists:
-                self._missing.pop(path, None)
-            elif now - self._missing.setdefault(path, now) >= CARE_SECONDS:
-                del self._missing[path]
-                self.counts["forgotten_paths"] += int(
-                    self._commands.eval(_FORGET_PATH, 2, b"due:stream:" + path, STREAMS, path)
-                )
-        while len(self._missing) > _MOST_CANDIDATES:
-            self._missing.popitem()
+    def _forget_lease(self, path: str, field: bytes, value: bytes) -> int:
+        lease = lease_name(self._group, path)
 
-    def _ours(self, leases: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
-        ours = self._group.encode()
-        return {field: value for field, value in leases.items() if group_of(field) == ours}
+        def act(pipe: Any) -> None:
+            if pipe.hget(lease, field) == value:
+                pipe.multi()
+                pipe.hdel(lease, field)
+
+        return self._transaction(act, lease)
+
+    def _forget_consumer(self, path: str, name: bytes) -> None:
+        stream, lease = stream_name(path), lease_name(self._group, path)
+
+        def act(pipe: Any) -> None:
+            pending = pipe.xpending_range(stream, self._group, "-", "+", 1, consumername=name)
+            if not pending and not pipe.hexists(lease, name):
+                pipe.multi()
+                pipe.xgroup_delconsumer(stream, self._group, name)
+
+        self._transaction(act, stream, lease)
+
+    def _transaction(self, act: Callable[[Any], None], *names: str) -> int:
+        """Replies to what `act` queued while the keys stayed as it saw them."""
+        for _ in range(_ATTEMPTS):
+            with self._commands.pipeline() as pipe:
+                try:
+                    for name in names:  # one by one: they belong to different rights
+                        pipe.watch(name)
+                    act(pipe)
+                    return len(pipe.execute())
+                except redis.WatchError:
+                    continue
+        return 0
+
+    def _leases(self, path: str) -> dict[bytes, bytes]:
+        found: dict[bytes, bytes] = self._commands.hgetall(lease_name(self._group, path))
+        return found

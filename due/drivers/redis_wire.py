@@ -16,6 +16,7 @@ import hiredis
 import redis
 
 from due.errors import InvalidOption, UpdatesUnavailable
+from due.logs import without_passwords
 
 _READ = 1 << 18
 _PARSER_KEEPS = 1 << 20
@@ -33,7 +34,7 @@ def client(url: str) -> redis.Redis:
     try:
         return redis.Redis.from_url(_redis_url(url), protocol=2, socket_timeout=10, socket_connect_timeout=5)
     except ValueError as error:
-        raise InvalidOption(f"Data Updates URL {url!r}: {error}") from None
+        raise InvalidOption(f"Data Updates URL {without_passwords(url)!r}: {error}") from None
 
 
 def _redis_url(url: str) -> str:
@@ -42,7 +43,16 @@ def _redis_url(url: str) -> str:
             return "unix://" + url.removeprefix(prefix)
     if url.startswith(("redis://", "rediss://")):
         return url
-    raise InvalidOption(f"Data Updates URL {url!r}: use redis://host:port/0, rediss://… or unix:///path.sock")
+    raise InvalidOption(
+        f"Data Updates URL {without_passwords(url)!r}: use redis://host:port/0, rediss://… or unix:///path.sock"
+    )
+
+
+def as_user(url: str, name: str, password: str) -> str:
+    """The URL of a server with this user and password; both have URL-safe characters only."""
+    scheme, _, rest = _redis_url(url).partition("://")
+    head, slash, tail = rest.partition("/")
+    return f"{scheme}://{name}:{password}@{head.rpartition('@')[2]}{slash}{tail}"
 
 
 @contextmanager
@@ -69,7 +79,9 @@ class Wire:
         try:
             self._connection.connect()
         except (redis.RedisError, OSError) as error:
-            raise UpdatesUnavailable(f"Data Updates at {url} cannot be reached: {error}") from None
+            raise UpdatesUnavailable(
+                f"Data Updates at {without_passwords(url)} cannot be reached: {error}"
+            ) from None
         # redis-py has no public way to wait on several connections
         self._socket: socket.socket = self._connection._sock  # noqa: SLF001
         self._socket.settimeout(None)  # the time-out was for opening the connection
@@ -200,11 +212,3 @@ def _parts(arguments: tuple[bytes | str | int, ...]) -> list[bytes]:
 def pack(arguments: tuple[bytes | str | int, ...]) -> bytes:
     """One command as bytes."""
     return cast("bytes", hiredis.pack_command(cast("Any", arguments)))  # its stub lacks the dots
-
-
-def glob(pattern: str) -> str | None:
-    """A key pattern as a Redis channel pattern that matches at least the same; None if it is exact."""
-    if "*" not in pattern:
-        return None
-    text = pattern.removesuffix("**").removesuffix(".") + "*" if pattern.endswith("**") else pattern
-    return "".join(f"\\{c}" if c in "?[]\\" else c for c in text)

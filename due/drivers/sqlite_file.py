@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from due.drivers.query import ArchiveQuery
@@ -199,7 +199,10 @@ class SqliteFile:
 
     def _connect(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        before = self._named()
+        if (before := self._named()) is None:
+            # SQLite gives the files beside it the same mode, and tells what is wrong where it cannot be made
+            with suppress(OSError):
+                os.close(os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600))
         connection = sqlite3.connect(
             self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
         )

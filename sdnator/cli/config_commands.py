@@ -73,11 +73,11 @@ def show(file: FileArgument = None, *, as_json: Json = False) -> None:
 
 
 def _holding(found: config_file.Config) -> Iterator[tuple[str, Any, str]]:
-    from sdnator.config.config_model import SWITCHES, fields, sections
+    from sdnator.config.config_model import LISTS, SWITCHES, fields, sections
 
     for section in sections():
-        if section == SWITCHES:
-            for number, each in enumerate(found.switches()):
+        if section in LISTS:
+            for number, each in enumerate(found.switches() if section == SWITCHES else found.grants()):
                 for option in fields(section):
                     source = found.sources.get((section, number, option), "")
                     yield f"{section}[{number}].{option}", _plain(getattr(each, option)), source
@@ -111,7 +111,7 @@ def example() -> None:
 
 def example_lines() -> Iterator[str]:
     """A file with all options at their defaults, commented out."""
-    from sdnator.config.config_model import SCHEMA, SWITCHES, default, fields, sections
+    from sdnator.config.config_model import LISTS, SCHEMA, default, fields, sections
     from sdnator.config.config_texts import texts
 
     yield "# Configuration of sdnator.  Options that are commented out show their default."
@@ -121,7 +121,7 @@ def example_lines() -> Iterator[str]:
         struct = declared.kind()
         yield ""
         yield from wrapped(" ".join((struct.__doc__ or "").split()))
-        yield f"# [[{section}]]" if section == SWITCHES else f"[{section}]"
+        yield f"# [[{section}]]" if section in LISTS else f"[{section}]"
         for name, field in fields(section).items():
             yield from _option_lines(name, field.type, default(section, name), texts(struct).get(name, ""))
 

@@ -19,11 +19,11 @@ from sdnator.errors import BadInput, SdnatorError
 from sdnator.redaction import redacted
 from sdnator.up import running
 
-State = Literal["ok", "missing", "optional"]
+State = Literal["ok", "missing", "optional", "exposed"]
 _LEAST_FREE = 1 << 30
 _SECONDS = 5.0
 _DISTRIBUTION = re.compile(r"[A-Za-z0-9._-]+")
-_MARKS = {"ok": "ok", "missing": "MISSING", "optional": "absent"}
+_MARKS = {"ok": "ok", "missing": "MISSING", "optional": "absent", "exposed": "EXPOSED"}
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,24 @@ def doctor(
         str, typer.Option(help="Data Archives to check, too.", metavar="URL", envvar="DUE_ARCHIVE")
     ] = "",
     switch: Annotated[str, typer.Option(help="P4Runtime switch to check, too.", metavar="HOST:PORT")] = "",
+    security: Annotated[
+        bool, typer.Option("--security", help="Check instead who could read, say or reach more than meant.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Check what is installed, reachable and permitted here, and say how to fix the rest.
 
-    Exit codes: 0 all required parts found, 1 a required part is missing, 2 misuse.
+    Exit codes: 0 all required parts found and nothing exposed, 1 otherwise, 2 misuse.
 
     Example: sdnator doctor --switch 10.0.0.2:9559
     """
-    checks = list(look(updates, archive, switch))
-    well = all(check.state != "missing" for check in checks)
+    if security:
+        from sdnator.cli.doctor_security import security_checks
+
+        checks = list(security_checks())
+    else:
+        checks = list(look(updates, archive, switch))
+    well = all(check.state not in ("missing", "exposed") for check in checks)
     if as_json:
         print(json.dumps({"well": well, "checks": [asdict(check) for check in checks]}))
     else:
@@ -338,4 +346,7 @@ def _show(checks: list[Check], *, well: bool) -> None:
     for check in checks:
         if check.remedy:
             print(f"{check.name}: {check.remedy}")
-    print("all required parts are here" if well else "a required part is MISSING: see above for what to do")
+    if any(check.state == "exposed" for check in checks):
+        print("something is EXPOSED: see above for what to do")
+    else:
+        print("all is as it should be" if well else "a required part is MISSING: see above for what to do")

@@ -21,6 +21,7 @@ from sdnator.redaction import redacted
 
 COMMANDS = {
     "allow": ("sdnator.cli.blocks_commands:allow", "Addresses, prefixes and MACs that are never blocked."),
+    "app": ("sdnator.cli.app_commands:app", "Apps that the pipeline does not start: their credentials."),
     "apps": (
         "sdnator.cli.coordinator_commands:apps",
         "List apps and their instances: state, process, items written and received.",

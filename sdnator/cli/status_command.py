@@ -14,6 +14,7 @@ from sdnator.cli.plain_table import plain_table
 from sdnator.counted import counted
 from sdnator.errors import PipelineError
 from sdnator.model_words import model_lines, model_of
+from sdnator.northbound import without_user
 from sdnator.redaction import redacted
 from sdnator.up import running
 from sdnator.up.running import shown
@@ -85,7 +86,7 @@ def _show_status(
     print(f"running for {_age(found.started)} as process {found.pid}; logs in {found.logs}")
     where = {
         "updates": redacted(found.updates),
-        "coordinator": found.coordinator,
+        "coordinator": without_user(found.coordinator),
         "dashboard": found.dashboard,
     }
     single = len(found.switches) == 1
@@ -101,7 +102,7 @@ def _show_status(
     if found.dashboard:
         print(f"sign in to the dashboard with the token in {found.token_file}")
     if apps is None:
-        print(f"the Coordinator at {found.coordinator} does not answer")
+        print(f"the Coordinator at {without_user(found.coordinator)} does not answer")
 
 
 def _state(name: str, part: Mapping[str, Any], apps: Mapping[str, str]) -> str:

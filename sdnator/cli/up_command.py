@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from sdnator.errors import BadInput, PipelineError, SdnatorError
+from sdnator.northbound import without_user
 from sdnator.redaction import redacted
 from sdnator.up import running
 from sdnator.up.planning import Given, plan_for
@@ -195,7 +196,7 @@ def _announce(found: running.Running, *, as_json: bool) -> None:
     lines = [
         ("Data Updates", updates),
         ("Data Archives", archive),
-        ("Coordinator", found.coordinator),
+        ("Coordinator", without_user(found.coordinator)),
         *(("switch", _switch_line(one)) for one in found.switches),
         ("logs", found.logs),
     ]

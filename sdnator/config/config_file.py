@@ -60,7 +60,7 @@ class Config:
 
     file: Path | None = None
     given: Mapping[str, Any] = field(default_factory=dict)
-    """Section to options, as plain values; of switches a list."""
+    """Section to options, as plain values; of switches and grants a list."""
     sources: Mapping[tuple[str | int, ...], str] = field(default_factory=dict)
     """Path of a given option to where it was given."""
 
@@ -77,6 +77,10 @@ class Config:
         section = sections()[name]
         chosen = self.section(name) if values is None else values
         return msgspec.convert({**(section.hidden or {}), **chosen}, section.kind())
+
+    def grants(self) -> list[Any]:
+        """Rights of apps, as far as the file names them."""
+        return [self.struct("grants", each) for each in self.given.get("grants") or []]
 
     def switches(self) -> list[Any]:
         """The switches; one embedded one if none is given."""
@@ -249,10 +253,10 @@ def _overridden(
     given: dict[str, Any], environment: Mapping[str, str], sources: dict[tuple[str | int, ...], str]
 ) -> Iterator[Fault]:
     """Override the file's values by the variables; yields variables that name no option."""
-    from sdnator.config.config_model import SWITCHES, sections
+    from sdnator.config.config_model import LISTS, sections
 
-    known = {variable(path): (path, kind) for path, kind in option_paths() if path[0] != SWITCHES}
-    own = {f"{PREFIX}{section.upper()}_" for section in sections() if section != SWITCHES}
+    known = {variable(path): (path, kind) for path, kind in option_paths() if path[0] not in LISTS}
+    own = {f"{PREFIX}{section.upper()}_" for section in sections() if section not in LISTS}
     for name in sorted(environment):
         if name in known:
             path, kind = known[name]
@@ -292,9 +296,11 @@ def _typed(text: str, kind: Any) -> Any:
 
 def _own_faults(given: Mapping[str, Any], place: Callable[[config_lines.Path], str]) -> Iterator[Fault]:
     """Errors that the parts find in values of the right type."""
+    from sdnator.config.config_model import LISTS
+
     config = Config(None, given)
     for name in given:
-        parts = enumerate(given[name]) if name == "switches" else [(None, None)]
+        parts = enumerate(given[name]) if name in LISTS else [(None, None)]
         for number, values in parts:
             at: config_lines.Path = (name,) if number is None else (name, number)
             try:

@@ -18,6 +18,9 @@ from sdnator.app_catalogue import apps
 SCHEMA = 1
 """Version of the file format; grows when an option changes its meaning."""
 SWITCHES = "switches"
+GRANTS = "grants"
+LISTS = (SWITCHES, GRANTS)
+"""Sections of which the file may have several."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +43,13 @@ class Section:
 PRODUCT_SECTIONS: Mapping[str, Section] = {
     "up": Section("sdnator.config.up_settings", "UpSettings"),
     SWITCHES: Section("sdnator.config.up_settings", "SwitchPlan"),
+    GRANTS: Section("sdnator.config.up_settings", "GrantPlan"),
     "dashboard": Section("sdnator.dashboard.settings", "DashboardOptions"),
     "supervisor": Section("sdnator.supervisor.settings", "SupervisorSettings"),
     "log": Section("sdnator.config.up_settings", "LogSettings"),
     "metrics": Section("sdnator.config.up_settings", "MetricsSettings"),
     "due": Section("due.config", "Options", {"updates": "", "archive": "", "directory": ""}),
-    "coordinator": Section("coordinator.service", "Settings", {"address_file": ""}),
+    "coordinator": Section("coordinator.service", "Settings", {"address_file": "", "token": ""}),
     "p4runtime_ctrl": Section(
         "apps.p4runtime_ctrl.settings", "Settings", {"switches": (), "program": "", "p4info": ""}
     ),
@@ -93,7 +97,7 @@ def model() -> type[BaseModel]:
     parts: dict[str, Any] = {"schema_": (int, SCHEMA)}
     for name, section in sections().items():
         made = model_of(section.kind(), frozenset(section.hidden or ()))
-        parts[name] = (list[made] if name == SWITCHES else made, None)  # type: ignore[valid-type]
+        parts[name] = (list[made] if name in LISTS else made, None)  # type: ignore[valid-type]
     config = ConfigDict(extra="forbid", strict=True)
     return create_model("SdnatorConfig", __config__=config, **parts)
 

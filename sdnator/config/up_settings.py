@@ -4,6 +4,9 @@ from typing import Literal
 
 import msgspec
 
+from due.errors import InvalidKey
+from due.keys import Key
+
 
 class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the pipeline keeps and shares its data."""
@@ -21,6 +24,28 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def __post_init__(self) -> None:
         if not self.quota >= 0.01:
             raise ValueError(f"quota={self.quota}: at least 0.01 GiB")
+
+
+class GrantPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Rights of one app on Data Updates beyond what it declares; a table for each app. Dangerous keys, which command
+    switches and apps, are granted to apps that are not the product's only if they are named here."""
+
+    app: str = ""
+    """Id of the app."""
+    publish: tuple[str, ...] = ()
+    """Key patterns that it may publish."""
+    observe: tuple[str, ...] = ()
+    """Key patterns that it may observe."""
+    declared: bool = True
+    """It may publish and observe what it declares, too, without the dangerous keys."""
+
+    def __post_init__(self) -> None:
+        for name in ("publish", "observe"):
+            for pattern in getattr(self, name):
+                try:
+                    Key.parse(pattern)
+                except InvalidKey as error:
+                    raise ValueError(f"{name}={pattern}: {error}") from None
 
 
 class LearnPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -10,6 +10,7 @@ These are the apps of `sdnator up`; without queries there is no Sonata adapter.
 No part is restarted: the results of a disturbed replay are not valid.
 """
 
+import secrets
 import sys
 import tempfile
 import time
@@ -31,6 +32,8 @@ from sdnator.app_catalogue import OURS
 from sdnator.capture.interfaces import Feed, VethPair, WireFeed
 from sdnator.errors import PipelineError
 from sdnator.replay.drop_counters import DropCounters
+from sdnator.rights.granting import OPERATOR, granted
+from sdnator.rights.identities import ADMIN, made, observable
 from sdnator.supervisor import Child, PartSpec, Supervisor
 from sdnator.supervisor.app_command import Backends, app_command
 from sdnator.supervisor.spec import PartProcess
@@ -93,6 +96,7 @@ class ReplayPipeline:
         self._run = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="sdnator-run-")))
         self._capture_socket = str(self._run / "capture.sock")
         self._coordinator_file = self._run / "coordinator.url"
+        self._identities = made(self._run, {name: granted(name).rights for name in ("coordinator", *OURS)})
 
     def __enter__(self) -> Self:
         try:
@@ -109,13 +113,22 @@ class ReplayPipeline:
 
     def _start(self) -> None:
         self._logs.mkdir(parents=True, exist_ok=True)
-        server = EmbeddedServer(self._run / "updates")
+        password = secrets.token_urlsafe(24)
+        server = EmbeddedServer(
+            self._run / "updates",
+            users=partial(self._identities.users_file, password),
+            admin=(self._identities.prefix + ADMIN, password),
+        )
         self._stack.callback(server.stop)
-        self.updates = server.url
+        self.updates = self._identities.url(server.url, OPERATOR)
         self._add("updates", partial(UpdatesProcess, server))
         self._add(
             "coordinator",
-            partial(self._app, "coordinator", {"address_file": str(self._coordinator_file)}),
+            partial(
+                self._app,
+                "coordinator",
+                {"address_file": str(self._coordinator_file), "token": secrets.token_urlsafe(24)},
+            ),
             after=("updates",),
         )
         self._add_switch()
@@ -227,7 +240,9 @@ class ReplayPipeline:
         }
 
     def _app(self, name: str, settings: Mapping[str, Any]) -> Child:
-        backends = Backends(updates=self.updates, archive=self.archive)
+        options = observable(self._identities.all[name].rights)
+        updates = self._identities.url(self.updates, name)
+        backends = Backends(updates=updates, archive=self.archive, options=options)
         return Child(name, app_command(name, self._plan.folder, backends, settings), self._logs)
 
     def check(self) -> None:

@@ -11,6 +11,7 @@ Switches are started first and stopped last, and no other part's restart touches
 """
 
 import os
+import secrets
 import shutil
 import time
 from collections.abc import Mapping
@@ -22,19 +23,25 @@ from typing import Any
 import msgspec
 
 from due.drivers.embedded_redis import EmbeddedServer
+from due.errors import InvalidOption
 from sdnator import p4_program
 from sdnator.app_catalogue import OURS
 from sdnator.config.planned_switches import PlannedSwitch
+from sdnator.private_files import kept_secret
+from sdnator.rights.granting import OPERATOR, granted
+from sdnator.rights.identities import ADMIN, made, observable
 from sdnator.supervisor import Child, PartSpec, RestartPolicy
 from sdnator.supervisor.app_command import Backends, app_command
 from sdnator.supervisor.spec import PartProcess
 from sdnator.supervisor.switch_program import SwitchProgram, socket_address
 from sdnator.supervisor.updates_server import UpdatesProcess
+from sdnator.up import running
 from sdnator.up.plan import StandingPlan
 
 _VITAL = ("coordinator", *OURS)
 """Parts without which the pipeline does not start; other apps are restarted if they fail."""
 _SPARK_SECONDS = 60.0
+COORDINATOR_TOKEN = "coordinator.token"  # noqa: S105 - a file's name
 _SUSPENDED_S = 0.4
 """A suspended switch forwards nothing: it is killed, and its spare takes over."""
 _TOKEN = "SDNATOR_DASHBOARD_TOKEN"  # noqa: S105 - a variable's name
@@ -53,8 +60,15 @@ class UpParts:
         self.logs = plan.state / "logs"
         self.address_file = plan.state / "coordinator.url"
         self._stack = stack
+        self._coordinator_token = kept_secret(plan.state / COORDINATOR_TOKEN)
+        self.granted = {name: granted(name, plan.grants) for name in plan.parts()}
+        self.identities = made(plan.state, {name: one.rights for name, one in self.granted.items()})
+        self.enforced = True
+        """Whether the server takes users; otherwise all parts use the given credential."""
         self._server = None if plan.updates else self._embedded_server()
-        self.updates = self._server.url if self._server is not None else plan.updates
+        self.server = self._server.admin_url if self._server is not None else plan.updates
+        """URL of Data Updates for whoever makes users there."""
+        self.updates = self._operators_url()
         self._programs = {each.name: self._switch(each) for each in plan.switches if _is_ours(each)}
         self._foreign_base_us = 0
 
@@ -70,12 +84,27 @@ class UpParts:
         """Address of its P4Runtime server."""
         return self._programs[switch.name].address if _is_ours(switch) else switch.kind
 
+    def _operators_url(self) -> str:
+        try:
+            return self.identities.url(self.server, OPERATOR)
+        except InvalidOption:  # reported at the start, which tries it
+            return self.server
+
     def _embedded_server(self) -> EmbeddedServer:
         """Its folder is unique to this run, so that remains of a killed run cannot use it."""
         for old in self.plan.state.glob("updates-*"):
             shutil.rmtree(old, ignore_errors=True)
-        server = EmbeddedServer(self.plan.state / f"updates-{os.getpid()}")
+        password = secrets.token_urlsafe(24)
+        server = EmbeddedServer(
+            self.plan.state / f"updates-{os.getpid()}",
+            users=partial(self.identities.users_file, password),
+            admin=(self.identities.prefix + ADMIN, password),
+        )
         self._stack.callback(server.stop)
+        link = running.updates_link(self.plan.state)
+        link.unlink(missing_ok=True)
+        link.symlink_to(server.socket)  # where enrolled apps find it, run after run
+        self._stack.callback(partial(link.unlink, missing_ok=True))
         return server
 
     def _switch(self, switch: PlannedSwitch) -> SwitchProgram:
@@ -160,7 +189,7 @@ class UpParts:
     def _app(self, name: str) -> PartProcess:
         """Start a DUE app with the current plan."""
         plan = self.plan
-        backends = Backends(updates=self.updates, archive=plan.archive, options=plan.engine)
+        backends = self.backends(name)
         command = app_command(
             name, plan.state, backends, self.settings(name), directory=plan.state / "due" / name
         )
@@ -172,11 +201,23 @@ class UpParts:
         environment = {_TOKEN: os.environ[_TOKEN]} if name == "dashboard" and _TOKEN in os.environ else {}
         return Child(name, command, self.logs, heartbeat=True, environment=environment)
 
+    def backends(self, name: str) -> Backends:
+        """Places of both backends, with the app's own credential."""
+        if not self.enforced:
+            return Backends(updates=self.updates, archive=self.plan.archive, options=self.plan.engine)
+        options = {**self.plan.engine, **observable(self.granted[name].rights)}
+        updates = self.identities.url(self.updates, name)
+        return Backends(updates=updates, archive=self.plan.archive, options=options)
+
+    def share_credential(self) -> None:
+        """All parts use the given credential, for it may make no users."""
+        self.enforced, self.updates = False, self.plan.updates
+
     def settings(self, name: str) -> Mapping[str, Any]:
         """An app's settings, with the addresses of other parts."""
         own = self.plan.settings_of(name)
         if name == "coordinator":
-            return {**own, "address_file": str(self.address_file)}
+            return {**own, "address_file": str(self.address_file), "token": self._coordinator_token}
         if name == "dashboard":
             return {**(self.plan.dashboard or {}), **self._dashboard_places()}
         if name == "p4runtime_ctrl":

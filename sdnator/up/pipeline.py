@@ -1,6 +1,6 @@
 """The pipeline that `sdnator up` keeps running: a supervisor with the parts of its plan."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
@@ -9,6 +9,7 @@ from due.drivers.redis_wire import Wire
 from due.errors import DueError, InvalidOption
 from sdnator.errors import BadInput, PipelineError
 from sdnator.redaction import redacted
+from sdnator.rights.rights_keeper import RightsKeeper, RightsRefused
 from sdnator.supervisor import LogLimits, PartReport, Supervisor
 from sdnator.supervisor.log_rotation import put_aside
 from sdnator.up.parts import UpParts
@@ -32,6 +33,7 @@ class StandingPipeline:
             file_bytes=chosen.file_bytes, files=chosen.log_files, minute_bytes=chosen.minute_bytes
         )
         self._supervisor = Supervisor(self._parts.specs(), tell, self._limits)
+        self._keeper = RightsKeeper(self._parts.server, self._parts.identities)
 
     def __enter__(self) -> Self:
         try:
@@ -54,7 +56,26 @@ class StandingPipeline:
         self._parts.address_file.unlink(missing_ok=True)
         if self.plan.updates:
             _try(self.plan.updates)
+            self._make_users()
+        for name, one in self._parts.granted.items():
+            if one.withheld:
+                keys = ", ".join(one.withheld)
+                self._tell(f"{name} may not publish {keys}: name it in [[grants]] if it is to command")
         self._supervisor.start()
+        if self._parts.enforced:
+            self._keeper.start()
+            self._stack.callback(self._keeper.stop)
+
+    def _make_users(self) -> None:
+        """On a given server: a user for each app; all share the given credential where it may make none."""
+        try:
+            self._keeper.apply()
+        except RightsRefused as error:
+            self._parts.share_credential()
+            self._tell(
+                f"every app may do everything on Data Updates, for --updates' user may make no users ({error}): "
+                "give it the right to ACL"
+            )
 
     @property
     def plan(self) -> StandingPlan:
@@ -103,7 +124,14 @@ class StandingPipeline:
 
     def watch(self) -> bool:
         """Restart parts that have died or hang; True if anything has changed.  Never blocks."""
+        for text in self._keeper.told():
+            self._tell(text)
         return self._supervisor.watch()
+
+    @property
+    def refusals(self) -> Mapping[str, int]:
+        """By identity: commands that Data Updates refused for want of a right."""
+        return dict(self._keeper.refusals)
 
     def wait(self, seconds: float) -> None:
         """Return after a time limit, or as soon as a part has become ready or has ended."""

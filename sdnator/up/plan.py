@@ -7,6 +7,7 @@ from typing import Any
 
 from sdnator.app_catalogue import OURS
 from sdnator.config.planned_switches import PlannedSwitch
+from sdnator.config.up_settings import GrantPlan
 from sdnator.supervisor.settings import SupervisorSettings
 
 _MODEL_FILES = ("load_model", "save_model", "keep_model", "keep_for")
@@ -22,6 +23,8 @@ class StandingPlan:
     """Data Updates URL; empty: an embedded server."""
     archive: str
     """Data Archives URL."""
+    grants: tuple[GrantPlan, ...] = ()
+    """Rights of apps that the configuration names."""
     switches: tuple[PlannedSwitch, ...] = (PlannedSwitch(),)
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Of the coordinator and the apps, by name."""
@@ -80,7 +83,7 @@ def _has_model(settings: Mapping[str, Any]) -> bool:
     return bool(settings.get("load_model")) or (bool(kept) and Path(kept).exists())
 
 
-_FOR_NEXT_START = ("updates", "archive", "switches", "apps", "metrics_host", "supervisor")
+_FOR_NEXT_START = ("updates", "archive", "switches", "apps", "grants", "metrics_host", "supervisor")
 
 
 def _differs(part: str, old: StandingPlan, new: StandingPlan) -> bool:

@@ -69,6 +69,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
         state=state,
         updates=given.updates or own.updates,
         archive=_checked_archive(archive) if archive else _own_archive(),
+        grants=tuple(config.grants()),
         switches=switches,
         settings=settings,
         apps=installed,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from due.errors import DueError
 from due.status_server import StatusServer
 from sdnator.errors import BadInput
+from sdnator.northbound import without_user
 from sdnator.supervisor.metrics import part_metrics
 from sdnator.up import running
 from sdnator.up.metrics_targets import write_targets
@@ -95,7 +96,7 @@ class UpReport:
 
     def _metrics(self) -> Mapping[str, str]:
         return {
-            "coordinator": self._pipeline.coordinator.removeprefix("http://"),
+            "coordinator": without_user(self._pipeline.coordinator).removeprefix("http://"),
             **self._pipeline.endpoints("metrics"),
             **({"supervisor": self._server.address} if self._server is not None else {}),
         }

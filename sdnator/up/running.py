@@ -19,6 +19,7 @@ from typing import Any
 from urllib.parse import quote
 
 from sdnator.errors import BadInput, PipelineError
+from sdnator.northbound import without_user
 from sdnator.private_files import write_private_json
 from sdnator.redaction import redacted_values
 
@@ -38,7 +39,7 @@ class Running:
     updates: str
     archive: str
     coordinator: str
-    """URL of the HTTP API."""
+    """URL of the HTTP API, with its token as `viewer:TOKEN@`."""
     switch: Mapping[str, Any] = field(default_factory=dict)
     """The first: name, address, device_id, target, ports, forward."""
     switches: Sequence[Mapping[str, Any]] = field(default_factory=list)
@@ -64,9 +65,8 @@ class Running:
 
 def shown(found: Running) -> dict[str, Any]:
     """The run file's content for other programs, without passwords."""
-    return redacted_values(
-        {name: getattr(found, name) for name in found.__dataclass_fields__ if name != "schema"}
-    )
+    values = {name: getattr(found, name) for name in found.__dataclass_fields__ if name != "schema"}
+    return redacted_values({**values, "coordinator": without_user(found.coordinator)})
 
 
 def state_folder() -> Path:
@@ -88,6 +88,11 @@ def _xdg(variable: str, default: str) -> Path:
     named = Path(os.environ.get(variable, ""))
     # the XDG standard says to ignore relative paths
     return (named if named.is_absolute() else Path.home() / default) / "sdnator"
+
+
+def updates_link(folder: Path) -> Path:
+    """A link to the socket of the embedded Data Updates server while it runs."""
+    return folder / "updates.sock"
 
 
 def model_file(folder: Path) -> Path:

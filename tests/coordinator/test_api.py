@@ -282,3 +282,27 @@ def test_every_route_is_documented(client: httpx.Client, north: Northbound) -> N
     assert routes - {"/observe"} == set(described["paths"])
     for path in described["paths"]:
         assert described["paths"][path]["get"]["summary"]
+
+
+@pytest.mark.parametrize(
+    "given", [None, "", "Bearer", "Bearer wrong", "Basic dmlld2VyOnNlY3JldA==", "bearer secret"]
+)
+def test_with_a_token_every_route_but_metrics_wants_it(given):
+    """A route that is added is tried, too: those of the application itself are taken."""
+    north: Any = object()
+    paths = {getattr(route, "path", "") for route in application(north).routes}
+    assert {"/apps", "/get", "/observe", "/health", "/openapi.json", "/metrics"} <= paths
+    headers = {} if given is None else {"authorization": given}
+    served = Api(north, "127.0.0.1", 0, token="secret")  # noqa: S106 - nobody's
+    served.start()
+    try:
+        for path in paths - {"/metrics", "/observe"}:
+            answer = httpx.get(served.url + path.replace("{app_id}", "x"), headers=headers)
+            assert (answer.status_code, answer.json()["error"]) == (401, "Unauthorized"), path
+        live = served.url.replace("http", "ws") + "/observe?key=a"
+        with pytest.raises(InvalidStatus), connect(live, additional_headers=headers):
+            pass
+        right = {"authorization": "Bearer secret"}
+        assert httpx.get(f"{served.url}/openapi.json", headers=right).status_code == 200
+    finally:
+        served.stop()

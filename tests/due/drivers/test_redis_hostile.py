@@ -7,8 +7,8 @@ import pytest
 from due import PUB_ONLY, Capability
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_aside import _MOST_BYTES, Aside, aside_name
-from due.drivers.redis_leases import readers_name
-from due.drivers.redis_streams import STREAMS, stream_name
+from due.drivers.redis_leases import lease_name
+from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
 from due.drivers.redis_wire import client
 from tests.due.conftest import wait_for
 
@@ -20,7 +20,8 @@ def test_garbage_leases_announcements_entries_and_consumers_stop_nobody(make_eng
     with EmbeddedServer(tmp_path / "u") as server:
         commands = client(server.url)
         for name in (*NAMES, b"r.hostile.*", b"r..x", "r.\u00e4".encode(), b"r.x:y"):
-            commands.sadd(STREAMS, name)
+            commands.sadd(PRODUCERS, name)
+            commands.zadd(announced_name("producer"), {name: 2e9})
         producer = make_engine("producer", url=server.url, init=RELIABLE)
         consumer = make_engine("consumer", url=server.url)
         got: list[Any] = []
@@ -28,8 +29,8 @@ def test_garbage_leases_announcements_entries_and_consumers_stop_nobody(make_eng
         producer.write("r.hostile", 0, [PUB_ONLY])
         wait_for(lambda: got == [0])
         for name in NAMES:
-            commands.hset(readers_name("r.hostile"), name, "no number")
-            commands.publish(STREAMS, name)
+            commands.hset(lease_name("consumer", "r.hostile"), name, "no number")
+            commands.publish(announced_name("producer"), name)
             commands.xgroup_createconsumer(stream_name("r.hostile"), "consumer", name)
         for fields in ({"f": "garbage"}, {"x": "y"}, {b"\xff": b"\xff", "f": b""}):
             commands.xadd(stream_name("r.hostile"), fields)
@@ -47,7 +48,8 @@ def test_garbage_leases_announcements_entries_and_consumers_stop_nobody(make_eng
 def test_foreign_entries_that_a_dead_member_left_stop_nobody(make_engine, tmp_path):
     with EmbeddedServer(tmp_path / "u") as server:
         commands, name = client(server.url), stream_name("r.hostile")
-        commands.sadd(STREAMS, "r.hostile")
+        commands.sadd(PRODUCERS, "producer")
+        commands.zadd(announced_name("producer"), {"r.hostile": 2e9})
         commands.xgroup_create(name, "consumer", "0", mkstream=True)
         commands.xadd(name, {"x": "y"})
         commands.xreadgroup("consumer", b"\xff dead", {name: ">"})
@@ -82,7 +84,8 @@ def test_a_reader_has_a_limit_of_paths(make_engine, tmp_path, monkeypatch, caplo
     monkeypatch.setattr("due.drivers.redis_reader._MOST_PATHS", 5)
     with EmbeddedServer(tmp_path / "u") as server:
         commands = client(server.url)
-        commands.sadd(STREAMS, *(f"{path}.p{n}" for n in range(20)))
+        commands.sadd(PRODUCERS, "producer")
+        commands.zadd(announced_name("producer"), {f"{path}.p{n}": 2e9 for n in range(20)})
         consumer = make_engine("consumer", url=server.url)
         consumer.observe(f"{path}.**").subscribe(print)
         counts = consumer.health()["receiving"]
@@ -121,11 +124,10 @@ def test_streams_leases_and_places_expire_a_day_after_their_last_use(make_engine
         producer.write("r.hostile", 0, [PUB_ONLY])
         producer.flush()
         wait_for(lambda: 0 < commands.ttl(stream_name("r.hostile")) <= 86_400)
-        commands.expire(stream_name("r.hostile"), 100)
         consumer = make_engine("consumer", url=server.url)
         consumer.observe("r.hostile").subscribe(print)
-        wait_for(lambda: commands.ttl(stream_name("r.hostile")) > 1000)
-        wait_for(lambda: commands.ttl(readers_name("r.hostile")) > 1000)
+        wait_for(lambda: commands.ttl(lease_name("consumer", "r.hostile")) > 1000)
+        wait_for(lambda: commands.ttl(announced_name("producer")) > 1000)
         assert producer.health()["updates"]["streams"] == 1
         for engine in (producer, consumer):
             engine.close()

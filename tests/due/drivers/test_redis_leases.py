@@ -5,9 +5,9 @@ import time
 import pytest
 
 from due.drivers import redis_upkeep
-from due.drivers.redis_leases import LeaseValue, LeaseWatch, readers_name
+from due.drivers.redis_leases import LeaseValue, LeaseWatch, lease_name
 from due.drivers.redis_reader import ServerTime
-from due.drivers.redis_streams import LIFETIME_S, STREAMS, stream_name
+from due.drivers.redis_streams import LIFETIME_S, stream_name
 from due.drivers.redis_upkeep import _FORGET_SECONDS, Upkeep
 from due.drivers.redis_wire import client
 
@@ -56,24 +56,23 @@ def test_values_never_repeat_when_the_clock_stands_or_goes_back(monkeypatch):
 
 
 def test_what_is_left_behind_is_forgotten_and_what_lives_is_not(server):
-    commands, path, gone = client(server.url), "r.upkeep.lives", "r.upkeep.gone"
-    commands.sadd(STREAMS, path, gone)
+    commands, path = client(server.url), "r.upkeep.lives"
+    leases = lease_name("group", path)
     commands.xgroup_create(stream_name(path), "group", "$", mkstream=True)
     for consumer in ("one", "dead", "busy"):
-        commands.hset(readers_name(path), f"group/{consumer}", "7")
+        commands.hset(leases, consumer, "7")
     commands.xadd(stream_name(path), {"f": "1"})
     commands.xreadgroup("group", "busy", {stream_name(path): ">"})
     commands.xgroup_createconsumer(stream_name(path), "group", "dead")
     upkeep, lease = Upkeep(commands, "group", "one"), LeaseValue()
     for minute in range(60):
-        commands.hset(readers_name(path), "group/one", lease.next())
+        commands.hset(leases, "one", lease.next())
         upkeep.tick([path], 60.0 * minute)
         _grow_older(upkeep)
-    assert set(commands.hkeys(readers_name(path))) == {b"group/one"}
+    assert set(commands.hkeys(leases)) == {b"one"}
     names = {one["name"] for one in commands.xinfo_consumers(stream_name(path), "group")}
     assert names == {b"busy"}, "its entry is not lost"
-    assert commands.smismember(STREAMS, [path, gone]) == [1, 0]
-    assert 0 < commands.ttl(stream_name(path)) <= LIFETIME_S
+    assert 0 < commands.ttl(leases) <= LIFETIME_S
     assert upkeep.counts["forgotten_leases"] == 2
     commands.close()
 
@@ -92,12 +91,12 @@ def test_a_group_goes_when_the_others_of_it_are_gone_and_stays_while_one_lives(s
     paths = {"r.left": b"0", "r.crashed": b"7", "r.alive": b"7"}
     for path, value in paths.items():
         commands.xgroup_create(stream_name(path), "group", "$", mkstream=True)
-        commands.hset(readers_name(path), "group/other", value)
+        commands.hset(lease_name("group", path), "other", value)
     upkeep = Upkeep(commands, "group", "one")
     upkeep.withdrawn(list(paths), 0.0)
     groups: list[set[str]] = []
     for second in range(1, 9):
-        commands.hset(readers_name("r.alive"), "group/other", lease.next())
+        commands.hset(lease_name("group", "r.alive"), "other", lease.next())
         upkeep.tick([], float(second))
         groups.append({path for path in paths if commands.xinfo_groups(stream_name(path))})
         for _, watch in upkeep._withdrawn.values():

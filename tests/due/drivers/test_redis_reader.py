@@ -7,7 +7,7 @@ import pytest
 import redis
 
 from due.drivers.base import Delivery
-from due.drivers.redis_leases import readers_name
+from due.drivers.redis_leases import lease_name
 from due.drivers.redis_reader import StreamReader
 from due.drivers.redis_streams import stream_name
 from due.drivers.redis_wire import client
@@ -22,10 +22,10 @@ def test_a_lease_is_not_renewed_after_it_was_given_up(server):
     for give_up in (StreamReader.close, lambda reader: reader.leave(lambda _path: False)):
         reader = StreamReader(server.url, commands, "group", "one", shared=False)
         reader.add(PATH, "0")
-        assert commands.hgetall(readers_name(PATH))[b"group/one"] != b"0"
+        assert commands.hgetall(lease_name("group", PATH))[b"one"] != b"0"
         give_up(reader)
         reader.renew()
-        assert commands.hgetall(readers_name(PATH)) == {b"group/one": b"0"}
+        assert commands.hgetall(lease_name("group", PATH)) == {b"one": b"0"}
     commands.close()
 
 

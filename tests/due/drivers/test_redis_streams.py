@@ -116,7 +116,7 @@ _REPLIES = st.recursive(
 @given(st.lists(_REPLIES, min_size=3, max_size=3))
 def test_whatever_the_server_answers_nothing_is_forgotten_by_mistake(replies):
     ledger = _ledger()
-    ledger.groups = (b"group",)
+    ledger.groups = ledger.known = (b"group",)
     _add(ledger, 3)
     question = Question(ledger)
     ledger.asking(0.0)

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from due.drivers.redis_wire import Wire, client, glob
+from due.drivers.redis_rights import channel_globs, covers
+from due.drivers.redis_wire import Wire, client
 from due.errors import InvalidOption, UpdatesUnavailable
 from due.keys import Key
 from tests.requirements import require_program
@@ -25,8 +26,13 @@ patterns = st.lists(st.sampled_from(["a", "b-c", "*"]), min_size=1, max_size=3).
 @given(patterns, paths)
 def test_a_channel_pattern_misses_nothing(pattern, path):
     if Key(pattern).matches_path(path):
-        wild = glob(pattern)
-        assert path == pattern if wild is None else fnmatch.fnmatchcase(path, wild)
+        assert any(fnmatch.fnmatchcase(path, glob) for glob in channel_globs(pattern))
+
+
+@given(patterns, patterns, paths)
+def test_what_covers_a_pattern_has_all_of_its_paths(wide, narrow, path):
+    if covers(wide, narrow) and Key(narrow).matches_path(path):
+        assert Key(wide).matches_path(path)
 
 
 def test_big_and_small_commands_survive(server):

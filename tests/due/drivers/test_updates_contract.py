@@ -70,7 +70,7 @@ def test_best_effort_reaches_all_who_subscribed_in_order(open_driver: Open) -> N
     exact.subscribe("a.b.c")
     wild.subscribe("a.**")
     other.subscribe("x.y.z")
-    publisher = driver.publisher()
+    publisher = driver.publisher("writer")
     publisher.publish("a.b.c", b"1", b"2")
     publisher.publish("a.b.c", b"3")
     assert numbers(received(exact, 3)) == numbers(received(wild, 3)) == [1, 2, 3]
@@ -85,7 +85,7 @@ def test_best_effort_reaches_all_who_subscribed_in_order(open_driver: Open) -> N
 
 def test_each_group_reads_a_stream_whole_and_in_order(open_driver: Open) -> None:
     driver = open_driver()
-    publisher = driver.publisher()
+    publisher = driver.publisher("writer")
     groups = [driver.receiver(name, f"{name}1") for name in ("one", "two")]
     for receiver in groups:
         receiver.follow("r.x.y")
@@ -102,7 +102,7 @@ def test_each_group_reads_a_stream_whole_and_in_order(open_driver: Open) -> None
 
 def test_what_was_not_acknowledged_goes_to_the_next_member_first(open_driver: Open) -> None:
     driver = open_driver()
-    publisher = driver.publisher()
+    publisher = driver.publisher("writer")
     first = driver.receiver("group", "first")
     first.follow("r.x.y")
     for number in range(6):
@@ -124,7 +124,7 @@ def test_what_was_not_acknowledged_goes_to_the_next_member_first(open_driver: Op
 
 def test_members_of_a_shared_group_divide_the_work(open_driver: Open) -> None:
     driver = open_driver()
-    publisher = driver.publisher()
+    publisher = driver.publisher("writer")
     members = [driver.receiver("group", name, shared=True) for name in ("a", "b")]
     paths = [f"r.x.y.{number}" for number in range(16)]
     for member in members:
@@ -153,7 +153,7 @@ def test_members_of_a_shared_group_divide_the_work(open_driver: Open) -> None:
 
 def test_a_group_may_begin_again_with_what_is_kept(open_driver: Open) -> None:
     driver = open_driver()
-    publisher = driver.publisher()
+    publisher = driver.publisher("writer")
     for number in range(5):
         publisher.append("r.x.y", b"%d" % number)
     publisher.settle(10)
@@ -170,7 +170,7 @@ def test_a_group_may_begin_again_with_what_is_kept(open_driver: Open) -> None:
 
 def test_a_stream_that_begins_later_is_read_from_its_beginning(open_driver: Open) -> None:
     driver = open_driver()
-    receiver, publisher = driver.receiver("group", "g1"), driver.publisher()
+    receiver, publisher = driver.receiver("group", "g1"), driver.publisher("writer")
     receiver.follow("r.**")
     publisher.append("r.new.path", b"1")
     publisher.append("s.other.path", b"2")
@@ -181,7 +181,7 @@ def test_a_stream_that_begins_later_is_read_from_its_beginning(open_driver: Open
 
 def test_a_full_window_makes_the_producer_wait_for_its_readers(open_driver: Open) -> None:
     driver = open_driver(window_bytes=10_000, retain_bytes=0)
-    publisher, receiver = driver.publisher(), driver.receiver("group", "g1")
+    publisher, receiver = driver.publisher("writer"), driver.receiver("group", "g1")
     receiver.follow("r.x.y")
     publisher.append("r.x.y", b"first")
     receiver.acknowledge(received(receiver, 1)[0])  # from here on the producer knows of this reader
@@ -210,7 +210,7 @@ def test_a_full_window_makes_the_producer_wait_for_its_readers(open_driver: Open
 
 def test_a_member_that_rests_receives_nothing_reliable(open_driver: Open) -> None:
     driver = open_driver()
-    publisher, receiver = driver.publisher(), driver.receiver("group", "g1")
+    publisher, receiver = driver.publisher("writer"), driver.receiver("group", "g1")
     receiver.follow("r.x.y")
     receiver.activate(False)
     publisher.append("r.x.y", b"1")
@@ -224,7 +224,7 @@ def test_a_member_that_rests_receives_nothing_reliable(open_driver: Open) -> Non
 
 def test_what_is_set_aside_can_be_listed(open_driver: Open) -> None:
     driver = open_driver()
-    publisher, receiver = driver.publisher(), driver.receiver("group", "g1")
+    publisher, receiver = driver.publisher("writer"), driver.receiver("group", "g1")
     receiver.follow("r.x.y")
     publisher.append("r.x.y", b"7")
     (delivery,) = received(receiver, 1)

@@ -51,7 +51,14 @@ def test_urls_reach_an_app_in_a_file_of_its_user_and_not_as_arguments(parts, tmp
     engine = tmp_path / "kitsune.engine.json"
     assert stat.S_IMODE(engine.stat().st_mode) == 0o600
     said = msgspec.json.decode(engine.read_bytes())
-    assert (said["updates"], said["linger"]) == (SECRET, 0.1)
+    password = made.identities.all["kitsune"].password
+    user = f"{made.identities.prefix}kitsune:{password}"
+    assert (said["updates"], said["linger"]) == (f"redis://{user}@127.0.0.1:1/0", 0.1)
+    assert "network.packets.p4runtime_ctrl.*.all" in said["observable"]
+    assert password not in repr(seen)
+    made.share_credential()  # of a server that lets it make no users
+    made._app("kitsune")
+    assert msgspec.json.decode(engine.read_bytes())["updates"] == SECRET
 
 
 def test_kitsune_goes_on_with_what_it_has_learnt(parts, tmp_path):

@@ -1,0 +1,149 @@
+"""Rights of one user of a Redis-protocol server: from key patterns to the rules of `ACL SETUSER`.  Pure.
+
+    publish a.b.*  ─►  PUBLISH due:a.b.* │ XADD … due:stream:a.b.* │ HGETALL due:lease:*:a.b.*
+    observe c.**   ─►  (P)SUBSCRIBE due:c, due:c.* │ XREADGROUP, XACK … due:stream:c, due:stream:c.*
+    its own        ─►  due:lease:<app>:*, due:poison:<app>, due:streams:<app>, its membership's channels
+
+Each line is a selector: a command passes only where one selector allows both the command and everything it names.
+In the server's patterns `*` also stands for dots, so that `a.*.c` gives `a.b.b.c`, too.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from due.drivers.redis_leases import lease_name
+from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
+from due.keys import ANY, ANY_NUMBER, Key
+
+EVERYTHING = "**"
+_CONNECTION = [
+    "+ping",
+    "+time",
+    "+info",
+    "+select",
+    "+multi",
+    "+exec",
+    "+discard",
+    "+unwatch",
+    "+unsubscribe",
+    "+punsubscribe",
+    "+client|id",
+    "+client|reply",
+    "+client|setinfo",
+    "+client|setname",
+    "+client|unblock",
+]
+_WRITES_STREAM = [
+    "+xadd",
+    "+expire",
+    "+xtrim",
+    "+exists",
+    "+xlen",
+    "+xgroup|create",
+    "+xinfo|groups",
+    "+xpending",
+]
+_READS_STREAM = [
+    "+xreadgroup",
+    "+xack",
+    "+xclaim",
+    "+xpending",
+    "+watch",
+    "+xinfo|consumers",
+    "+xgroup|create",
+    "+xgroup|setid",
+    "+xgroup|destroy",
+    "+xgroup|delconsumer",
+]
+_OWN_LEASES = ["+hset", "+hget", "+hdel", "+hexists", "+hgetall", "+expire", "+watch"]
+_OWN_ASIDE = ["+xadd", "+xrange", "+xtrim", "+xlen", "+expire", "+memory|usage"]
+_OWN_ANNOUNCEMENTS = ["+zadd", "+zremrangebyscore", "+expire"]
+
+
+class Rights(msgspec.Struct, frozen=True, kw_only=True):
+    """What one app may say and see on Data Updates."""
+
+    app: str
+    """Its id; `*`: any, for those who may use every id."""
+    publish: tuple[str, ...] = ()
+    """Key patterns; specs do not count."""
+    observe: tuple[str, ...] = ()
+
+
+def channel_globs(pattern: str) -> tuple[str, ...]:
+    """The paths of a key pattern as the server's patterns; those without `*` are exact."""
+    path = Key.parse(pattern).path
+    if path == ANY_NUMBER:
+        return (ANY,)
+    if path.endswith(f".{ANY_NUMBER}"):
+        before = path.removesuffix(f".{ANY_NUMBER}")
+        return (before, f"{before}.{ANY}")
+    return (path,)
+
+
+def granted_for(pattern: str, granted: Sequence[str]) -> tuple[str, ...]:
+    """The granted patterns through which an observer of `pattern` receives what it may.
+
+    A server lets nobody subscribe to a pattern that is not literally among the granted ones.
+    """
+    wanted = Key.parse(pattern)
+    if wanted.exact_path or not granted or EVERYTHING in granted:
+        return (pattern,)
+    for one in granted:
+        if covers(one, pattern):
+            return (one,)
+    paths = Key.parse(wanted.path)
+    return tuple(one for one in granted if Key.parse(Key.parse(one).path).offers(paths)) or (pattern,)
+
+
+def covers(wide: str, narrow: str) -> bool:
+    """Whether every path of `narrow` is one of `wide`."""
+    left, right = Key.parse(wide).segments, Key.parse(narrow).segments
+    for place, segment in enumerate(left):
+        if segment == ANY_NUMBER:
+            return True
+        if place == len(right):
+            return left[place:] == (ANY_NUMBER,)
+        if right[place] == ANY_NUMBER or segment not in (ANY, right[place]):
+            return False
+    return len(left) == len(right)
+
+
+def acl_rules(rights: Rights) -> list[str]:
+    """The rules of `ACL SETUSER` after name and password; they replace all earlier ones."""
+    own = rights.app
+    publish = [f"due.{kind}.{own}" for kind in ("registration", "heartbeat", "health")]
+    publish = _globs((*rights.publish, *publish))
+    observe = _globs((*rights.observe, f"due.assignment.{own}"))
+    return [
+        *("resetkeys", "resetchannels", "clearselectors", "-@all", *_CONNECTION),
+        _selector(["+publish"], _channels((*publish, f"streams:{own}"))),
+        _selector(_WRITES_STREAM, _keys("~", map(stream_name, publish))),
+        _selector(["+hgetall"], _keys("%R~", (lease_name("*", path) for path in publish))),
+        _selector(["+subscribe", "+psubscribe"], _channels((*observe, "streams:*"))),
+        _selector(_READS_STREAM, _keys("~", map(stream_name, observe))),
+        _selector(_OWN_LEASES, [f"~{lease_name(own, '*')}"]),
+        _selector(_OWN_ASIDE, [f"~due:poison:{own}"]),
+        _selector(_OWN_ANNOUNCEMENTS, [f"~{announced_name(own)}"]),
+        _selector(["+sadd"], [f"~{PRODUCERS}"]),
+        _selector(["+smembers", "+zrange"], [f"%R~{PRODUCERS}", f"%R~{announced_name('*')}"]),
+    ]
+
+
+def _globs(patterns: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(glob for pattern in patterns for glob in channel_globs(pattern)))
+
+
+def _selector(commands: Sequence[str], places: Sequence[str]) -> str:
+    return f"({' '.join((*commands, *places))})"
+
+
+def _channels(paths: Iterable[str]) -> list[str]:
+    found = list(paths)
+    # only with all channels a pattern may be subscribed to that is not literally here
+    return ["allchannels"] if ANY in found else [f"&due:{path}" for path in found]
+
+
+def _keys(mark: str, names: Iterable[str]) -> list[str]:
+    return [f"{mark}{name}" for name in names]

@@ -1,0 +1,167 @@
+"""`sdnator doctor --security`: who could read, say or reach more than meant, running or not."""
+
+import ipaddress
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.error import HTTPError, URLError
+from urllib.parse import unquote, urlsplit
+
+from sdnator.cli.doctor import Check
+from sdnator.config import config_file
+from sdnator.northbound import without_user
+from sdnator.redaction import redacted
+from sdnator.rights.granting import OPERATOR, is_dangerous
+from sdnator.rights.identities import Identities
+from sdnator.up import running
+
+_SECRETS = ("identities.json", "run.json", "*.engine.json", "*.settings.json", "*.token", "coordinator.url")
+_SECONDS = 5.0
+_ELSEWHERE = ("redis://", "mongodb://")
+
+
+def security_checks() -> Iterator[Check]:
+    """All of them.  Raises BadInput for a wrong configuration."""
+    state, config = running.state_folder(), config_file.load(config_file.find())
+    found = running.find()
+    archive = found.archive if found is not None else config.struct("up").archive or running.default_archive()
+    yield check_folder_mode(state)
+    yield check_secrets(state)
+    yield check_archive_mode(archive)
+    yield check_listeners(config)
+    yield check_urls(config, found)
+    yield check_commanding(state)
+    if found is not None:
+        yield check_server_rights(found)
+        yield check_coordinator_token(found)
+
+
+def check_folder_mode(folder: Path) -> Check:
+    """Whether others may look into the state folder."""
+    if not folder.exists():
+        return Check("state folder", "ok", f"{folder} is not there yet")
+    if others := _others(folder):
+        return Check("state folder", "exposed", f"{folder} has mode {others}", f"chmod 700 {folder}")
+    return Check("state folder", "ok", f"{folder} is its owner's alone")
+
+
+def check_secrets(folder: Path) -> Check:
+    """Whether others may read a file with a credential."""
+    files = sorted({path for pattern in _SECRETS for path in folder.glob(pattern)})
+    wide = [str(path) for path in files if _others(path)]
+    if wide:
+        said = f"others can read {', '.join(wide)}"
+        return Check(
+            "secrets", "exposed", said, f"chmod 600 {' '.join(wide)}, and make them anew: docs/security.md"
+        )
+    return Check("secrets", "ok", f"{len(files)} files with credentials, each its owner's alone")
+
+
+def check_archive_mode(url: str) -> Check:
+    """Whether others may read the embedded archive."""
+    if not url.startswith("sqlite:"):
+        return Check("archive", "ok", f"{redacted(url)}: its server decides who reads it")
+    path = Path(unquote(urlsplit(url).path))
+    if path.exists() and _others(path):
+        return Check("archive", "exposed", f"others can read {path}", f"chmod 600 {path}")
+    return Check("archive", "ok", f"{path} is its owner's alone")
+
+
+def check_listeners(config: config_file.Config) -> Check:
+    """What is configured to listen for other machines."""
+    places = {
+        "dashboard.host": config.struct("dashboard").host,
+        "coordinator.http_host": config.struct("coordinator").http_host,
+        "metrics.host": config.struct("metrics").host,
+        **{f"switches.{one.name}.listen": _host(one.listen) for one in config.switches()},
+    }
+    wide = [f"{name}={place}" for name, place in places.items() if not _is_local(place)]
+    if wide:
+        remedy = "keep it on loopback, or put a proxy with TLS and log-in before it"
+        return Check("listeners", "exposed", f"other machines reach {', '.join(wide)} without TLS", remedy)
+    return Check("listeners", "ok", "everything listens on loopback or on sockets of the state folder")
+
+
+def check_urls(config: config_file.Config, found: running.Running | None) -> Check:
+    """Backends on other machines without TLS."""
+    up = config.struct("up")
+    urls = {up.updates, up.archive} | ({found.updates, found.archive} if found is not None else set())
+    bare = sorted(
+        redacted(url)
+        for url in urls
+        if url.startswith(_ELSEWHERE)
+        and not _is_local(urlsplit(url).hostname or "")
+        and "tls=true" not in url
+    )
+    if bare:
+        return Check(
+            "backends", "exposed", f"{', '.join(bare)}: without TLS", "use rediss:// or mongodb://…?tls=true"
+        )
+    return Check("backends", "ok", "no password crosses the network without TLS")
+
+
+def check_commanding(state: Path) -> Check:
+    """Who outside the pipeline may command."""
+    named = sorted(
+        f"{name} ({key})"
+        for name, one in Identities(state).all.items()
+        if one.enrolled and name != OPERATOR
+        for key in one.rights.publish
+        if is_dangerous(key, name)
+    )
+    if named:
+        return Check("commanding apps", "ok", ", ".join(named), "")
+    return Check("commanding apps", "ok", "no enrolled app may command a switch, an enforcer or an app")
+
+
+def check_server_rights(found: running.Running) -> Check:
+    """Whether Data Updates refuses whoever has no credential."""
+    from due.drivers.redis_wire import Wire
+    from due.errors import DueError
+
+    scheme, _, rest = found.updates.partition("://")
+    bare = f"{scheme}://{rest.rpartition('@')[2]}"
+    try:
+        wire = Wire(bare)
+        answer = wire.call("PUBLISH", "due:sdnator.doctor", "")
+        wire.close()
+    except DueError:
+        return Check("Data Updates", "ok", "nobody connects without a credential")
+    if isinstance(answer, Exception):
+        return Check("Data Updates", "ok", "without a credential nothing may be said")
+    remedy = "give the server a password, and --updates a user that may make users (ACL)"
+    return Check("Data Updates", "exposed", f"{redacted(bare)} lets anybody publish", remedy)
+
+
+def check_coordinator_token(found: running.Running) -> Check:
+    """Whether the Coordinator's API refuses whoever has no token."""
+    from urllib.request import ProxyHandler, build_opener
+
+    url = without_user(found.coordinator)
+    try:
+        with build_opener(ProxyHandler({})).open(f"{url}/apps", timeout=_SECONDS):
+            pass
+    except HTTPError as error:
+        return Check("Coordinator", "ok", f"{url} answers {error.code} to whoever has no token")
+    except (URLError, OSError) as error:
+        return Check("Coordinator", "ok", f"{url} does not answer: {error}")
+    return Check("Coordinator", "exposed", f"{url} shows anybody everything", "restart the pipeline")
+
+
+def _others(path: Path) -> str:
+    """The mode where others than the owner may do something; empty where they may not."""
+    mode = stat.S_IMODE(path.stat().st_mode)
+    return f"{mode:o}" if mode & 0o077 else ""
+
+
+def _host(place: str) -> str:
+    return "" if not place or place.startswith("unix:") else place.rpartition(":")[0].strip("[]")
+
+
+def _is_local(host: str) -> bool:
+    if host in ("", "localhost"):
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,1 @@
+"""Identities of apps and what each may publish and observe."""
