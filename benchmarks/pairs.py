@@ -56,9 +56,9 @@ def other_process(target: Callable[..., None], *arguments: Any) -> Iterator[Conn
         here.close()
 
 
-def run_due(url: str, size: int, count: int) -> float:
-    """DUE with its defaults, one callback per message."""
-    with other_process(_due_consumer, url, count) as pipe:
+def run_due(url: str, size: int, count: int, consumers_url: str = "") -> float:
+    """DUE with its defaults, one callback per message; the consumer may have a credential of its own."""
+    with other_process(_due_consumer, consumers_url or url, count) as pipe:
         producer = engine(url, "producer", PRODUCER)
         payload, write = bytes(size), producer.write
         flags = [PUB_ONLY]

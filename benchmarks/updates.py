@@ -21,6 +21,7 @@ from benchmarks.pairs import (
     run_raw_frames,
     run_records,
 )
+from benchmarks.secured_updates import secured_figures
 from due.drivers.embedded_redis import EmbeddedServer
 
 SIZES = (100, 1000, 10_000)
@@ -45,7 +46,13 @@ WHY_NOT_RAW = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
-    options = arguments("updates", __doc__, rounds=3).parse_args(argv)
+    parser = arguments("updates", __doc__, rounds=3)
+    parser.add_argument("--secured", action="store_true", help="compare instead DUE without and with rights")
+    options = parser.parse_args(argv)
+    if options.secured:
+        costs = secured_figures(options.rounds, options.scale)
+        write_json(options.json, {"machine": machine(), "rounds": options.rounds, **costs})
+        return 0
     figures: dict[str, object] = {"machine": machine(), "rounds": options.rounds}
     rates: dict[str, dict[str, float]] = {name: {} for name in RUNNERS}
     with tempfile.TemporaryDirectory() as folder, EmbeddedServer(folder) as server:
@@ -62,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             {"records": lambda: run_records(server.url, ROWS, max(10, int(BATCHES * options.scale)))},
             options.rounds,
         )["records"]
-        costs = _costs(server.url, int(200_000 * options.scale), 4 * options.rounds)
+        producers = _costs(server.url, int(200_000 * options.scale), 4 * options.rounds)
     os_ken = {str(size): osken.events_per_second(size) for size in SIZES} if osken.available() else None
     for name in RUNNERS:
         figures[f"{name}_msgs_per_s"] = rates[name]
@@ -72,10 +79,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures["records_per_s"] = records
     figures["records_vs_pipeline100"] = records / rates["pipeline100"]["100"]
     figures["producer_cpu_s_per_million_by_consumers"] = {
-        n: median(found) for n, found in costs["due"].items()
+        n: median(found) for n, found in producers["due"].items()
     }
-    figures["three_consumers_extra"] = _extra(costs["due"])
-    figures["three_consumers_extra_raw"] = _extra(costs["raw"])
+    figures["three_consumers_extra"] = _extra(producers["due"])
+    figures["three_consumers_extra_raw"] = _extra(producers["raw"])
     _show(rates, os_ken, figures)
     write_json(options.json, figures)
     return 0

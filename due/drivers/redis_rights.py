@@ -115,7 +115,8 @@ def acl_rules(rights: Rights) -> list[str]:
     own = rights.app
     publish = [f"due.{kind}.{own}" for kind in ("registration", "heartbeat", "health")]
     publish = _globs((*rights.publish, *publish))
-    observe = _globs((*rights.observe, f"due.assignment.{own}"))
+    # from each other's heartbeats the instances of an app learn who works
+    observe = _globs((*rights.observe, f"due.assignment.{own}", f"due.heartbeat.{own}"))
     return [
         *("resetkeys", "resetchannels", "clearselectors", "-@all", *_CONNECTION),
         _selector(["+publish"], _channels((*publish, f"streams:{own}"))),

@@ -79,6 +79,8 @@ def test_rules_name_every_key_of_an_app_and_none_of_another():
         "&due:a.b.*",
         "~due:stream:a.b.*",
         "&due:c.*.d",
+        "&due:due.assignment.mine",
+        "&due:due.heartbeat.mine",
         "~due:stream:c.*.d",
         "~due:lease:mine:*",
     ):
