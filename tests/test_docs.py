@@ -78,8 +78,9 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
             words += ["--fm-grace", "90", "--ad-grace", "900"]
     values = {"CAPTURE.pcap": str(capture), "LABELS.csv": str(labels_path(capture)), "12000": "1000"}
     arguments = [values.get(word, word) for word in words[1:]]
-    if words[1] == "model":
+    if words[1] in ("model", "app") or "--security" in words:
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+        monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     if "--model" in words:
         trained = [
             "--fm-grace",
