@@ -61,7 +61,7 @@ class KafkaUpdates:
             )
         )
 
-    def publisher(self) -> "KafkaPublisher":
+    def publisher(self, app: str) -> "KafkaPublisher":  # noqa: ARG002 - announcements are topics
         """A new sending half."""
         return KafkaPublisher(self._address, self._control, self._producer, self._limits)
 

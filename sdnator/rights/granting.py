@@ -66,6 +66,7 @@ _PRODUCT: dict[str, Rights] = {
             observe=(
                 *("network.anomaly.kitsune.alert", "network.evidence.*.*", "network.training.*", _SWITCHES),
                 *("network.confirmation.*.*", "network.enforced.*.*", "network.instruction.*.firewall"),
+                "network.packets.p4runtime_ctrl.*.*",
                 *(
                     f"network.{family}.sonata.*"
                     for family in ("handshake", "traffic_query", "traffic_capture")
