@@ -81,6 +81,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def with_credential(self) -> "Options":
         """These options with what the file that $DUE_CREDENTIAL names says of Data Updates, unless they name it.
 
+        Returns:
+            The options to use.
+
         Raises:
             InvalidOption: the file cannot be read, is malformed, or others than its owner can read it.
         """

@@ -26,13 +26,13 @@ from sdnator.rights.granting import OPERATOR, operator
 
 FILE = "identities.json"
 ADMIN = "admin"
-"""Identity that makes the others on the embedded server."""
+"""AppIdentity that makes the others on the embedded server."""
 _PROBE = "user default on nopass resetkeys resetchannels clearselectors -@all +ping"
 """Whoever has no credential learns whether the server answers, and nothing else."""
 _APP_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
-class Identity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class AppIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One user of Data Updates."""
 
     password: str
@@ -43,7 +43,7 @@ class Identity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 class _Book(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     installation: str
-    identities: dict[str, Identity]
+    identities: dict[str, AppIdentity]
 
 
 class Identities:
@@ -80,13 +80,13 @@ class Identities:
         except OSError as error:
             raise BadInput(f"{self.path}: {error.strerror}") from None
 
-    def put(self, name: str, rights: Rights, *, enrolled: bool = False) -> Identity:
+    def put(self, name: str, rights: Rights, *, enrolled: bool = False) -> AppIdentity:
         """Give an identity these rights; its password stays.  Only while `changing`."""
         if not _APP_ID.fullmatch(name):
             raise BadInput(f"{name!r}: an app id has 1 to 64 letters, digits, _ and -")
         known = self._book.identities.get(name)
         password = known.password if known is not None else secrets.token_urlsafe(24)
-        made = Identity(password=password, rights=rights, enrolled=enrolled)
+        made = AppIdentity(password=password, rights=rights, enrolled=enrolled)
         self._book.identities[name] = made
         return made
 
@@ -101,7 +101,7 @@ class Identities:
         }
 
     @property
-    def all(self) -> Mapping[str, Identity]:
+    def all(self) -> Mapping[str, AppIdentity]:
         """By name; the administrator is not among them."""
         return self._book.identities
 
@@ -128,7 +128,7 @@ class Identities:
         return "\n".join((_PROBE, admin, *users)) + "\n"
 
 
-def credential_file(url: str, archive: str, identity: Identity) -> dict[str, Any]:
+def credential_file(url: str, archive: str, identity: AppIdentity) -> dict[str, Any]:
     """What an app's options of the engine say about its identity."""
     places = {"updates": url, **({"archive": archive} if archive else {})}
     return {**places, **observable(identity.rights)}
@@ -150,4 +150,4 @@ def made(folder: Path, rights: Mapping[str, Rights]) -> Identities:
     return found
 
 
-__all__ = ["Identities", "Identity", "credential_file", "made", "observable"]
+__all__ = ["Identities", "AppIdentity", "credential_file", "made", "observable"]
