@@ -150,4 +150,4 @@ def made(folder: Path, rights: Mapping[str, Rights]) -> Identities:
     return found
 
 
-__all__ = ["Identities", "AppIdentity", "credential_file", "made", "observable"]
+__all__ = ["AppIdentity", "Identities", "credential_file", "made", "observable"]
