@@ -162,10 +162,9 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
     operator, said = running
     token = Path(said["token_file"]).read_text().strip()
     until(lambda: operator.figures("status")["apps"].get("firewall") == "active")
-    backends = ("--updates", said["updates"], "--archive", said["archive"])
 
     def told():
-        done = operator.run("blocks", "add", ADDRESS, "--reason", "a test", *backends)
+        done = operator.run("blocks", "add", ADDRESS, "--reason", "a test")
         return done.returncode == 0 or "blocked already" in done.stderr
 
     until(told)
