@@ -232,7 +232,7 @@ def look_around(page):
     until(lambda: all(name in page.text() for name in ("kitsune", "sonata_adapter", "active")))
     page.click(".q-tab", "Queries")
     # the firewall wants this one from the start
-    page.find(".queries", "network.traffic_query.sonata.syn_flood")
+    page.find(".queries", "network.traffic_query.sonata.new_tcp")
     page.click(".explain-now")
     page.find(".plan-said", "this is where it would run")
     page.find(".operators", "counting stage")
