@@ -64,8 +64,10 @@ def list_queries(
         typer.echo(json.dumps({"queries": rows, "streams": _streams()}))
         return
     lines = [(row["name"], "switch" if row["in_switch"] else "host", row["meaning"]) for row in rows]
-    lines += [(name, "host", stream["meaning"]) for name, stream in _streams().items()]
-    typer.echo(plain_table(("query", "runs", "meaning"), lines))
+    typer.echo(plain_table(("query", "runs", "meaning"), lines) + "\n")
+    # apart, because their names are long
+    streams = [(name, stream["meaning"]) for name, stream in _streams().items()]
+    typer.echo(plain_table(("raw stream (host)", "meaning"), streams))
 
 
 @queries.command("show")

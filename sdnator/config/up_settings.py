@@ -4,9 +4,6 @@ from typing import Literal
 
 import msgspec
 
-from due.errors import InvalidKey
-from due.keys import Key
-
 
 class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the pipeline keeps and shares its data."""
@@ -40,6 +37,9 @@ class GrantPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """It may publish and observe what it declares, too, without the dangerous keys."""
 
     def __post_init__(self) -> None:
+        from due.errors import InvalidKey  # here, because `sdnator --help` needs none of it
+        from due.keys import Key
+
         for name in ("publish", "observe"):
             for pattern in getattr(self, name):
                 try:

@@ -193,6 +193,7 @@ def test_frames_wait_while_a_full_disk_takes_neither_archive_nor_spool(shelf, tm
         archiver.flush(0.5)
     shelf.problem = None
     archiver.flush(60)
+    wait_for(lambda: not archiver.backlog())  # a few frames may have fitted into what was left of the spool
     assert sorted(shelf.items) == list(range(1000))
     assert archiver.statistics()["lost"] == 0
     archiver.close()
