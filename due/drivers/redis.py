@@ -483,11 +483,14 @@ class RedisPublisher:
         wire.make_room()
         ledger.lasting = False
         if restarted:
+            unread = ledger.unread()
             ledger.forget_ids()
             empty = not self._called(wire, "EXISTS", stream_name(ledger.path))
             retained = list(ledger.retained) if empty else []
-            self._resend(wire, retained)
-            self._restore_groups(wire, ledger, len(retained))
+            done = max(0, len(retained) - unread)
+            self._resend(wire, retained[:done])
+            self._restore_groups(wire, ledger, done)
+            self._resend(wire, retained[done:])
         self._resend(wire, [entry for entry in ledger.kept if entry.id is None])
         if ledger.kept or ledger.retained:
             self._put_off(ledger)

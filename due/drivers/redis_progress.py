@@ -12,12 +12,9 @@ from typing import Any
 import hiredis
 
 from due.drivers.redis_leases import lease_field, lease_name
-from due.drivers.redis_streams import StreamLedger, parse_id, stream_name
+from due.drivers.redis_streams import NOBODY, NOTHING, StreamLedger, parse_id, stream_name
 from due.drivers.redis_wire import pack, understood
 
-NOBODY = (2**63, 0)
-"""Position if no live group reads: everything may be forgotten."""
-_NOTHING = (0, 0)
 _MOST_GROUPS = 1024
 """Whoever may read a stream may make groups of it."""
 
@@ -64,7 +61,7 @@ class Question:
         count = len(self._known)
         replies, groups, pendings = self._replies[:count], self._replies[count], self._replies[count + 1 :]
         if any(isinstance(reply, hiredis.ReplyError) for reply in replies):
-            return _NOTHING
+            return NOTHING
         leases = {
             lease_field(group, consumer): value
             for group, reply in zip(self._known, replies, strict=True)
@@ -77,7 +74,7 @@ class Question:
         self.ledger.groups = tuple(name for name in names if name in live)
         self.ledger.known = tuple(dict.fromkeys((*sorted(live), *names)))[:_MOST_GROUPS]
         if len(self.ledger.groups) < len(live) or self.surprised:
-            return _NOTHING
+            return NOTHING
         pending = dict(zip(self._groups, pendings, strict=True))
         return min((_position(g, pending) for g in found if g[b"name"] in self.ledger.groups), default=NOBODY)
 
@@ -91,7 +88,7 @@ def _position(group: dict[bytes, Any], pending: dict[bytes, Any]) -> tuple[int, 
         return parse_id(group[b"last-delivered-id"])
     summary = pending.get(group[b"name"])
     if summary is None or isinstance(summary, hiredis.ReplyError):
-        return _NOTHING
+        return NOTHING
     if summary[1] is None:  # acknowledged meanwhile
         return parse_id(group[b"last-delivered-id"])
     ms, number = parse_id(summary[1])

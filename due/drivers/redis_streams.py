@@ -18,6 +18,10 @@ from due.errors import UpdatesUnavailable
 
 PRODUCERS = "due:producers"
 """Set of the apps that have announced streams."""
+NOBODY = (2**63, 0)
+"""Position if no live group reads: everything may be forgotten."""
+NOTHING = (0, 0)
+"""Position of which only this is sure."""
 _OVERHEAD = 200
 LIFETIME_S = 86_400
 """Streams and leases expire after this long without a producer and a reader, seconds."""
@@ -82,6 +86,8 @@ class StreamLedger:
         self.patience = 0.0
         """Expected length of its next wait, seconds."""
         self._asked_bytes = 0
+        self._read_to = NOBODY
+        """What the groups had acknowledged as of the last answer that said it."""
 
     def ask_again(self, now: float, seconds: float) -> bool:
         """Whether to ask for the readers' progress: after `seconds`, or after many new bytes."""
@@ -130,15 +136,22 @@ class StreamLedger:
         return {group_of(field) for field in self._leases.living(self._group_timeout)}
 
     def acknowledged(self, up_to: tuple[int, int]) -> None:
-        """All live groups have acknowledged the ids up to this one."""
+        """All live groups have acknowledged the ids up to this one; `NOTHING`: there are groups, not known how far."""
+        if up_to != NOTHING or self._read_to == NOBODY:
+            self._read_to = up_to
         while self.kept and (at := self.kept[0].id) is not None and at <= up_to:
             entry = self.kept.popleft()
             self.kept_bytes -= entry.size
             self.retained.append(entry)
             self._retained_bytes += entry.size
 
+    def unread(self) -> int:
+        """How many of the retained payloads a group still reads, which came when nobody seemed to."""
+        return sum(entry.id is not None and entry.id > self._read_to for entry in self.retained)
+
     def forget_ids(self) -> None:
         """The server was restarted: earlier ids mean nothing, and its clock may be behind them."""
+        self._read_to = NOTHING
         for entry in (*self.retained, *self.kept):
             entry.id = None
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from due.drivers.redis_progress import Question
-from due.drivers.redis_streams import LEAST_PAUSE, StreamLedger, next_pause, parse_id
+from due.drivers.redis_streams import LEAST_PAUSE, NOBODY, NOTHING, StreamLedger, next_pause, parse_id
 from due.errors import UpdatesUnavailable
 
 
@@ -41,6 +41,21 @@ def test_acknowledged_payloads_are_retained_up_to_a_limit_then_trimmed():
     assert [e.id for e in ledger.retained] == [(3, 0), (4, 0), (5, 0), (6, 0)]
     assert ledger.trim_point() is None
     assert ledger.trim_point(streams=2) == (5, 0), "streams of one process share the limit"
+
+
+def test_what_a_late_group_has_not_read_is_not_behind_it_after_a_restart():
+    """While nobody seems to read, payloads are retained; a group may be found that still reads them."""
+    ledger = StreamLedger("a.b", 1000, 10_000, 30.0)
+    for number in range(1, 6):
+        ledger.add(b"x").id = (number, 0)
+    ledger.acknowledged(NOBODY)
+    assert ledger.unread() == 0
+    ledger.acknowledged(NOTHING)
+    assert ledger.unread() == 5, "a group was found, not known how far it is"
+    ledger.acknowledged((2, 0))
+    assert ledger.unread() == 3
+    ledger.acknowledged(NOTHING)
+    assert ledger.unread() == 3, "an answer that says nothing changes nothing"
 
 
 def test_what_the_server_has_not_answered_is_never_forgotten():
