@@ -5,8 +5,8 @@
 
 Policy: while the archive is away, frames go to disk up to the spool's size, beyond it they are lost and
 counted; without a spool they wait.  Where the spool's disk takes nothing, as where a full disk holds both, they
-go into the spool's reserve; without room there they wait as long as the queue has room, and are lost and counted then.  Only when the queue is full, because archive
-and disk are slower than the writers, does `put` wait.  Nothing is lost silently: see `statistics`.
+go into the spool's reserve; without room there they wait as long as the queue has room, and are lost and counted
+then.  Only when the queue is full, because archive and disk are slower than the writers, does `put` wait.  Nothing is lost silently: see `statistics`.
 """
 
 import logging
