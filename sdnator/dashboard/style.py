@@ -46,16 +46,9 @@ summary { cursor: pointer; list-style: none; text-decoration: underline; }
 .form { display: flex; gap: 8px; flex-wrap: wrap; align-items: center; width: 100%; }
 @media (max-width: 900px) {
   .board { grid-template-columns: minmax(0, 1fr); }
-  .health { border-radius: 8px; padding: 10px 14px; font-size: 1.05rem; font-weight: 500; width: 100%; color: #fff; }
-.health.well { background: #1b6e3a; } .health.notice { background: #8a5200; } .health.trouble { background: #b71c1c; }
-.scores svg text, .flow svg text { fill: currentColor !important; stroke: none !important; }
-.body--dark .text-primary { color: #8dbdf0 !important; }
-summary { cursor: pointer; list-style: none; text-decoration: underline; }
-:focus-visible { outline: 2px solid #2f6fb3; outline-offset: 1px; }
-.body--dark :focus-visible { outline-color: #8dbdf0; }
-.figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
+  .figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
   .nicegui-content { padding: 8px; gap: 8px; }
-  .q-tab__icon { display: none; }
+  .q-tab__icon { display: none; } .q-tab { padding: 0 7px; min-width: 0; } .q-tab__label { font-size: .8rem; }
   .entry { flex-wrap: wrap; } .entry .text { flex-basis: 70%; }
   .entry .side { margin-left: 14px; }
 }
