@@ -41,7 +41,13 @@ static const double *factors(AfterImage *self, double dt)
     return memo->factor;
 }
 
-static void decay_stream(AfterImage *self, Stream *s, double t)
+/* As `factors`; `event` is the packet that is replayed, or NULL. */
+static const double *factors_at(AfterImage *self, double dt, const Event *event)
+{
+    return event && event->since == dt ? event->factor : factors(self, dt);
+}
+
+static void decay_stream_at(AfterImage *self, Stream *s, double t, const Event *event)
 {
     double dt = t - s->last;
     if (!(dt > 0))
@@ -49,7 +55,7 @@ static void decay_stream(AfterImage *self, Stream *s, double t)
     s->last = t;
     if (!s->packets) /* nothing to damp yet: 1e-20 + 1 is 1 at any age */
         return;
-    const double *f = factors(self, dt);
+    const double *f = factors_at(self, dt, event);
     EACH_SCALE(k)
     {
         s->cf1[k] *= f[k];
@@ -58,13 +64,18 @@ static void decay_stream(AfterImage *self, Stream *s, double t)
     }
 }
 
-static void decay_link(AfterImage *self, Link *link, double t)
+static void decay_stream(AfterImage *self, Stream *s, double t)
+{
+    decay_stream_at(self, s, t, NULL);
+}
+
+static void decay_link(AfterImage *self, Link *link, double t, const Event *event)
 {
     double dt = t - link->last;
     if (!(dt > 0))
         return;
     link->last = t;
-    const double *f = factors(self, dt);
+    const double *f = factors_at(self, dt, event);
     EACH_SCALE(k)
     {
         link->cf3[k] *= f[k];
@@ -72,9 +83,9 @@ static void decay_link(AfterImage *self, Link *link, double t)
     }
 }
 
-static void update_link(AfterImage *self, Link *link, int side, const double *residual, double t)
+static void update_link_at(AfterImage *self, Link *link, int side, const double *residual, double t, const Event *event)
 {
-    decay_link(self, link, t);
+    decay_link(self, link, t, event);
     double *other = link->residual[!side];
     EACH_SCALE(k)
     {
@@ -82,6 +93,11 @@ static void update_link(AfterImage *self, Link *link, int side, const double *re
         link->w3[k] += 1;
         link->residual[side][k] = residual[k];
     }
+}
+
+static void update_link(AfterImage *self, Link *link, int side, const double *residual, double t)
+{
+    update_link_at(self, link, side, residual, t, NULL);
 }
 
 static void insert(AfterImage *self, Stream *s, double v, double t)
@@ -125,7 +141,7 @@ static void account(AfterImage *self, const Table *table, Link *link, int side)
         return;
     double since[SCALES], until[SCALES], dt = hub->spoken - link->then[side];
     memcpy(since, dt > 0 ? factors(self, dt) : ONE, sizeof since);
-    decay_link(self, link, hub->spoken);
+    decay_link(self, link, hub->spoken, NULL);
     dt = link->last - hub->spoken;
     memcpy(until, dt > 0 ? factors(self, dt) : ONE, sizeof until);
     const double *other = link->residual[!side];
@@ -195,8 +211,8 @@ static void catch_up(AfterImage *self, const Table *table, int32_t at)
             if (event->order >= until)
                 break;
             link->seen[far]++;
-            decay_stream(self, s, event->time);
-            update_link(self, link, far, event->residual, event->time);
+            decay_stream_at(self, s, event->time, event);
+            update_link_at(self, link, far, event->residual, event->time, event);
         }
         if (self->bounded && link->seen[far] == hub->logged)
             note_account(link, far, hub);
@@ -215,9 +231,13 @@ static void log_event(AfterImage *self, Stream *hub, double t, const double *res
         hub->log = larger;
         hub->log_room = room;
     }
+    double since = hub->logged ? t - logged(hub, hub->logged - 1)->time : 0;
     Event *event = logged(hub, hub->logged++);
     event->order = self->order;
     event->time = t;
+    event->since = since;
+    if (since > 0)
+        memcpy(event->factor, factors(self, since), sizeof event->factor);
     memcpy(event->residual, residual, sizeof event->residual);
     if (!self->bounded)
         return;

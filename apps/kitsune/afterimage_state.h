@@ -11,10 +11,13 @@
 
 #define EACH_SCALE(k) for (int k = 0; k < SCALES; k++)
 
-/* One missed packet, kept for peers that have not needed it yet. */
+/* One missed packet, kept for peers that have not needed it yet.  Every peer that replays two packets in a row damps by
+ * the time between them: those factors are computed once. */
 typedef struct {
     uint64_t order;
     double time;
+    double since; /* the hub's packet before */
+    double factor[SCALES];
     double residual[SCALES];
 } Event;
 
