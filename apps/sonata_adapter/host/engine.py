@@ -4,9 +4,14 @@
                                                                       └─► tables when the window closes
 
 A window closes when a packet is `lateness_us` beyond its end (at most a quarter of the window), or on
-`advance` or `finish`.  Packets of a closed window are left out and counted in `late`.
+`advance` or `finish`.  Packets of a closed window are left out and counted in `late`.  Captured packets pass
+at once, whatever their window.
+
+A window's packets are held back until there are as many as a query needs to report anything: most windows of
+a network at peace end before, and cost nothing.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Set
 from itertools import pairwise
 from typing import Final, Protocol
@@ -41,6 +46,7 @@ from apps.sonata_adapter.query.dataflow import (
 )
 from apps.sonata_adapter.query.expressions import Kind, kind_of
 from apps.sonata_adapter.query.language import PACKET_KINDS, Query
+from apps.sonata_adapter.query.least_packets import least_packets
 from apps.sonata_adapter.results import Captured, QueryResult
 from due import RecordBatch
 
@@ -48,6 +54,10 @@ DEFAULT_LIMIT: Final = 1 << 20
 DEFAULT_LATENESS_US: Final = 500_000
 _ROOM: Final = 2
 """Initial table size relative to the previous window's; fuller tables are slower."""
+_MOST_HELD: Final = 64
+"""Batches of which a window holds packets back; each stays in memory as a whole."""
+_Rows = slice | NDArray[np.intp] | None
+"""Rows of a batch; None: all."""
 _NEW_FLOWS: Final = PacketSource((), once=True)
 """The source of all nodes that need only the first packet of each flow."""
 
@@ -59,6 +69,7 @@ class _Running:
         self.name = query.name
         self.window_us = query.window_us
         self.outcome: Outcome = compile_query(query)
+        self.least = least_packets(self.outcome)
         self.kinds = query.fields
         self.since_us = since_us
         """Capture time when it came into force; None: before the first packet."""
@@ -83,6 +94,10 @@ class _Window:
         self._reported: dict[str, Reported] = {}
         self._flows = flows
         self._kept: Set[Node] = frozenset()
+        self.packets = 0
+        self.held: list[tuple[RecordBatch, _Rows]] = []
+        """Packets that no operator has seen yet."""
+        self.fed = False
 
     def keep(self, nodes: Set[Node]) -> None:
         """Keep the tables of these nodes until the window's end."""
@@ -218,6 +233,9 @@ class HostEngine:
 
     def add(self, query: Query) -> None:
         """Bring a query into force under its name; raises `InvalidQuery`."""
+        for (length, _), window in self._windows.items():
+            # what came before a query is not the query's; so few packets have no result
+            deque(self._released(window, self._by_length().get(length, [])), maxlen=0)
         self._queries[query.name] = _Running(query, self.watermark_us)
         self._keep_tables()
         for flows in self._flows.values():
@@ -250,10 +268,10 @@ class HostEngine:
         times = batch["time_us"]
         first, last = int(times.min()), int(times.max())
         whole = PacketColumns(batch, self._numberings)
-        outputs: list[QueryResult | Captured] = []
+        outputs = list(self._streamed(whole))
         for length, queries in self._by_length().items():
-            for index, packets in self._windows_of(whole, length, first - self.base_us, last - self.base_us):
-                outputs += self._feed(length, index, packets, queries, batch)
+            for index, rows in self._windows_of(whole, length, first - self.base_us, last - self.base_us):
+                outputs += self._take(length, index, whole, rows, queries)
         self.without_payload += whole.missing.payloads
         whole.forget()
         outputs += self.advance(last if horizon_us is None else horizon_us)
@@ -280,29 +298,37 @@ class HostEngine:
     def _by_length(self) -> dict[int, list[_Running]]:
         found: dict[int, list[_Running]] = {}
         for running in self._queries.values():
-            found.setdefault(running.window_us, []).append(running)
+            if not isinstance(running.outcome, TupleStream):
+                found.setdefault(running.window_us, []).append(running)
         return found
+
+    def _streamed(self, whole: PacketColumns) -> Iterator[QueryResult | Captured]:
+        for running in self._queries.values():
+            if isinstance(running.outcome, TupleStream):
+                packets = filtered(whole, running.outcome.node.filters)
+                yield from _captured(running, running.outcome, packets)
 
     def _windows_of(
         self, whole: PacketColumns, length: int, first: int, last: int
-    ) -> Iterator[tuple[int, PacketColumns]]:
+    ) -> Iterator[tuple[int, _Rows]]:
         closed = self._closed.get(length)
         if first // length == last // length:
             if closed is None or first // length > closed:
-                yield first // length, whole
+                yield first // length, None
             else:
                 self.late += len(whole)
             return
         indices = (whole.batch["time_us"] - self.base_us) // length
-        for index, packets in _parts(whole, indices):
+        for index, rows in _parts(indices):
             if closed is None or index > closed:
-                yield index, packets
+                yield index, rows
             else:
-                self.late += len(packets)
+                self.late += _count(rows, len(whole))
 
-    def _feed(
-        self, length: int, index: int, packets: PacketColumns, queries: list[_Running], batch: RecordBatch
+    def _take(
+        self, length: int, index: int, whole: PacketColumns, rows: _Rows, queries: list[_Running]
     ) -> Iterator[QueryResult | Captured]:
+        """Packets of a window: held back while they are too few for any result, then fed with those before."""
         window = self._windows.get((length, index))
         if window is None:
             flows = self._flows.setdefault(length, SeenFlows())
@@ -310,17 +336,32 @@ class HostEngine:
             window = _Window(start, length, self._limit, flows, self._sizes.get(length, {}))
             window.keep(self._kept)
             self._windows[length, index] = window
+        window.packets += _count(rows, len(whole))
+        few = window.packets < min(running.least for running in queries)
+        if few and not window.fed and len(window.held) < _MOST_HELD:
+            window.held.append((whole.batch, rows))
+            return
+        yield from self._released(window, queries)
+        yield from self._feed(window, _rows_of(whole, rows), whole.batch, queries)
+
+    def _released(self, window: _Window, queries: list[_Running]) -> Iterator[QueryResult | Captured]:
+        """Feed what was held back."""
+        held, window.held, window.fed = window.held, [], True
+        for batch, rows in held:
+            packets = PacketColumns(batch, self._numberings)
+            yield from self._feed(window, _rows_of(packets, rows), batch, queries)
+            self.without_payload += packets.missing.payloads
+            packets.forget()
+
+    def _feed(
+        self, window: _Window, packets: PacketColumns, batch: RecordBatch, queries: list[_Running]
+    ) -> Iterator[QueryResult | Captured]:
         memo: dict[Node, TupleRows | Update] = {}
         for running in queries:
             for node in running.nodes():
                 window.feed(node, packets, memo)
-            match running.outcome:
-                case Crossing():
-                    yield from self._crossings(running, running.outcome, window, memo, batch)
-                case TupleStream():
-                    yield from _captured(running, running.outcome, memo)
-                case WindowTable():
-                    pass
+            if isinstance(running.outcome, Crossing):
+                yield from self._crossings(running, running.outcome, window, memo, batch)
 
     def _crossings(
         self,
@@ -349,24 +390,39 @@ class HostEngine:
         outputs: list[QueryResult | Captured] = []
         for key in sorted(keys, key=lambda key: ((key[1] + 1) * key[0], key[0])):
             window = self._windows.pop(key)
-            self._sizes[key[0]] = window.sizes()
             self._closed[key[0]] = max(key[1], self._closed.get(key[0], key[1]))
+            if not window.fed:
+                continue
+            self._sizes[key[0]] = window.sizes()
             for running in self._queries.values():
                 if running.window_us == key[0] and isinstance(running.outcome, WindowTable):
                     outputs += _final(running, running.outcome, window)
         return outputs
 
 
-def _parts(whole: PacketColumns, indices: NDArray[np.int64]) -> Iterator[tuple[int, PacketColumns]]:
-    """The packets of each window; packets in order of time share computed values."""
+def _parts(indices: NDArray[np.int64]) -> Iterator[tuple[int, slice | NDArray[np.intp]]]:
+    """The rows of each window."""
     steps = np.diff(indices)
     if (steps < 0).any():
         for index in np.unique(indices).tolist():
-            yield index, whole.at(np.flatnonzero(indices == index))
+            yield index, np.flatnonzero(indices == index)
         return
     edges = [0, *(np.flatnonzero(steps) + 1).tolist(), len(indices)]
     for first, end in pairwise(edges):
-        yield int(indices[first]), whole.between(first, end)
+        yield int(indices[first]), slice(first, end)
+
+
+def _count(rows: _Rows, size: int) -> int:
+    if isinstance(rows, slice):
+        return int(rows.stop - rows.start)
+    return size if rows is None else len(rows)
+
+
+def _rows_of(packets: PacketColumns, rows: _Rows) -> PacketColumns:
+    """Some rows of a batch; rows in order share computed values."""
+    if isinstance(rows, slice):
+        return packets.between(rows.start, rows.stop)
+    return packets if rows is None else packets.at(rows)
 
 
 def _final(running: _Running, outcome: WindowTable, window: _Window) -> Iterator[QueryResult | Captured]:
@@ -400,9 +456,8 @@ def _result(
 
 
 def _captured(
-    running: _Running, outcome: TupleStream, memo: dict[Node, TupleRows | Update]
+    running: _Running, outcome: TupleStream, packets: TupleRows
 ) -> Iterator[QueryResult | Captured]:
-    packets = memo[outcome.node]
     assert isinstance(packets, PacketColumns)  # noqa: S101 - a stream's node is a packet source
     if not len(packets):
         return
