@@ -21,7 +21,7 @@ from dataplane.ports.port import Arrived, NullPort, Port, Wakeup
 from dataplane.v1model.switch import FrameResult
 
 _CHUNK = 256
-_BLOCK = 1024
+_BLOCK = 4096
 """Most frames of a capture that are processed before others have their turn."""
 _IDLE_MS = 100
 _PACKET_OUTS = 4096

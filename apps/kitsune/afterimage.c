@@ -192,6 +192,72 @@ static Link *next_to_replay(const Table *table, int32_t at, uint64_t *until)
     return first;
 }
 
+/* All scales at once; what lies behind them in memory is read, too, and made zero. */
+typedef double Wide __attribute__((vector_size(8 * LANES)));
+typedef int64_t Mask __attribute__((vector_size(8 * LANES)));
+
+#define WIDE(name, from)                                 \
+    Wide name;                                           \
+    memcpy(&name, from, sizeof name);                    \
+    name = (Wide)((Mask)name & (Mask){-1, -1, -1, -1, -1})
+
+/* Replays packets of one hub for as long as each damps stream and link by its own step: the same operations as those
+ * of `decay_stream_at` and `update_link_at`, with the sums kept in registers. */
+#define REPLAY_STEPS(name)                                                                       \
+    static void name(Stream *s, Link *link, int far, const Stream *hub, uint64_t until)          \
+    {                                                                                            \
+        WIDE(cf1, s->cf1);                                                                       \
+        WIDE(cf2, s->cf2);                                                                       \
+        WIDE(w, s->w);                                                                           \
+        WIDE(cf3, link->cf3);                                                                    \
+        WIDE(w3, link->w3);                                                                      \
+        WIDE(other, link->residual[!far]);                                                       \
+        const Event *last = NULL;                                                                \
+        double time = s->last;                                                                   \
+        uint64_t seen = link->seen[far];                                                         \
+        for (; seen < hub->logged; seen++) {                                                     \
+            const Event *event = logged(hub, seen);                                              \
+            if (event->order >= until || !(event->since > 0) || event->time - time != event->since) \
+                break;                                                                           \
+            Wide f, residual;                                                                    \
+            memcpy(&f, event->factor, sizeof f);                                                 \
+            memcpy(&residual, event->residual, sizeof residual);                                 \
+            cf1 *= f;                                                                            \
+            cf2 *= f;                                                                            \
+            w *= f;                                                                              \
+            cf3 = cf3 * f + residual * other;                                                    \
+            w3 = w3 * f + 1;                                                                     \
+            time = event->time;                                                                  \
+            last = event;                                                                        \
+        }                                                                                        \
+        if (!last)                                                                               \
+            return;                                                                              \
+        s->last = link->last = time;                                                             \
+        link->seen[far] = seen;                                                                  \
+        memcpy(s->cf1, &cf1, sizeof s->cf1);                                                     \
+        memcpy(s->cf2, &cf2, sizeof s->cf2);                                                     \
+        memcpy(s->w, &w, sizeof s->w);                                                           \
+        memcpy(link->cf3, &cf3, sizeof link->cf3);                                               \
+        memcpy(link->w3, &w3, sizeof link->w3);                                                  \
+        memcpy(link->residual[far], last->residual, sizeof link->residual[far]);                 \
+    }
+
+REPLAY_STEPS(replay_any)
+#if defined(__x86_64__)
+__attribute__((target("avx512f"))) REPLAY_STEPS(replay_avx512)
+#endif
+
+static void replay_steps(Stream *s, Link *link, int far, const Stream *hub, uint64_t until)
+{
+#if defined(__x86_64__)
+    if (__builtin_cpu_supports("avx512f")) {
+        replay_avx512(s, link, far, hub, until);
+        return;
+    }
+#endif
+    replay_any(s, link, far, hub, until);
+}
+
 /* Brings a stream up to date with the hubs it is linked to, packet by packet in their order. */
 static void catch_up(AfterImage *self, const Table *table, int32_t at)
 {
@@ -210,6 +276,10 @@ static void catch_up(AfterImage *self, const Table *table, int32_t at)
             const Event *event = logged(hub, link->seen[far]);
             if (event->order >= until)
                 break;
+            if (s->packets && s->last == link->last && event->since > 0 && event->time - s->last == event->since) {
+                replay_steps(s, link, far, hub, until);
+                continue;
+            }
             link->seen[far]++;
             decay_stream_at(self, s, event->time, event);
             update_link_at(self, link, far, event->residual, event->time, event);
@@ -239,6 +309,7 @@ static void log_event(AfterImage *self, Stream *hub, double t, const double *res
     if (since > 0)
         memcpy(event->factor, factors(self, since), sizeof event->factor);
     memcpy(event->residual, residual, sizeof event->residual);
+    memset(event->zero, 0, sizeof event->zero);
     if (!self->bounded)
         return;
     if (t > hub->spoken) {

@@ -7,6 +7,7 @@
 #include "afterimage_pool.h"
 
 #define SCALES 5
+#define LANES 8 /* of the widest registers */
 #define MEMO_SLOTS 4096
 
 #define EACH_SCALE(k) for (int k = 0; k < SCALES; k++)
@@ -18,7 +19,7 @@ typedef struct {
     double time;
     double since; /* the hub's packet before */
     double factor[SCALES];
-    double residual[SCALES];
+    double residual[SCALES], zero[LANES - SCALES];
 } Event;
 
 typedef struct {

@@ -209,7 +209,7 @@ def replay(
             help="Most packets in flight.",
             min=1,
             max=65_536,
-            show_default="16384 while nothing can be blocked, else 128",
+            show_default="65536 while nothing can be blocked, else 128",
         ),
     ] = None,
     telemetry: Annotated[

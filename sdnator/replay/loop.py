@@ -39,11 +39,11 @@ from sdnator.replay.survey import Survey
 
 CONFIRM_SECONDS = 5.0
 """Seconds for the confirmation of the last decisions."""
-CHUNK = 4096
+CHUNK = 16_384
 """Most packets sent at a time."""
 SHARE = 4
 """A quarter of the window is free before more is sent, so that every stage gets packets in batches."""
-FREE_WINDOW = {"digest": 16_384, "packet-in": 1_024}
+FREE_WINDOW = {"digest": 65_536, "packet-in": 1_024}
 """Most packets in flight while nothing can be blocked, by the way in which headers come."""
 BLOCKING_WINDOW = 128
 """Most packets in flight while a block may take effect, unless `--window` says otherwise."""

@@ -26,7 +26,7 @@ _FIRST_PAUSE: Final = 0.05
 _DEPUTY_WAITS_S: Final = 0.5
 _LONGEST_LINGER_S: Final = 0.01
 _LISTS: Final = 4
-"""Most digest lists handed over at once: some two thousand frames, so that all parts work at the same time."""
+"""Most digest lists handed over at once: up to eight thousand frames, so that all parts work at the same time."""
 _BYTES: Final = 32 << 20
 """Of digest lists that wait for the listener."""
 _SHARE: Final = 4

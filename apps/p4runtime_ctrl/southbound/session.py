@@ -27,7 +27,7 @@ _BATCH: Final = 5_000
 _AHEAD: Final = 1_000
 """Packet-outs that may wait for the switch."""
 _DIGEST_WAITS_NS: Final = 2_000_000
-_DIGEST_LIST: Final = 512
+_DIGEST_LIST: Final = 2048
 _DIGEST_ACK_NS: Final = 1_000_000_000
 _CHANNEL_OPTIONS: Final = (
     ("grpc.max_receive_message_length", _RECEIVED_BYTES),
