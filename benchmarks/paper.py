@@ -31,6 +31,8 @@ from benchmarks import (
 )
 from benchmarks.measure import arguments, machine, table, write_json
 from benchmarks.paper_findings import CLAIMS, Measured, judge
+from due import DueError
+from sdnator.demos.syn_flood.demo import terminable
 
 GROUPS: Final[Mapping[str, tuple[int, ...]]] = {
     "messages": (1, 2, 3, 4),
@@ -59,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     missing: dict[int, str] = {}
     cells: dict[str, Any] = {}
     seconds: dict[str, float] = {}
-    with tempfile.TemporaryDirectory() as folder:
+    with terminable(), tempfile.TemporaryDirectory() as folder:
         keep = options.keep or Path(folder) / "cells.jsonl"
         report_folder = options.report / "production" if options.report is not None else None
         seeds = options.seeds or (1 if options.quick else 20)
@@ -76,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 more, cells[group] = measures[group]()
                 found |= more
-            except (LookupError, OSError, RuntimeError, subprocess.SubprocessError) as error:
+            except (LookupError, OSError, RuntimeError, subprocess.SubprocessError, DueError) as error:
                 missing |= dict.fromkeys(GROUPS[group], str(error))
             seconds[group] = round(time.monotonic() - begun, 1)
             print(f"{group}: {seconds[group]} s", file=sys.stderr, flush=True)

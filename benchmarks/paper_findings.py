@@ -120,7 +120,8 @@ CLAIMS: Final = (
 
 WHY: Final = {
     1: "os-ken, Ryu's successor, hands an event over inside one process; DUE goes through a server to another one.",
-    5: "the publisher and the archiver share two cores here.",
+    5: "a publisher alone makes more messages a second than the archive takes (`archive_alone_to_off`); once the "
+    "archive's queue is full, `write` waits, and nothing is lost. `burst_on_to_off` is before that.",
     12: "the paper's other schedulers ignore priority; `urgent_first` beside it does not.",
 }
 """What is known of the reason, where a figure needs one."""

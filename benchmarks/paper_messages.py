@@ -1,11 +1,11 @@
 """Findings 1 to 4: latency and throughput of one producer and one consumer, each a process, against os-ken and raw Redis.
 
 Payloads are random bytes, the same for all peers.  DUE runs as apps do: under a Coordinator, with declared keys, best
-effort and reliable.
+effort and reliable, at its default settings; a batch is written and its last item sent without waiting.  Beside os-ken,
+whose events stay in one process, it also runs in one process, over memory://.
 """
 
 import os
-import statistics
 import struct
 import subprocess
 import sys
@@ -31,7 +31,10 @@ _GAP_S: Final = 0.001
 _BYTES: Final = 100_000_000
 """Least of this and of the number of messages bounds a run of throughput."""
 _WAIT_S: Final = 120.0
-_ITEM: Final = 24
+
+_OSKEN: Final = "os-ken {} B batch 1"
+"""Its events have no batches."""
+_MEMORY: Final = "due in one process {} B batch 1"
 
 Latencies = list[float]
 
@@ -40,28 +43,27 @@ def figures(rounds: int, *, quick: bool) -> tuple[dict[int, dict[str, Measured]]
     """Findings 1 to 4 by number, and all cells."""
     sizes = (100, 1_000) if quick else SIZES
     cells: dict[str, list[dict[str, float]]] = {}
-    osken_us: list[float] = []
     with (
         tempfile.TemporaryDirectory() as folder,
         EmbeddedServer(folder) as server,
         _coordinator(server.url, folder),
     ):
         for _ in range(rounds):
-            if osken.available():
-                osken_us.append(statistics.median(osken.latency_us(1_000, 500)))
             for size in sizes:
+                if osken.available():
+                    cells.setdefault(_OSKEN.format(size), []).append(_osken(size, quick=quick))
+                    few = _latencies(_in_process_us(size, 300 if quick else 1_000))
+                    cells.setdefault(_MEMORY.format(size), []).append(few)
                 for batch in BATCHES:
                     for name, cell in _cells(server.url, folder, size, batch, quick=quick).items():
                         cells.setdefault(name, []).append(cell)
-    return _findings(cells, osken_us), {
+    return _findings(cells), {
         name: {field: Measured(tuple(one[field] for one in some)).to_value() for field in some[0]}
         for name, some in cells.items()
     }
 
 
-def _findings(
-    cells: dict[str, list[dict[str, float]]], osken_us: list[float]
-) -> dict[int, dict[str, Measured]]:
+def _findings(cells: dict[str, list[dict[str, float]]]) -> dict[int, dict[str, Measured]]:
     def ratios(above: str, below: str, field: str) -> Measured:
         return Measured(tuple(a[field] / b[field] for a, b in zip(cells[above], cells[below], strict=True)))
 
@@ -71,17 +73,40 @@ def _findings(
         2: {
             f"latency_to_raw_batch{n}": ratios(due(1_000, n), raw(1_000, n), "latency_p50_us")
             for n in BATCHES
+        }
+        | {
+            f"latency_to_raw_{size}_B_batch{n}": ratios(due(size, n), raw(size, n), "latency_p50_us")
+            for size in SIZES
+            for n in BATCHES
+            if size != 1_000 and due(size, n) in cells
         },
         3: {"batch100_to_batch1": ratios(due(1_000, 100), due(1_000, 1), "per_second")},
         4: {"per_second": Measured(tuple(one["per_second"] for one in cells[due(100, 100)]))},
     }
-    if osken_us:
-        ours = [one["latency_p50_us"] for one in cells[due(1_000, 1)]]
+    events = _OSKEN.format(1_000)
+    if events in cells:
         found[1] = {
-            "latency_to_osken": Measured(tuple(a / b for a, b in zip(ours, osken_us, strict=True))),
-            "osken_p50_us": Measured(tuple(osken_us)),
+            "latency_to_osken": ratios(due(1_000, 1), events, "latency_p50_us"),
+            "in_one_process_to_osken": ratios(_MEMORY.format(1_000), events, "latency_p50_us"),
+            "osken_p50_us": Measured(tuple(one["latency_p50_us"] for one in cells[events])),
+            "due_p50_us": Measured(tuple(one["latency_p50_us"] for one in cells[due(1_000, 1)])),
         }
     return found
+
+
+def _osken(size: int, *, quick: bool) -> dict[str, float]:
+    return {
+        **_latencies(osken.latency_us(size, 300 if quick else 1_000)),
+        "per_second": osken.events_per_second(size, 5_000 if quick else 20_000),
+    }
+
+
+def _latencies(times: Latencies) -> dict[str, float]:
+    ordered = sorted(times)
+    return {
+        "latency_p50_us": ordered[len(ordered) // 2],
+        "latency_p99_us": ordered[int(0.99 * (len(ordered) - 1))],
+    }
 
 
 def _cells(url: str, folder: str, size: int, batch: int, *, quick: bool) -> dict[str, dict[str, float]]:
@@ -91,7 +116,7 @@ def _cells(url: str, folder: str, size: int, batch: int, *, quick: bool) -> dict
     many = many // batch * batch
     found = {}
     for delivery in ("best_effort", "reliable"):
-        arguments = (url, f"{folder}/due", delivery, size, batch)
+        arguments = (url, f"{folder}/due", delivery, batch)
         found[f"due {delivery} {size} B batch {batch}"] = _cell(
             partial(_due, arguments, payload), few, many, batch
         )
@@ -104,21 +129,16 @@ def _cell(
 ) -> dict[str, float]:
     times, _ = run(max(few, batch * 10) // batch * batch, _GAP_S)
     _, seconds = run(many, 0.0)
-    times.sort()
-    return {
-        "latency_p50_us": times[len(times) // 2],
-        "latency_p99_us": times[int(0.99 * (len(times) - 1))],
-        "per_second": many / seconds,
-    }
+    return {**_latencies(times), "per_second": many / seconds}
 
 
 def _due(
-    arguments: tuple[str, str, str, int, int], payload: bytes, count: int, gap: float
+    arguments: tuple[str, str, str, int], payload: bytes, count: int, gap: float
 ) -> tuple[Latencies, float]:
-    url, folder, delivery, size, batch = arguments
+    url, folder, delivery, batch = arguments
     key = f"bench.{delivery}.paper.message"
     with other_process(_due_consumer, url, folder, key, count) as pipe:
-        engine = _engine(url, folder, frame_bytes=(size + _ITEM) * batch, linger=0.05)
+        engine = _engine(url, folder)
         chosen: Delivery = "reliable" if delivery == "reliable" else "best_effort"
         engine.init("paper_producer", PRODUCER, capabilities=(Capability(key, delivery=chosen),))
         _until(lambda: bool(engine.assignments()))
@@ -151,10 +171,30 @@ def _due_consumer(pipe: Connection, url: str, folder: str, key: str, count: int)
     engine.close()
 
 
-def _engine(url: str, folder: str, **options: Any) -> Engine:
-    return Engine(
-        Options(updates=url, archive="memory://", directory=folder, single_bytes=1 << 20, **options)
+def _engine(url: str, folder: str) -> Engine:
+    return Engine(Options(updates=url, archive="memory://", directory=folder))
+
+
+def _in_process_us(size: int, count: int) -> Latencies:
+    """One-way times of messages sent one by one within this process, µs."""
+    url, key, times, payload = (
+        f"memory://paper-{os.getpid()}",
+        "bench.paper.memory.message",
+        [],
+        os.urandom(size),
     )
+    options = Options(updates=url, archive=url, coordinated=False)
+    consumer, producer = Engine(options), Engine(options)
+    consumer.init("paper_consumer", CONSUMER, interests=(Interest(key),))
+    consumer.observe(key).subscribe(lambda item: times.append((time.time_ns() - item.timestamp) / 1_000))
+    producer.init("paper_producer", PRODUCER, capabilities=(Capability(key),))
+    for _ in range(count):
+        producer.write(key, payload, [PUB_ONLY, NO_WAIT])
+        time.sleep(_GAP_S)
+    _until(lambda: len(times) == count)
+    producer.close()
+    consumer.close()
+    return times
 
 
 def _raw(url: str, payload: bytes, batch: int, count: int, gap: float) -> tuple[Latencies, float]:

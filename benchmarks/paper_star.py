@@ -29,6 +29,8 @@ _HUB: Final = "10.77.0.1"
 _PORT: Final = 6379
 _START_S: Final = 240.0
 _SETTLE_S: Final = 3.0
+_WARM_S: Final = 10.0
+"""From the start of the apps: windows fill, and TCP finds its rate."""
 _ROOT: Final = Path(__file__).parents[1]
 _MBIT: Final = MESSAGE_BYTES * 8 / 1e6
 
@@ -72,7 +74,7 @@ def _capacity(pairs: int, seconds: float) -> float:
     """Sum of all pairs without limits and latency, Mb/s."""
     with Star(pairs, 0.0) as star:
         star.set_delay(0.0)
-        time.sleep(_SETTLE_S)
+        time.sleep(_WARM_S)
         return sum(star.rates(seconds))
 
 
@@ -81,6 +83,7 @@ def _cells(
 ) -> list[dict[str, Any]]:
     found = []
     with Star(pairs, rate) as star:
+        time.sleep(_WARM_S)
         for _ in range(rounds):
             for delay in delays:
                 star.set_delay(delay)
@@ -90,7 +93,8 @@ def _cells(
                     {
                         "pairs": pairs,
                         "one_way_s": delay,
-                        "round_trip_ms": star.round_trip_ms(),
+                        "round_trip_ms": star.round_trip_ms(busy=False),
+                        "busy_round_trip_ms": star.round_trip_ms(busy=True),
                         "sum_mbit": sum(rates),
                         "jain": jain(rates),
                         "per_app_mbit": rates,
@@ -128,13 +132,13 @@ class Star:
             _ip("-n", self._wire, "link", "set", "star", "up")
             self._link(self._hub, "up0", f"{_HUB}/16", "hub0")
             _ip("-n", self._wire, "link", "set", "hub0", "master", "star")
-            apps = [self._leaf(stack, number) for number in range(2 * self._pairs)]
-            between = [f"x{number},y{number}" for number in range(len(apps))]
+            leaves = [self._leaf(stack, number) for number in range(2 * self._pairs + 1)]
+            between = [f"x{number},y{number}" for number in range(len(leaves))]
             self._relay = self._start(
                 stack, self._wire, [sys.executable, "-m", "benchmarks.paper_relay", *between]
             )
             self._serve(stack)
-            self._run_apps(stack, apps)
+            self._run_apps(stack, leaves)
             self._stack = stack.pop_all()
         return self
 
@@ -161,13 +165,19 @@ class Star:
             found.append((span[-1][1] - span[0][1]) / (span[-1][0] - span[0][0]) * _MBIT)
         return found
 
-    def round_trip_ms(self) -> float:
-        """Time to connect from the first app's namespace to the hub: the relay itself, measured under this load."""
+    def round_trip_ms(self, *, busy: bool) -> float:
+        """Time to connect to the hub while all apps are at work, ms.
+
+        Args:
+            busy: over the first app's link, with what waits in it; else over a link that no app uses: the relay
+                itself.
+        """
+        leaf = f"{self._name}l{0 if busy else 2 * self._pairs}"
         code = (
             "import socket, time; t = time.monotonic(); "
             f"socket.create_connection(('{_HUB}', {_PORT}), 30); print((time.monotonic() - t) * 1000)"
         )
-        command = ["ip", "netns", "exec", f"{self._name}l0", sys.executable, "-c", code]
+        command = ["ip", "netns", "exec", leaf, sys.executable, "-c", code]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=60)
         return float(done.stdout)
 

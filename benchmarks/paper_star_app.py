@@ -1,7 +1,7 @@
 """One app of the star: `python -m benchmarks.paper_star_app producer|consumer URL PAIR FOLDER`, until it is ended.
 
-A producer writes messages of 1,000 bytes, 12,500 in a row, held back by the reliable stream alone; a consumer prints the
-time and how many it has received, four times a second.
+A producer writes messages of 1,000 bytes, 12,500 in a row, held back by the reliable stream's window alone, at its
+default; a consumer prints the time and how many it has received, four times a second.
 """
 
 import os
@@ -13,7 +13,6 @@ from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Interest, Item
 
 MESSAGE_BYTES: Final = 1_000
 BATCH: Final = 12_500
-WINDOW_BYTES: Final = 4 << 20
 _TELL_S: Final = 0.25
 
 
@@ -27,8 +26,6 @@ def main(role: str, url: str, pair: str, folder: str) -> None:
             directory=folder,
             coordinated=False,
             connect_timeout=60.0,
-            window_bytes=WINDOW_BYTES,
-            retain_bytes=WINDOW_BYTES,
         )
     )
     if role == "producer":

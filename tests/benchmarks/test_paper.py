@@ -1,14 +1,19 @@
 """The paper's benchmark: how findings are judged, and the forwarder that delays the star's links."""
 
 import math
+import re
+import signal
 import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from benchmarks import paper_report
+from benchmarks.paper_cases import run_ending
 from benchmarks.paper_findings import CLAIMS, Measured, judge
 from benchmarks.paper_star import jain
 from sdnator.testing.waiting import wait_for
@@ -53,6 +58,74 @@ def test_jain_is_one_for_equal_shares():
     """And 1/n where one of n has it all."""
     assert math.isclose(jain([5.0] * 8), 1.0)
     assert math.isclose(jain([1.0, 0.0, 0.0, 0.0]), 0.25)
+
+
+def test_the_page_shows_every_finding_and_what_was_drawn(tmp_path):
+    """A row for each claim; a picture for each group with cells, none for the others, and no dead link."""
+    one = Measured((2.0, 1.0, 3.0)).to_value()
+    message = {"latency_p50_us": one, "per_second": one}
+    cells = {
+        "messages": {"due reliable 100 B batch 1": message, "os-ken 100 B batch 1": message},
+        "archive": {
+            "sqlite": {"batch 1": one, "off": one, "on": one},
+            "mongodb": "nx-27017 is not installed",
+        },
+        "cases": {
+            "workflow 1": {"packets_lost": 0, "alerts": 510, "mitigation": True},
+            "workflow 2": {"failed": "no <root>"},
+        },
+        "star": {"link_mbit": 5.0, "runs": [{"pairs": 2, "one_way_s": 0.05, "sum_mbit": 9.0, "jain": 1.0}]},
+    }
+    results = {
+        "machine": {"cores": 2},
+        "versions": {"sdnator": "0"},
+        "findings_reported": 0,
+        "findings_reproduced": 0,
+        "findings": [msgspec.to_builtins(judge(claim, {}, "no <time>")) for claim in CLAIMS],
+        "cells": cells,
+    }
+    page = paper_report.write(results, tmp_path).read_text()
+    assert page.count("<tr><td>") == len(CLAIMS)
+    assert "no &lt;time&gt;" in page
+    assert re.findall(r'<img src="([^"]+)"', page) == ["messages.png", "archive.png", "star.png"]
+    assert all((tmp_path / f"{name}.png").stat().st_size > 5_000 for name in ("messages", "archive", "star"))
+    assert "packets lost 0, alerts 510" in page
+    assert "failed no &lt;root&gt;" in page
+    page = paper_report.write(results | {"cells": {}}, tmp_path / "empty").read_text()
+    assert "<img" not in page
+
+
+CHILD = """
+import pathlib, signal, sys, time
+def leave(number, frame):
+    pathlib.Path("unwound").touch()
+    sys.exit(3)
+signal.signal(signal.SIGTERM, leave)
+pathlib.Path("begun").touch()
+time.sleep(600)
+"""
+
+
+def test_a_case_that_takes_too_long_is_asked_to_end(tmp_path):
+    """It has the time to remove its namespaces, and its end is told."""
+    code, _, problem = run_ending((sys.executable, "-c", CHILD), tmp_path, 5.0)
+    assert (code, (tmp_path / "unwound").exists()) == (3, True)
+    assert "asked to end after 5 s" in problem
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_case_ends_with_the_benchmark(tmp_path, number):
+    """Whether the benchmark is asked to end or killed, what it runs unwinds."""
+    parent = (
+        "import sys; from pathlib import Path; from benchmarks.paper_cases import run_ending; "
+        "from sdnator.demos.syn_flood.demo import terminable\n"
+        f"with terminable(): run_ending((sys.executable, '-c', {CHILD!r}), Path({str(tmp_path)!r}), 600.0)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent], cwd=ROOT)
+    wait_for((tmp_path / "begun").exists, 60)
+    process.send_signal(number)
+    process.wait(60)
+    wait_for((tmp_path / "unwound").exists, 60)
 
 
 @pytest.fixture

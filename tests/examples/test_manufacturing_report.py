@@ -4,9 +4,11 @@ import json
 
 import msgspec
 import pytest
+from manufacturing.core.orders import SCENARIOS
 from manufacturing.criteria import FLEETS
 from manufacturing.running import report
 from manufacturing.running.command import main
+from manufacturing.scheduling import SCHEDULERS
 from manufacturing.statistics import CellResult, CellTable, cells
 
 SHARE = {
@@ -93,3 +95,25 @@ def test_run_ends_with_the_schedule_of_the_simulation(capsys):
     said = capsys.readouterr().out
     assert "live Gantt chart: http://127.0.0.1:" in said
     assert "schedule through REST and DUE as in the simulation: yes" in said
+
+
+def test_verify_goes_on_where_it_stopped(tmp_path, capsys):
+    """Every scenario and scheduler through REST and DUE, each once; what the file holds is not run again."""
+    path = tmp_path / "verified.jsonl"
+    small = ["--fleets", "2", "--orders", "2", "--fraction", "0.02", "--in-process"]
+    words = ["verify", "--results", str(path), "--seed", "3", *small]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    cells_of_a_fleet = len(SCENARIOS) * len(SCHEDULERS)
+    assert (
+        f"{cells_of_a_fleet} of {cells_of_a_fleet} schedules as in the simulation; 0 cells are missing"
+        in said
+    )
+    assert "anomalies, dynamic, 2 printers: the same schedule" in said
+    lines = path.read_text().splitlines()
+    changed = json.loads(lines.pop()) | {"same": False}
+    path.write_text("\n".join([*lines[1:], json.dumps(changed)]) + "\n")
+    assert main(words) == 1
+    said = capsys.readouterr().out
+    assert said.count("the same schedule") == 1
+    assert f"{cells_of_a_fleet - 1} of {cells_of_a_fleet} schedules" in said

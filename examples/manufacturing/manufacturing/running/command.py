@@ -1,4 +1,5 @@
-"""The command `sdnator-manufacturing`: `run` one scenario live, `compare` all schedulers over seeds and fleets."""
+"""The command `sdnator-manufacturing`: `run` one scenario live, `verify` that REST and DUE change no schedule, `compare`
+all schedulers over seeds and fleets."""
 
 import argparse
 import sys
@@ -16,13 +17,12 @@ from manufacturing.running import report
 from manufacturing.running.in_process import InProcessProduction
 from manufacturing.running.page import GanttPage
 from manufacturing.running.processes import ProcessProduction
+from manufacturing.running.verify import MOST_S, STEP_S, VerifiedCell, verify_all
 from manufacturing.running.watcher import Stalled
 from manufacturing.scheduling import SchedulerName, scheduler
 from manufacturing.statistics import CellTable, measure
 
-_STEP_S: Final = 180.0
-_MOST_S: Final = 4 * 3_600.0
-_NOT_WHOLE = 3
+_NOT_WHOLE: Final = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,22 +47,29 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--seeds", type=int, default=1, help="the first one live, the others from the pure cores"
     )
-    run.add_argument("--orders", type=int, default=ORDERS, help="fewer for a quick look")
-    run.add_argument(
-        "--fraction", type=float, default=1.0, help="of the jobs of each order, for a quick look"
-    )
+    _add_size(run)
     run.add_argument(
         "--speed-up", type=float, default=0.0, help="simulated seconds a second at most; 0: no limit"
     )
-    run.add_argument("--in-process", action="store_true", help="all apps in one process over memory://")
     run.add_argument("--port", type=int, default=0, help="of the page; 0 takes a free one")
     run.add_argument(
         "--stay", type=float, default=0.0, help="seconds for which the page stays when all is done"
     )
     run.set_defaults(do=_run)
+    check = commands.add_parser(
+        "verify", help="one seed of each cell through REST, DUE and Coordinator: the simulation's schedule?"
+    )
+    _add_size(check)
+    check.add_argument("--seed", type=int, default=0)
+    check.add_argument("--fleets", type=_fleets, default=FLEETS, help="sizes, such as 5,10,20,40")
+    check.add_argument("--results", type=Path, required=True, help="file of JSON lines; what it has is kept")
+    check.add_argument(
+        "--minutes", type=float, default=0.0, help="begin no more cells after so long; 0: no limit"
+    )
+    check.set_defaults(do=_verify)
     compare = commands.add_parser("compare", help="all scenarios, schedulers and fleets from the pure cores")
     compare.add_argument("--seeds", type=int, default=SEEDS)
-    compare.add_argument("--fleets", type=_fleets, default=FLEETS, help="sizes, such as 5,10,20,40")
+    compare.add_argument("--fleets", type=_judged_fleets, default=FLEETS, help="sizes, such as 5,10,20,40")
     compare.add_argument(
         "--results", type=Path, required=True, help="file of JSON lines; what it has is kept"
     )
@@ -75,8 +82,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_size(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--orders", type=int, default=ORDERS, help="fewer for a quick look")
+    parser.add_argument(
+        "--fraction", type=float, default=1.0, help="of the jobs of each order, for a quick look"
+    )
+    parser.add_argument("--in-process", action="store_true", help="all apps in one process over memory://")
+
+
 def _fleets(text: str) -> tuple[int, ...]:
-    found = tuple(int(part) for part in text.split(","))
+    return tuple(int(part) for part in text.split(","))
+
+
+def _judged_fleets(text: str) -> tuple[int, ...]:
+    found = _fleets(text)
     if NORMAL_FLEET not in found:
         raise argparse.ArgumentTypeError(f"{text}: the criteria need a fleet of {NORMAL_FLEET}")
     return found
@@ -98,7 +117,7 @@ def _run(options: argparse.Namespace) -> int:
     ):
         print(f"live Gantt chart: {page.url}", flush=True)
         begun = time.monotonic()
-        production.watcher.wait_done(_STEP_S, _MOST_S)
+        production.watcher.wait_done(STEP_S, MOST_S)
         print(f"all jobs done after {time.monotonic() - begun:.1f} s", flush=True)
         prints = production.watcher.prints()
         time.sleep(options.stay)
@@ -112,6 +131,40 @@ def _run(options: argparse.Namespace) -> int:
             f"seed {seed}: makespan {result.makespan / 3_600:.2f} h, urgent {result.ppe_makespan / 3_600:.2f} h"
         )
     return 0 if same else 1
+
+
+def _verify(options: argparse.Namespace) -> int:
+    def scenario(name: ScenarioName, machines: int) -> Scenario:
+        return Scenario(
+            name=name,
+            seed=options.seed,
+            machines=machines,
+            orders=options.orders,
+            fraction=options.fraction,
+        )
+
+    found, missing = verify_all(
+        scenario,
+        options.fleets,
+        options.results,
+        production=InProcessProduction if options.in_process else ProcessProduction,
+        minutes=options.minutes,
+        tell=_tell_cell,
+    )
+    same = sum(one.same for one in found)
+    print(f"{same} of {len(found)} schedules as in the simulation; {missing} cells are missing")
+    if same < len(found):
+        return 1
+    return _NOT_WHOLE if missing else 0
+
+
+def _tell_cell(one: VerifiedCell) -> None:
+    result = one.problem or ("the same schedule" if one.same else "another schedule")
+    print(
+        f"{one.scenario}, {one.scheduler}, {one.machines} printers: {result}, "
+        f"{one.prints} prints, {one.seconds:.1f} s",
+        flush=True,
+    )
 
 
 def _compare(options: argparse.Namespace) -> int:

@@ -18,12 +18,13 @@ from manufacturing.core.orders import Scenario
 from manufacturing.running.in_process import APPS, settings_of
 from manufacturing.running.watcher import Watcher
 from manufacturing.scheduling import SchedulerName
+from manufacturing.scheduling.integer_program import SECONDS
 from sdnator.supervisor import Child, PartSpec, Supervisor
 
 PACKAGE: Final = Path(__file__).resolve().parent.parent.parent
 _LOOK_S: Final = 0.1
-_HUNG_S: Final = 60.0
-"""An integer program takes up to 20 s, in which the scheduler hears nothing."""
+_HUNG_S: Final = SECONDS + 50.0
+"""An integer program may take `SECONDS`, in which the scheduler hears nothing."""
 
 
 class ProcessProduction:

@@ -22,8 +22,9 @@ from scipy.sparse import coo_array
 GAP: Final = 0.03
 NODES: Final = 1
 """Nodes of the search tree after which the best division so far is taken: a limit that does not depend on the
-machine, so that a schedule is the same everywhere.  `SECONDS` is for the worst case."""
-SECONDS: Final = 20.0
+machine, so that a schedule is the same everywhere.  `SECONDS` of the wall clock are for the worst case: a program takes
+a few on an idle core, and a limit that struck on a busy one would make another schedule."""
+SECONDS: Final = 100.0
 _MORE: Final = 2
 """Printers for each kind beyond those of the greedy division."""
 _SETUP_WEIGHT: Final = 0.02
