@@ -52,7 +52,7 @@ __all__ = [
 
 _BUFFER = 1 << 20
 MAX_PACKETS = 100_000_000
-"""Most packets of one capture: times, senders and states are held in memory (30 bytes each)."""
+"""Most packets of one capture: times, lengths, senders and states are held in memory (60 bytes each)."""
 
 
 class CaptureError(BadInput, ValueError):
@@ -118,6 +118,8 @@ class Capture:
         try:
             self.size = os.fstat(self._file.fileno()).st_size
             self._gunzip: GunzipStream | None = None
+            self.plain = False
+            """The file is pcap, and not gzipped."""
             self._records = self._start()
             self._first = self._first_frame()
         except OSError as error:
@@ -176,6 +178,7 @@ class Capture:
             stream = io.BufferedReader(self._gunzip, _BUFFER)
         magic = stream.read(4)
         if magic in PCAP_MAGICS:
+            self.plain = self._gunzip is None
             return read_pcap(stream, magic)
         if magic == PCAPNG_MAGIC:
             return read_pcapng(stream)

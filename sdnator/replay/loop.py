@@ -15,19 +15,15 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Confirmation, Decision
 from apps.sonata_adapter.keys import HANDSHAKE
-from dataplane.frame_block import FrameBlock
 from dataplane.ports.capture_port import CapturePortError
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
-from sdnator.capture.captures import Capture
+from sdnator.capture.capture_blocks import CaptureBlocks
 from sdnator.capture.interfaces import Feed
 from sdnator.errors import PipelineError
 from sdnator.incidents.incident_rows import newest_of_each, with_counters
@@ -354,19 +350,16 @@ class ReplayPass:
     def _feed(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
         flight = self._result.flight
         begun = time.monotonic()
-        with Capture(self._survey.path) as capture:
-            frames = iter(capture)
+        with CaptureBlocks(self._survey.path, self._survey.frames()) as capture:
             while flight.sent < self._survey.packets:
                 room = self._wait_for_room(pipeline, feed, progress)
-                count = self._keep_pace(pipeline, progress, begun, min(room, CHUNK))
-                times_ns, lengths, data = zip(*islice(frames, count), strict=True)
+                block = capture.take(self._keep_pace(pipeline, progress, begun, min(room, CHUNK)))
                 self._look(pipeline, progress)
                 # Counted first: a verdict or score may come back before `send` returns.
-                self._note_watched(flight.sent, len(data))
-                times_us = np.array(times_ns, np.int64) // 1_000 - self._survey.base_us
+                self._note_watched(flight.sent, len(block))
                 with self._observer.moved:
-                    flight.send(len(data))
-                feed.send_block(FrameBlock.of(times_us, lengths, data))
+                    flight.send(len(block))
+                feed.send_block(block)
         self._drain(pipeline, feed, progress)
         self._looked = 0.0
         self._look(pipeline, progress)
@@ -416,8 +409,9 @@ class ReplayPass:
             self._result.uncounted_drops = max(0, dropped - sum(self._result.drops_counted.values()))
 
     def _note_watched(self, first: int, count: int) -> None:
-        for index in self._watch.intersection(range(first, first + count)):
-            self._result.sent_at[index] = time.monotonic()
+        for index in self._watch:
+            if first <= index < first + count:
+                self._result.sent_at[index] = time.monotonic()
 
     def _keep_pace(self, pipeline: ReplayPipeline, progress: Progress | None, begun: float, most: int) -> int:
         """Wait for the next packet's time; how many are due then, at least 1 and at most `most`."""

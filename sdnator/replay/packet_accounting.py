@@ -68,6 +68,8 @@ class PacketAccounting:
 
     def judge(self, verdicts: bytes) -> None:
         """Take the switch's verdicts on the next packets, in order (bit 0 copied, bit 1 forwarded)."""
+        if not verdicts:
+            return
         given = np.frombuffer(verdicts, np.uint8)
         states = self.state[self.judged : self.judged + len(given)]
         if len(states) < len(given):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sdnator.capture.capture_blocks import FrameIndex
 from sdnator.capture.captures import Capture, CutCapture
 
 _BATCH = 16_384
@@ -26,6 +27,12 @@ class Survey:
     """Source address of IPv4 frames (behind up to two VLAN tags) and of ARP; 0 for others."""
     bytes: int
     cut: CutCapture | None
+    lengths: NDArray[np.uint32]
+    """Bytes of each frame on the wire."""
+    captured: NDArray[np.uint32]
+    """Bytes of each frame in the capture."""
+    plain: bool
+    """The file is pcap, and not gzipped."""
 
     @property
     def packets(self) -> int:
@@ -35,6 +42,10 @@ class Survey:
     def base_us(self) -> int:
         """Start of the earliest packet's second, us since the epoch: the switch counts from here."""
         return int(self.time_ns.min()) // 1_000_000_000 * 1_000_000
+
+    def frames(self) -> FrameIndex:
+        """For the second reading."""
+        return FrameIndex(self.time_ns // 1_000 - self.base_us, self.lengths, self.captured, self.plain)
 
     def notes(self) -> list[str]:
         """Notes about the capture for the report."""
@@ -60,23 +71,28 @@ def survey(path: Path, progress: Callable[[int, int], None] | None = None) -> Su
         CaptureError: as `Capture` does.
     """
     times, macs, addresses = array("q"), array("Q"), array("I")  # lists would take ten times as much memory
-    total = 0
+    lengths, captured = array("I"), array("I")
     with Capture(path) as capture:
         for time_ns, length, data in capture:
             times.append(time_ns)
             macs.append(int.from_bytes(data[6:12], "big"))
             addresses.append(_ipv4_source(data))
-            total += length
+            lengths.append(length)
+            captured.append(len(data))
             if progress is not None and len(times) % _BATCH == 0:
                 progress(capture.position, capture.size)
-        cut = capture.cut
+        cut, plain = capture.cut, capture.plain
+    wire = np.array(lengths, np.uint32)
     return Survey(
         path,
         np.array(times, np.int64),
         np.array(macs, np.uint64),
         np.array(addresses, np.uint32),
-        total,
+        int(wire.sum(dtype=np.int64)),
         cut,
+        wire,
+        np.array(captured, np.uint32),
+        plain,
     )
 
 

@@ -51,6 +51,33 @@ static int skip(Span *s, uint64_t tag) {
     }
 }
 
+/* A number as so many bytes, right-aligned; 0 if it does not fit. */
+static int number(const uint8_t *at, long size, uint8_t *to, long width) {
+    while (size && !*at) at++, size--;
+    if (size > width) return 0;
+    if (width > 8) {
+        memset(to, 0, width - size);
+        if (size) memcpy(to + width - size, at, size);
+        return 1;
+    }
+    uint64_t value = 0;
+    while (size--) value = value << 8 | *at++;
+    for (long i = width; i--; value >>= 8) to[i] = (uint8_t)value;
+    return 1;
+}
+
+/* A member as switches write it: a bitstring of less than 128 bytes and nothing else.  0 if it is written otherwise. */
+static int usual_member(Span *all, const uint8_t **value, long *size) {
+    const uint8_t *at = all->at;
+    if (all->end - at < 4 || at[0] != (1 << 3 | 2) || at[2] != (1 << 3 | 2) || at[1] > 0x7F || at[3] + 2 != at[1])
+        return 0;
+    if (at[1] > all->end - at - 2) return 0;
+    *value = at + 4;
+    *size = at[3];
+    all->at = at + 4 + at[3];
+    return 1;
+}
+
 /* The value of one member, right-aligned; 0 if it is damaged or does not fit. */
 static int member(Span s, uint8_t *to, long width) {
     Span value = {0, 0};
@@ -64,12 +91,7 @@ static int member(Span s, uint8_t *to, long width) {
             if (!skip(&s, tag)) return 0;
         }
     }
-    while (value.at < value.end && !*value.at) value.at++;
-    long size = value.end - value.at;
-    if (size > width) return 0;
-    memset(to, 0, width - size);
-    if (size) memcpy(to + width - size, value.at, size);
-    return 1;
+    return number(value.at, value.end - value.at, to, width);
 }
 
 static int row(Span s, const int32_t *widths, long fields, uint8_t *to) {
@@ -85,6 +107,13 @@ static int row(Span s, const int32_t *widths, long fields, uint8_t *to) {
         }
     }
     while (all.at < all.end) {
+        const uint8_t *value;
+        long size;
+        if (found < fields && usual_member(&all, &value, &size)) {
+            if (!number(value, size, to, widths[found])) return 0;
+            to += widths[found++];
+            continue;
+        }
         if (!varint(&all, &tag)) return 0;
         if (tag != (1 << 3 | 2)) {
             if (!skip(&all, tag)) return 0;

@@ -47,6 +47,10 @@ class PacketRows:
         columns = {name: column[rows] for name, column in self.columns.items()}
         return PacketRows(columns, self.queries[rows], self.whole[rows])
 
+    def where(self, chosen: NDArray[np.bool_]) -> "PacketRows":
+        """The chosen rows; a copy only if others are left out."""
+        return self if chosen.all() else self.only(chosen)
+
     def matching(self, bit: int) -> RecordBatch:
         """The records that meet a request."""
         rows = has_bit(self.queries, bit)
@@ -99,11 +103,13 @@ class SequenceMerger:
             self._told = self._passed[stream] = self._told + len(rows)
             self.copies += len(rows) if stream == "packet" else 0
             return [rows]
-        rows = rows.only(np.flatnonzero(rows.sequence))
+        rows = rows.where(rows.sequence != 0)
         if not len(rows):
             return []
-        told: list[PacketRows] = []
         back = np.flatnonzero(np.diff(rows.sequence, prepend=self._passed[stream]) <= 0)
+        if not len(back):
+            return self._follow(stream, rows)
+        told: list[PacketRows] = []
         for begin, end in pairwise(sorted({0, *back.tolist(), len(rows)})):
             if begin in back:  # the switch counts from 1 again
                 told += self.flush()
@@ -120,9 +126,7 @@ class SequenceMerger:
 
     def _follow(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
         self._passed[stream] = int(rows.sequence[-1])
-        fresh = rows.sequence > self._told
-        if not fresh.all():
-            rows = rows.only(fresh)
+        rows = rows.where(rows.sequence > self._told)
         held = self._held[stream]
         self._held[stream] = rows if held is None else _joined(held, rows)
         return self._tell(self._decided()) if len(self) <= _LONGEST else self.flush()
@@ -131,8 +135,10 @@ class SequenceMerger:
         """The highest number up to which each number has arrived or is given up."""
         both = max(self._told, min(self._passed.values()))
         there = [rows.sequence[rows.whole] for rows in self._held.values() if rows is not None and len(rows)]
-        numbers = np.unique(np.concatenate(there)) if there else np.zeros(0, np.int64)
-        numbers = numbers[numbers > both]
+        later = [numbers[numbers > both] for numbers in there]
+        # each of them is in order already: merging them is faster than np.unique, which hashes
+        numbers = np.sort(np.concatenate(later), kind="stable") if later else np.zeros(0, np.int64)
+        numbers = numbers[np.diff(numbers, prepend=both) != 0]
         run = numbers == both + 1 + np.arange(len(numbers))
         return both + (len(run) if run.all() else int(run.argmin()))
 
@@ -143,19 +149,17 @@ class SequenceMerger:
             if rows is None:
                 continue
             ripe = rows.sequence <= end
-            if ripe.all():
-                self._held[stream] = None
-            else:
-                self._held[stream] = rows.only(~ripe)
-            chosen[stream] = rows.only(ripe)
+            self._held[stream] = None if ripe.all() else rows.only(~ripe)
+            chosen[stream] = rows.where(ripe)
         self._told = max(self._told, min(end, max(self._passed.values())))
         chosen = {stream: rows for stream, rows in chosen.items() if len(rows)}
         self.copies += len(chosen.get("packet", ()))
         return [self._merged(**chosen)] if len(chosen) > 1 else list(chosen.values())
 
     def _merged(self, packet: PacketRows, digest: PacketRows) -> PacketRows:
-        fresh = ~np.isin(digest.sequence, packet.sequence)
-        rows = _joined(packet, digest if fresh.all() else digest.only(fresh))
+        known, numbers = packet.sequence, digest.sequence
+        place = np.minimum(np.searchsorted(known, numbers), len(known) - 1)
+        rows = _joined(packet, digest.where(known[place] != numbers))
         return rows.only(np.argsort(rows.sequence, kind="stable"))
 
 

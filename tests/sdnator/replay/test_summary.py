@@ -26,6 +26,9 @@ def surveyed(*macs: int) -> Survey:
         np.zeros(count, np.uint32),
         0,
         None,
+        np.zeros(count, np.uint32),
+        np.zeros(count, np.uint32),
+        True,
     )
 
 

@@ -7,6 +7,8 @@ import numpy as np
 
 from sdnator.replay.survey import Survey
 
+LENGTHS = (np.zeros(2, np.uint32), np.zeros(2, np.uint32), True)
+
 
 class CountingTimes(np.ndarray[Any, np.dtype[np.int64]]):
     """Times that count how often somebody looks for the least of them."""
@@ -21,6 +23,6 @@ class CountingTimes(np.ndarray[Any, np.dtype[np.int64]]):
 def test_the_start_is_looked_for_once_not_for_every_packet():
     """The feeder asks for it with each packet: a search each time would be quadratic in the capture."""
     times = np.array([7_900_000_000, 5_500_000_000], np.int64).view(CountingTimes)
-    survey = Survey(Path("x"), times, np.zeros(2, np.uint64), np.zeros(2, np.uint32), 0, None)
+    survey = Survey(Path("x"), times, np.zeros(2, np.uint64), np.zeros(2, np.uint32), 0, None, *LENGTHS)
     assert [survey.base_us for _ in range(100)] == [5_000_000] * 100
     assert CountingTimes.looked == 1
