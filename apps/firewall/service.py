@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -34,7 +33,6 @@ from apps.firewall.evidence.archive import Archive
 from apps.firewall.evidence.history import FAMILIES
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
 from apps.firewall.evidence.past import ArchivedPast
-from apps.firewall.evidence.recent_rows import AGED_S
 from apps.firewall.evidence_handler import EvidenceHandler
 from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
 from apps.firewall.policy.auto_allowlist import surroundings
@@ -43,14 +41,11 @@ from apps.firewall.policy.decider import Decider
 from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.instructions import Desk, refused_as_foreign, refused_as_late
 from apps.firewall.policy.rate_limits import RateLimits
-from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
-from apps.firewall.syn.examinations import Examination, Examinations
-from apps.firewall.syn.recent_syns import Surges
+from apps.firewall.syn.flood_handler import TELEMETRY, FloodHandler
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.suspect_samples import SuspectSamples
-from apps.firewall.syn.syn_ack_buffer import Answers, SynAckBuffer, Wanted, packet_outs
-from apps.firewall.syn.syn_defence import EVERY_SWITCH, Suspicion, SynDefence, Watch
+from apps.firewall.syn.syn_defence import EVERY_SWITCH
 from apps.messages import (
     Alert,
     Answer,
@@ -68,7 +63,6 @@ from due import Capability, DueError, Engine, Interest, Item, Key, RecordBatch
 
 KITSUNES_EVIDENCE = f"{EVIDENCE}.kitsune.*"
 SAMPLES = "network.packets.p4runtime_ctrl.*"
-TELEMETRY = "network.telemetry.firewall"
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.alert"),
@@ -114,8 +108,6 @@ START_PATIENCE_S = 30.0
 ARCHIVED_WORD_S = 2.0
 CLOCKS_DIFFER_NS = 2 * 3600 * 1_000_000_000
 PANICS = {"dataKey": history.INSTRUCTIONS, "value.verb": "panic"}
-ONE_DIRECTION = 1000
-"""Warn about one-way traffic after this many SYNs without a SYN-ACK."""
 
 T = TypeVar("T")
 
@@ -132,23 +124,27 @@ class FirewallService:
         self._rules = settings.rules
         self._known = KnownSources(settings.known_limit)
         self._ledger = BlockLifecycle(settings.rules, known=self._known)
-        self._counts = dict.fromkeys(("alerts", "evidence", "handshakes", "syns", "syn_acks"), 0)
-        services = tuple(TcpService.parse(text) for text in settings.guard)
+        self._counts = dict.fromkeys(("alerts", "evidence"), 0)
         allowed = (*settings.rules.allow, *(surroundings() if settings.allow_surroundings else ()))
-        after_s = settings.syn.reset_after_ms / 1000
-        self._answers = Answers(settings.syn.sample, AGED_S + after_s)
-        allow_list = AllowList.parse(allowed)
-        self._syn = SynDefence(settings.syn, services, self._ledger, allow_list, self._known, self._is_silent)
         self._limits = RateLimits(settings.rules)
         self._allow_entries = AllowEntries()
         self._leftovers: dict[str, list[TableUpdate]] = {}
         self._switches: dict[str, str] = {}
         """Connected switches, and the controller instance that reported each."""
-        self._surges = Surges(settings.syn.threshold, settings.syn.window_ms)
-        self._examinations = Examinations(settings.syn.grace_ms, settings.syn.patience_ms)
-        self._samples = SuspectSamples(settings.syn.sample_most, settings.syn.sample_ms / 1000)
-        resets = settings.syn.resets if settings.syn.challenge else 0
-        self._resets = SynAckBuffer(self._answers, after_s=after_s, limit=resets)
+        self._lock = threading.RLock()
+        self._floods = FloodHandler(
+            engine,
+            settings,
+            self._ledger,
+            allowed,
+            self._known,
+            self._switches,
+            lambda decision, resets: self._publish(decision, resets=resets),
+            lambda addresses, now: self._handler.offences_of_many(addresses, now),  # noqa: PLW0108 - it comes later
+            self._lock,
+            lambda: time.monotonic(),  # noqa: PLW0108 - tests set the clock of this module
+        )
+        self._syn = self._floods.defence
         self._bindings = ArpBindings(
             training_s=settings.arp_training_s,
             settle_s=settings.arp_settle_s,
@@ -183,8 +179,6 @@ class FirewallService:
             self._publish,
         )
         self._stored = StoredAnswers(engine, threading.Lock())
-        self._lock = threading.RLock()
-        self._stopped = False
         self._panics: deque[str] = deque(maxlen=1000)
         """Ids of archived panics that were carried out."""
         self._words_since = time.time_ns()
@@ -239,14 +233,10 @@ class FirewallService:
         else:
             query = Key("network.traffic_query.sonata.new_tcp").with_specs(**specs).text
             self._hear(query, arrivals.flood_in, self._on_surge)
-            for name in self._samples.names():
+            for name in self._floods.sample_names():
                 self._hear(f"{SAMPLES}.{name}", arrivals.syns_in, self._on_syns)
         if rules.resets:
             self._hear(stream.with_specs(flag="syn+ack").text, arrivals.syn_acks_in, self._on_syn_acks)
-
-    def _is_silent(self, service: TcpService) -> bool:
-        """Without resets SYN-ACKs are not requested, and answers are unknown."""
-        return self._settings.syn.resets > 0 and self._answers.lacks(service)
 
     def _take_up_history(self) -> None:
         """Restore what was in force before a restart, as it still is in the switch."""
@@ -274,9 +264,9 @@ class FirewallService:
     def tick(self) -> None:
         """Examine suspected floods that are due, and write known sources in batches."""
         with self._lock:
-            self._look_at_what_is_due()
-            self._request(self._samples.ended(time.monotonic()))
-            self._reset()
+            self._floods.tick()
+            for notice in self._floods.notices(self._now):
+                self._announcer.say(notice, logging.INFO)
             updates = self._known.changes()
             for switch in self._switches if updates else ():
                 self._command(switch, updates)
@@ -288,7 +278,7 @@ class FirewallService:
     def stop(self) -> None:
         """Deliver queued events; blocks stay in force, and in the archive."""
         with self._lock:
-            self._stopped = True
+            self._floods.stop()
             self._incidents.flush()
         self._announcer.close()
 
@@ -296,11 +286,10 @@ class FirewallService:
         """Counters for the operator and for Prometheus."""
         return {
             **self._counts,
+            **self._floods.health(),
             "arp_thefts": self._thefts.thefts,
             "blocks": sum(not each.decision.dry_run for each in self._ledger.blocks.values()),
             "would_block": sum(each.decision.dry_run for each in self._ledger.blocks.values()),
-            "guarded": [str(service) for service in self._syn.guarded],
-            "guards": len(self._syn.guarded),
             "rate_limits": len(self._limits.standing),
             "rate_limits_refused": self._limits.refused,
             "known_sources": len(self._known),
@@ -310,12 +299,6 @@ class FirewallService:
             "refused_by_cap": self._ledger.refused,
             "blocking_stopped": int(bool(self._ledger.stopped)),
             "stopped_by": self._ledger.stopped,
-            "syns_kept": len(self._syn.recent),
-            "syn_samples": len(self._samples),
-            "resets": self._resets.sent,
-            "resets_spared": self._resets.spared,
-            "resets_left_out": self._resets.left_out,
-            "resets_waited_out": self._resets.waited_out,
             "bindings": len(self._bindings),
             "archive_away": self._archive.unanswered,
             "answers_unstored": self._stored.unstored,
@@ -399,116 +382,32 @@ class FirewallService:
     def _on_handshake(self, _: Item, shake: tuple[str, TcpService, int]) -> None:
         source, service, at = shake
         with self._lock:
-            self._counts["handshakes"] += 1
-            self._syn.handshake(source, service, self._time.fit(at))
+            self._floods.handshake(source, service, self._time.fit(at))
 
     def _on_flood(self, item: Item, flood: FloodReported) -> None:
-        summary = f"{flood.count} new half-open connections to {flood.dst} within a window"
         with self._lock:
-            now = self._time.fit(item.event_time)
-            self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
+            self._floods.report(item, flood, self._time.fit(item.event_time))
 
     def _on_surge(self, item: Item, flood: FloodReported) -> None:
-        """The switch has counted the SYNs itself; from now on some of them are copied."""
-        summary = f"{flood.count} SYNs went to {flood.dst} within {self._settings.syn.window_ms} ms"
         with self._lock:
-            now = self._time.fit(item.event_time)
-            self._request(self._samples.begin(flood.dst, time.monotonic()))
-            self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
-
-    def _request(self, requests: Iterable[dict[str, Any]]) -> None:
-        for request in requests:
-            self._engine.write(f"{TELEMETRY}.{request['name']}", request, [due.NO_WAIT])
+            self._floods.surge(item, flood, self._time.fit(item.event_time))
 
     def _on_syns(self, item: Item, batch: RecordBatch) -> None:
-        rules = self._settings.syn
         with self._lock:
             # by what came before: handshakes and SYNs come under keys of their own, in no order between the two
-            self._look_at_what_is_due()
+            self._floods.look_at_what_is_due()
             batch = self._believed(batch)
-            if not len(batch):
-                return
-            self._counts["syns"] += len(batch)
-            self._syn.recent.add(batch)
-            self._examinations.hear(int(batch["time_us"].max()) * 1000, time.monotonic())
-            if rules.copies == "suspects":
-                self._samples.taken(item.key.rpartition(".")[2], len(batch), time.monotonic())
-                self._request(self._samples.ended(time.monotonic()))
-            for surge in self._surges.add(batch) if rules.copies == "all" else ():
-                summary = f"{rules.threshold} SYNs went to {surge.host} within {rules.window_ms} ms"
-                self._suspect(Suspicion(surge.host, evidence_of(item, summary), surge.at, surge.window))
-            if self._examinations.live:
-                self._look_at_what_is_due()
+            if len(batch):
+                self._floods.syns(item, batch)
+
+    def _on_syn_acks(self, _: Item, batch: RecordBatch) -> None:
+        with self._lock:
+            self._floods.syn_acks(self._believed(batch), len(batch))
 
     def _believed(self, batch: RecordBatch) -> RecordBatch:
         """The packets with a plausible time."""
         rows = self._row_time.believed(batch["time_us"])
         return batch if rows is None else batch.take(rows)
-
-    def _on_syn_acks(self, _: Item, batch: RecordBatch) -> None:
-        with self._lock:
-            self._counts["syn_acks"] += len(batch)
-            self._answers.add(self._believed(batch), time.monotonic())
-
-    def _look_later(self, seconds: float) -> None:
-        """Use a timer: the next tick may come 50 ms later, and the next SYN never."""
-        timer = threading.Timer(seconds, self._wake)
-        timer.daemon = True
-        timer.start()
-
-    def _wake(self) -> None:
-        with self._lock:
-            if not self._stopped:
-                self._look_at_what_is_due()
-
-    def _suspect(self, suspicion: Suspicion) -> None:
-        if self._settings.syn.copies == "all" and not len(self._syn.recent):
-            # SYNs do not come: there is nothing to wait for
-            self._look(Examination(suspicion, suspicion.now, sure=False))
-        elif (wait := self._examinations.suspect(suspicion, time.monotonic())) is not None:
-            self._look_later(wait)
-
-    def _look_at_what_is_due(self) -> None:
-        for examination in self._examinations.due(time.monotonic()):
-            self._look(examination)
-
-    def _look(self, due: Examination) -> None:
-        """Examine the SYNs of a suspected flood, and decide."""
-        watch = self._syn.suspect(due.suspicion, due.at)
-        if self._is_too_early(watch, due):
-            again = replace(due.suspicion, now=due.at)
-            wait = self._examinations.suspect(again, time.monotonic())
-            if wait is not None:
-                self._look_later(wait)
-            return
-        often = watch.often(self._settings.syn) if due.sure else ()
-        offences = self._handler.offences_of_many(often, watch.now)
-        for decision in self._syn.conclude(watch, offences, sure=due.sure):
-            # the guard before the block has had the source's connections reset
-            decision = self._publish(decision, resets=False)  # noqa: PLW2901 - as it was published
-            if decision.action == "protect" and not decision.dry_run:
-                target = decision.target
-                wanted = Wanted(TcpService(target.address, target.port or 0), since=due.suspicion.since)
-                self._resets.plan(decision.id, wanted, time.monotonic())
-        if watch.unsure:
-            self._examinations.doubt(due, time.monotonic())
-
-    def _is_too_early(self, watch: Watch, due: Examination) -> bool:
-        """Whether the sample, which began with the report, is still too small to tell."""
-        rules = self._settings.syn
-        patience = rules.patience_ms * 1_000_000
-        waited = due.at - due.suspicion.since
-        return rules.copies == "suspects" and not due.sure and watch.total < rules.least and waited < patience
-
-    def _reset(self) -> None:
-        halves = self._resets.due(time.monotonic(), sorted(self._switches), self._syn.spared)
-        for switch in self._switches if halves else ():
-            for value in packet_outs(halves):
-                self._engine.write(f"network.packet_out.firewall.{switch}", value, [due.NO_WAIT])
-        while self._resets.notes:
-            note = self._resets.notes.popleft()
-            said = OperatorNotice("resets", f"{note.decision}: {note.text}", self._now)
-            self._announcer.say(said, logging.INFO)
 
     # -- ARP ----------------------------------------------------------------------------------
 
@@ -580,7 +479,7 @@ class FirewallService:
                 self._ledger.confirm(confirmation)
                 self._limits.confirm(confirmation)
             self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
-            self._resets.confirm(confirmation.id, confirmation.state, time.monotonic())
+            self._floods.confirmed(confirmation)
         if confirmation.state == "failed":
             words = f"{item.app_id} {confirmation.switch} refused {confirmation.id}: {confirmation.cause}"
             log.error("%s", one_line(words))
@@ -605,9 +504,8 @@ class FirewallService:
                 self._count(SWITCHES, state.switch, reading.id, reading.packets, state.event_time)
             self._mirrors.note(state.switch, mirror=state.mirror)
             self._arm(item, state)
-            self._examinations.live = state.clock != "packets"
+            self._floods.hear_switch(state, believed=believed)
             if believed:
-                self._examinations.tick(state.event_time)
                 self._lapse(state.event_time)
 
     def _lapse(self, now: int) -> None:
@@ -634,7 +532,7 @@ class FirewallService:
             family = "block_prefix"
             self._carry_out_prefix(decision, self._switches)
         elif resets and decision.action == "block" and target.kind == "ip" and not decision.dry_run:
-            self._resets.plan(decision.id, Wanted(source=target.address), time.monotonic())
+            self._floods.blocked(decision)
         self._engine.write(
             f"network.{family}.firewall.{kind}",
             decision.to_value(),
@@ -652,15 +550,8 @@ class FirewallService:
                 self._keep(switch, [prefix_update(kind, decision.target.address)], decision.id)
 
     def _say_notices(self) -> None:
-        counts = self._counts
-        if counts["syns"] > ONE_DIRECTION and not counts["syn_acks"] + counts["handshakes"]:
-            counts["syn_acks_missing"] = counts.get("syn_acks_missing", 0) + 1
-            if counts["syn_acks_missing"] == 1:
-                text = (
-                    f"{counts['syns']:,} SYNs and no SYN-ACK: nobody answers, or only one direction passes the switch;"
-                    " then no source becomes known, and half-open connections end by the server's own time-out"
-                )
-                self._announcer.say(OperatorNotice("one_direction", text, self._now))
+        if (notice := self._floods.one_direction(self._now)) is not None:
+            self._announcer.say(notice)
         for notices in (self._ledger.notices, self._limits.notices):
             while notices:
                 self._announcer.say(notices.popleft(), logging.ERROR)
