@@ -58,11 +58,14 @@ class FrameBlock:
         """The frames as they were on the wire: what was cut off is zeros."""
         if np.array_equal(self.captured, self.lengths):
             return self
-        data = np.zeros(int(self.lengths.sum(dtype=np.int64)), np.uint8)
-        ends = np.cumsum(self.lengths, dtype=np.int64)
-        shift = np.repeat(ends - self.lengths - self.starts()[:-1], self.captured)
-        data[np.arange(len(self.data)) + shift] = np.frombuffer(self.data, np.uint8)
-        return type(self)(self.times_us, self.lengths, self.lengths, data.tobytes())
+        missing = self.lengths.astype(np.int64) - self.captured
+        cut = np.flatnonzero(missing)
+        ends, zeros = self.starts()[1:][cut].tolist(), memoryview(bytes(int(missing.max())))
+        data, pieces, begin = memoryview(self.data), list[memoryview](), 0
+        for end, lacking in zip(ends, missing[cut].tolist(), strict=True):
+            pieces += data[begin:end], zeros[:lacking]
+            begin = end
+        return type(self)(self.times_us, self.lengths, self.lengths, b"".join((*pieces, data[begin:])))
 
     def frames(self) -> Iterator[bytes]:
         """One frame after the other, as captured."""

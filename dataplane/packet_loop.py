@@ -217,7 +217,7 @@ class PacketLoop:
         port.done(result.verdicts)
 
     def _send_slices(self, outputs: FrameSlices) -> None:
-        for number in np.unique(outputs.ports).tolist():
+        for number in np.flatnonzero(np.bincount(outputs.ports)).tolist():
             of_port, port = outputs.to(number), self._ports.get(number)
             if isinstance(port, NullPort):
                 port.counters.sent += len(of_port)

@@ -16,6 +16,7 @@ Exit codes: 2 wrong options, 1 a backend or the app failed, or a thread died.
 """
 
 import argparse
+import gc
 import json
 import logging
 import os
@@ -256,6 +257,8 @@ class _Run:
             self._report()
             self._status.liveness = liveness.state
             self._status.start()
+        # modules and what was restored stay: scanning them again and again took a twentieth of all CPU of a replay
+        gc.freeze()
         print(json.dumps(self._ready()), flush=True)
         try:
             self._go_round(stopped, liveness)

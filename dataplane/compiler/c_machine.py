@@ -291,13 +291,15 @@ class CMachine:
             return FrameSlices(numbers[rows], begins[rows], ends[rows], records)
 
         reported = kinds == _OUT_DIGEST
+        samples = {}
+        for number, name in self._digests.items():
+            mine = reported & (numbers == number)
+            if mine.any():
+                samples[name] = slices(mine).frames()
         return BatchResult(
             outputs=slices(kinds == _OUT_PORT),
             packet_ins=slices(kinds == _OUT_CPU).frames(),
-            samples={
-                self._digests[number]: slices(reported & (numbers == number)).frames()
-                for number in np.unique(numbers[reported]).tolist()
-            },
+            samples=samples,
             verdicts=verdicts,
         )
 
