@@ -71,7 +71,7 @@ _LEDGERS: Final = (
             neighbours_share, least_scale_share, asked_s, present_s, theft, again_s, soon_s;
         int32_t refused_bytes, replies_count, chosen, blocks, most_logins;
     } BehaviourLimits;
-    typedef struct { int32_t windows, own; double window[4], least_scale; } CounterSettings;
+    typedef struct { int32_t windows, own, rates; double window[4], least_scale; } CounterSettings;
     typedef struct {
         int32_t what, block;
         uint64_t who[4], victim[2];
@@ -109,7 +109,7 @@ _LEDGERS: Final = (
     typedef struct {
         int32_t what, kept_in, kept_at, row;
         uint64_t who[4];
-        int64_t second, packets, over, destinations, first_over, training_rate, training_destinations;
+        int64_t second, packets, over, destinations; uint64_t first_over; int64_t training_rate, training_destinations;
         double peak;
     } SenderEvent;
     typedef struct Senders Senders;

@@ -18,7 +18,7 @@ typedef struct {
 } BehaviourLimits;
 
 typedef struct {
-    int32_t windows, own;
+    int32_t windows, own, rates;
     double window[MOST_WINDOWS], least_scale;
 } CounterSettings;
 
@@ -155,6 +155,15 @@ static const double *counts_of(const Table *table, const Subject *key)
     return at == NONE ? NULL : payload(table, at);
 }
 
+/* Nats of a count above everybody's highest, without its rarity. */
+static double counter_excess(const Counter *counter, double count, double most)
+{
+    double least = counter->set.least_scale;
+    if (counter->set.rates)
+        return log((count + least) / (most + least)) / counter->shared_scale;
+    return (count - most) / fmax(least, counter->shared_scale * most);
+}
+
 static Seen counter_measure(const Counter *counter, const BehaviourLimits *limits, const Subject *whose, const double *sums, uint64_t kind)
 {
     Subject by_kind = {{kind, 0, 0, 0, 0, 0}};
@@ -162,10 +171,8 @@ static Seen counter_measure(const Counter *counter, const BehaviourLimits *limit
     Seen best = {0, 0, sums[0], counter->set.window[0], 0};
     for (int i = 0; i < counter->usable; i++) {
         double count = sums[i], most = shared ? shared[i] : 0;
-        if (count > most) {
-            double scale = fmax(counter->set.least_scale, counter->shared_scale * most);
-            weigh_more(&best, counter->rarity + (count - most) / scale, count, counter->set.window[i], most);
-        }
+        if (count > most)
+            weigh_more(&best, counter->rarity + counter_excess(counter, count, most), count, counter->set.window[i], most);
         if (own) {
             double usual = fmax(own[i], limits->neighbours_share * most);
             if (count > usual) {

@@ -18,7 +18,8 @@ _EVENT: Final = np.dtype(
     [
         *((name, "i4") for name in ("what", "kept_in", "kept_at", "row")),
         *((name, "u8") for name in ("ends", "where", "hi", "lo")),
-        *((name, "i8") for name in ("second", "packets", "over", "destinations", "first_over")),
+        *((name, "i8") for name in ("second", "packets", "over", "destinations")),
+        ("first_over", "u8"),
         *(("training_rate", "i8"), ("training_destinations", "i8"), ("peak", "f8")),
     ]
 )

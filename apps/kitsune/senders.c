@@ -17,7 +17,9 @@ enum { SEEN, TOWARDS, TRAINED, CLOCK_SET_BACK, ANOMALOUS, FORGOTTEN };
 typedef struct {
     int32_t what, kept_in, kept_at, row;
     uint64_t who[4];
-    int64_t second, packets, over, destinations, first_over, training_rate, training_destinations;
+    int64_t second, packets, over, destinations;
+    uint64_t first_over;
+    int64_t training_rate, training_destinations;
     double peak;
 } SenderEvent;
 
@@ -169,7 +171,7 @@ static void tell_anomalous(Senders *s, const Tally *tally, Record *record, int64
     event->packets = tally->packets;
     event->over = tally->over;
     event->destinations = tally->destinations;
-    event->first_over = (int64_t)tally->first_over;
+    event->first_over = tally->first_over;
     event->peak = tally->peak;
     event->training_rate = record->training_rate;
     event->training_destinations = record->training_destinations;

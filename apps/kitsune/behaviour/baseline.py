@@ -9,15 +9,18 @@ they are and in whatever statistic, then what is above everybody's highest weigh
 
     ln(m / n) + excess / scale
 
-nats.  A host is above its own highest as often as the bound assumes, so that this weighs excess / scale only.
-Blocks are long, so counts that belong together fall into one, and no independence of packets is assumed.
+nats.  Rates of single conversations spread over orders of magnitude: of these the excess is that of the logarithms,
+so that the tail is a power law, with an exponent of 2.5 at most.  A host is above its own highest as often as the
+bound assumes, so that this weighs excess / scale only.  Blocks are long, so counts that belong together fall into
+one, and no independence of packets is assumed.
 
-Source: block maxima and the jackknife (Coles, An Introduction to Statistical Modeling of Extreme Values, 2001,
-chapter 3; Efron, 1982).
+Source: heavy tails of traffic (Crovella & Bestavros, Self-similarity in World Wide Web traffic, 1997); block maxima
+and the jackknife (Coles, An Introduction to Statistical Modeling of Extreme Values, 2001, chapter 3; Efron, 1982).
 """
 
+import math
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -27,10 +30,12 @@ BLOCKS: Final = 10
 MOST_EVENTS: Final = 1_024
 """Events remembered of one subject; of more within a window the oldest do not count."""
 MOST_SUBJECTS: Final = 65_536
-LEAST_SCALE: Final = 0.75
+LEAST_SCALE: Final = 1.0
 """Events: the scale of the tail where training shows no variation at all."""
 LEAST_SHARE: Final = 0.25
 """The scale is at least this share of the highest count of training."""
+LEAST_LOG_SCALE: Final = 0.4
+"""The same for logarithms of rates: a power law with an exponent of 2.5 at most, as rates of flows have."""
 NEIGHBOURS_SHARE: Final = 0.1
 """A subject may do at least this share of what the busiest of all does: a quiet hour of training proves little."""
 
@@ -101,11 +106,13 @@ class BlockMaxima:
         return columns
 
 
-def _excesses(maxima: Iterable[BlockMaxima], windows: int, early: int) -> tuple[float, float]:
+def _excesses(
+    maxima: Iterable[BlockMaxima], windows: int, early: int, relative: Callable[[float, float], float]
+) -> tuple[float, float]:
     """Leave out each block in turn.
 
     Returns:
-        The mean excess of a block above all others, as a share of their highest count (plus one); and how many
+        The mean excess of a block above all others, in the units of `relative`; and how many
         blocks of a training are above all others, those apart in which everything was new.
     """
     ratios: list[float] = []
@@ -115,7 +122,7 @@ def _excesses(maxima: Iterable[BlockMaxima], windows: int, early: int) -> tuple[
             rest = each.highest(windows, without=block)
             above = [(count, most) for count, most in zip(counts, rest, strict=True) if count > most]
             exceeding += bool(above) and block >= early
-            ratios += [(count - most) / (most + 1) for count, most in above if most]
+            ratios += [relative(count, most) for count, most in above if most]
     return sum(ratios) / len(ratios) if ratios else 0.0, exceeding * BLOCKS / (BLOCKS - early)
 
 
@@ -141,19 +148,24 @@ class Baseline:
         windows: number of window lengths.
         least_scale: of the tail, where training shows no variation at all.
         own: compare a subject with its own highest counts, too.
+        rates: counts are rates of conversations, whose tail is a power law; without `own`.
     """
 
-    def __init__(self, windows: int, least_scale: float = LEAST_SCALE, *, own: bool = True) -> None:
+    def __init__(
+        self, windows: int, least_scale: float = LEAST_SCALE, *, own: bool = True, rates: bool = False
+    ) -> None:
         self._windows = windows
         self.least_scale = least_scale
         self.own = own
+        self.rates = rates
+        self._least_share = LEAST_LOG_SCALE if rates else LEAST_SHARE
         self._learning: dict[Any, BlockMaxima] = {}
         self._kinds: dict[Any, BlockMaxima] = {}
         self.highest: dict[Any, list[float]] = {}
         """Highest counts by subject and window."""
         self.shared: dict[Any, list[float]] = {}
         """The same over all subjects, by kind: what somebody unknown may do."""
-        self._own_scale = self._shared_scale = LEAST_SHARE
+        self._own_scale = self._shared_scale = self._least_share
         self.exceeded = 0.0
         """How often a block of training was above all others, whoever's counts they were."""
         self.rarity = 0.0
@@ -192,16 +204,28 @@ class Baseline:
                 known by now; newcomers are compared with them nevertheless.
         """
         self.shared = {kind: maxima.highest(self._windows) for kind, maxima in self._kinds.items()}
-        relative, self.exceeded = _excesses(self._kinds.values(), self._windows, early)
-        self._shared_scale = max(relative, LEAST_SHARE)
+        relative, self.exceeded = _excesses(self._kinds.values(), self._windows, early, self._relative)
+        self._shared_scale = max(relative, self._least_share)
         late = {
             subject: BlockMaxima({block: counts for block, counts in maxima.blocks.items() if block >= early})
             for subject, maxima in self._learning.items()
         }
         self.highest = {subject: maxima.highest(self._windows) for subject, maxima in late.items()}
-        self._own_scale = max(_excesses(late.values(), self._windows, early)[0], LEAST_SHARE)
+        self._own_scale = max(_excesses(late.values(), self._windows, early, self._relative)[0], LEAST_SHARE)
         self._learning.clear()
         self._kinds.clear()
+
+    def _relative(self, count: float, most: float) -> float:
+        """How far a block's count is above the highest of all others, in units that all kinds share."""
+        if self.rates:
+            return math.log((count + self.least_scale) / (most + self.least_scale))
+        return (count - most) / (most + 1)
+
+    def _excess(self, count: float, most: float) -> float:
+        """Nats of a count above everybody's highest, without its rarity."""
+        if self.rates:
+            return self._relative(count, most) / self._shared_scale
+        return (count - most) / max(self.least_scale, self._shared_scale * most)
 
     def nats(self, subject: Any, counts: tuple[float, ...], kind: Any = None) -> Weighed:
         """Weigh counts.
@@ -216,8 +240,7 @@ class Baseline:
         shared = self.shared.get(kind) or [0.0] * self._windows
         for number, (count, most) in enumerate(zip(counts, shared, strict=False)):
             if count > most:
-                scale = max(self.least_scale, self._shared_scale * most)
-                best = best.or_more(self.rarity + (count - most) / scale, number, most)
+                best = best.or_more(self.rarity + self._excess(count, most), number, most)
             if own is not None:
                 usual = max(own[number], NEIGHBOURS_SHARE * most)
                 if count > usual:

@@ -159,7 +159,7 @@ class Behaviour:
             "ports": StatisticCounter(windows=BURST_WINDOWS_S),
             "targets": StatisticCounter(windows=BURST_WINDOWS_S, own=False),
             "logins": StatisticCounter(0.9, own=False),
-            "one_way": StatisticCounter(8.0, (1.0,), own=False),
+            "one_way": StatisticCounter(8.0, (1.0,), own=False, rates=True),
             "claims": StatisticCounter(),
             "thefts": StatisticCounter(),
             "strangers": StatisticCounter(1.5, (1.0, 10.0)),
@@ -301,7 +301,7 @@ class Behaviour:
         if call is None:
             return []
         added = self._called.added(call.sender, self._callbacks.nats, ended.time)
-        seen = SeenCount(added, self._callbacks.nats, 1.0, call.seconds, self._callbacks.back)
+        seen = SeenCount(added, self._callbacks.nats, 1.0, call.seconds, float(self._callbacks.back))
         found = Finding("callbacks", call.sender, call.host, call.service, *seen, ended.time, ended.arrival)
         return [found] if added else []
 

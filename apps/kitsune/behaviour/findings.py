@@ -110,9 +110,10 @@ class StatisticCounter:
         windows: tuple[float, ...] = WINDOWS_S,
         *,
         own: bool = True,
+        rates: bool = False,
     ) -> None:
         self.sums = SlidingSums(windows)
-        self.baseline = Baseline(len(windows), least_scale, own=own)
+        self.baseline = Baseline(len(windows), least_scale, own=own, rates=rates)
         self.found = FoundSoFar()
         self.usable = len(windows)
 

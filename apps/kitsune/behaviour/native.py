@@ -199,6 +199,7 @@ class NativeBehaviour(Behaviour):
                 {
                     "windows": len(counter.sums.windows),
                     "own": counter.baseline.own,
+                    "rates": counter.baseline.rates,
                     "window": list(counter.sums.windows),
                     "least_scale": counter.baseline.least_scale,
                 }

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.kitsune.behaviour.baseline import MOST_EVENTS, Baseline, SlidingSums
+from apps.kitsune.behaviour.baseline import LEAST_SCALE, MOST_EVENTS, Baseline, SlidingSums
 
 
 def learnt(counts_of_blocks, subject="host", early=0):
@@ -77,7 +77,7 @@ def test_each_kind_has_its_own_highest_count():
         baseline.learn("host", block, (9.0,), "common")
     baseline.close()
     assert baseline.nats("host", (9,), "common").nats == 0
-    assert baseline.nats("host", (9,), "never seen").nats > 10
+    assert baseline.nats("host", (9,), "never seen").nats == pytest.approx(9 / LEAST_SCALE)
 
 
 def test_being_above_everybody_weighs_more_than_above_oneself():
@@ -107,3 +107,16 @@ def test_state_survives_json():
         assert again.nats(("s1", 1, (2, 3)), (9,), kind) == seen
     with pytest.raises(ValueError, match="windows"):
         Baseline(2).restore(baseline.to_state())
+
+
+def test_rates_weigh_by_orders_of_magnitude():
+    """A stream three times as fast as any before may be a new program; one a thousand times as fast is a flood."""
+    baseline = Baseline(1, 8.0, own=False, rates=True)
+    for block in range(4):
+        baseline.learn("host", block, (40.0,), "udp")
+    baseline.close()
+    assert baseline.nats("other", (40,), "udp").nats == 0
+    assert baseline.nats("other", (120,), "udp").nats < 3
+    assert baseline.nats("other", (4_000,), "udp").nats > 10
+    doubled = [baseline.nats("other", (48 * 2**n - 8,), "udp").nats for n in (1, 2, 3)]
+    assert doubled[1] - doubled[0] == pytest.approx(doubled[2] - doubled[1])
