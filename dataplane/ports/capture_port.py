@@ -16,6 +16,7 @@ import select
 import socket
 import struct
 import threading
+import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,6 +41,8 @@ _MAX_BLOCK_FRAMES = 1 << 16
 _MAX_BLOCK_BYTES = 1 << 28
 _CHUNK = 1 << 18
 _VERDICTS_WAITING = 1 << 20
+PATIENCE_S = 90.0
+"""Seconds for which a feeder waits for a switch that reads nothing."""
 
 
 class CapturePortError(DataplaneError):
@@ -261,11 +264,13 @@ class CaptureFeed:
     b'\\x03\\x03'
 
     path: the switch's socket
+    patience_s: seconds after which a switch that reads nothing has failed
 
     Raises CaptureError where nobody listens there.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, patience_s: float = PATIENCE_S) -> None:
+        self._patience_s = patience_s
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.connect(path)
@@ -285,7 +290,7 @@ class CaptureFeed:
         self._epoll.register(self._kept.fileno(), select.EPOLLIN)
 
     def send(self, times_us: Sequence[int], wire_lengths: Sequence[int], frames: Sequence[bytes]) -> None:
-        """Frames in order; blocks while the switch does not read.
+        """Frames in order; blocks while the switch does not read, until the feeder's patience is over.
 
         times_us: µs since the capture's base second
         wire_lengths: bytes on the wire, at least what was captured
@@ -302,17 +307,21 @@ class CaptureFeed:
         self._send(_packed(block))
 
     def _send(self, data: bytes) -> None:
-        view = memoryview(data)
+        view, since = memoryview(data), time.monotonic()
         while view:
             # verdicts are read meanwhile: two ends that both wait to write would wait for ever
-            readable, writable, _ = select.select([self._socket], [self._socket], [])
+            readable, writable, _ = select.select([self._socket], [self._socket], [], self._patience_s)
+            if not writable and time.monotonic() - since >= self._patience_s:
+                raise CapturePortError(
+                    f"the switch has read nothing from its capture port for {self._patience_s:.0f} s"
+                )
             if readable:
                 with self._lock:
                     self._receive()
                 self._kept.set()
             if writable:
                 try:
-                    view = view[self._socket.send(view) :]
+                    view, since = view[self._socket.send(view) :], time.monotonic()
                 except BlockingIOError:
                     continue
                 except OSError as error:

@@ -150,3 +150,12 @@ def test_nobody_there_is_said_plainly(tmp_path):
 def test_a_folder_that_does_not_exist_is_said_plainly(tmp_path):
     with pytest.raises(PortError, match="writable folder"):
         CapturePort(str(tmp_path / "none" / "s"))
+
+
+def test_a_switch_that_stops_reading_is_an_error_not_a_wait_for_ever(tmp_path):
+    """A replay whose switch hangs ends with a reason."""
+    path = str(tmp_path / "s")
+    with contextlib.closing(CapturePort(path)), CaptureFeed(path, patience_s=0.05) as feed:
+        frames = [bytes(60_000)] * 400
+        with pytest.raises(CapturePortError, match="has read nothing"):
+            feed.send([0] * len(frames), [60_000] * len(frames), frames)
