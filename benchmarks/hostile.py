@@ -116,7 +116,8 @@ def attack_all(
         kind: [each for each in targets if is_sanitized(each) == (kind == SANITIZED)]
         for kind in (PLAIN, SANITIZED)
     }
-    by_coverage = [name for name, kind in kinds.items() if kind == PLAIN and guided and _has_atheris()]
+    guided = guided and _has_atheris()
+    by_coverage = [name for name, kind in kinds.items() if kind == PLAIN and guided]
     with ThreadPoolExecutor(1) as builder:
         # at once, beside the other targets: it takes longer than most of them
         built = builder.submit(builds) if modules[SANITIZED] else None
