@@ -25,7 +25,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.chaos_checker import Violation, check
+from benchmarks.chaos_checker import Violation, check, longest_gaps
 from benchmarks.chaos_faults import ACTIONS, FaultAction, left_out
 from benchmarks.chaos_frames import LATE_S, ForwardingProbe
 from benchmarks.chaos_probes import Probes, until
@@ -69,6 +69,7 @@ class ChaosRun:
         self._spoken = 0
         self._begun: list[tuple[float, PlannedFault]] = []
         self._settled_s = float("nan")
+        self._breaking_since = float("nan")
 
     def go(self) -> dict[str, Any]:
         """Start, break, settle, judge."""
@@ -138,7 +139,7 @@ class ChaosRun:
         return self._pair[name].process.pid if name in self._pair else self._stage.supervisor.pids()[name]
 
     def _break(self) -> None:
-        began = time.monotonic()
+        began = self._breaking_since = time.monotonic()
         told = began + _PROGRESS_S
         lasting: list[tuple[float, FaultAction]] = []
         for fault in [*self._faults, None]:
@@ -237,6 +238,8 @@ class ChaosRun:
             "machine_gap_ms": self._gap_by_target(machine_gaps),
             "forwarding_lost_ms": self._gap_by_target(self._gaps(self._wire, float("inf"))),
             "machine_lost_ms": self._gap_by_target(self._gaps(self._control, float("inf"))),
+            "gaps": self._longest(self._wire),
+            "machine_gaps": self._longest(self._control),
             "seed": self._seed,
             "seconds": self._seconds,
             "settled_s": self._settled_s,
@@ -278,6 +281,9 @@ class ChaosRun:
             index = max((n for n, (begun, _) in enumerate(self._begun) if begun <= at + 0.05), default=-1)
             longest[index] = max(longest.get(index, 0.0), length)
         return longest
+
+    def _longest(self, probe: ForwardingProbe | None) -> list[dict[str, float]]:
+        return longest_gaps(probe.gaps(), self._breaking_since) if probe is not None else []
 
     def _gap_by_target(self, gaps: dict[int, float]) -> dict[str, float]:
         found = {"none": gaps.get(-1, 0.0)}

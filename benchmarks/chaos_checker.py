@@ -237,3 +237,17 @@ def gap_ms(sent: Sequence[float], missed: Sequence[int]) -> list[tuple[float, fl
         )
         for first, last in runs
     ]
+
+
+def longest_gaps(
+    gaps: Sequence[tuple[float, float]], began: float, most: int = 100
+) -> list[dict[str, float]]:
+    """The longest gaps, in order of time, so that they can be held against logs.
+
+    Args:
+        gaps: as `gap_ms` returns them.
+        began: when the first fault was due, on the same clock, s.
+        most: how many are kept.
+    """
+    kept = sorted(sorted(gaps, key=lambda gap: gap[1])[-most:])
+    return [{"time": round(at - began, 2), "ms": round(length, 1)} for at, length in kept]

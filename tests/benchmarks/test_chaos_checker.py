@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.chaos_checker import Asked, Decided, Passed, RunRecord, Word, check, gap_ms
+from benchmarks.chaos_checker import Asked, Decided, Passed, RunRecord, Word, check, gap_ms, longest_gaps
 
 BLOCK = Decided("d1", "block", "20.0.7.9")
 LIFT = Decided("d1", "unblock", "20.0.7.9")
@@ -111,6 +111,11 @@ def test_gaps_are_runs_of_missed_frames():
     sent = [0.0, 0.5, 1.0, 1.5, 2.0]
     assert gap_ms(sent, [1, 2, 4]) == [(0.5, 1000.0), (2.0, 500.0)]
     assert gap_ms(sent, []) == []
+
+
+def test_the_longest_gaps_are_told_in_order_of_time():
+    found = longest_gaps([(14.0, 30.04), (11.0, 5.0), (12.5, 800.0)], 10.0, most=2)
+    assert found == [{"time": 2.5, "ms": 800.0}, {"time": 4.0, "ms": 30.0}]
 
 
 def test_what_a_damaged_archive_took_with_it_is_excused():
