@@ -162,10 +162,12 @@ class Corrupt(Kill):
     def begin(self) -> None:
         super().begin()
         spool = self.stage.spool(self.fault.targets[0])
-        spool.mkdir(parents=True, exist_ok=True)
         for file in [each for each in spool.rglob("*") if each.is_file()]:
             _damage(file)
-        (spool / "spool-9.db").write_bytes(os.urandom(4096))
+        # a disk that another fault has filled takes no damaged file more
+        with suppress(OSError):
+            spool.mkdir(parents=True, exist_ok=True)
+            (spool / "spool-9.db").write_bytes(os.urandom(4096))
 
 
 class CorruptArchive(FaultAction):
