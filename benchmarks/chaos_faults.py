@@ -164,7 +164,7 @@ class Corrupt(Kill):
         spool = self.stage.spool(self.fault.targets[0])
         for file in [each for each in spool.rglob("*") if each.is_file()]:
             _damage(file)
-        # a disk that another fault has filled takes no damaged file more
+        # a full disk takes no damaged file more
         with suppress(OSError):
             spool.mkdir(parents=True, exist_ok=True)
             (spool / "spool-9.db").write_bytes(os.urandom(4096))

@@ -160,6 +160,8 @@ class SqliteFile:
         self._path = path
         self._synchronous = synchronous
         self._closed = False
+        self._written: sqlite3.Connection | None = None
+        """The connection whose transaction runs now: whoever runs it closes it where it was let go meanwhile."""
         self._reset()
 
     def _reset(self) -> None:
@@ -232,11 +234,11 @@ class SqliteFile:
             self._enter()
             if self._writer is None:
                 self._writer = self._connect()
-            connection = self._writer
-            connection.execute("BEGIN IMMEDIATE")
-            self.keys.forget()
-            self.sources.forget()
+            connection = self._written = self._writer
             try:
+                connection.execute("BEGIN IMMEDIATE")
+                self.keys.forget()
+                self.sources.forget()
                 yield connection
                 connection.execute("COMMIT")
                 self._check_place()
@@ -245,6 +247,11 @@ class SqliteFile:
                 if connection.in_transaction:
                     connection.execute("ROLLBACK")
                 raise
+            finally:
+                if self._written is connection:
+                    self._written = None
+                if self._writer is not connection:
+                    connection.close()
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
@@ -295,9 +302,14 @@ class SqliteFile:
         )
 
     def _let_go(self) -> None:
-        """Drop connections to a damaged or moved file; the next call reopens it.  Running reads close their own."""
+        """Drop connections to a damaged or moved file; the next call reopens it.  What runs closes its own.
+
+        Left to the garbage collector they would keep the old file's space taken.
+        """
         for connection in self._idle:
             connection.close()
+        if self._writer is not None and self._writer is not self._written:
+            self._writer.close()
         self._reset()
 
     def shrink(self) -> None:

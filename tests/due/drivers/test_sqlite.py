@@ -1,7 +1,9 @@
 """The file archive: many processes at a time, index use, honest errors, nothing left open over a fork."""
 
+import gc
 import multiprocessing
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -253,6 +255,26 @@ def test_a_file_that_is_moved_away_is_written_no_more(tmp_path: Path, *, instead
     old = opened(tmp_path / "folder")
     assert [item.sequence for item in old.find({})] == [1, 2, 3], "what stood there stays readable"
     old.close()
+
+
+def test_a_file_that_was_replaced_takes_no_space(tmp_path: Path) -> None:
+    """Nobody waits for the garbage collector, which may come late or never."""
+    archive = opened(tmp_path)
+    gc.disable()
+    try:
+        for start in (1, 2, 3):
+            archive.insert(items(1, start=start))
+            assert archive.find({})
+            shutil.copyfile(tmp_path / "archive.db", tmp_path / "copy.db")
+            for end in ("-wal", "-shm"):
+                (tmp_path / f"archive.db{end}").unlink(missing_ok=True)
+            (tmp_path / "copy.db").replace(tmp_path / "archive.db")
+            archive.insert(items(1, start=start + 20))
+            held = [str(each.readlink()) for each in Path("/proc/self/fd").iterdir() if each.is_symlink()]
+            assert [each for each in held if str(tmp_path) in each and "deleted" in each] == []
+    finally:
+        gc.enable()
+    archive.close()
 
 
 def test_a_file_that_is_moved_away_while_it_is_written_has_not_taken_it(tmp_path: Path) -> None:
