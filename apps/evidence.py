@@ -128,6 +128,8 @@ class TrainingState(Message, frozen=True, kw_only=True):
     """Capture time of training."""
     senders: Number
     """Senders that training has seen."""
+    hosts: Number = 0
+    """MAC addresses among them: those behind a router have its own.  0 until training is done."""
     event_time: Time
     """Of the last packet, ns."""
     seconds_left: Rate | None = None

@@ -12,7 +12,9 @@ of the paper (block at the first score over the threshold) and the rule of secon
     novelty_blocks            blocks in benign novelty
     false_blocks_per_day, …_upper95   blocks a day of benign traffic, and the upper end of its 95 % interval
     real_benign               the benign part of the real capture: packets behind training, blocks
-    by_attack                 with the packets dropped and challenged, and the packets and hosts of others that were hit
+    by_attack                 with the packets dropped and challenged, and the packets and hosts of others that were hit;
+                              `peak_score` and `over_1` are Kitsune's scores of the attack's packets, those dropped
+                              apart: where none is over 1, the two other rules cannot block
     paper_rule, seconds_rule  the same under these rules
     fastnetmon                Debian's FastNetMon on the floods (seed 1), with its settings, or why it was not run
 
@@ -296,6 +298,8 @@ def _attack(run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpe
         "seed": seed,
         "s_to_decision": min(((each.time_ns - first_ns) / 1e9 for each in good), default=math.inf),
         "packets": int(mine.sum()),
+        "peak_score": float(run.scores[mine].max(initial=0.0)),
+        "over_1": int((run.scores[mine] >= 1).sum()),
         "stopped_share": float(stopped[mine].mean()) if mine.any() else 0.0,
         "dropped": int((stopped & ~run.challenges & ~run.limited)[mine].sum()),
         "challenged": int(run.challenges[mine].sum()),

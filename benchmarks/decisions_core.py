@@ -68,6 +68,8 @@ class DecisionRun:
     """Which packets of the last `feed` were challenged; they are among the stopped."""
     limited: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     """Which packets of the last `feed` were over a rate limit."""
+    scores: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    """Kitsune's scores of the packets of the last `feed`; 0 for those that were dropped."""
 
     def __post_init__(self) -> None:
         self.detector = self.watched or detector_for(self.training_packets)
@@ -89,6 +91,7 @@ class DecisionRun:
         stopped = np.zeros(len(traffic), bool)
         self.challenges = np.zeros(len(traffic), bool)
         self.limited = np.zeros(len(traffic), bool)
+        self.scores = np.zeros(len(traffic))
         start = 0
         while start < len(traffic):
             learning = self.training_packets - self.detector.trained
@@ -107,12 +110,14 @@ class DecisionRun:
             left = ~drops
             if left.any():
                 rows = columns if left.all() else {name: column[left] for name, column in columns.items()}
-                self._look(rows)
+                self.scores[part][left] = self._look(rows)
         return stopped
 
-    def _look(self, columns: Mapping[str, Any]) -> None:
-        _, alerts = self.detector.process(RecordBatch(dict(columns)), SWITCH)
+    def _look(self, columns: Mapping[str, Any]) -> npt.NDArray[np.float64]:
+        """Take rows; returns their scores."""
+        scored, alerts = self.detector.process(RecordBatch(dict(columns)), SWITCH)
         self.judge(alerts, self.detector.take_evidence(), int(columns["time_us"][-1]) * 1_000)
+        return scored.scores
 
     def judge(self, alerts: Sequence[Alert], heard: Sequence[Evidence], now: int) -> None:
         """Decide about what the detector has said until a capture time, ns."""

@@ -23,6 +23,9 @@ from due import Item
 
 EVIDENCE_KEPT: Final = 10
 SENDERS_KEPT: Final = 10_000
+TARGETS_KEPT: Final = 1_000
+OFFENCES_HOLD_S: Final = 10.0
+"""Seconds for which the archived blocks of a target are not asked for again."""
 
 
 class EvidenceHandler:
@@ -38,6 +41,7 @@ class EvidenceHandler:
         incidents: what belongs together.
         lessons: what was called a false alarm.
         publish: writes a decision.
+        clock: monotonic time, seconds.
     """
 
     def __init__(
@@ -51,6 +55,7 @@ class EvidenceHandler:
         incidents: IncidentReports,
         lessons: FalseAlarms,
         publish: Callable[[Decision], Decision],
+        clock: Callable[[], float],
     ) -> None:
         self.decider = decider
         self._ledger = ledger
@@ -61,6 +66,9 @@ class EvidenceHandler:
         self._incidents = incidents
         self._lessons = lessons
         self._publish = publish
+        self._clock = clock
+        self._earlier: dict[Target, tuple[float, list[Item]]] = {}
+        """Archived blocks by target, and when they were read."""
         self._exhibits: defaultdict[Sender, deque[Exhibit]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
 
     def alert(self, item: Item, alert: Alert) -> None:
@@ -148,8 +156,25 @@ class EvidenceHandler:
 
     def _offences_of(self, target: Target, now: int) -> int | None:
         """Earlier blocks of a target; None if the archive does not answer."""
-        earlier = self._archive.find(history.offences_query(target), most=OFFENCES_READ)
+        earlier = self._earlier_blocks(target)
         return None if earlier is None else history.count_offences(earlier, target, now, self._lessons)
+
+    def decided(self) -> None:
+        """A decision was published: the archive knows more than was read."""
+        self._earlier.clear()
+
+    def _earlier_blocks(self, target: Target) -> list[Item] | None:
+        """Evidence about one sender comes many times a second, and a query would hold each piece up."""
+        now = self._clock()
+        read_at, found = self._earlier.get(target, (float("-inf"), []))
+        if now - read_at < OFFENCES_HOLD_S:
+            return found
+        asked = self._archive.find(history.offences_query(target), most=OFFENCES_READ)
+        if asked is not None:
+            if len(self._earlier) >= TARGETS_KEPT:
+                self._earlier.clear()
+            self._earlier[target] = now, asked
+        return asked
 
     def offences_of_many(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
         """Earlier blocks by address; None if the archive does not answer."""

@@ -168,6 +168,7 @@ class FirewallService:
             self._incidents,
             self._lessons,
             self._publish,
+            lambda: time.monotonic(),  # noqa: PLW0108 - tests set the clock of this module
         )
         self._thefts = TheftHandler(
             settings.arp,
@@ -249,7 +250,9 @@ class FirewallService:
         self._limits.restore(standing)
         self._incidents.restore(self._past.incidents())
         self._lessons.restore(self._past.false_alarms())
-        self._handler.decider.trained(self._past.training())
+        training = self._past.training()
+        self._handler.decider.trained(training)
+        self._ledger.trained_hosts = 0 if training is None else training.hosts
         if standing:
             log.info("decisions in force from the archive: %d", len(standing))
 
@@ -428,6 +431,7 @@ class FirewallService:
     def _on_training(self, _: Item, state: TrainingState) -> None:
         with self._lock:
             self._handler.decider.trained(state)
+            self._ledger.trained_hosts = state.hosts
 
     def _on_evidence(self, item: Item, evidence: Evidence) -> None:
         with self._lock:
@@ -526,6 +530,7 @@ class FirewallService:
         kind = ("ipv6" if ":" in target.address else "ipv4") if target.kind == "ip" else "mac"
         log.warning("%s %s: %s", decision.action, decision.what, one_line(decision.reason))
         self._incidents.decided(decision)
+        self._handler.decided()
         self._lessons.decided(decision)
         family = FAMILIES[decision.action]
         if is_prefix(target) and family == "block":

@@ -389,6 +389,7 @@ class KitsuneService:
             done=model.is_trained,
             seconds=behaviour.seconds,
             senders=len(behaviour.senders),
+            hosts=len({mac for _, _, mac, _ in behaviour.senders}) if model.is_trained else 0,
             event_time=event_time,
             seconds_left=0.0 if model.is_trained else self._progress.seconds_left(event_time // 1_000),
             ports=tuple(

@@ -5,7 +5,8 @@
                  └────────────────────────────────────────────────┘
 
 The feeder keeps a bounded number of packets in flight, counted by scored + dropped, so that no queue
-of the loop can overflow and the loop's delay, in packets, is small and known.
+of the loop can overflow and the loop's delay, in packets, is small and known.  A replay may be a hundred times as fast
+as its capture, so it does not run further than a second of capture time ahead of a decision that is on its way.
 """
 
 import tempfile
@@ -59,6 +60,10 @@ COORDINATED = "coordinated"
 """Phase of an engine whose declarations the Coordinator knows."""
 _DECIDED = ("block", "unblock", "protect", "unprotect", "meter", "unmeter")
 """Actions of confirmed decisions; prefixes are blocked by commands that carry the decision's id."""
+STOPPING = ("block", "meter")
+"""Actions of decisions that drop packets."""
+AHEAD_NS = 1_000_000_000
+"""Capture time that may pass between a decision and the switch's answer: more than it takes on a wire."""
 PACKETS = "packets"
 """The controller's name for the request of every packet."""
 INTERESTS = (
@@ -178,6 +183,13 @@ class _Observer:
         self.last = time.monotonic()
         """When the last alert, decision or confirmation came."""
         self._decided: set[str] = set()
+        self._unanswered: dict[str, tuple[int, float]] = {}
+        """Decisions on their way to the switch: capture time, and until when an answer is waited for."""
+
+    def is_ahead(self, time_ns: int) -> bool:
+        """Whether a packet of this capture time is too far ahead of a decision that is on its way."""
+        now = time.monotonic()
+        return any(time_ns > at + AHEAD_NS and now < until for at, until in self._unanswered.values())
 
     def subscribe(self, engine: Engine) -> None:
         engine.observe("network.anomaly.kitsune.score").subscribe(self._on_score)
@@ -207,6 +219,8 @@ class _Observer:
             decision = Decision.from_value(item.value)
             self._result.decisions.append(decision)
             self._decided.add(decision.id)
+            if not decision.dry_run and decision.action in STOPPING:
+                self._unanswered[decision.id] = decision.event_time, time.monotonic() + CONFIRM_SECONDS
             self.last = time.monotonic()
 
     def _on_handshake(self, item: Item) -> None:
@@ -220,11 +234,13 @@ class _Observer:
     def _on_confirmation(self, item: Item) -> None:
         confirmation = Confirmation.from_value(item.value)
         with self.moved:
+            self._unanswered.pop(confirmation.id, None)
             if confirmation.action not in _DECIDED and confirmation.id not in self._decided:
                 return  # of a command: an entry of a query, or a known source
             self.last = time.monotonic()
             self._result.confirmations.append(confirmation)
             self._result.confirmed_at.append(time.monotonic())
+            self.moved.notify_all()
             if confirmation.state == "installed":
                 self.blocks += 1
 
@@ -438,8 +454,14 @@ class ReplayPass:
     def _wait_for_room(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> int:
         sent, mitigate = self._result.flight.sent, self._result.mitigate
         limit = self._options.in_flight_limit(sent, mitigate=mitigate)
+        next_ns = int(self._survey.time_ns[sent])
         self._await(
-            pipeline, feed, progress, lambda flight: flight.in_flight <= limit - max(1, limit // SHARE)
+            pipeline,
+            feed,
+            progress,
+            lambda flight: (
+                flight.in_flight <= limit - max(1, limit // SHARE) and not self._observer.is_ahead(next_ns)
+            ),
         )
         room = limit - self._result.flight.in_flight
         left = self._options.training_packets - sent

@@ -75,6 +75,8 @@ class BlockLifecycle:
     """Number of blocks that a cap prevented."""
     known: Collection[str] = frozenset()
     """Hosts known from handshakes."""
+    trained_hosts: int = 0
+    """Hosts that training saw; few of them may have finished a handshake so far."""
     notices: deque[OperatorNotice] = field(default_factory=lambda: deque(maxlen=NOTICES))
     """Notices that are not yet published."""
     stopped: str = ""
@@ -106,8 +108,9 @@ class BlockLifecycle:
             return f"{len(self._recent)} blocks were decided within a minute (max_decisions_per_minute)"
         if host in self.known:
             blocked = sum(block.host in self.known for block in self.blocks.values())
-            if blocked >= max(1, int(self.rules.max_known_share * len(self.known))):
-                return f"{blocked} of {len(self.known)} known hosts are blocked (max_known_share)"
+            hosts = max(len(self.known), self.trained_hosts)
+            if blocked >= max(1, int(self.rules.max_known_share * hosts)):
+                return f"{blocked} of {hosts} known hosts are blocked (max_known_share)"
         self.stopped = ""
         return None
 

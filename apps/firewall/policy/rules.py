@@ -40,7 +40,8 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     max_decisions_per_minute: int = 120
     """Most blocks decided in a minute of capture time; beyond it the firewall stops blocking and reports that."""
     max_known_share: float = 0.25
-    """Largest share of the hosts known from handshakes that may be blocked at a time (one always may)."""
+    """Largest share of the hosts known from handshakes, or from training if that saw more, that may be blocked at a time
+    (one always may)."""
     block_known_addresses: bool = False
     """Also block addresses known from handshakes that are behind a router; others can forge them."""
     prefix_neighbours: int = 128

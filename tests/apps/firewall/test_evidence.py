@@ -50,6 +50,29 @@ def test_weak_evidence_blocks_when_it_persists():
     assert on.blocked == [CAMERA.mac]
 
 
+class CountingEngine(FakeEngine):
+    """Counts the questions about earlier blocks of a MAC."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = 0
+
+    def get(self, query: object, *, limit: int | None = None) -> list[Item]:
+        self.asked += CAMERA.mac in str(query)
+        return super().get(query, limit=limit)
+
+
+def test_the_archive_is_asked_once_while_evidence_about_a_sender_goes_on():
+    """A query would hold each piece up; after a decision the archive knows more, and is asked again."""
+    engine = CountingEngine()
+    on = desk(engine=engine)
+    hear(on, *[evidence(1.5, AT + n) for n in range(5)])
+    assert (engine.asked, on.blocked) == (1, [])
+    hear(on, evidence(20.0, AT + 5, first_packet=7, sender=structs.replace(CAMERA, mac="02:00:00:00:00:77")))
+    hear(on, evidence(1.0, AT + 6))
+    assert engine.asked == 2
+
+
 def test_a_foreign_app_can_speak_and_nobody_in_its_name():
     on = desk(evidence_apps=("honeypot",))
     hear(on, evidence(20.0, AT), app="honeypot")

@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from apps.evidence import TrainingState
 from apps.firewall.policy.rules import Rules
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Answer, Instruction, TableCommand
@@ -282,6 +283,22 @@ def test_known_hosts_are_not_blocked_in_numbers():
         desk.hand(ALERT, alert(anomalous_seconds=5).to_value() | {"sender": sender})
     assert len(desk.blocked) == 2
     assert any("max_known_share" in text for text in desk.events)
+
+
+def test_hosts_of_training_count_though_few_have_finished_a_handshake():
+    """A quarter of two hosts would let the second attacker of a network of twelve go on."""
+    desk = Desk()
+    state = TrainingState(
+        packets=9, wanted=9, done=True, seconds=3_600.0, senders=500, hosts=12, event_time=NOW
+    )
+    desk.hand("network.training.kitsune", state.to_value(), pattern="network.training.*")
+    for number in range(4):
+        value = {"source": f"10.0.0.{number}", "service": VICTIM, "port": 80, "at": NOW}
+        desk.hand("network.handshake.sonata.tcp", value)
+        sender = {"switch": "s1", "port": 1, "mac": f"02:00:00:00:00:0{number}", "ip": f"10.0.0.{number}"}
+        desk.hand(ALERT, alert(anomalous_seconds=5).to_value() | {"sender": sender})
+    assert len(desk.blocked) == 3
+    assert any("3 of 12 known hosts" in text for text in desk.events)
 
 
 def test_one_direction_is_told_once():

@@ -1,9 +1,23 @@
 """Who dies in a replay is named; tests/end_to_end has the replay itself."""
 
 import pytest
+from msgspec import structs
 
+from apps.messages import Confirmation, Decision, Message, Target
+from due import Item
 from sdnator.errors import PipelineError
-from sdnator.replay.loop import BLOCKING_WINDOW, FREE_WINDOW, WIRE_WINDOW, ReplayOptions, _name_the_dead
+from sdnator.replay.loop import (
+    BLOCKING_WINDOW,
+    FREE_WINDOW,
+    WIRE_WINDOW,
+    PassResult,
+    ReplayOptions,
+    _name_the_dead,
+    _Observer,
+)
+from sdnator.replay.packet_accounting import PacketAccounting
+
+SECOND = 1_000_000_000
 
 
 class Dying:
@@ -47,3 +61,26 @@ def test_headers_come_by_digest_where_the_switch_sends_lists():
         "packet-in",
     ]
     assert ReplayOptions(telemetry="packet-in").headers == "packet-in"
+
+
+def test_replay_does_not_run_away_from_a_decision_on_its_way():
+    """A second of capture time behind the decision packets wait for the switch's answer; a dry run holds nothing up."""
+    observer = _Observer(PassResult(PacketAccounting(1), True))
+    at = 1_000 * SECOND
+    made = Decision(
+        id="d1", action="block", switch="s1", target=Target(kind="ip", address="10.0.0.1"), reason="r",
+        event_time=at, expires=0,
+    )  # fmt: skip
+    observer._on_decision(_item(structs.replace(made, id="d0", dry_run=True)))
+    assert not observer.is_ahead(at + 60 * SECOND)
+    observer._on_decision(_item(made))
+    assert not observer.is_ahead(at + SECOND)
+    assert observer.is_ahead(at + SECOND + 1)
+    observer._on_confirmation(
+        _item(Confirmation(id="d1", switch="s1", state="installed", action="block", event_time=at))
+    )
+    assert not observer.is_ahead(at + 60 * SECOND)
+
+
+def _item(message: Message) -> Item:
+    return Item("network.any.app.key", message.to_value(), 1, 1, "app", "i1", 1)
