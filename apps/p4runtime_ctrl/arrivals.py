@@ -8,7 +8,8 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from apps.messages import Decision, Message, MessageError, TableCommand, Time, as_map, sender_of
+from apps.intake import as_map
+from apps.messages import Decision, Message, MessageError, TableCommand, Time, sender_of
 from apps.p4runtime_ctrl.telemetry.demand import Offer
 from apps.packets import as_column, read_columns
 from due import Item, RecordBatch
