@@ -23,9 +23,11 @@ from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
 from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder, late, order_in
 from apps.kitsune.successor import Comparison, Successor
+from apps.kitsune.top_talkers import TalkerTable
 from apps.kitsune.training_progress import TrainingProgress
 from apps.messages import Alert, Answer, Decision, Intake, Message, Name, Number, Time, sender_of
 from apps.packets import PACKET_COLUMNS, SteadyTime, read_columns
+from apps.talkers import TALKERS
 from due import NO_WAIT, Capability, Engine, Interest, Item, RecordBatch
 
 PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
@@ -36,6 +38,7 @@ ALERT: Final = "network.anomaly.kitsune.alert"
 EVIDENCE_KEY: Final = f"{EVIDENCE}.kitsune"
 TRAINING_KEY: Final = f"{TRAINING}.kitsune"
 DRIFT_KEY: Final = f"{DRIFT}.kitsune"
+TALKERS_KEY: Final = f"{TALKERS}.kitsune"
 
 INTERESTS = (Interest(PACKETS), Interest(BLOCKS), Interest(SWITCHES), Interest(ORDERS))
 CAPABILITIES = (
@@ -45,6 +48,7 @@ CAPABILITIES = (
     Capability(TRAINING_KEY, delivery="reliable", archive="always"),
     Capability(DRIFT_KEY, delivery="reliable", archive="always"),
     Capability(ANSWER, delivery="reliable", archive="always"),
+    Capability(f"{TALKERS_KEY}.*"),
 )
 
 _USED: Final = {
@@ -120,6 +124,7 @@ class KitsuneService:
         self._progress = TrainingProgress(self._detector.model.training_packets)
         self._intake = Intake(_log)
         self._time = SteadyTime(_STEP_US)
+        self._talkers = TalkerTable()
         self._lock = threading.Lock()
         self._arrived: dict[str, int] = {}
         """Arrival number of the newest packet scored, by switch."""
@@ -307,6 +312,7 @@ class KitsuneService:
             self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
             self._write_evidence()
             self._write_alerts(alerts)
+            self._tell_talkers(batch, switch)
             self._tell_training(event_time)
             self._tell_drift(event_time)
             if self._detector.model.is_trained and not self._told:
@@ -398,6 +404,13 @@ class KitsuneService:
             ),
         )
         self._engine.write(TRAINING_KEY, state.to_value(), [NO_WAIT], event_time=event_time)
+
+    def _tell_talkers(self, batch: RecordBatch, switch: str) -> None:
+        """Who sends most, while somebody looks."""
+        if switch not in self._arrived or not self._engine.wanted(key := f"{TALKERS_KEY}.{switch}"):
+            return
+        if (found := self._talkers.add(batch, switch)) is not None:
+            self._engine.write(key, found.to_value(), [NO_WAIT], event_time=found.event_time)
 
     def _tell_drift(self, event_time: int) -> None:
         """Once when scores have left training's distribution, and once when they are back."""

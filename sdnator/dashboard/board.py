@@ -13,6 +13,7 @@ from typing import Any, Final
 from apps.enforcement import SWITCHES, place_text
 from apps.incidents import Incident
 from apps.messages import Alert, Confirmation, Decision
+from apps.talkers import TopTalkers
 
 ALERTS_KEPT: Final = 200
 DECISIONS_KEPT: Final = 500
@@ -82,6 +83,8 @@ class Board:
         self.switches: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
         self.cost: OrderedDict[str, Mapping[str, float]] = OrderedDict()
         """What each switch sends to its controller a second."""
+        self.talkers: OrderedDict[str, tuple[float, TopTalkers]] = OrderedDict()
+        """Who sends most, by switch, and when (s) that was heard."""
         self.health: OrderedDict[str, Mapping[str, Any]] = OrderedDict()
         self.apps: list[dict[str, Any]] = []
         self.instances: list[dict[str, Any]] = []
@@ -169,6 +172,12 @@ class Board:
             _keep(self.cost, name, _rates(before, value, now - then))
         if name not in self._asked or now - then >= _COST_SECONDS:
             _keep(self._asked, name, (now, value))
+
+    def talks(self, found: TopTalkers, now: float) -> None:
+        """Who sends most through a switch, come at `now` (s)."""
+        with self.lock:
+            _keep(self.talkers, found.switch, (now, found))
+            self._changed("talkers")
 
     def knows_switch(self, name: str) -> bool:
         """Whether it has said anything."""

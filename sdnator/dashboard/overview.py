@@ -13,6 +13,9 @@ from sdnator.model_words import headline
 Level = Literal["well", "notice", "trouble"]
 _LOST: Final = ("lost", "dropped_slow", "set_aside")
 _ACTION_STATES: Final = {"decided": "decided", "in_force": "in force", "over": "over", "failed": "FAILED"}
+_TALKED_S: Final = 10.0
+"""A list that is older says nothing of now: the switch is silent, or nobody counts."""
+_TALKERS: Final = 10
 _COSTS: Final = {
     "packet_in": "packet-in",
     "digests": "digest",
@@ -109,6 +112,27 @@ def asked_rows(board: Board) -> Iterator[dict[str, Any]]:
             "reason": ", ".join(asked) or "nothing is asked of it: it copies no packet",
             "action": "",
         }
+
+
+def talker_rows(board: Board, now: float) -> list[dict[str, Any]]:
+    """The senders of most bytes through all switches, the busiest first; none where nothing has come for a while."""
+    found = []
+    for heard, one in board.talkers.values():
+        seconds = (one.event_time - one.since) / 1e9
+        if now - heard > _TALKED_S or seconds <= 0:
+            continue
+        for each in one.talkers:
+            who = each.sender.ip or each.sender.mac
+            row = {
+                "id": f"{one.switch} {each.sender.port} {who}",
+                "sender": who,
+                "from": f"{one.switch} {each.sender.port}",
+                "bits": number(8 * each.bytes / seconds),
+                "packets": number(each.packets / seconds),
+                "share": f"{each.bytes / max(1, one.bytes):.0%}",
+            }
+            found.append((8 * each.bytes / seconds, row))
+    return [row for _, row in sorted(found, key=lambda one: -one[0])[:_TALKERS]]
 
 
 def port_rows(

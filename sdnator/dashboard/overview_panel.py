@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from sdnator.dashboard.charts import Point, score_chart, score_points, threshold, top
-from sdnator.dashboard.overview import asked_rows, health, port_rows, timeline
+from sdnator.dashboard.overview import asked_rows, health, port_rows, talker_rows, timeline
 from sdnator.dashboard.switch_reading import read_traffic
 from sdnator.dashboard.texts import alert_row, decision_row, incident_row, number
 from sdnator.model_words import headline, model_lines
@@ -57,7 +57,14 @@ def _panel(title: str, *, wide: bool = False) -> Iterator[None]:
 
 def _table(name: str, *labels: str) -> ui.table:
     """A table whose columns are found in rows by the labels' first words."""
-    fields = {"forwarded/s": "forwarded", "bits/s": "bits", "dropped/s": "dropped", "dropped in all": "total"}
+    fields = {
+        "forwarded/s": "forwarded",
+        "bits/s": "bits",
+        "dropped/s": "dropped",
+        "dropped in all": "total",
+        "packets/s": "packets",
+        "share": "share",
+    }
     columns = [
         {
             "name": label,
@@ -67,7 +74,7 @@ def _table(name: str, *labels: str) -> ui.table:
         }
         for label in labels
     ]
-    table = ui.table(rows=[], columns=columns, row_key=columns[0]["field"], pagination=8)
+    table = ui.table(rows=[], columns=columns, row_key="id", pagination=8)
     table.classes(f"plain {name}").props("flat dense rows-per-page-label=rows")
     return table
 
@@ -108,6 +115,11 @@ class OverviewPanel:
                 self._ports = _table("ports", "port", "forwarded/s", "bits/s", "dropped/s", "dropped in all")
                 self._ports.add_slot(
                     "no-data", '<div class="nothing">no switch forwards or drops by an entry yet</div>'
+                )
+            with _panel("Top talkers"):
+                self._talkers = _table("talkers", "sender", "from", "bits/s", "packets/s", "share")
+                self._talkers.add_slot(
+                    "no-data", '<div class="nothing">no packet has been counted for ten seconds</div>'
                 )
             with _panel("What is asked of the switches"):
                 self._asked = self._feed("asked", "", "no switch has been heard of yet")
@@ -156,6 +168,7 @@ class OverviewPanel:
             if time.monotonic() - self._listed >= _LISTS_SECONDS:
                 self._listed = time.monotonic()
                 rows = self._rows()
+                rows["talkers"] = talker_rows(board, time.monotonic())
             figures, told, model = self._figures(now), health(board), board.model()
         if self._health.text != told.text:
             self._health.set_text(told.text)
@@ -179,6 +192,7 @@ class OverviewPanel:
             "decisions": self._decisions,
             "alerts": self._alerts,
             "asked": self._asked,
+            "talkers": self._talkers,
         }
 
     def _show_model(self, model: Mapping[str, Any] | None) -> None:

@@ -20,6 +20,7 @@ from apps.enforcement import CONFIRMED
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Answer, Confirmation, Decision, Instruction, sender_of
 from apps.sonata_adapter.plan_answer import plan_key
+from apps.talkers import TALKERS, TopTalkers
 from due import NO_WAIT, Capability, Engine, Interest, Item
 from due.errors import DueError, InvalidOption
 from sdnator.dashboard.board import Board
@@ -32,6 +33,7 @@ INSTRUCTION = "network.instruction.dashboard.firewall"
 DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*", "network.meter.firewall.*")
 CONFIRMATIONS = f"{CONFIRMED}.*.*"
 _STATE = "network.switch.p4runtime_ctrl"
+_TALKERS = f"{TALKERS}.kitsune.*"
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.score"),
@@ -42,6 +44,7 @@ INTERESTS = (
     Interest(f"{_STATE}.*"),
     Interest("due.health.*"),
     Interest(ANSWERS),
+    Interest(_TALKERS),
 )
 CAPABILITIES = (Capability(INSTRUCTION, delivery="reliable", archive="always"),)
 
@@ -131,6 +134,7 @@ class DashboardService:
             f"{_STATE}.*": lambda item: board.switch(item.value, time.monotonic()),
             "due.health.*": lambda item: board.healthy(item.app_id, item.value, time.monotonic()),
             ANSWERS: self._on_answer,
+            _TALKERS: lambda item: board.talks(TopTalkers.from_value(item.value), time.monotonic()),
         }
         for key, handler in handlers.items():
             observe(key).subscribe(self._tolerant(handler))

@@ -451,7 +451,7 @@ def test_a_switch_that_runs_already_is_used_and_left_running(operator):
 
 @pytest.mark.parametrize("switch", ["embedded", "bmv2"])
 def test_two_interfaces_are_a_wire_and_their_packets_are_seen(operator, switch):
-    """Frames of one side leave at the other, and their headers come as record batches."""
+    """Frames of one side leave at the other, their headers come as record batches, and their sender is a top talker."""
     require_netns()
     if switch == "bmv2":
         optional_program("simple_switch_grpc")
@@ -473,22 +473,26 @@ def test_two_interfaces_are_a_wire_and_their_packets_are_seen(operator, switch):
                 return False
 
         until(passes)
-        viewer = stack.enter_context(
-            subprocess.Popen(
-                operator.command(
-                    "observe", "network.packets.p4runtime_ctrl.s1.all", "--count", "1", "--json"
-                ),
-                env=operator.environment,
-                stdout=subprocess.PIPE,
-                text=True,
+
+        def observed(key):
+            viewer = stack.enter_context(
+                subprocess.Popen(
+                    operator.command("observe", key, "--count", "1", "--json"),
+                    env=operator.environment,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
             )
-        )
-        until(lambda: passes() and viewer.poll() is not None)
-        assert viewer.stdout is not None
-        batch = json.loads(viewer.stdout.read())["value"]
+            until(lambda: passes() and viewer.poll() is not None)
+            assert viewer.stdout is not None
+            return json.loads(viewer.stdout.read())["value"]
+
+        batch = observed("network.packets.p4runtime_ctrl.s1.all")
         assert set(batch["port"]) == {1}
         now_us = time.time_ns() // 1_000
         assert all(abs(now_us - each) < SECONDS * 10**6 for each in batch["time_us"])
+        (talker,) = observed("network.traffic.kitsune.s1")["talkers"]
+        assert (talker["sender"]["ip"], talker["sender"]["port"]) == ("10.0.0.1", 1)
 
 
 def raw(interface):

@@ -19,6 +19,7 @@ from apps.kitsune.service import (
     INTERESTS,
     PACKETS,
     SCORE,
+    TALKERS_KEY,
     TRAINING_KEY,
 )
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest
@@ -136,6 +137,7 @@ def test_declares_what_it_does():
     assert Interest(PACKETS) in INTERESTS
     assert {each.key for each in CAPABILITIES} == {
         *(SCORE, ALERT, f"{EVIDENCE_KEY}.*", TRAINING_KEY),
-        *(DRIFT_KEY, ANSWER),
+        *(DRIFT_KEY, ANSWER, f"{TALKERS_KEY}.*"),
     }
-    assert all(c.delivery == "reliable" and c.archive == "always" for c in CAPABILITIES)
+    kept = [c for c in CAPABILITIES if c.key != f"{TALKERS_KEY}.*"]
+    assert all(c.delivery == "reliable" and c.archive == "always" for c in kept)

@@ -3,9 +3,11 @@
 import pytest
 
 from apps.incidents import Incident, IncidentAction
+from apps.messages import Sender
+from apps.talkers import Talker, TopTalkers
 from sdnator.dashboard.board import Board
 from sdnator.dashboard.charts import score_points
-from sdnator.dashboard.overview import asked_rows, health, port_rows, timeline
+from sdnator.dashboard.overview import asked_rows, health, port_rows, talker_rows, timeline
 
 SECOND = 10**9
 WELL = {
@@ -101,3 +103,20 @@ def test_silence_is_a_gap_in_the_chart():
         found.score({"count": 1, "over": 0, "max": 0.5}, now)
     highest, _ = score_points(found.scores.bins, found.scores.width)
     assert [value for _, value in highest] == [0.5, 0.5, None, 0.5]
+
+
+def test_top_talkers_are_rates_of_the_last_window_and_go_when_nothing_comes():
+    found = board()
+    for switch, octets in (("s1", 1_000), ("s2", 9_000)):
+        sender = Sender(switch=switch, port=2, mac="02:00:00:00:00:01", ip="10.0.0.1")
+        one = Talker(sender=sender, packets=10, bytes=octets)
+        window = TopTalkers(
+            switch=switch, since=0, event_time=2 * SECOND, packets=20, bytes=2 * octets, talkers=(one,)
+        )
+        found.talks(window, 5.0)
+    rows = talker_rows(found, 6.0)
+    assert [(one["from"], one["sender"], one["bits"], one["share"]) for one in rows] == [
+        ("s2 2", "10.0.0.1", "36.0 k", "50%"),
+        ("s1 2", "10.0.0.1", "4,000", "50%"),
+    ]
+    assert talker_rows(found, 60.0) == []
