@@ -80,7 +80,7 @@ class P4RuntimeCtrlService:
         self._offers = Offers(lambda request: classifier.entries((request,)))
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
-        self._by_digest = settings.telemetry == "digest"
+        self._by_digest = {each.name: settings.by_digest(each) for each in settings.switches}
         self._sentinel = FailClosedWatchdog(settings)
         self._active = True
         self._looked_at = 0.0
@@ -221,7 +221,7 @@ class P4RuntimeCtrlService:
             for name, agent in self._agents.items():
                 everything = key_of("packets", name, ALL)
                 wanted = (*keys, everything) if self._engine.wanted(everything) else keys
-                demand = demand_for(name, wanted, self._offers, by_digest=self._by_digest)
+                demand = demand_for(name, wanted, self._offers, by_digest=self._by_digest[name])
                 if demand != self._asked.get(name):
                     self._asked[name] = demand
                     agent.want(demand)

@@ -33,7 +33,7 @@ class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """File (.npy, int64) with the time of each frame of a capture, us since the epoch, by arrival number: for replays
     on a switch with a clock of its own; empty: the switch's time stamps hold."""
     target: str = ""
-    """Kind of switch, for display."""
+    """Kind of switch: `embedded`, `bmv2`; anything else is for display."""
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -44,8 +44,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """The compiled program, BMv2 JSON."""
     p4info: str
     """Its p4info in protobuf text format."""
-    telemetry: Literal["packet-in", "digest"] = "packet-in"
-    """Source of the packets' record batches: copied frames, or digests with the header fields."""
+    telemetry: Literal["auto", "packet-in", "digest"] = "auto"
+    """Source of the packets' record batches: copied frames, or digests with the header fields; auto: digests of
+    embedded switches, which send them in lists, and copied frames of others."""
     batch: int = 1024
     """Most packets in one record batch."""
     linger_ms: float = 2.0
@@ -71,3 +72,14 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     restore_since: int = 0
     """... only those written after this time (ns since the epoch)."""
     guard: GuardSettings = GuardSettings()
+
+    def by_digest(self, switch: SwitchSettings) -> bool:
+        """Whether a switch's packets come as digests.
+
+        Args:
+            switch: one of `switches`.
+
+        Returns:
+            False: they come as copied frames.
+        """
+        return self.telemetry == "digest" or (self.telemetry == "auto" and switch.target == "embedded")

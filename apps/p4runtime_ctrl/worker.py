@@ -76,10 +76,14 @@ class SwitchWorker:
         self._mine = mine
         self._settings = settings
         self._program = program
-        by_digest = settings.telemetry == "digest"
         times = CaptureTimes.load(Path(mine.capture_times)) if mine.capture_times else None
         self._outbound = PacketPublisher(
-            mine.name, self._program, mine.base_us, self._publish, by_digest=by_digest, times=times
+            mine.name,
+            self._program,
+            mine.base_us,
+            self._publish,
+            by_digest=settings.by_digest(mine),
+            times=times,
         )
         self._progress = self._outbound.progress
         self._packet_outs = PacketOuts(self._program, mine.base_us)

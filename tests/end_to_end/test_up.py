@@ -491,6 +491,10 @@ def test_two_interfaces_are_a_wire_and_their_packets_are_seen(operator, switch):
         assert set(batch["port"]) == {1}
         now_us = time.time_ns() // 1_000
         assert all(abs(now_us - each) < SECONDS * 10**6 for each in batch["time_us"])
+        state = observed("network.switch.p4runtime_ctrl.s1")
+        assert bool(state["digests"]) == (switch == "embedded"), (
+            "headers travel in lists where the switch has them"
+        )
         (talker,) = observed("network.traffic.kitsune.s1")["talkers"]
         assert (talker["sender"]["ip"], talker["sender"]["port"]) == ("10.0.0.1", 1)
 
