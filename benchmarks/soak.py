@@ -183,12 +183,12 @@ class SoakRun:
     def soak(self, pps: float, seconds: float, every_s: float, samples: Path) -> None:
         """Load for so long; each sample is appended to a file."""
         began, told = time.monotonic(), 0.0
-        first = (self.load.sent, self.load.came, self.load.stopped, self.load.missed)
+        before = self.sample(0.0)
         self.load.pps = pps
         with samples.open("a", encoding="utf-8") as file:
             while (now := time.monotonic() - began) < seconds:
                 sample = self.sample(now)
-                _without(sample, *first)
+                _without(sample, before)
                 file.write(json.dumps(sample) + "\n")
                 file.flush()
                 if now >= told:
@@ -197,12 +197,12 @@ class SoakRun:
                 time.sleep(max(0.0, every_s - (time.monotonic() - began - now)))
 
 
-def _without(sample: dict[str, Any], sent: int, came: int, stopped: int, missed: int) -> None:
-    """Leaves out what was sent to find the capacity."""
-    sample["sent"] -= sent
-    sample["came"] -= came
-    sample["stopped"] -= stopped
-    sample["lost"]["frames"] -= missed
+def _without(sample: dict[str, Any], before: Mapping[str, Any]) -> None:
+    """Leaves out what was sent, and lost by too much of it, to find the capacity."""
+    for name in ("sent", "came", "stopped"):
+        sample[name] -= before[name]
+    for name, count in before["lost"].items():
+        sample["lost"][name] -= count
 
 
 def _tell(sample: Mapping[str, Any]) -> None:
