@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from dataplane.errors import DataplaneError
 from dataplane.p4runtime.device import Device
 from dataplane.p4runtime.pipeline import ForwardingPipeline
 from dataplane.ports.port import Arrived, NullPort, Port, Wakeup
+from dataplane.ports.veth_port import VethPort
 from dataplane.v1model.switch import FrameResult
 
 _CHUNK = 256
@@ -212,7 +214,7 @@ class PacketLoop:
         arrived = port.receive(limit)
         if not len(arrived):
             return
-        result = self._process(pipeline, number, arrived)
+        result = self._process(pipeline, number, arrived, lossless=port.lossless)
         self._hand_out(pipeline, result, lossless=port.lossless)
         port.done(result.verdicts)
 
@@ -221,6 +223,8 @@ class PacketLoop:
             of_port, port = outputs.to(number), self._ports.get(number)
             if isinstance(port, NullPort):
                 port.counters.sent += len(of_port)
+            elif isinstance(port, VethPort):
+                port.send_many(of_port.data, of_port.begins, of_port.ends)
             else:
                 self._send(number, of_port.frames())
 
@@ -232,10 +236,15 @@ class PacketLoop:
         for frame in frames:
             port.send(frame)
 
-    def _process(self, pipeline: ForwardingPipeline, number: int, arrived: Arrived) -> FrameResult:
-        if arrived.block is not None:
-            self._clock.advance(int(arrived.block.times_us[-1]))
-            return pipeline.switch.process_block(number, arrived.block)
+    def _process(
+        self, pipeline: ForwardingPipeline, number: int, arrived: Arrived, *, lossless: bool
+    ) -> FrameResult:
+        if (block := arrived.block) is not None:
+            if lossless:
+                self._clock.advance(int(block.times_us[-1]))
+            else:
+                block = replace(block, times_us=np.full(len(block), self._clock.now()))
+            return pipeline.switch.process_block(number, block)
         frames = arrived.frames
         times = arrived.times_us or [self._clock.now()] * len(frames)
         if arrived.times_us:

@@ -42,7 +42,7 @@ class Arrived:
     """Frames in the order of their arrival.
 
     times_us: µs of the capture, one per frame; empty = stamp them with the switch's clock
-    block: frames of a capture, end to end, in place of the other two
+    block: frames end to end, in place of the other two; without a capture their times say nothing
     """
 
     frames: Sequence[bytes] = ()

@@ -9,17 +9,19 @@ import subprocess
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dataplane.ports.port import PortError
-from dataplane.ports.veth_port import VethPort, with_vlan_tag
+from dataplane.ports.veth_port import VethPort, tags_taken_out, with_vlan_tag
 from tests.requirements import require_netns
 
 SOL_PACKET, AUXDATA = 263, 8
 
 
 def auxiliary(status, tci, tpid):
-    return [(SOL_PACKET, AUXDATA, struct.pack("=IIIHHHH", status, 64, 64, 0, 14, tci, tpid))]
+    data = struct.pack("=IIIHHHH", status, 64, 64, 0, 14, tci, tpid)
+    return struct.pack("@Nii", 16 + len(data), SOL_PACKET, AUXDATA) + data
 
 
 def test_a_tag_the_kernel_took_out_is_put_back():
@@ -30,8 +32,13 @@ def test_a_tag_the_kernel_took_out_is_put_back():
     assert (
         with_vlan_tag(frame, auxiliary(0x50, 5, 0x88A8)) == bytes(range(12)) + b"\x88\xa8\x00\x05\x08\x00rest"
     )
-    assert with_vlan_tag(frame, auxiliary(0, 5, 0x8100)) == frame
-    assert with_vlan_tag(frame, []) == frame
+
+
+def test_tags_are_found_among_many_frames():
+    """A frame without auxiliary data, or with another's, has no tag to put back."""
+    rows = [auxiliary(0x10, 1, 0), auxiliary(0, 1, 0x8100), bytes(36), auxiliary(0x50, 5, 0x88A8)]
+    control = np.array([np.frombuffer(row, np.uint8) for row in rows])
+    assert tags_taken_out(control).tolist() == [True, False, False, True]
 
 
 def test_an_interface_that_is_not_there_is_said_plainly():
@@ -84,7 +91,8 @@ def received(port, count):
     frames, deadline = [], time.monotonic() + 60
     while len(frames) < count and time.monotonic() < deadline:
         select.select([port], [], [], 0.2)
-        frames += port.receive(100).frames
+        arrived = port.receive(100)
+        frames += arrived.frames if arrived.block is None else arrived.block.frames()
     return frames
 
 
@@ -132,3 +140,32 @@ def test_an_interface_that_goes_down_is_counted_and_comes_back(cable, pair):
     carried(pair)
     other.send(frame)
     assert received(port, 1) == [frame]
+
+
+def test_more_frames_than_one_call_takes_pass_whole_and_in_order(cable):
+    """Long and short ones mixed; what is over the MTU is left out, and what stands behind it is sent."""
+    port, other = cable
+    other.setsockopt(socket.SOL_SOCKET, 33, 8 << 20)  # SO_RCVBUFFORCE: nobody reads meanwhile
+    random = np.random.default_rng(1)
+    frames = [
+        b"\x02" * 12 + b"\x88\xb5" + number.to_bytes(4, "big") + random.bytes(int(size))
+        for number, size in enumerate(random.integers(42, 1_496, 600))
+    ]
+    for frame in frames:
+        other.send(frame)
+    assert received(port, 600) == frames
+    wrong = b"\x02" * 12 + b"\x88\xb5" + bytes(1_600)
+    sent = [*frames[:300], wrong, *frames[300:]]
+    ends = np.cumsum([len(frame) for frame in sent])
+    port.send_many(b"".join(sent), ends - [len(frame) for frame in sent], ends)
+    assert [other.recv(2_000) for _ in frames] == frames
+    assert (port.counters.sent, port.counters.oversized, port.counters.failed) == (600, 1, 0)
+
+
+def test_frames_for_an_interface_that_is_down_are_counted(pair):
+    port = VethPort(pair[0])
+    subprocess.run(["ip", "link", "set", pair[0], "down"], check=True)
+    port.send(b"\x02" * 12 + b"\x88\xb5" + bytes(46))
+    port.receive(10)
+    assert (port.counters.sent, port.counters.failed > 0) == (0, True)
+    port.close()
