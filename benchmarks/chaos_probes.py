@@ -18,7 +18,7 @@ from benchmarks.chaos_checker import Asked, Decided, RunRecord, Word, in_force
 from benchmarks.faults_programs import SPEECH
 from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item, Options
 from due.backends import open_archive
-from p4rt import P4RuntimeStub
+from p4rt import INSECURE, P4RuntimeStub
 from sdnator import p4_program
 from sdnator.blocks.blocks_archive import INSTRUCTION
 
@@ -227,7 +227,7 @@ def _reliable(key: str) -> Capability:
 def held(address: str) -> frozenset[str] | None:
     """Addresses that a switch drops, read from it; None while it does not answer."""
     info = ProgramInfo.from_text(p4_program.find().p4info.read_text(encoding="utf-8"))
-    where = Address(address, 1, 0)
+    where = Address(address, 1, 0, security=INSECURE)
     with where.channel() as channel:
         session = P4RuntimeSession(P4RuntimeStub(channel), where, CompiledProgram(b"", info.message), None)
         try:

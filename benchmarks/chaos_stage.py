@@ -49,7 +49,12 @@ class _RelayedParts(UpParts):
         if name not in CONTROLLERS:
             return super().settings(name)
         found = super().settings(CONTROLLERS[0])
-        return {**found, "switches": [{**each, "address": self.relays[name]} for each in found["switches"]]}
+        return {
+            **found,
+            "switches": [
+                {**each, "address": self.relays[name], "insecure": True} for each in found["switches"]
+            ],
+        }
 
     def standby_controller(self) -> PartProcess:
         """Start the second controller, which `sdnator up` has not."""

@@ -18,7 +18,7 @@ from apps.p4runtime_ctrl.errors import SwitchError
 from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram, P4RuntimeSession
 from dataplane.ports.capture_port import CaptureFeed
 from due import Capability, Engine
-from p4rt import P4RuntimeStub
+from p4rt import INSECURE, P4RuntimeStub
 from sdnator.testing.cable import Cable
 from sdnator.testing.controller_run import PACKETS, ControllerRun, Heard, block, frame
 from sdnator.testing.product_program import program
@@ -92,7 +92,7 @@ class SenderTraffic:
 
 def _blocked(address: str) -> frozenset[str] | None:
     """Senders that the switch drops, read from it; None while it does not answer."""
-    where = Address(address, 1, 0)
+    where = Address(address, 1, 0, security=INSECURE)
     table = program().table("ingress.block_src").id
     with where.channel() as channel:
         session = P4RuntimeSession(
@@ -241,7 +241,7 @@ def closed_after_kill(folder: Path) -> Figures:
     with ControllerRun(folder, fail="closed") as stage:
         stage.controller()
         wires = program().table("ingress.forward_port").id
-        where = Address(stage.target.address, 1, 0)
+        where = Address(stage.target.address, 1, 0, security=INSECURE)
         with where.channel() as channel:
             session = P4RuntimeSession(
                 P4RuntimeStub(channel), where, CompiledProgram(b"", program().message), None

@@ -27,7 +27,7 @@ from dataplane.packet_loop import PacketClock, PacketLoop
 from dataplane.ports.port import MemoryPort
 from dataplane.v1model.program import load
 from dataplane.v1model.switch import Backend
-from p4rt import p4info, p4runtime, status
+from p4rt import open_channel, p4info, p4runtime, status
 from sdnator.p4_program import find
 from sdnator.testing.p4runtime_client import EntryBuilder, delete, insert, modify, program_config
 from sdnator.testing.switch_entities import every_entity
@@ -194,7 +194,7 @@ class _LiveServer:
         self._loop.start()
         self._server.start()
         atexit.register(self._server.stop)
-        channel = grpc.insecure_channel(self._server.address)
+        channel = open_channel(self._server.address)
         self._calls: dict[str, Any] = {
             name: (channel.unary_stream if name == "Read" else channel.unary_unary)(_SERVICE + name)
             for name in _CALLS[:-1]

@@ -134,7 +134,7 @@ class SwitchStage:
         coordinator = self._app("coordinator", "coordinator.service", {})
         coordinator.wait_ready()
         compiled = p4_program.find()
-        switch = {"name": "s1", "address": self.switch.address, "forward": {"1": 2}}
+        switch = {"name": "s1", "address": self.switch.address, "insecure": True, "forward": {"1": 2}}
         settings = {"switches": [switch], "program": str(compiled.bmv2_json), "p4info": str(compiled.p4info)}
         controller = self._app("p4runtime_ctrl", "apps.p4runtime_ctrl.service", settings)
         controller.wait_ready()

@@ -20,7 +20,7 @@ from benchmarks.switch_stage import (
     process,
     program,
 )
-from p4rt import P4RuntimeStub, p4runtime
+from p4rt import INSECURE, P4RuntimeStub, open_channel, p4runtime
 from sdnator.testing.p4runtime_client import EntryBuilder, P4RuntimeClient, insert
 
 WARM_UP = 2_000
@@ -81,7 +81,7 @@ def raw_server(pipe: Any, count: int) -> None:
 
 def raw_rate(port: int) -> float:
     """Messages per second of one whole stream."""
-    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+    with open_channel(f"127.0.0.1:{port}", INSECURE) as channel:
         stream = P4RuntimeStub(channel).StreamChannel(iter([p4runtime.StreamMessageRequest()]))
         next(stream)
         start, count = time.monotonic(), 0

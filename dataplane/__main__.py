@@ -26,8 +26,9 @@ import grpc
 from dataplane.errors import DataplaneError
 from dataplane.faults import Faults
 from dataplane.heartbeat import LivenessPipe, Turning
+from dataplane.p4runtime.client_rights import DEFAULT, RIGHTS, CertificateRights
 from dataplane.p4runtime.device import Device
-from dataplane.p4runtime.listening import default_address
+from dataplane.p4runtime.listening import default_address, socket_path
 from dataplane.p4runtime.pipeline import ForwardingPipeline, verify
 from dataplane.p4runtime.server import P4RuntimeServer, ServerError
 from dataplane.p4runtime.status import InvalidArgument
@@ -59,6 +60,15 @@ def options() -> argparse.ArgumentParser:
     add("--tls-cert", type=Path, help="PEM certificate chain of the server; with --tls-key")
     add("--tls-key", type=Path, help="PEM private key of the server")
     add("--tls-client-ca", type=Path, help="PEM certificates of CAs; clients must then show a certificate")
+    add(
+        "--tls-rights",
+        action="append",
+        default=[],
+        metavar="NAME=RIGHTS",
+        help=f"rights of clients by the name (CN) of their certificate, some of {','.join(RIGHTS)}; default: "
+        + " ".join(DEFAULT),
+    )
+    add("--insecure", action="store_true", help="HOST:PORT without certificates: whoever reaches it commands")
     add("--trust", action="append", default=[], metavar="SHA256", help="allow this program, too")
     add(
         "--trust-file",
@@ -98,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     clock = PacketClock(driven=captures(arguments.port), base_us=arguments.base_us)
-    credentials = _credentials(arguments)
+    credentials, rights = _credentials(arguments), _rights(arguments)
     programs = TrustedPrograms(arguments.trust, arguments.trust_file)
     prepared = _prepared(arguments, clock, programs) if arguments.spare else None
     if arguments.spare and not (stop.readable_first(0) and os.read(0, 1)):
@@ -112,13 +122,13 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
         ports=ports,
         clock=clock.now,
         programs=programs,
-        roles=arguments.role,
+        roles=[*arguments.role, *(rights.roles if rights is not None else ())],
         prepared=prepared,
     )
     loop = PacketLoop(device, ports, clock, on_end=stop.set)
     try:
         address = arguments.grpc or default_address(f"switch-{arguments.device_id}-{os.getpid()}.sock")
-        server = P4RuntimeServer(device, address, credentials)
+        server = P4RuntimeServer(device, address, credentials, rights)
         heartbeat = _heartbeat(arguments.heartbeat_fd, device, server, loop)
     except DataplaneError:
         for port in ports.values():
@@ -188,7 +198,15 @@ def _write(where: str, counts: Mapping[str, Any]) -> None:
 
 
 def _credentials(arguments: argparse.Namespace) -> grpc.ServerCredentials | None:
+    tcp = bool(arguments.grpc) and socket_path(arguments.grpc) is None
+    if tcp and arguments.tls_client_ca is None and not arguments.insecure:
+        raise ServerError(
+            f"--grpc {arguments.grpc}: P4Runtime over TCP asks clients for certificates: give --tls-cert, --tls-key "
+            "and --tls-client-ca (`sdnator cert init` makes the files), or --insecure in a lab"
+        )
     if arguments.tls_cert is None and arguments.tls_key is None:
+        if arguments.tls_client_ca is not None:
+            raise ServerError("--tls-client-ca needs --tls-cert and --tls-key")
         return None
     if arguments.tls_cert is None or arguments.tls_key is None:
         raise ServerError("TLS needs both --tls-cert and --tls-key")
@@ -198,6 +216,13 @@ def _credentials(arguments: argparse.Namespace) -> grpc.ServerCredentials | None
     except OSError as error:
         raise ServerError(f"cannot read {error.filename}: {error.strerror}") from error
     return grpc.ssl_server_credentials(chain, root_certificates=ca, require_client_auth=ca is not None)
+
+
+def _rights(arguments: argparse.Namespace) -> CertificateRights | None:
+    """On a Unix socket gRPC shows no certificates, and the socket's mode decides who connects."""
+    if arguments.tls_client_ca is None or socket_path(arguments.grpc) is not None:
+        return None
+    return CertificateRights(arguments.tls_rights or DEFAULT)
 
 
 def _end_with_parent() -> None:

@@ -13,12 +13,17 @@ Nothing here is ours but the registering; both ends import it, as both would imp
 """
 
 from p4rt import polling as polling  # isort: skip  # before anything loads gRPC
+from p4rt.channels import INSECURE, ChannelSecurity, InsecureChannel, open_channel
 from p4rt.messages import p4data, p4info, p4runtime, p4types, status
 from p4rt.service import P4RuntimeStub, add_p4runtime_servicer, or_none, stream_of_bytes
 
 __all__ = [
+    "INSECURE",
+    "ChannelSecurity",
+    "InsecureChannel",
     "P4RuntimeStub",
     "add_p4runtime_servicer",
+    "open_channel",
     "or_none",
     "p4data",
     "p4info",

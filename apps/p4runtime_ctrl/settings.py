@@ -14,7 +14,9 @@ class SwitchSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     name: str
     """Name of the switch in keys."""
     address: str
-    """Address of its P4Runtime server, HOST:PORT."""
+    """Address of its P4Runtime server, HOST:PORT or unix:/PATH; HOST:PORT needs TLS, or `insecure`."""
+    insecure: bool = False
+    """Without TLS over TCP, where every user of the machine and the network may command it: BMv2 in a lab."""
     device_id: int = 1
     base_us: int = 0
     """Absolute time of the switch's clock zero: integer microseconds since the epoch."""
@@ -58,9 +60,10 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     cpu_port: int = 510
     """Number of the switch's port to the controller."""
     tls_ca: str = ""
-    """CA certificate that signed the switches' certificates, a file; empty: no TLS."""
+    """CA certificate that signed the switches' certificates, a file; TLS is used where the address is no Unix
+    socket and the switch not `insecure`."""
     tls_certificate: str = ""
-    """Controller's own certificate, a file, for switches that ask for one."""
+    """Controller's own certificate, a file; its name (CN) says its role to the embedded switch."""
     tls_key: str = ""
     """Key of that certificate, a file."""
     timeout_s: float = 5.0

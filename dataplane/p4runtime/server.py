@@ -20,6 +20,7 @@ import grpc.aio
 import uvloop
 
 from dataplane.p4runtime import messages, status
+from dataplane.p4runtime.client_rights import PACKET_OUT, PIPELINE, TABLES, CertificateRights, Peer
 from dataplane.p4runtime.device import MAX_STREAMS, Device
 from dataplane.p4runtime.listening import ServerError, ready_to_bind, socket_path
 from dataplane.p4runtime.status import Refused
@@ -64,15 +65,19 @@ class Servicer:
     """The six calls of P4Runtime, for one device.
 
     pool: for what may take long
+    rights: of clients by their certificates; None: everybody who connects may do everything
     """
 
-    def __init__(self, device: Device, pool: ThreadPoolExecutor) -> None:
+    def __init__(
+        self, device: Device, pool: ThreadPoolExecutor, rights: CertificateRights | None = None
+    ) -> None:
         self._device = device
         self._pool = pool
+        self._rights = rights
         self.reads_in_progress = 0
 
     async def Write(self, request: Any, context: _Context) -> Any:  # noqa: N802
-        await _require(request, context)
+        await self._require(request, context, TABLES)
         run = self._at_once if len(request.updates) <= _SMALL_WRITE else self._aside
         try:
             results = await run(self._device.write, request)
@@ -83,7 +88,7 @@ class Servicer:
         return p4runtime.WriteResponse()
 
     async def Read(self, request: Any, context: _Context) -> AsyncIterator[Any]:  # noqa: N802
-        await _require(request, context)
+        await self._require(request, context)
         if self.reads_in_progress >= _MOST_READS:
             busy = f"{_MOST_READS} Reads are in progress: try again when one is done"
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, busy)
@@ -102,7 +107,7 @@ class Servicer:
             await _abort_batch(context, reading.results, "Read")
 
     async def SetForwardingPipelineConfig(self, request: Any, context: _Context) -> Any:  # noqa: N802
-        await _require(request, context)
+        await self._require(request, context, PIPELINE)
         try:
             await self._aside(self._device.set_pipeline, request)
         except Refused as error:
@@ -110,22 +115,25 @@ class Servicer:
         return p4runtime.SetForwardingPipelineConfigResponse()
 
     async def GetForwardingPipelineConfig(self, request: Any, context: _Context) -> Any:  # noqa: N802
-        await _require(request, context)
+        await self._require(request, context)
         try:
             return await self._aside(self._device.get_pipeline, request)
         except Refused as error:
             await context.abort(status.grpc_code(error), str(error))
 
     async def Capabilities(self, request: Any, context: _Context) -> Any:  # noqa: N802
-        await _require(request, context)
+        await self._require(request, context)
         return p4runtime.CapabilitiesResponse(p4runtime_api_version=API_VERSION)
 
     async def StreamChannel(self, requests: AsyncIterator[Any], context: _Context) -> None:  # noqa: N802
         try:
+            if self._rights is not None:
+                self._rights.require_stream(context.auth_context())
             stream = await self._at_once(self._device.open_stream)
         except Refused as error:
             await context.abort(status.grpc_code(error), str(error))
-        listener = asyncio.create_task(self._listen(stream, requests))
+        peer = None if self._rights is None else context.auth_context()
+        listener = asyncio.create_task(self._listen(stream, requests, peer))
         try:
             await stream.send(context.write)
         finally:
@@ -134,25 +142,31 @@ class Servicer:
         if stream.error is not None:
             await context.abort(status.grpc_code(stream.error), str(stream.error))
 
-    async def _listen(self, stream: ControllerStream, requests: AsyncIterator[Any]) -> None:
+    async def _listen(
+        self, stream: ControllerStream, requests: AsyncIterator[Any], peer: Peer | None
+    ) -> None:
         """Take in what a controller sends, until it stops or breaks the rules of arbitration."""
         try:
             async for request in requests:
                 if request is None:
                     raise status.InvalidArgument(_NO_MESSAGE)
-                await self._take(stream, request)
+                await self._take(stream, request, peer)
         except Refused as error:
             stream.end(error)
         finally:
             stream.end()
 
-    async def _take(self, stream: ControllerStream, request: Any) -> None:
+    async def _take(self, stream: ControllerStream, request: Any, peer: Peer | None) -> None:
         kind = request.WhichOneof("update")
         if kind == "arbitration":
+            if self._rights is not None and peer is not None:
+                self._rights.require_claim(peer, request.arbitration.role.name)
             await self._at_once(self._device.arbitrate, stream, request.arbitration)
             return
         try:
             if kind == "packet":
+                if self._rights is not None and peer is not None:
+                    self._rights.require(peer, PACKET_OUT)
                 if self._device.crowded():  # this controller is not read on, and only this one waits
                     await self._aside(self._device.packet_out, stream, request.packet)
                 else:
@@ -166,6 +180,17 @@ class Servicer:
         except Refused as error:
             stream.post(messages.stream_error(error, request))
 
+    async def _require(self, request: Any | None, context: _Context, right: str = "") -> None:
+        """The request is a message, which gRPC would log a traceback for, and the client may make it."""
+        if request is None:
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, _NO_MESSAGE)
+        if self._rights is None:
+            return
+        try:
+            self._rights.require(context.auth_context(), right)
+        except Refused as error:
+            await context.abort(status.grpc_code(error), str(error))
+
     async def _at_once(self, call: Callable[..., _T], *arguments: Any) -> _T:
         """In this thread, unless the device is busy with something that takes long."""
         if not self._device.control.acquire(blocking=False):
@@ -177,12 +202,6 @@ class Servicer:
 
     async def _aside(self, call: Callable[..., _T], *arguments: Any) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._pool, call, *arguments)
-
-
-async def _require(request: Any | None, context: _Context) -> None:
-    """Not left to gRPC, which would log a traceback for each."""
-    if request is None:
-        await context.abort(grpc.StatusCode.INVALID_ARGUMENT, _NO_MESSAGE)
 
 
 async def _abort_batch(context: _Context, results: list[Refused | None], what: str) -> None:
@@ -199,19 +218,24 @@ class P4RuntimeServer:
 
     address: "unix:/path", or "host:port"; port 0 = any, see `address` afterwards
     credentials: for TLS; without, plain text
+    rights: of clients by the certificates that these credentials demand; None: all
 
     Raises ServerError.
     """
 
     def __init__(
-        self, device: Device, address: str, credentials: grpc.ServerCredentials | None = None
+        self,
+        device: Device,
+        address: str,
+        credentials: grpc.ServerCredentials | None = None,
+        rights: CertificateRights | None = None,
     ) -> None:
         self._socket = socket_path(address)
         self._turns = 0
         # each stream may hold one up while packet-outs are crowded
         self._pool = ThreadPoolExecutor(MAX_STREAMS + _WORKERS, thread_name_prefix="p4runtime")
         with ready_to_bind(address):
-            self.servicer = Servicer(device, self._pool)
+            self.servicer = Servicer(device, self._pool, rights)
             self._server, port = _in_loop(_bound(self.servicer, address, credentials))
         self.address = address if self._socket is not None else f"{address.rpartition(':')[0]}:{port}"
 

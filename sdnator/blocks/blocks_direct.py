@@ -14,6 +14,7 @@ from sdnator.errors import PipelineError
 
 if TYPE_CHECKING:
     from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
+    from p4rt import ChannelSecurity
 
 BLOCK_TABLES: Final = ("ingress.block_src", "ingress.block_mac", "ingress.block")
 LIMIT_TABLES: Final = ("ingress.limit", "ingress.limit_spared", "ingress.limit_over")
@@ -27,7 +28,12 @@ Service = tuple[str, int]
 """Address and port of a guarded service."""
 
 
-def lift_in_switch(address: str, device_id: int, guards: Sequence[Service] = ()) -> int:
+def lift_in_switch(
+    address: str,
+    device_id: int,
+    guards: Sequence[Service] = (),
+    security: "ChannelSecurity | None" = None,
+) -> int:
     """Delete every entry that drops traffic, and these guards; returns the number of deleted entries.
 
     Raises `PipelineError` if the switch does not answer or refuses.
@@ -35,10 +41,10 @@ def lift_in_switch(address: str, device_id: int, guards: Sequence[Service] = ())
     import grpc
 
     from apps.p4runtime_ctrl.errors import ControllerError
-    from p4rt import P4RuntimeStub
+    from p4rt import P4RuntimeStub, open_channel
 
     options = [("grpc.max_receive_message_length", -1)]
-    with grpc.insecure_channel(address, options=options) as channel:
+    with open_channel(address, security, options) as channel:
         stub = P4RuntimeStub(channel)
         try:
             program = _program(stub, device_id)

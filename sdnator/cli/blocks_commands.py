@@ -32,6 +32,7 @@ from sdnator.blocks.blocks_places import PlaceAnswer, answers_of
 from sdnator.blocks.blocks_why import as_text, decision_line, life_of
 from sdnator.blocks.lessons import lesson_lines, lessons_in_force
 from sdnator.cli.plain_table import fitted
+from sdnator.cli.switch_place import Insecure, SwitchAddress, place_of
 from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
 from sdnator.up import running
@@ -180,6 +181,7 @@ def panic(
         typer.Option(help="P4Runtime switch to clear; default: the running pipeline's.", metavar="HOST:PORT"),
     ] = "",
     device_id: Annotated[int, typer.Option(help="P4Runtime device id of --switch.", min=1)] = 1,
+    insecure: Insecure = False,
 ) -> None:
     """Lift everything at once, except the guards that the settings name.
 
@@ -196,19 +198,18 @@ def panic(
         else:
             return
     guards = _lift_in_archive(archive)
-    place = (switch, device_id) if switch else _running_switch()
-    address, number = place
-    count = lift_in_switch(address, number, guards)
-    typer.echo(f"{counted(count, 'entry')} deleted in the switch at {address}")
+    place = place_of(switch, device_id, insecure=insecure) if switch else _running_switch()
+    count = lift_in_switch(place.address, place.device_id, guards, place.security)
+    typer.echo(f"{counted(count, 'entry')} deleted in the switch at {place.address}")
 
 
-def _running_switch() -> tuple[str, int]:
+def _running_switch() -> SwitchAddress:
     found = running.find()
     if found is None:
         raise PipelineError(
             "no switch is known: give --switch HOST:PORT; controllers remove the entries when they are restarted"
         )
-    return str(found.switch["address"]), int(found.switch["device_id"])
+    return place_of("", 1)
 
 
 def _lift_in_archive(archive: str) -> list[tuple[str, int]]:

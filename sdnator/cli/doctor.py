@@ -45,6 +45,9 @@ def doctor(
         str, typer.Option(help="Data Archives to check, too.", metavar="URL", envvar="DUE_ARCHIVE")
     ] = "",
     switch: Annotated[str, typer.Option(help="P4Runtime switch to check, too.", metavar="HOST:PORT")] = "",
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="--switch names one without TLS, in a lab.")
+    ] = False,
     security: Annotated[
         bool, typer.Option("--security", help="Check instead who could read, say or reach more than meant.")
     ] = False,
@@ -61,7 +64,7 @@ def doctor(
 
         checks = list(security_checks())
     else:
-        checks = list(look(updates, archive, switch))
+        checks = list(look(updates, archive, switch, insecure=insecure))
     well = all(check.state not in ("missing", "exposed") for check in checks)
     if as_json:
         print(json.dumps({"well": well, "checks": [asdict(check) for check in checks]}))
@@ -70,7 +73,9 @@ def doctor(
     raise typer.Exit(0 if well else 1)
 
 
-def look(updates: str = "", archive: str = "", switch: str = "") -> Iterator[Check]:
+def look(
+    updates: str = "", archive: str = "", switch: str = "", *, insecure: bool = False
+) -> Iterator[Check]:
     """All checks, one after the other.  Raises BadInput for a malformed address."""
     yield check_python()
     yield check_packages()
@@ -93,7 +98,7 @@ def look(updates: str = "", archive: str = "", switch: str = "") -> Iterator[Che
     if archive:
         yield check_archive(archive)
     if switch:
-        yield check_switch(switch)
+        yield check_switch(switch, insecure=insecure)
 
 
 def check_python() -> Check:
@@ -315,16 +320,18 @@ def _reached(option: str, url: str, attempt: Callable[[], None], remedy: str) ->
     return Check(option, "ok", f"{redacted(url)} answers")
 
 
-def check_switch(address: str) -> Check:
+def check_switch(address: str, *, insecure: bool = False) -> Check:
     """A given P4Runtime switch: its version."""
     import grpc
 
     from dataplane.p4runtime.listening import is_address
-    from p4rt import P4RuntimeStub, p4runtime
+    from p4rt import P4RuntimeStub, open_channel, p4runtime
+    from sdnator.config.switch_security import security_for
 
     if not is_address(address):
         raise BadInput(f"--switch {address}: give HOST:PORT or unix:/PATH")
-    with grpc.insecure_channel(address) as channel:
+    security = security_for(address, insecure=insecure)
+    with open_channel(address, security) as channel:
         try:
             reply = P4RuntimeStub(channel).Capabilities(p4runtime.CapabilitiesRequest(), timeout=_SECONDS)
         except grpc.RpcError as error:

@@ -34,6 +34,7 @@ COMMANDS = {
         "sdnator.cli.blocks_commands:blocks",
         "Blocks, guards, rate limits: list, add, remove, explain, false alarms, lift all.",
     ),
+    "cert": ("sdnator.cli.cert_commands:app", "Certificates for P4Runtime over TCP."),
     "config": (
         "sdnator.cli.config_commands:config",
         "Configuration: check it, show effective values, print an example.",
@@ -223,6 +224,9 @@ def replay(
     keep: Annotated[
         Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")
     ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="--switch HOST:PORT is one without TLS, in a lab.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Replay a capture through switch, controller, Kitsune, Sonata adapter and firewall.
@@ -252,6 +256,7 @@ def replay(
             report=report,
             keep=keep,
             as_json=as_json,
+            insecure=insecure,
         )
     )
 

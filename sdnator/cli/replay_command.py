@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 from rich.console import Console
 from rich.markup import escape
@@ -22,6 +22,9 @@ from sdnator.replay import run as replay_run
 from sdnator.replay.loop import ReplayOptions, Telemetry
 from sdnator.replay.packet_accounting import PacketAccounting
 from sdnator.report.writer import check_folder
+
+if TYPE_CHECKING:
+    from p4rt import ChannelSecurity
 
 DEFAULT_TRAIN = 55_000
 """Packets to train on: the published 5,000 + 50,000."""
@@ -52,6 +55,7 @@ class ReplayRequest:
     report: Path | None
     keep: Path | None
     as_json: bool
+    insecure: bool = False
 
 
 def options_of(request: ReplayRequest) -> ReplayOptions:
@@ -68,6 +72,7 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
         fm_grace, ad_grace = request.fm_grace, request.ad_grace
     return ReplayOptions(
         switch=request.switch,
+        security=_security(request),
         inject=request.inject,
         fm_grace=fm_grace,
         ad_grace=ad_grace,
@@ -109,6 +114,15 @@ def check_switch(switch: str, inject: str | None) -> None:
         raise BadInput(f"--switch {switch}: give embedded, bmv2 or HOST:PORT, or unix:/PATH")
     if inject is None:
         raise BadInput(f"--switch {switch}: add --inject IFACE, the interface through which frames enter it")
+
+
+def _security(request: ReplayRequest) -> "ChannelSecurity | None":
+    """How the channel to an external switch is secured.  Raises BadInput."""
+    if not is_address(request.switch):
+        return None
+    from sdnator.config.switch_security import security_for
+
+    return security_for(request.switch, insecure=request.insecure)
 
 
 def _telemetry(text: str | None) -> Telemetry | None:

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from sdnator.cli.switch_place import DeviceId, SwitchAddress, SwitchArgument, place_of
+from sdnator.cli.switch_place import DeviceId, Insecure, SwitchAddress, SwitchArgument, place_of
 from sdnator.errors import BadInput, PipelineError
 
 PACKAGE = "p4runtime-shell==0.0.6"
@@ -26,6 +26,7 @@ def shell(
     switch: SwitchArgument = "",
     *,
     device_id: DeviceId = 1,
+    insecure: Insecure = False,
     again: Annotated[
         bool, typer.Option("--again", help="Recreate the shell's environment, if it is broken.")
     ] = False,
@@ -37,7 +38,7 @@ def shell(
 
     Example: sdnator shell s1
     """
-    place = place_of(switch, device_id)
+    place = place_of(switch, device_id, insecure=insecure)
     _look(place)
     python = environment(again=again)
     print(
@@ -103,9 +104,9 @@ def _look(place: SwitchAddress) -> None:
     """One line for an unreachable switch; the shell itself prints a page of traceback."""
     import grpc
 
-    from p4rt import P4RuntimeStub, p4runtime
+    from p4rt import P4RuntimeStub, open_channel, p4runtime
 
-    with grpc.insecure_channel(place.address) as channel:
+    with open_channel(place.address, place.security) as channel:
         try:
             P4RuntimeStub(channel).Capabilities(p4runtime.CapabilitiesRequest(), timeout=_LOOK_SECONDS)
         except grpc.RpcError as error:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sdnator.cli.plain_table import plain_table
-from sdnator.cli.switch_place import DeviceId, SwitchAddress, SwitchArgument, place_of
+from sdnator.cli.switch_place import DeviceId, Insecure, SwitchAddress, SwitchArgument, place_of
 from sdnator.errors import BadInput, PipelineError
 
 if TYPE_CHECKING:
@@ -27,13 +27,14 @@ def tables(
     *,
     table: Annotated[str, typer.Option(help="Show only this table.", metavar="NAME")] = "",
     device_id: DeviceId = 1,
+    insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
     """Show tables of a switch: size, entries, default actions; with --table every entry.
 
     Example: sdnator tables s1 --table block_mac
     """
-    place = place_of(switch, device_id)
+    place = place_of(switch, device_id, insecure=insecure)
     program, rows = read_tables(place, table)
     if as_json:
         print(json.dumps({"switch": place.name, "address": place.address, "entries": rows}))
@@ -45,12 +46,14 @@ def tables(
         )
 
 
-def counters(switch: SwitchArgument = "", *, device_id: DeviceId = 1, as_json: Json = False) -> None:
+def counters(
+    switch: SwitchArgument = "", *, device_id: DeviceId = 1, insecure: Insecure = False, as_json: Json = False
+) -> None:
     """Show counters of a switch's entries, above all of blocks.
 
     Example: sdnator counters s1
     """
-    place = place_of(switch, device_id)
+    place = place_of(switch, device_id, insecure=insecure)
     counted = [row for row in read_tables(place, "")[1] if "packets" in row]
     if as_json:
         print(json.dumps({"switch": place.name, "address": place.address, "counters": counted}))
@@ -64,14 +67,14 @@ def read_tables(place: SwitchAddress, table: str) -> "tuple[ProgramInfo, list[di
 
     from apps.p4runtime_ctrl.errors import ControllerError
     from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
-    from p4rt import P4RuntimeStub, p4runtime
+    from p4rt import P4RuntimeStub, open_channel, p4runtime
 
     request = p4runtime.GetForwardingPipelineConfigRequest(
         device_id=place.device_id,
         response_type=p4runtime.GetForwardingPipelineConfigRequest.P4INFO_AND_COOKIE,
     )
     options = [("grpc.max_receive_message_length", -1)]
-    with grpc.insecure_channel(place.address, options=options) as channel:
+    with open_channel(place.address, place.security, options) as channel:
         stub = P4RuntimeStub(channel)
         try:
             reply = stub.GetForwardingPipelineConfig(request, timeout=_SECONDS)

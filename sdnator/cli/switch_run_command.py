@@ -26,8 +26,12 @@ def switch(
     ] = None,
     grpc: Annotated[
         str,
-        typer.Option(help="Address on which P4Runtime is served; port 0: any free one.", metavar="HOST:PORT"),
-    ] = "127.0.0.1:9559",
+        typer.Option(
+            help="Address on which P4Runtime is served: HOST:PORT (port 0: any free one) with certificates or "
+            "--insecure, or unix:/PATH; default: a Unix socket that only its user can reach.",
+            metavar="ADDRESS",
+        ),
+    ] = "",
     device_id: Annotated[int, typer.Option(help="P4Runtime device id.", min=1)] = 1,
     cpu_port: Annotated[
         int, typer.Option(help="Number of the port to the controller.", min=1, max=510)
@@ -40,6 +44,20 @@ def switch(
     tls_client_ca: Annotated[
         str, typer.Option(help="PEM certificates of the CAs that sign clients' certificates.", metavar="FILE")
     ] = "",
+    tls_rights: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Rights of clients by the name of their certificate: some of tables, packet-out and pipeline; "
+            "default: controller all, operator all but pipeline, viewer none but reading.",
+            metavar="NAME=RIGHTS",
+        ),
+    ] = None,
+    insecure: Annotated[
+        bool,
+        typer.Option(
+            "--insecure", help="HOST:PORT without certificates: whoever reaches it commands, in a lab."
+        ),
+    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON line when it is ready, one with the counters at the end.")
     ] = False,
@@ -50,7 +68,10 @@ def switch(
 
     Example: sdnator switch --port 1=veth:eth1 --port 2=veth:eth2
     """
-    command = ["--grpc", grpc, "--device-id", str(device_id), "--cpu-port", str(cpu_port)]
+    command = ["--device-id", str(device_id), "--cpu-port", str(cpu_port)]
+    command += ["--grpc", grpc] if grpc else []
+    command += ["--insecure"] if insecure else []
+    command += [part for each in tls_rights or () for part in ("--tls-rights", each)]
     command += ["--backend", backend, "--state-json", "-"]
     for port in ports or []:
         command += ["--port", port]

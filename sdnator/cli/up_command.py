@@ -64,6 +64,10 @@ def up(
             metavar="HOST:PORT",
         ),
     ] = "",
+    insecure: Annotated[
+        bool,
+        typer.Option("--insecure", help="Speak P4Runtime with the switch without TLS over TCP, in a lab."),
+    ] = False,
     device_id: Annotated[int | None, typer.Option(help="P4Runtime device id of the switch.", min=1)] = None,
     updates: Annotated[
         str,
@@ -121,6 +125,7 @@ def up(
         switch=switch,
         device_id=device_id,
         listen=grpc,
+        insecure=insecure,
         updates=updates,
         archive=archive,
         train=train,

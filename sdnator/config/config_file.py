@@ -341,13 +341,14 @@ def _meaning_faults(name: str, made: Any) -> Iterator[tuple[tuple[str, ...], str
 
 def _switch_faults(config: Config, place: Callable[[config_lines.Path], str]) -> Iterator[Fault]:
     from sdnator.config.planned_switches import planned
+    from sdnator.config.switch_security import check_security
 
     names: set[str] = set()
     for number, each in enumerate(config.given.get("switches") or ()):
         at = ("switches", number)
         try:
             made = config.struct("switches", each)
-            planned(made, look=False)
+            check_security(planned(made, look=False), config.section("p4runtime_ctrl"))
         except msgspec.ValidationError:
             continue  # reported already
         except BadInput as error:

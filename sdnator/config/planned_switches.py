@@ -29,6 +29,9 @@ class PlannedSwitch:
     mirror: bool = False
     listen: str = ""
     """HOST:PORT on which a switch that `sdnator up` starts serves P4Runtime; empty: a private address."""
+    insecure: bool = False
+    tls_certificate: str = ""
+    tls_key: str = ""
 
 
 def planned(plan: SwitchPlan, *, look: bool = True) -> PlannedSwitch:
@@ -46,6 +49,9 @@ def planned(plan: SwitchPlan, *, look: bool = True) -> PlannedSwitch:
         fail=plan.fail,
         mirror=plan.mirror,
         listen=_checked_listen(plan),
+        insecure=plan.insecure,
+        tls_certificate=plan.tls_certificate,
+        tls_key=plan.tls_key,
     )
 
 

@@ -88,7 +88,14 @@ class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """The switch sees copies only, as behind a mirror (SPAN) port or a tap: it decides, but claims to stop nothing."""
     listen: str = ""
     """HOST:PORT on which a switch that `sdnator up` starts serves P4Runtime; empty: a Unix socket that only its
-    user can reach (embedded), or 127.0.0.1 (BMv2)."""
+    user can reach (embedded), or 127.0.0.1 (BMv2). The embedded switch needs TLS there, or `insecure`."""
+    insecure: bool = False
+    """P4Runtime over TCP without TLS: whoever reaches its port may command the switch. For a stock BMv2 in a lab."""
+    tls_certificate: str = ""
+    """File of the certificate with which an embedded switch listens on HOST:PORT; clients need one that
+    `p4runtime_ctrl.tls_ca` signed."""
+    tls_key: str = ""
+    """File of its key."""
 
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("-", "").replace("_", "").isalnum():

@@ -37,6 +37,8 @@ class SwitchPlace(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     address: str
     device_id: int = 1
+    security: dict[str, str | bool] = {}
+    """How channels to it are secured: `ca`, `certificate` and `key`, files, or `insecure`; empty: by a Unix socket."""
 
 
 class Settings(DashboardOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):

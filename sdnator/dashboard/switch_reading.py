@@ -64,9 +64,9 @@ def _read(place: SwitchPlace, tables: Sequence[str]) -> tuple[Any, list[Any]]:
     import grpc
 
     from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
-    from p4rt import P4RuntimeStub, p4runtime
+    from p4rt import P4RuntimeStub, open_channel, p4runtime
 
-    with grpc.insecure_channel(place.address, options=[("grpc.max_receive_message_length", -1)]) as channel:
+    with open_channel(place.address, _security(place), [("grpc.max_receive_message_length", -1)]) as channel:
         stub = P4RuntimeStub(channel)
         wanted = p4runtime.GetForwardingPipelineConfigRequest(device_id=place.device_id)
         wanted.response_type = p4runtime.GetForwardingPipelineConfigRequest.P4INFO_AND_COOKIE
@@ -77,6 +77,17 @@ def _read(place: SwitchPlace, tables: Sequence[str]) -> tuple[Any, list[Any]]:
             raise OSError(
                 f"switch {place.name} at {place.address} does not answer: {error.code().name}"
             ) from None
+
+
+def _security(place: SwitchPlace) -> Any:
+    from p4rt import ChannelSecurity
+
+    try:
+        made = ChannelSecurity(**place.security)  # type: ignore[arg-type]  # said by `sdnator up`
+        made.check(place.address)
+    except (TypeError, ValueError) as error:
+        raise OSError(f"switch {place.name}: {error}") from None
+    return made
 
 
 def _entries(stub: Any, device_id: int, program: Any, tables: Sequence[str]) -> list[Any]:

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import grpc
 
-from p4rt import P4RuntimeStub, p4runtime
+from p4rt import ChannelSecurity, P4RuntimeStub, open_channel, p4runtime
 from sdnator.errors import PipelineError
 
 BLOCK_TABLES = ("ingress.block", "ingress.block_src", "ingress.block_mac", "ingress.limit_over")
@@ -20,15 +20,16 @@ class DropCounters:
     Args:
         address: HOST:PORT of the switch's P4Runtime server.
         device_id: its P4Runtime device id.
+        security: how the channel to it is secured; None: by a Unix socket only.
 
     Raises:
         PipelineError: from all methods, if the switch does not answer.
     """
 
-    def __init__(self, address: str, device_id: int) -> None:
+    def __init__(self, address: str, device_id: int, security: ChannelSecurity | None = None) -> None:
         self._address = address
         self._device_id = device_id
-        self._channel = grpc.insecure_channel(address)
+        self._channel = open_channel(address, security)
         self._stub = P4RuntimeStub(self._channel)
         self._request: Any = None
         self._seen: dict[bytes, int] = {}

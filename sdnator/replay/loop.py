@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Confirmation, Decision
@@ -33,6 +33,9 @@ from sdnator.replay.packet_accounting import PacketAccounting, PacketState
 from sdnator.replay.pipeline import SWITCH_NAME, PipelinePlan, ReplayPipeline
 from sdnator.replay.readiness import QueriesReady
 from sdnator.replay.survey import Survey
+
+if TYPE_CHECKING:
+    from p4rt import ChannelSecurity
 
 CONFIRM_SECONDS = 5.0
 """Seconds for the confirmation of the last decisions."""
@@ -93,6 +96,8 @@ class ReplayOptions:
     """How a capture is replayed."""
 
     switch: str = "embedded"
+    security: "ChannelSecurity | None" = None
+    """How channels to an external switch are secured."""
     inject: str | None = None
     """Interface to send frames into, for a switch that is already running."""
     fm_grace: int = 5_000
@@ -290,6 +295,7 @@ class ReplayPass:
             plan = PipelinePlan(
                 folder=folder,
                 switch=options.switch,
+                security=options.security,
                 inject=options.inject,
                 base_us=self._survey.base_us,
                 times_us=self._survey.time_ns // 1_000,

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from dataplane.ports.capture_port import CaptureFeed
 from due.drivers.embedded_redis import EmbeddedServer
+from p4rt import INSECURE, ChannelSecurity
 from sdnator import p4_program
 from sdnator.app_catalogue import OURS
 from sdnator.capture.interfaces import Feed, VethPair, WireFeed
@@ -54,6 +55,8 @@ class PipelinePlan:
     """Empty folder for the archive, settings and logs."""
     switch: str = "embedded"
     """embedded, bmv2, or HOST:PORT of an external P4Runtime switch."""
+    security: ChannelSecurity | None = None
+    """How channels to an external switch are secured."""
     inject: str | None = None
     """Interface through which frames enter an external switch."""
     device_id: int = 1
@@ -182,13 +185,20 @@ class ReplayPipeline:
         return self._coordinator_file.read_text(encoding="utf-8").strip()
 
     @property
+    def _security(self) -> ChannelSecurity:
+        """BMv2 has no TLS; ours listens on loopback."""
+        if self._plan.switch == "bmv2":
+            return INSECURE
+        return self._plan.security or ChannelSecurity()
+
+    @property
     def gives_verdicts(self) -> bool:
         """Whether the switch gives a verdict on each frame."""
         return self._inject is None
 
     def drop_counters(self) -> DropCounters:
         """Counters of the switch's block entries, for switches without verdicts."""
-        return DropCounters(self._address, self._plan.device_id)
+        return DropCounters(self._address, self._plan.device_id, self._security)
 
     def feed(self) -> Feed:
         """The input for frames."""
@@ -200,6 +210,9 @@ class ReplayPipeline:
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
             "telemetry": self._plan.telemetry,
+            "tls_ca": self._security.ca,
+            "tls_certificate": self._security.certificate,
+            "tls_key": self._security.key,
             # the archive of a folder that was used before holds an earlier run's blocks
             "restore_since": self._begun_ns,
             "switches": [
@@ -207,6 +220,7 @@ class ReplayPipeline:
                     "name": SWITCH_NAME,
                     "address": self._address,
                     "device_id": self._plan.device_id,
+                    "insecure": self._security.insecure,
                     "base_us": self._plan.base_us,
                     "capture_times": self._capture_times(),
                     "target": self._plan.switch,

@@ -16,7 +16,7 @@ import grpc
 
 from dataplane.bmv2 import Bmv2, Bmv2Error
 from due.drivers.embedded_redis import die_with_parent
-from p4rt import P4RuntimeStub, p4runtime
+from p4rt import INSECURE, P4RuntimeStub, open_channel, p4runtime
 
 _ASK_SECONDS = 1.0
 _HUNG_SECONDS = 10.0
@@ -53,7 +53,7 @@ def _options() -> argparse.ArgumentParser:
 
 def _watch(switch: Bmv2, came: list[int], beats: int) -> int:
     answered = time.monotonic()
-    with grpc.insecure_channel(switch.address) as channel:
+    with open_channel(switch.address, INSECURE) as channel:  # it has no TLS
         stub = P4RuntimeStub(channel)
         while not came:
             switch.check()

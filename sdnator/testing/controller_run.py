@@ -23,6 +23,7 @@ from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram
 from dataplane.ports.capture_port import CaptureFeed
 from due import Engine, Item, Options
 from due.drivers.embedded_redis import EmbeddedServer
+from p4rt import INSECURE
 from sdnator.supervisor import Child
 from sdnator.testing.product_program import P4INFO, PROGRAM, program
 from sdnator.testing.switch_target import SwitchTarget
@@ -122,6 +123,7 @@ class ControllerRun:
         switch = {
             "name": "s1",
             "address": self.target.address,
+            "insecure": True,
             "base_us": BASE_US,
             "forward": {"1": 2},
             **self.switch_options,
@@ -211,7 +213,7 @@ class Bystander:
     def __init__(self, address: str, *, rank: int = 1) -> None:
         compiled = CompiledProgram(PROGRAM.read_bytes(), program().message)
         self._primary = threading.Event()
-        self._connection = Connection(Address(address, 1, rank), compiled, self)
+        self._connection = Connection(Address(address, 1, rank, security=INSECURE), compiled, self)
 
     def __enter__(self) -> Self:
         self._connection.open()

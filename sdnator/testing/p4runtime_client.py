@@ -9,7 +9,7 @@ from typing import Any, Self
 import grpc
 from google.protobuf import text_format
 
-from p4rt import P4RuntimeStub, p4info, p4runtime, status
+from p4rt import INSECURE, P4RuntimeStub, open_channel, p4info, p4runtime, status
 
 _OPTIONS = (
     ("grpc.max_receive_message_length", -1),
@@ -50,7 +50,7 @@ class P4RuntimeClient:
         self, address: str, *, device_id: int = 1, election_id: int | None = 1, role: str = ""
     ) -> None:
         self.device_id, self.election_id, self.role = device_id, election_id, role
-        self.channel = grpc.insecure_channel(address, options=_OPTIONS)
+        self.channel = open_channel(address, INSECURE, _OPTIONS)
         self.stub = P4RuntimeStub(self.channel)
         self.error: grpc.RpcError | None = None
         """What ended the stream, if something did."""

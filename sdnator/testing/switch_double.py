@@ -1,9 +1,12 @@
 """The real embedded switch in this process: its gRPC server, its packet loop, ports in memory."""
 
+import itertools
+import os
 from collections.abc import Iterable, Mapping
 from typing import Self
 
 from dataplane.p4runtime.device import Device
+from dataplane.p4runtime.listening import default_address
 from dataplane.p4runtime.server import P4RuntimeServer
 from dataplane.p4runtime.trust import TrustedPrograms
 from dataplane.packet_loop import PacketClock, PacketLoop
@@ -12,6 +15,7 @@ from dataplane.v1model.switch import Backend
 from sdnator.testing.waiting import wait_for
 
 DEVICE_ID = 1
+_NUMBERS = itertools.count()
 
 
 class SwitchDouble:
@@ -31,7 +35,7 @@ class SwitchDouble:
         roles: that controllers may claim beside the default one.
         programs: which may be loaded; None: the product's own only.
 
-    The server listens on a free TCP port of 127.0.0.1, and takes no passwords: it is no switch for a network.
+    The server listens on a Unix socket that only its user can reach.
     """
 
     def __init__(
@@ -57,12 +61,14 @@ class SwitchDouble:
             programs=programs or TrustedPrograms(),
             roles=roles,
         )
-        self.server = P4RuntimeServer(self.device, "127.0.0.1:0")
+        self.server = P4RuntimeServer(
+            self.device, default_address(f"double-{os.getpid()}-{next(_NUMBERS)}.sock")
+        )
         self.loop = PacketLoop(self.device, self.ports, self.clock)
         self.loop.start()
         self.server.start()
         self.address = self.server.address
-        """HOST:PORT of its P4Runtime server."""
+        """Of its P4Runtime server, unix:/PATH."""
 
     def sent(self, port: int, count: int, *, seconds: float = 30.0) -> list[bytes]:
         """Take the next frames that the switch sent through a port in memory.

@@ -31,6 +31,7 @@ class SwitchTarget:
         self.folder = folder
         self._ports = ports
         self._more = more
+        self._open = () if "--tls-client-ca" in more else ("--insecure",)
         self._address = "127.0.0.1:0"
         self._process: Child | Bmv2 | None = None
 
@@ -51,7 +52,7 @@ class SwitchTarget:
     def _embedded(self) -> Child:
         ports = [part for port in self._ports for part in ("--port", port)]
         places = ["--grpc", self._address, "--device-id", "1", "--cpu-port", "510"]
-        child = Child("switch", ["dataplane", *places, *ports, *self._more], self.folder)
+        child = Child("switch", ["dataplane", *places, *ports, *self._more, *self._open], self.folder)
         try:
             self._address = str(child.wait_ready()["grpc"])
         except BaseException:

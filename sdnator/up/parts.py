@@ -16,9 +16,10 @@ import shutil
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -27,6 +28,7 @@ from due.errors import InvalidOption
 from sdnator import p4_program
 from sdnator.app_catalogue import OURS
 from sdnator.config.planned_switches import PlannedSwitch
+from sdnator.config.switch_security import security_of, switch_options
 from sdnator.private_files import kept_secret
 from sdnator.rights.granting import OPERATOR, granted
 from sdnator.rights.identities import ADMIN, made, observable
@@ -37,6 +39,9 @@ from sdnator.supervisor.switch_program import SwitchProgram, socket_address
 from sdnator.supervisor.updates_server import UpdatesProcess
 from sdnator.up import running
 from sdnator.up.plan import StandingPlan
+
+if TYPE_CHECKING:
+    from p4rt import ChannelSecurity
 
 _VITAL = ("coordinator", *OURS)
 """Parts without which the pipeline does not start; other apps are restarted if they fail."""
@@ -121,7 +126,12 @@ class UpParts:
             ports=ports,
             address=address,
             device_id=switch.device_id,
+            options=switch_options(switch, self.plan.settings_of("p4runtime_ctrl")),
         )
+
+    def security_of(self, switch: PlannedSwitch) -> "ChannelSecurity":
+        """How channels to it are secured."""
+        return security_of(switch, self.plan.settings_of("p4runtime_ctrl"))
 
     def _restart(self, *, at_once: bool = False) -> RestartPolicy:
         chosen = self.plan.supervisor
@@ -238,6 +248,7 @@ class UpParts:
                     "name": switch.name,
                     "address": self.switch_address(switch),
                     "device_id": switch.device_id,
+                    "insecure": self.security_of(switch).insecure,
                     "base_us": self._base_us(switch),
                     # the clock zero of an external switch is unknown until its first packet
                     "clock": "own" if _is_ours(switch) else "heard",
@@ -263,7 +274,12 @@ class UpParts:
             "coordinator_file": str(self.address_file),
             "run_file": str(self.plan.state / "run.json"),
             "switches": [
-                {"name": one.name, "address": self.switch_address(one), "device_id": one.device_id}
+                {
+                    "name": one.name,
+                    "address": self.switch_address(one),
+                    "device_id": one.device_id,
+                    "security": asdict(self.security_of(one)),
+                }
                 for one in self.plan.switches
             ],
         }

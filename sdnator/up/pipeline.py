@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from due.drivers.redis_wire import Wire
 from due.errors import DueError, InvalidOption
@@ -99,6 +100,11 @@ class StandingPipeline:
     def switch_addresses(self) -> dict[str, str]:
         """Of the P4Runtime servers, by switch."""
         return {one.name: self._parts.switch_address(one) for one in self.plan.switches}
+
+    @property
+    def switch_securities(self) -> dict[str, dict[str, Any]]:
+        """How channels to each switch are secured."""
+        return {one.name: asdict(self._parts.security_of(one)) for one in self.plan.switches}
 
     @property
     def dashboard(self) -> str:

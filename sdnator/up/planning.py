@@ -11,11 +11,14 @@ import msgspec
 from sdnator import app_catalogue
 from sdnator.config import config_file
 from sdnator.config.planned_switches import PlannedSwitch, planned
+from sdnator.config.switch_security import check_security
 from sdnator.errors import BadInput
 from sdnator.up import running
 from sdnator.up.plan import StandingPlan
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from sdnator.config.config_file import Config
     from sdnator.config.up_settings import SwitchPlan, UpSettings
 
@@ -35,6 +38,7 @@ class Given:
     switch: str = ""
     device_id: int | None = None
     listen: str = ""
+    insecure: bool = False
     updates: str = ""
     archive: str = ""
     train: int | None = None
@@ -57,7 +61,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
     archive = given.archive or own.archive
     settings = {"p4runtime_ctrl": config.section("p4runtime_ctrl"), "sonata_adapter": _adapter(config, given)}
     settings["coordinator"] = _coordinator(config, given.quota or own.quota, embedded=not archive)
-    switches = tuple(_planned(each) for each in _switches(config, given))
+    switches = tuple(_planned(each, settings["p4runtime_ctrl"]) for each in _switches(config, given))
     settings["kitsune"] = (
         _kept(_kitsune(config, given), switches, state) if own.keep_model else _kitsune(config, given)
     )
@@ -153,6 +157,7 @@ def _switches(config: "Config", given: Given) -> "list[SwitchPlan]":
         "ports": given.ports,
         "wires": given.wires,
         "listen": given.listen,
+        "insecure": given.insecure,
     }
     changed = {name: value for name, value in said.items() if value}
     if changed and len(switches) > 1:
@@ -162,6 +167,7 @@ def _switches(config: "Config", given: Given) -> "list[SwitchPlan]":
             "wires": "wire",
             "device_id": "device-id",
             "listen": "grpc",
+            "insecure": "insecure",
         }
         raise BadInput(
             f"--{option[next(iter(changed))]}: {config.file} has {len(switches)} switches; set it there"
@@ -169,11 +175,13 @@ def _switches(config: "Config", given: Given) -> "list[SwitchPlan]":
     return [msgspec.structs.replace(switches[0], **changed)] if changed else switches
 
 
-def _planned(plan: "SwitchPlan") -> PlannedSwitch:
+def _planned(plan: "SwitchPlan", controller: "Mapping[str, Any]") -> PlannedSwitch:
     try:
-        return planned(plan)
+        made = planned(plan)
+        check_security(made, controller)
     except BadInput as error:
         raise BadInput(f"switch {plan.name}: {error}" if plan.name != "s1" else str(error)) from None
+    return made
 
 
 def _dashboard(config: "Config", state: Path) -> dict[str, Any] | None:

@@ -81,12 +81,13 @@ class UpReport:
         return found
 
     def _switches(self) -> list[dict[str, Any]]:
-        addresses = self._pipeline.switch_addresses
+        addresses, securities = self._pipeline.switch_addresses, self._pipeline.switch_securities
         return [
             {
                 "name": one.name,
                 "address": addresses[one.name],
                 "device_id": one.device_id,
+                "security": securities[one.name],
                 "target": one.kind,
                 "ports": {str(number): kind for number, kind in one.ports.items()},
                 "forward": {str(number): egress for number, egress in one.forward.items()},

@@ -77,7 +77,7 @@ def test_signals_end_it_cleanly(number):
     ("arguments", "text"),
     [
         (["--port", "1=nonsense"], "kinds are"),
-        (["--grpc", "203.0.113.1:1"], "cannot listen"),
+        (["--grpc", "203.0.113.1:1", "--insecure"], "cannot listen"),
         (["--grpc", "unix:relative"], "must be an absolute path"),
         (["--base-us", str(1 << 60)], "clock cannot begin"),
         (["--heartbeat-fd", "999"], "heartbeat descriptor 999"),
@@ -265,7 +265,7 @@ def certificate(folder):
     subprocess.run(
         [
             openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
-            "-keyout", f"{folder}/key.pem", "-out", f"{folder}/cert.pem", "-subj", "/CN=localhost",
+            "-keyout", f"{folder}/key.pem", "-out", f"{folder}/cert.pem", "-subj", "/CN=controller",
             "-addext", "subjectAltName=DNS:localhost",
         ],
         check=True, capture_output=True,

@@ -203,12 +203,12 @@ def test_same_loop_on_a_switch_that_runs_already(short_capture):
     with ExitStack() as stack:
         wire = VethPair.make(stack, "test")
         ports = ("--port", f"1=veth:{wire.far}", "--port", "2=null")
-        command = [sys.executable, "-m", "dataplane", "--grpc", "127.0.0.1:0", *ports]
+        command = [sys.executable, "-m", "dataplane", "--grpc", "127.0.0.1:0", "--insecure", *ports]
         switch = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE))
         stack.callback(switch.terminate)
         assert switch.stdout is not None
         address = json.loads(switch.stdout.readline())["grpc"]
-        where = ("--switch", address, "--inject", wire.near)
+        where = ("--switch", address, "--insecure", "--inject", wire.near)
         found = figures("replay", short_capture, "--train", "1100", *where, "--no-mitigate")
     assert (found["packets_lost"], found["packets_dropped"]) == (0, 0)
     assert found["packets_scored"] == found["packets_in"]

@@ -2,7 +2,7 @@
 
 from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram, P4RuntimeSession
 from due import Capability
-from p4rt import P4RuntimeStub
+from p4rt import INSECURE, P4RuntimeStub
 from sdnator.testing.controller_run import ControllerRun, Heard, block
 from sdnator.testing.product_program import program
 from sdnator.testing.waiting import wait_for
@@ -14,7 +14,7 @@ SECONDS = 90
 
 def entries_of(address):
     """What a switch holds in the tables of blocks and wires; reading needs no rights over it."""
-    where = Address(address, 1, 0)
+    where = Address(address, 1, 0, security=INSECURE)
     with where.channel() as channel:
         session = P4RuntimeSession(
             P4RuntimeStub(channel), where, CompiledProgram(b"", program().message), None

@@ -8,7 +8,6 @@ import queue
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import grpc
@@ -18,7 +17,7 @@ from apps.p4runtime_ctrl.errors import Malformed, NotPrimary, P4InfoError, Switc
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.state.desired_state import Change, check_entry
 from apps.p4runtime_ctrl.state.desired_switch import UpdateOutcome
-from p4rt import P4RuntimeStub, p4runtime, status
+from p4rt import ChannelSecurity, InsecureChannel, P4RuntimeStub, open_channel, p4runtime, status
 
 _METADATA_BYTES: Final = 16 << 20  # a failed batch explains each of its updates in trailing metadata
 _RECEIVED_BYTES: Final = 256 << 20
@@ -73,27 +72,34 @@ class Address:
     copies_session: int = 1
     cpu_port: int = 510
     timeout_s: float = 5.0
-    credentials: grpc.ChannelCredentials | None = None
+    security: ChannelSecurity | None = None
 
     def channel(self) -> grpc.Channel:
-        if self.credentials is not None:
-            return grpc.secure_channel(self.target, self.credentials, options=_CHANNEL_OPTIONS)
-        return grpc.insecure_channel(self.target, options=_CHANNEL_OPTIONS)
+        """A channel of its own.  Raises P4InfoError where the settings do not say how it is secured."""
+        try:
+            return open_channel(self.target, self.security, _CHANNEL_OPTIONS)
+        except InsecureChannel as error:
+            raise P4InfoError(str(error)) from None
 
 
-def credentials(ca: str, certificate: str, key: str) -> grpc.ChannelCredentials | None:
-    """TLS by files of certificates, None without `ca`; raises `P4InfoError` naming one that cannot be read."""
-    if not ca:
-        return None
-    try:
-        parts = [Path(name).read_bytes() if name else None for name in (ca, key, certificate)]
-    except OSError as error:
-        raise P4InfoError(f"TLS file {error.filename}: {error.strerror}") from error
-    return grpc.ssl_channel_credentials(*parts)
+def security_of(settings: Settings, mine: SwitchSettings) -> ChannelSecurity:
+    """How channels to a switch of the settings are secured; `insecure` of one switch wins over TLS of all."""
+    if mine.insecure:
+        return ChannelSecurity(insecure=True)
+    return ChannelSecurity(ca=settings.tls_ca, certificate=settings.tls_certificate, key=settings.tls_key)
 
 
 def address_of(settings: Settings, mine: SwitchSettings) -> Address:
-    """Address of a switch of the settings, with the controller's rank."""
+    """Address of a switch of the settings, with the controller's rank.
+
+    Raises:
+        P4InfoError: the settings do not say how its channels are secured, or name files that cannot be read.
+    """
+    security = security_of(settings, mine)
+    try:
+        security.check(mine.address)
+    except InsecureChannel as error:
+        raise P4InfoError(str(error)) from None
     return Address(
         mine.address,
         mine.device_id,
@@ -101,7 +107,7 @@ def address_of(settings: Settings, mine: SwitchSettings) -> Address:
         copies_session=settings.copy_session,
         cpu_port=settings.cpu_port,
         timeout_s=settings.timeout_s,
-        credentials=credentials(settings.tls_ca, settings.tls_certificate, settings.tls_key),
+        security=security,
     )
 
 

@@ -223,13 +223,13 @@ def counters(options: dict[str, Any]) -> None:
     import grpc
 
     from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
-    from p4rt import P4RuntimeStub, p4runtime
+    from p4rt import INSECURE, P4RuntimeStub, open_channel, p4runtime
 
     program = ProgramInfo.from_text(Path(options["p4info"]).read_text(encoding="utf-8"))
     outcomes = next(each.preamble.id for each in program.message.counters if each.preamble.name == _OUTCOMES)
     tables = {name: program.table(name).id for name in _DYNAMIC}
     limits = [("grpc.max_receive_message_length", -1)]
-    with grpc.insecure_channel(options["grpc"], options=limits) as channel, _report(options) as report:
+    with open_channel(options["grpc"], INSECURE, limits) as channel, _report(options) as report:
         stub = P4RuntimeStub(channel)
 
         def read(entity: Any) -> list[Any]:

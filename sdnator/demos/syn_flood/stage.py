@@ -135,6 +135,7 @@ class FloodStage:
             "name": SWITCH,
             "address": self.grpc,
             "device_id": _DEVICE,
+            "insecure": self._kind == "bmv2",
             "base_us": self._switch.base_us if self._switch is not None else 0,
             "target": self._kind,
         }

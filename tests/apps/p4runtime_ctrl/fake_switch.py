@@ -6,6 +6,8 @@ UNKNOWN with one `p4.Error` per update.
 """
 
 import queue
+import shutil
+import tempfile
 import threading
 import time
 from concurrent import futures
@@ -39,7 +41,7 @@ class FakeSwitch:
         self.full_tables: set[int] = set()
         self.hide_details = False
         self.forget()
-        self.port = 0
+        self._folder = tempfile.mkdtemp(prefix="fake-switch-")
         self._server = None
 
     def forget(self) -> None:
@@ -60,6 +62,7 @@ class FakeSwitch:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+        shutil.rmtree(self._folder)
 
     def start(self) -> None:
         self._server = grpc.server(futures.ThreadPoolExecutor(16), options=[("grpc.so_reuseport", 0)])
@@ -67,7 +70,7 @@ class FakeSwitch:
         deadline = time.monotonic() + 60
         while True:
             try:
-                self.port = self._server.add_insecure_port(f"127.0.0.1:{self.port}")
+                self._server.add_insecure_port(self.address)
                 break
             except RuntimeError:  # the one before may not have let the port go yet
                 assert time.monotonic() < deadline
@@ -87,7 +90,7 @@ class FakeSwitch:
 
     @property
     def address(self) -> str:
-        return f"127.0.0.1:{self.port}"
+        return f"unix:{self._folder}/socket"
 
     def primary(self) -> Stream | None:
         with self.lock:

@@ -12,6 +12,7 @@ from apps.p4runtime_ctrl.southbound.session import Address, CompiledProgram
 from apps.p4runtime_ctrl.state.desired_state import INSERT, Change
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.telemetry.classifier import TelemetryRequest
+from p4rt import INSECURE
 from sdnator.testing.product_program import PROGRAM, program
 from sdnator.testing.switch_target import KINDS, SwitchTarget
 from tests.requirements import optional_program
@@ -25,7 +26,7 @@ class Attached:
         self.changed = threading.Condition()
         self.reports, self.session, self.error = [], None, None
         pipeline = CompiledProgram(PROGRAM.read_bytes(), program().message)
-        self.connection = Connection(Address(address, 1, rank), pipeline, self)
+        self.connection = Connection(Address(address, 1, rank, security=INSECURE), pipeline, self)
         self.connection.open()
 
     def became_primary(self, session):

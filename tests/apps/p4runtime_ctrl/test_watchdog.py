@@ -21,7 +21,7 @@ def switch():
 
 
 def settings(address, fail="closed"):
-    one = SwitchSettings(name="s1", address=address, forward=WIRES, fail=fail)
+    one = SwitchSettings(name="s1", address=address, forward=WIRES, fail=fail, insecure=True)
     return Settings(switches=(one,), program=str(PROGRAM), p4info=str(P4INFO))
 
 

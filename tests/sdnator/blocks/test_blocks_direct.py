@@ -9,6 +9,7 @@ from apps.messages import Decision, Target
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from due import Item
 from due.backends import open_archive
+from p4rt import INSECURE
 from sdnator.blocks.blocks_archive import all_decisions, key_of
 from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.cli.blocks_commands import blocks
@@ -120,7 +121,7 @@ def test_panic_without_an_archive(switch, tmp_path, capsys):
 def test_switch_that_is_none():
     """Named, with what went wrong."""
     with pytest.raises(PipelineError, match=r"switch at 127\.0\.0\.1:1: UNAVAILABLE"):
-        lift_in_switch("127.0.0.1:1", 1)
+        lift_in_switch("127.0.0.1:1", 1, security=INSECURE)
 
 
 def test_nothing_runs(monkeypatch, tmp_path):

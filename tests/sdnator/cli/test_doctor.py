@@ -90,7 +90,7 @@ def test_given_servers_are_tried(tmp_path):
         done = run("--updates", server.url, "--archive", f"sqlite://{tmp_path}/a.db")
         assert done.exit_code == 0
         assert f"{server.url} answers" in " ".join(done.stdout.split()), "a long line is wrapped"
-    done = run("--updates", "redis://:secret@127.0.0.1:1/0", "--switch", "127.0.0.1:1")
+    done = run("--updates", "redis://:secret@127.0.0.1:1/0", "--switch", "127.0.0.1:1", "--insecure")
     assert done.exit_code == 1
     assert "UNAVAILABLE" in done.stdout
     assert "secret" not in done.stdout

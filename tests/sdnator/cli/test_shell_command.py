@@ -52,7 +52,7 @@ def test_where_it_cannot_be_made_the_reason_is_said():
 
 def test_a_switch_that_is_not_there_is_said_before_anything_is_made(steps):
     with pytest.raises(PipelineError, match="UNAVAILABLE"):
-        shell("127.0.0.1:1")
+        shell("127.0.0.1:1", insecure=True)
     assert not steps
 
 

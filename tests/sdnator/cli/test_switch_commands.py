@@ -131,6 +131,6 @@ def test_secrets_of_the_guard_are_not_shown(program):
 
 def test_a_switch_that_does_not_answer_is_one_clear_error():
     with pytest.raises(PipelineError, match=r"switch at 127\.0\.0\.1:1: "):
-        run("tables", "127.0.0.1:1")
+        run("tables", "127.0.0.1:1", "--insecure")
     with pytest.raises(PipelineError, match="sdnator up"):
         run("counters", "s1")

@@ -12,7 +12,17 @@ _RUN = "import typer; from sdnator.cli.switch_run_command import switch; typer.r
 
 
 def start(*arguments):
-    command = [sys.executable, "-c", _RUN, "--grpc", "127.0.0.1:0", "--backend", "python", *arguments]
+    command = [
+        sys.executable,
+        "-c",
+        _RUN,
+        "--grpc",
+        "127.0.0.1:0",
+        "--insecure",
+        "--backend",
+        "python",
+        *arguments,
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -5,7 +5,7 @@ from concurrent import futures
 import grpc
 import pytest
 
-from p4rt import add_p4runtime_servicer, p4runtime
+from p4rt import INSECURE, add_p4runtime_servicer, p4runtime
 from sdnator.errors import PipelineError
 from sdnator.replay.drop_counters import DropCounters
 
@@ -51,14 +51,14 @@ def switch():
 
 def test_only_what_is_dropped_from_now_on_counts(switch):
     switch.counts = {1: 40}
-    with DropCounters(switch.address, 1) as drops:
+    with DropCounters(switch.address, 1, INSECURE) as drops:
         assert drops.dropped() == 0
         switch.counts = {1: 43, 2: 5}
         assert drops.dropped() == 8
 
 
 def test_entries_that_go_stay_counted_and_may_come_again(switch):
-    with DropCounters(switch.address, 1) as drops:
+    with DropCounters(switch.address, 1, INSECURE) as drops:
         switch.counts = {1: 10}
         assert drops.dropped() == 10
         switch.counts = {}
@@ -68,7 +68,7 @@ def test_entries_that_go_stay_counted_and_may_come_again(switch):
 
 
 def test_an_entry_made_anew_between_two_reads_begins_at_nothing(switch):
-    with DropCounters(switch.address, 1) as drops:
+    with DropCounters(switch.address, 1, INSECURE) as drops:
         switch.counts = {1: 10}
         assert drops.dropped() == 10
         switch.counts = {1: 4}
@@ -77,4 +77,4 @@ def test_an_entry_made_anew_between_two_reads_begins_at_nothing(switch):
 
 def test_a_switch_that_is_away_is_named(switch):
     with pytest.raises(PipelineError, match=r"127\.0\.0\.1:1: UNAVAILABLE"):
-        DropCounters("127.0.0.1:1", 1)
+        DropCounters("127.0.0.1:1", 1, INSECURE)

@@ -10,7 +10,7 @@ from apps.p4runtime_ctrl.errors import NotPrimary, Unreachable
 from apps.p4runtime_ctrl.southbound.connection import Connection
 from apps.p4runtime_ctrl.southbound.session import Address
 from apps.p4runtime_ctrl.state.desired_state import INSERT, Change
-from p4rt import p4runtime
+from p4rt import INSECURE, p4runtime
 from sdnator.testing.product_program import packet_in, pipeline, program
 from tests.apps.p4runtime_ctrl.fake_switch import FakeSwitch
 
@@ -68,7 +68,9 @@ def connect(switch):
     def make(**options):
         listener = Listener()
         rank = options.pop("rank", 1)
-        connection = Connection(Address(switch.address, 1, rank), pipeline(), listener, **options)
+        connection = Connection(
+            Address(switch.address, 1, rank, security=INSECURE), pipeline(), listener, **options
+        )
         connection.open()
         opened.append(connection)
         return connection, listener
@@ -136,7 +138,7 @@ def test_digests_between_packets_do_not_cut_them_into_many_lists():
     listener = Listener()
     digests = [p4runtime.DigestList(list_id=number) for number in range(4)]
     packets = [packet_in(number) for number in range(4)]
-    connection = Connection(Address("nowhere", 1, 1), pipeline(), listener)
+    connection = Connection(Address("nowhere", 1, 1, security=INSECURE), pipeline(), listener)
     connection._tell([message for pair in zip(digests, packets, strict=True) for message in pair])
     assert (listener.digest_lists, listener.lists) == ([digests], [packets])
 
@@ -213,7 +215,7 @@ def test_calls_to_a_dead_switch_are_unreachable(switch, connect):
 
 def test_a_new_stream_wins_though_the_wall_clock_was_set_back(monkeypatch):
     """Its election id is higher than that of the stream before."""
-    connection = Connection(Address("nowhere", 1, 1), pipeline(), Listener())
+    connection = Connection(Address("nowhere", 1, 1, security=INSECURE), pipeline(), Listener())
     before = connection._usual_id()
     past = time.time_ns() - 3600 * 10**9
     monkeypatch.setattr("apps.p4runtime_ctrl.southbound.connection.time.time_ns", lambda: past)
