@@ -28,6 +28,7 @@ import numpy as np
 from apps.messages import Alert, Sender
 from due import PRODUCER, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
+from sdnator.rights.sign_in_link import new_link
 from sdnator.supervisor import Child
 
 SCORE, ALERT = "network.anomaly.kitsune.score", "network.anomaly.kitsune.alert"
@@ -70,7 +71,7 @@ def measure(folder: Path, rate: int, seconds: float) -> dict[str, Any]:
     """One run."""
     with EmbeddedServer(folder / "server") as server:
         settings = folder / "settings.json"
-        settings.write_text(json.dumps({"port": 0}), encoding="utf-8")
+        settings.write_text(json.dumps({"port": 0, "state": str(folder)}), encoding="utf-8")
         places = ("--updates", server.url, "--archive", f"sqlite://{folder}/archive.db")
         rest = ("--directory", str(folder / "due"), "--settings", str(settings), "--metrics", "127.0.0.1:0")
         child = Child("dashboard", ("sdnator.dashboard", *places, *rest), folder)
@@ -79,7 +80,7 @@ def measure(folder: Path, rate: int, seconds: float) -> dict[str, Any]:
             producer = multiprocessing.get_context("spawn").Process(
                 target=produce, args=(server.url, str(folder), rate, seconds), daemon=True
             )
-            with browser(str(ready["dashboard"])) as driver:
+            with browser(new_link(folder, str(ready["dashboard"]))) as driver:
                 producer.start()
                 return watch(driver, child.pid, str(ready["metrics"]), seconds, rate)
         finally:

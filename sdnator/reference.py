@@ -254,7 +254,13 @@ def keys() -> str:
     )
     lines += ["## Packets", "", *_packets(), "## Messages", "", times, ""]
     base = import_module("apps.messages").Message
-    for module in ("apps.messages", "apps.evidence", "apps.incidents", "apps.enforcement"):
+    for module in (
+        "apps.messages",
+        "apps.evidence",
+        "apps.incidents",
+        "apps.enforcement",
+        "sdnator.rights.audited_deed",
+    ):
         for kind in vars(import_module(module)).values():
             own = inspect.isclass(kind) and kind.__module__ == module
             if own and issubclass(kind, base) and kind is not base:

@@ -9,14 +9,29 @@ from urllib.parse import unquote, urlsplit
 
 from sdnator.cli.doctor import Check
 from sdnator.config import config_file
+from sdnator.config.up_settings import SwitchPlan
+from sdnator.counted import counted
+from sdnator.errors import BadInput
 from sdnator.northbound import without_user
 from sdnator.redaction import redacted
 from sdnator.rights.granting import OPERATOR, is_dangerous
 from sdnator.rights.identities import Identities
+from sdnator.rights.users import Users
 from sdnator.up import running
 
-_SECRETS = ("identities.json", "run.json", "*.engine.json", "*.settings.json", "*.token", "coordinator.url")
+_SECRETS = (
+    "identities.json",
+    "users.json",
+    "dashboard.link",
+    "certificates/*.key",
+    "run.json",
+    "*.engine.json",
+    "*.settings.json",
+    "*.token",
+    "coordinator.url",
+)
 _SECONDS = 5.0
+_UNIX = "unix:"
 _ELSEWHERE = ("redis://", "mongodb://")
 
 
@@ -29,6 +44,8 @@ def security_checks() -> Iterator[Check]:
     yield check_secrets(state)
     yield check_archive_mode(archive)
     yield check_listeners(config)
+    yield check_switches(config, found)
+    yield check_page_users(state, config)
     yield check_urls(config, found)
     yield check_commanding(state)
     if found is not None:
@@ -73,13 +90,46 @@ def check_listeners(config: config_file.Config) -> Check:
         "dashboard.host": config.struct("dashboard").host,
         "coordinator.http_host": config.struct("coordinator").http_host,
         "metrics.host": config.struct("metrics").host,
-        **{f"switches.{one.name}.listen": _host(one.listen) for one in config.switches()},
     }
     wide = [f"{name}={place}" for name, place in places.items() if not _is_local(place)]
     if wide:
         remedy = "keep it on loopback, or put a proxy with TLS and log-in before it"
         return Check("listeners", "exposed", f"other machines reach {', '.join(wide)} without TLS", remedy)
     return Check("listeners", "ok", "everything listens on loopback or on sockets of the state folder")
+
+
+def check_switches(config: config_file.Config, found: running.Running | None) -> Check:
+    """Switches that speak P4Runtime over TCP without certificates, by the configuration and in the pipeline."""
+    named = {one.name for one in config.switches() if one.insecure and not _by_socket(one)}
+    running_now = () if found is None else (found.switches or (found.switch,))
+    named |= {
+        str(one["name"])
+        for one in running_now
+        if one.get("security", {}).get("insecure") and not str(one["address"]).startswith(_UNIX)
+    }
+    if named:
+        said = f"whoever reaches the P4Runtime port of {', '.join(sorted(named))} commands it"
+        return Check("switches", "exposed", said, "`sdnator cert init`, and leave out insecure = true")
+    return Check("switches", "ok", "P4Runtime by Unix socket, or with certificates on both sides")
+
+
+def check_page_users(state: Path, config: config_file.Config) -> Check:
+    """Whether people have names at the page, or all of them share the owner's token."""
+    options = config.struct("dashboard")
+    if not options.enabled:
+        return Check("page", "ok", "it is not served")
+    try:
+        users = Users(state).all
+    except BadInput as error:
+        return Check("page", "exposed", str(error), "nobody but the owner can sign in")
+    if users:
+        operators = sorted(name for name, one in users.items() if one.role == "operator")
+        said = f"{counted(len(users), 'user')}; operators: {', '.join(operators) or 'none'}"
+        return Check("page", "ok", said)
+    if _is_local(options.host):
+        return Check("page", "ok", "there are no users: the owner's token or link signs in, and nothing else")
+    said = f"there are no users, and dashboard.host={options.host}: all who look share the owner's token"
+    return Check("page", "exposed", said, "`sdnator user add NAME` for each of them")
 
 
 def check_urls(config: config_file.Config, found: running.Running | None) -> Check:
@@ -154,8 +204,10 @@ def _others(path: Path) -> str:
     return f"{mode:o}" if mode & 0o077 else ""
 
 
-def _host(place: str) -> str:
-    return "" if not place or place.startswith("unix:") else place.rpartition(":")[0].strip("[]")
+def _by_socket(switch: SwitchPlan) -> bool:
+    """An embedded switch without an address listens on a socket."""
+    place = switch.listen if switch.kind in ("embedded", "bmv2") else switch.kind
+    return place.startswith(_UNIX) or (switch.kind == "embedded" and not place)
 
 
 def _is_local(host: str) -> bool:

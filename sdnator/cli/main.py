@@ -26,6 +26,10 @@ COMMANDS = {
         "sdnator.cli.coordinator_commands:apps",
         "List apps and their instances: state, process, items written and received.",
     ),
+    "audit": (
+        "sdnator.cli.audit_command:audit",
+        "Show who signed in, was refused, and told the firewall what.",
+    ),
     "backup": (
         "sdnator.cli.backup_commands:backup",
         "Write archive, configuration and trained models into one file.",
@@ -108,6 +112,7 @@ COMMANDS = {
         "sdnator.cli.switch_commands:tables",
         "Show tables of a switch: size, entries, default actions; with --table every entry.",
     ),
+    "user": ("sdnator.cli.user_commands:app", "Who may sign in to the dashboard, and as what."),
     "up": ("sdnator.cli.up_command:up", "Run the whole pipeline until Ctrl-C, SIGTERM or `sdnator down`."),
 }
 """Name to module and first line of help."""

@@ -100,7 +100,7 @@ def _show_status(
         print(line)
     print(f"logs take {sum(one['log_bytes'] for one in found.health.values()) / 1e6:.1f} MB")
     if found.dashboard:
-        print(f"sign in to the dashboard with the token in {found.token_file}")
+        print(f"sign in to the dashboard: `sdnator user link`, or the token in {found.token_file}")
     if apps is None:
         print(f"the Coordinator at {without_user(found.coordinator)} does not answer")
 

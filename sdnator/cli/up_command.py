@@ -16,6 +16,7 @@ import typer
 from sdnator.errors import BadInput, PipelineError, SdnatorError
 from sdnator.northbound import without_user
 from sdnator.redaction import redacted
+from sdnator.rights.sign_in_link import new_link
 from sdnator.up import running
 from sdnator.up.planning import Given, plan_for
 from sdnator.up.running import shown
@@ -210,13 +211,21 @@ def _announce(found: running.Running, *, as_json: bool) -> None:
     if found.model:
         lines.append(("model", found.model))
     if found.dashboard:
-        lines += [("dashboard", found.dashboard), ("", f"sign in with the token in {found.token_file}")]
+        lines += [("dashboard", found.dashboard), ("", _way_in(found))]
     for name, where in lines:
         print(f"{name:<14}{where}")
     print(f"for your own apps: export DUE_UPDATES={quote(updates)} DUE_ARCHIVE={quote(archive)}")
     if (updates, archive) != (found.updates, found.archive):
         print("where … stands for user and password, which are not shown")
     print("The pipeline runs; Ctrl-C or `sdnator down` ends it.", flush=True)
+
+
+def _way_in(found: running.Running) -> str:
+    """A link for who sits here; none where the output may be kept in a file that others read."""
+    if sys.stdout.isatty():
+        with suppress(OSError):
+            return f"open {new_link(running.state_folder(), found.dashboard)} to sign in (once)"
+    return f"`sdnator user link` prints a link that signs in; the token is in {found.token_file}"
 
 
 def _switch_line(switch: object) -> str:

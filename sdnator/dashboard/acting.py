@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Literal
 
 from nicegui import ui
 
+from sdnator.dashboard.gate import SIGN_IN
+
 if TYPE_CHECKING:
     from apps.messages import Answer
     from sdnator.dashboard.page_backend import PageBackend
 
 _ANSWER_SECONDS = 10.0
-_WRONG_SECONDS = 1.0
 
 
 class Acting:
@@ -23,51 +24,33 @@ class Acting:
 
     @property
     def allowed(self) -> bool:
-        """Whether this browser has signed in; asked anew with every deed, whatever the page shows."""
-        return self._service.sessions.may_act(self._session)
+        """Whether an operator has signed in here; asked anew with every deed, whatever the page shows."""
+        return self._service.sessions.may_act(self._session, time.monotonic())
 
-    def sign_in_button(self) -> None:
-        """In the header: sign in, or out."""
-        if self.allowed:
-            ui.button("Sign out", icon="logout", on_click=self._sign_out).props(
-                "flat dense no-caps color=white"
-            ).classes("sign-out")
-            return
-        with ui.dialog() as dialog, ui.card().style("min-width: min(360px, 90vw)"):
-            ui.label("Sign in").classes("text-subtitle1 text-weight-medium")
-            ui.label("The token stands in the file that `sdnator up` and `sdnator status` name.").classes(
-                "quiet"
-            )
-            field = ui.input("Token", password=True).props("autofocus outlined dense").classes("token w-full")
-            fault = ui.label("").classes("fault")
+    @property
+    def may_look(self) -> bool:
+        """Whether this browser is still signed in."""
+        return self._service.sessions.may_look(self._session, time.monotonic())
 
-            async def try_it() -> None:
-                sessions, source = self._service.sessions, ui.context.client.ip
-                await asyncio.sleep(sessions.delay_s(source, time.monotonic()))
-                wrong = sessions.sign_in(self._session, str(field.value or ""), source)
-                if not wrong:
-                    ui.navigate.reload()
-                    return
-                await asyncio.sleep(_WRONG_SECONDS)
-                field.set_value("")
-                fault.set_text(wrong)
-
-            field.on("keydown.enter", try_it)
-            with ui.row().classes("w-full justify-end"):
-                ui.button("Cancel", on_click=dialog.close).props("flat no-caps")
-                ui.button("Sign in", on_click=try_it).props("unelevated no-caps").classes("sign-in-now")
-        ui.button("Sign in", icon="login", on_click=dialog.open).props(
+    def sign_out_button(self) -> None:
+        """In the header: who sits there, and the way out."""
+        sessions = self._service.sessions
+        ui.label(f"{sessions.name_of(self._session)}, {sessions.role_of(self._session)}").classes("who")
+        ui.button("Sign out", icon="logout", on_click=self._sign_out).props(
             "flat dense no-caps color=white"
-        ).classes("sign-in")
+        ).classes("sign-out")
 
     def _sign_out(self) -> None:
-        self._service.sessions.sign_out(self._session)
-        ui.navigate.reload()
+        sessions = self._service.sessions
+        if name := sessions.name_of(self._session):
+            self._service.note(name, "signed out", ui.context.client.ip or "")
+        sessions.sign_out(self._session)
+        ui.navigate.to(SIGN_IN)
 
     async def instruct(self, verb: Literal["unblock", "allow", "false_alarm"], subject: str) -> None:
         """Tell the firewall, and show what it says."""
         if not self.allowed:
-            ui.notify("sign in first", type="warning")
+            ui.notify("sign in as an operator first", type="warning")
             return
         loop = asyncio.get_running_loop()
         told: asyncio.Future[Answer] = loop.create_future()
@@ -79,7 +62,8 @@ class Acting:
         def answered(answer: "Answer") -> None:
             loop.call_soon_threadsafe(tell, answer)
 
-        name = await asyncio.to_thread(self._service.instruct, verb, subject, answered)
+        who = self._service.sessions.name_of(self._session)
+        name = await asyncio.to_thread(self._service.instruct, verb, subject, who, answered)
         try:
             answer = await asyncio.wait_for(told, _ANSWER_SECONDS)
         except TimeoutError:

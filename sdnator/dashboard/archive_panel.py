@@ -12,6 +12,7 @@ from sdnator.counted import counted
 from sdnator.dashboard.texts import clock
 from sdnator.errors import BadInput
 from sdnator.notation import brief, instant_ns, typed_key
+from sdnator.rights.audited_deed import AUDITED
 
 if TYPE_CHECKING:
     from due import Item
@@ -40,6 +41,9 @@ class ArchivePanel:
                 ui.button("Search", icon="search", on_click=self._search).props("unelevated no-caps").classes(
                     "search-now"
                 )
+                ui.button("Who did what", icon="history", on_click=self._audit).props(
+                    "unelevated no-caps"
+                ).classes("audit-now")
                 self._key.on("keydown.enter", self._search)
             self._said = ui.label("").classes("quiet said")
             columns = [
@@ -55,6 +59,10 @@ class ArchivePanel:
         if not self._opened:
             self._opened = True
             await self._search()
+
+    async def _audit(self) -> None:
+        self._key.set_value(AUDITED)
+        await self._search()
 
     async def _search(self) -> None:
         now = time.time_ns()

@@ -7,6 +7,7 @@ from nicegui import app, ui
 from sdnator.dashboard.acting import Acting
 from sdnator.dashboard.apps_panel import AppsPanel
 from sdnator.dashboard.archive_panel import ArchivePanel
+from sdnator.dashboard.gate import KEY, SIGN_IN
 from sdnator.dashboard.overview_panel import OverviewPanel
 from sdnator.dashboard.queries_panel import QueriesPanel
 from sdnator.dashboard.style import STYLE
@@ -20,14 +21,9 @@ def build(service: "PageBackend") -> None:
     """One browser's page."""
     ui.add_css(STYLE)
     ui.colors(primary="#2f6fb3")
-    session = str(app.storage.browser["id"])
+    session = str(app.storage.browser.get(KEY, ""))
     acting = Acting(service, session)
-    with ui.header(elevated=False).classes("items-center bar"):
-        ui.label("SDNator").classes("text-weight-medium text-subtitle1")
-        degraded = ui.label("").classes("degraded")
-        ui.space()
-        _dark_button()
-        acting.sign_in_button()
+    degraded = _header(acting)
     tabs, places = _tabs()
     with ui.tab_panels(tabs, value="Overview", animated=False).classes("w-full").props("keep-alive"):
         with ui.tab_panel(places["Overview"]).classes("q-pa-none"):
@@ -41,19 +37,22 @@ def build(service: "PageBackend") -> None:
         with ui.tab_panel(places["Archive"]).classes("q-pa-none"):
             archive = ArchivePanel(service)
 
+    quick = {"Overview": overview.refresh, "Machinery": apps.refresh, "Queries": queries.refresh}
+
     def refresh() -> None:
-        """Only what is on show costs anything."""
+        """Only what is on show costs anything, and only who may still look is shown it."""
+        if not acting.may_look:
+            ui.navigate.to(SIGN_IN)
+            return
         if degraded.text != service.board.degraded:
             degraded.set_text(service.board.degraded)
-        if tabs.value == "Overview":
-            overview.refresh()
-        elif tabs.value == "Machinery":
-            apps.refresh()
-        elif tabs.value == "Queries":
-            queries.refresh()
+        if tabs.value in quick:
+            quick[tabs.value]()
 
     async def refresh_slowly() -> None:
         """What has to be asked for."""
+        if not acting.may_look:
+            return
         if tabs.value == "Switches":
             await switches.refresh()
         elif tabs.value == "Overview":
@@ -64,6 +63,17 @@ def build(service: "PageBackend") -> None:
     ui.timer(1 / service.settings.frames, refresh)
     ui.timer(3.0, refresh_slowly)
     tabs.on_value_change(refresh_slowly)
+
+
+def _header(acting: Acting) -> ui.label:
+    """The header; returns its place for what is degraded."""
+    with ui.header(elevated=False).classes("items-center bar"):
+        ui.label("SDNator").classes("text-weight-medium text-subtitle1")
+        degraded = ui.label("").classes("degraded")
+        ui.space()
+        _dark_button()
+        acting.sign_out_button()
+    return degraded
 
 
 def _tabs() -> tuple[ui.tabs, dict[str, ui.tab]]:

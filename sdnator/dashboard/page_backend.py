@@ -19,7 +19,11 @@ class PageBackend(Protocol):
     sessions: Sessions
     """Who has signed in."""
 
-    def instruct(self, verb: Any, subject: str, answered: Callable[[Answer], None]) -> str:
+    def note(self, who: str, deed: str, source: str) -> None:
+        """Keep in the archive what somebody did, and from which address."""
+        ...
+
+    def instruct(self, verb: Any, subject: str, who: str, answered: Callable[[Answer], None]) -> str:
         """Tell the firewall; returns the instruction's id, and `answered` gets its answer.  Raises DueError."""
         ...
 

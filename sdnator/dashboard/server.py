@@ -18,7 +18,8 @@ _RECONNECT_SECONDS = 30.0
 _HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"x-frame-options": b"DENY",
-    b"referrer-policy": b"no-referrer",
+    # not "no-referrer": with that browsers send forms of our own pages without their origin
+    b"referrer-policy": b"same-origin",
 }
 
 
@@ -85,10 +86,22 @@ def serve(
     import uvicorn
     from fastapi import FastAPI
     from nicegui import ui
+    from starlette.middleware.sessions import SessionMiddleware
 
+    from sdnator.dashboard.gate import Gate
     from sdnator.dashboard.page import build
 
     app = FastAPI(openapi_url=None)
+    app.add_middleware(Gate, sessions=service.sessions, noted=service.note)
+    # added last, so that it reads the cookie before the gate asks for it; forgotten with the process: who was signed in
+    # signs in again
+    app.add_middleware(
+        SessionMiddleware,
+        secret_key=secrets.token_urlsafe(32),
+        session_cookie="sdnator",
+        same_site="strict",
+        max_age=None,
+    )
     ui.run_with(
         app,
         root=lambda: build(service),
@@ -99,9 +112,6 @@ def serve(
         message_history_length=_HISTORY,
         reconnect_timeout=_RECONNECT_SECONDS,
         show_welcome_message=False,
-        # forgotten with the process: who was signed in signs in again
-        storage_secret=secrets.token_urlsafe(32),
-        session_middleware_kwargs={"session_cookie": "sdnator", "same_site": "strict"},
     )
     guarded: Any = Guard(app, service.settings.names)
     config = uvicorn.Config(guarded, log_level="warning", access_log=False, lifespan="on")

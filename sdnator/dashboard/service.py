@@ -27,9 +27,13 @@ from sdnator.dashboard.board import Board
 from sdnator.dashboard.settings import Settings
 from sdnator.dashboard.sign_in import Sessions, WeakToken, token_from
 from sdnator.errors import BadInput, SdnatorError
+from sdnator.rights import sign_in_link
+from sdnator.rights.audited_deed import REFUSED, AuditedDeed, MinuteLimit
+from sdnator.rights.users import Users
 
 ANSWERS = "network.answer.firewall.dashboard"
 INSTRUCTION = "network.instruction.dashboard.firewall"
+AUDIT = "network.audit.dashboard.page"
 DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*", "network.meter.firewall.*")
 CONFIRMATIONS = f"{CONFIRMED}.*.*"
 _STATE = "network.switch.p4runtime_ctrl"
@@ -46,9 +50,15 @@ INTERESTS = (
     Interest(ANSWERS),
     Interest(_TALKERS),
 )
-CAPABILITIES = (Capability(INSTRUCTION, delivery="reliable", archive="always"),)
+CAPABILITIES = (
+    Capability(INSTRUCTION, delivery="reliable", archive="always"),
+    Capability(AUDIT, delivery="reliable", archive="always"),
+)
 
 _POLL_SECONDS = 2.0
+_REFUSALS = 30
+"""Refused sign-ins of a minute that are kept in the archive: guessing must not fill it."""
+_NAME_CHARACTERS = 64
 _ANSWER_SECONDS = 10.0
 _WAITING = 64
 _EXPLAINED = 16
@@ -69,6 +79,9 @@ class DashboardService:
         self._engine = engine
         self._waiting: dict[str, Callable[[Answer], None]] = {}
         self._misunderstood = 0
+        self._refusals = MinuteLimit(_REFUSALS)
+        self._unnoted = 0
+        """Refused sign-ins that are not in the audit trail."""
         self._explained = 0
         """Pages that hear what is done for a key."""
         self._stopping = threading.Event()
@@ -79,9 +92,11 @@ class DashboardService:
     def start(self) -> None:
         """Subscribe, listen, and serve as soon as the page's library is loaded.  Raises InvalidOption."""
         try:
-            self.sessions = Sessions(token_from(self.settings.token_file, os.environ))
+            self.sessions = self._sessions()
         except (WeakToken, OSError) as error:
             raise InvalidOption(f"dashboard.token_file: {error}") from None
+        except BadInput as error:
+            raise InvalidOption(str(error)) from None
         self._socket = listening(self.settings.host, self.settings.port)
         self._subscribe()
         self._take_up_history()
@@ -89,6 +104,12 @@ class DashboardService:
             thread = threading.Thread(target=work, name=f"dashboard {name}", daemon=True)
             thread.start()
             self._threads.append(thread)
+
+    def _sessions(self) -> Sessions:
+        token, state = token_from(self.settings.token_file, os.environ), self.settings.state
+        return (
+            Sessions(token, Users(Path(state)), Path(state) / sign_in_link.FILE) if state else Sessions(token)
+        )
 
     def ready(self) -> dict[str, Any]:
         """For the ready line."""
@@ -182,14 +203,30 @@ class DashboardService:
             for item in last:
                 self.board.switch(item.value)
 
-    def instruct(self, verb: Any, subject: str, answered: Callable[[Answer], None]) -> str:
+    def note(self, who: str, deed: str, source: str) -> None:
+        """Keep in the archive what somebody did; refusals beyond the limit of a minute are counted only."""
+        if deed == REFUSED and not self._refusals.pass_on(time.monotonic()):
+            self._unnoted += 1
+            return
+        # whoever is refused chose the name
+        name = "".join(one if one.isprintable() else "?" for one in who[:_NAME_CHARACTERS])
+        log.info("%s: %s, from %s", name, deed, source or "the page")
+        deed_done = AuditedDeed(who=name, deed=deed, source=source, unnoted=self._unnoted)
+        try:
+            self._engine.write(AUDIT, deed_done.to_value(), [NO_WAIT])
+        except DueError as error:
+            log.warning("the audit trail lacks that %s: %s: %s", name, deed, error)
+
+    def instruct(self, verb: Any, subject: str, who: str, answered: Callable[[Answer], None]) -> str:
         """Tell the firewall; `answered` is called in the engine's thread.  Returns the instruction's id."""
-        instruction = Instruction(id=uuid4().hex[:12], verb=verb, subject=subject, reason="by the dashboard")
+        instruction = Instruction(
+            id=uuid4().hex[:12], verb=verb, subject=subject, reason=f"by {who} on the dashboard"
+        )
         while len(self._waiting) >= _WAITING:
             self._waiting.pop(next(iter(self._waiting)))
         self._waiting[instruction.id] = answered
         self._engine.write(INSTRUCTION, instruction.to_value(), [NO_WAIT])
-        log.info("%s %s, by somebody who has signed in", verb, subject)
+        self.note(who, f"{verb} {subject}", "")
         return instruction.id
 
     def forget(self, instruction: str) -> None:

@@ -15,7 +15,7 @@ class DashboardOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     names: tuple[str, ...] = ()
     """Host names that browsers may use for the dashboard, besides localhost and IP addresses."""
     token_file: str = ""
-    """File with the sign-in token; empty: `dashboard.token` in the state folder, made at the first start.
+    """File with the owner's sign-in token; empty: `dashboard.token` in the state folder, made at the first start.
     $SDNATOR_DASHBOARD_TOKEN overrides both."""
     frames: float = 4.0
     """Most updates of the page per second."""
@@ -47,5 +47,7 @@ class Settings(DashboardOptions, frozen=True, kw_only=True, forbid_unknown_field
     coordinator_file: str = ""
     """File that holds the URL of the Coordinator's HTTP API."""
     switches: tuple[SwitchPlace, ...] = ()
+    state: str = ""
+    """Folder with the users of the page and the link of `sdnator up`; empty: the owner's token alone signs in."""
     run_file: str = ""
     """File to which `sdnator up` writes the state of its parts; empty: none."""

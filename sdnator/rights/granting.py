@@ -75,11 +75,11 @@ _PRODUCT: dict[str, Rights] = {
         ),
         Rights(
             app="dashboard",
-            publish=("network.instruction.dashboard.*",),
+            publish=("network.instruction.dashboard.*", "network.audit.dashboard.*"),
             observe=(
                 *("network.anomaly.kitsune.score", "network.anomaly.kitsune.alert", *_DECISIONS, _SWITCHES),
                 *("network.confirmation.*.*", "network.incident.firewall.*", "network.answer.*.dashboard"),
-                *("network.query_plan.sonata_adapter", "due.health.*"),
+                *("network.query_plan.sonata_adapter", "network.traffic.kitsune.*", "due.health.*"),
             ),
         ),
         *(

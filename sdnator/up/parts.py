@@ -272,6 +272,7 @@ class UpParts:
     def _dashboard_places(self) -> Mapping[str, Any]:
         return {
             "coordinator_file": str(self.address_file),
+            "state": str(self.plan.state),
             "run_file": str(self.plan.state / "run.json"),
             "switches": [
                 {

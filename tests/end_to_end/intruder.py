@@ -39,6 +39,12 @@ FRAMES = "network.frames.p4runtime_ctrl.s1.all"
 _REGEX = {"dataKey": {"$regex": r"^((\w|\.)+)+!$"}}
 _TIMEOUT_S = 60.0
 _ROLE = "intruder"
+_UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
 _NOWHERE = "127.0.0.1:1"
 
 
@@ -52,10 +58,10 @@ def _attempt(deed: Callable[[], object]) -> str:
     return THROUGH
 
 
-def _request(place: str, path: str, headers: Mapping[str, str]) -> None:
+def _request(place: str, path: str, headers: Mapping[str, str], form: bytes | None = None) -> None:
     connection = http.client.HTTPConnection(place, timeout=_TIMEOUT_S)
     try:
-        connection.request("GET", path, headers=dict(headers))
+        connection.request("GET" if form is None else "POST", path, body=form, headers=dict(headers))
         status = connection.getresponse().status
     finally:
         connection.close()
@@ -66,17 +72,32 @@ def _request(place: str, path: str, headers: Mapping[str, str]) -> None:
 def _by_http(place: str, token: str) -> dict[str, str]:
     """Whole frames, and the query that once froze the Coordinator."""
     rights = {"Authorization": f"Bearer {token}"} if token else {}
-    upgrade = {
-        "Connection": "Upgrade",
-        "Upgrade": "websocket",
-        "Sec-WebSocket-Version": "13",
-        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
-    }
     query = quote(json.dumps(_REGEX))
     return {
-        "frames": _attempt(lambda: _request(place, f"/observe?key={FRAMES}", rights | upgrade)),
+        "frames": _attempt(lambda: _request(place, f"/observe?key={FRAMES}", rights | _UPGRADE)),
         "regex": _attempt(lambda: _request(place, f"/get?query={query}", rights)),
         "apps": _attempt(lambda: _request(place, "/apps", rights)),
+    }
+
+
+def _by_page(place: str) -> dict[str, str]:
+    """The page, what it is made of, its frames, and its sign-in with what anybody may guess."""
+    origin = {"Origin": f"http://{place}", "Content-Type": "application/x-www-form-urlencoded"}
+    upgrade = {**_UPGRADE, "Origin": f"http://{place}"}
+    return {
+        "page": _attempt(lambda: _request(place, "/", {})),
+        "files": _attempt(lambda: _request(place, "/_nicegui/", {})),
+        "frames": _attempt(
+            lambda: _request(place, "/_nicegui_ws/socket.io/?EIO=4&transport=websocket", upgrade)
+        ),
+        "polled frames": _attempt(
+            lambda: _request(place, "/_nicegui_ws/socket.io/?EIO=4&transport=polling", origin)
+        ),
+        "link": _attempt(lambda: _request(place, "/link/guess", {})),
+        "sign in": _attempt(lambda: _request(place, "/sign-in", origin, b"name=owner&password=guess")),
+        "sign in by the token": _attempt(
+            lambda: _request(place, "/sign-in", origin, b"name=&password=guess")
+        ),
     }
 
 
@@ -145,6 +166,7 @@ def main() -> None:
     """Become the user, try everything, tell."""
     told = json.load(sys.stdin)
     _by_http(_NOWHERE, "")
+    _by_page(_NOWHERE)
     _by_p4runtime(f"unix:/{_NOWHERE}")
     _by_updates(f"redis://{_NOWHERE}")
     if told["uid"] != os.geteuid():
@@ -158,6 +180,7 @@ def main() -> None:
         token = url.partition("://")[2].rpartition("@")[0].partition(":")[2]
     found = {
         "http": _by_http(told["coordinator"], token),
+        "page": _by_page(told["page"]),
         "p4runtime": _by_p4runtime(told["switch"]),
         "updates": _by_updates(url),
         "looked": _looked(Path(told["folder"])),

@@ -96,16 +96,13 @@ class Page:
         except WebDriverException:
             return False
 
-    def sign_in(self, token, done):
-        """Open the dialog, give the token; once more where a slow machine had the page loaded anew."""
+    def sign_in(self, token, done, name=""):
+        """Fill in the form; once more where a slow machine had the page loaded anew."""
 
         def attempt():
             if done():
                 return True
-            if not self.seen(".token input"):
-                self.click_now(".sign-in")
-                soon(lambda: self.seen(".token input") or done())
-            if self.type_now(".token input", token):
+            if self.type_now(".name input", name) and self.type_now(".token input", token):
                 self.click_now(".sign-in-now")
                 soon(done)
             return done()
@@ -173,11 +170,14 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
     driver = browser()
     try:
         page = Page(driver, said["dashboard"])
-        page.find(".decisions", ADDRESS)
-        page.find(".health", "uarding 1 switch")  # it was connected before the page was there
-        assert not page.shows(".undo"), "who has not signed in may only look"
-        page.sign_in("not the token, but as long", lambda: page.seen(".fault", "not the token"))
+        page.find(".sign-in-now")
+        assert not page.shows(".decisions"), "who has not signed in sees nothing"
+        assert page.driver.execute_script(NAMELESS) == []
+        assert unreadable(page) == []
+        page.sign_in("not the token, but as long", lambda: page.seen(".fault", "are wrong"))
+        as_a_viewer(operator, page)
         page.sign_in(token, lambda: page.seen(".sign-out"))
+        page.driver.get_log("browser")  # it holds that the wrong password was refused
 
         for label, table, address in (("Undo", "block_src", ADDRESS), ("Release", "protect", GUARDED)):
 
@@ -189,9 +189,25 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
         page.find(".decisions", "nothing is blocked")
         look_around(page)
         for_everybody(page)
+        who_did_what(operator, page)
         without_a_mouse(page)
+        by_a_link(operator, page)
     finally:
         driver.quit()
+
+
+def as_a_viewer(operator, page):
+    """Who may only look sees the block and no way to undo it, and is out as soon as the user is removed."""
+    password = "correct horse battery"  # noqa: S105
+    done = operator.run("user", "add", "vera", "--password-stdin", given=password + "\n")
+    assert done.returncode == 0, done.stderr
+    page.sign_in(password, lambda: page.seen(".sign-out"), "vera")
+    page.find(".who", "vera, viewer")
+    page.find(".decisions", ADDRESS)
+    page.find(".health", "uarding 1 switch")  # it was connected before the page was there
+    assert not page.shows(".undo"), "who is no operator may only look"
+    assert operator.run("user", "remove", "vera").returncode == 0
+    page.find(".sign-in-now")
 
 
 CONTRAST = """
@@ -295,7 +311,26 @@ def without_a_mouse(page):
     page.find(".plan-said", "this is where it would run")
     reach(".sign-out")
     press(Keys.ENTER)
-    page.find(".sign-in")
+    page.find(".sign-in-now")
+
+
+def who_did_what(operator, page):
+    """The page's archive and the command line tell of the sign-ins and of what was undone."""
+    page.click(".q-tab", "Archive")
+    page.click(".audit-now")
+    page.find(".found", "signed in")
+    deeds = [(one["who"], one["deed"].split()[0]) for one in operator.figures("audit")["deeds"]]
+    assert {("owner", "refused"), ("vera", "signed"), ("owner", "signed"), ("owner", "unblock")} <= set(deeds)
+
+
+def by_a_link(operator, page):
+    """It signs in at once, and only once."""
+    link = operator.run("user", "link").stdout.strip()
+    page.driver.get(link)
+    page.find(".who", "owner, operator")
+    page.driver.delete_all_cookies()
+    page.driver.get(link)
+    page.find(".fault", "was used")
 
 
 def look_around(page):

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from due.drivers.embedded_redis import EmbeddedServer
@@ -50,6 +51,7 @@ class Pipeline:
             "credential": str(credential or ""),
             "token": token,
             "coordinator": without_user(self.found.coordinator).partition("://")[2],
+            "page": self.found.dashboard.partition("://")[2].rstrip("/"),
             "switch": self.found.switch["address"],
             "folder": str(self.folder),
         }
@@ -107,6 +109,33 @@ def _refused(found: dict[str, str]) -> None:
     assert THROUGH not in found.values(), found
 
 
+def refused_at_the_page(found: dict[str, str]) -> None:
+    """To the form from the page itself, 401 or 403 at every other door."""
+    assert found.pop("page") == "HTTPException: 303"
+    assert set(found.values()) <= {"HTTPException: 401", "HTTPException: 403"}
+    assert len(found) == 6
+
+
+def test_the_owner_signs_in_by_a_link_and_what_was_refused_can_be_read(pipeline):
+    done = pipeline.operator.run("user", "link")
+    assert done.returncode == 0, done.stderr
+    with httpx.Client(timeout=SECONDS) as browser:
+        link = done.stdout.strip()
+        assert link.startswith(pipeline.found.dashboard)
+        assert browser.get(link).status_code == 200
+        page = browser.get(pipeline.found.dashboard)
+        assert page.status_code == 200
+        assert "sign-in" not in str(page.url)
+        pipeline.attacked(_NOBODY)
+
+        def told():
+            deeds = pipeline.operator.figures("audit")["deeds"]
+            found = {(one["who"], one["deed"]) for one in deeds}
+            return {("owner", "signed in by a link"), ("owner", "refused to sign in")} <= found
+
+        until(told)
+
+
 def test_the_owner_goes_through_the_same_doors(pipeline):
     token = (pipeline.state / "coordinator.token").read_text().strip()
     found = pipeline.attacked(os.geteuid(), token=token)
@@ -129,6 +158,7 @@ def test_another_user_without_a_credential_gets_nothing(pipeline):
     assert set(found["http"].values()) <= {"HTTPException: 401", "HTTPException: 403"}
     assert all("UNAVAILABLE" in text and "ermission denied" in text for text in found["p4runtime"].values())
     _refused(found["updates"])
+    refused_at_the_page(found["page"])
     assert found["looked"]["readable"] == [_MARKER]
     assert _wires(pipeline) == before
     until(pipeline.operator.well)
@@ -162,6 +192,7 @@ def test_an_enrolled_app_says_its_own_and_commands_nothing(pipeline):
     assert all("NoPermissionError" in text for name, text in found["updates"].items() if name not in own)
     assert {f"publish {key}" for key in COMMANDS} <= found["updates"].keys()
     _refused(found["http"])
+    refused_at_the_page(found["page"])
     _refused(found["p4runtime"])
     assert _wires(pipeline) == before
     until(pipeline.operator.well)

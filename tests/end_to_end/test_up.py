@@ -44,7 +44,7 @@ class Operator:
     def command(self, *words: str) -> list[str]:
         return [sys.executable, "-m", "tests.end_to_end.operator_app", *words]
 
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+    def run(self, *words: str, given: str = "") -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             self.command(*words),
             env=self.environment,
@@ -52,6 +52,7 @@ class Operator:
             text=True,
             timeout=SECONDS,
             check=False,
+            input=given,
         )
 
     def figures(self, *words: str):

@@ -6,9 +6,17 @@ import pytest
 
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_rights import Rights
-from sdnator.cli.doctor_security import check_listeners, check_server_rights, check_urls, security_checks
+from sdnator.cli.doctor_security import (
+    check_listeners,
+    check_page_users,
+    check_server_rights,
+    check_switches,
+    check_urls,
+    security_checks,
+)
 from sdnator.config import config_file
 from sdnator.rights.identities import ADMIN, Identities, made
+from sdnator.rights.users import Users
 from sdnator.up import running
 
 
@@ -55,8 +63,7 @@ def test_an_enrolled_app_that_may_command_is_named(state):
         ('[dashboard]\nhost = "0.0.0.0"', "dashboard.host=0.0.0.0"),
         ('[coordinator]\nhttp_host = "::"', "coordinator.http_host=::"),
         ('[metrics]\nhost = "10.0.0.1"', "metrics.host=10.0.0.1"),
-        ('[[switches]]\nlisten = "0.0.0.0:9559"', "switches.s1.listen=0.0.0.0"),
-        ('[[switches]]\nlisten = "127.0.0.1:9559"', ""),
+        ('[dashboard]\nhost = "127.0.0.1"', ""),
     ],
 )
 def test_listeners_for_other_machines_are_found(tmp_path, text, exposed):
@@ -64,6 +71,45 @@ def test_listeners_for_other_machines_are_found(tmp_path, text, exposed):
     path.write_text(text)
     check = check_listeners(config_file.load(path, {}))
     assert (exposed in check.found) if exposed else check.state == "ok"
+
+
+@pytest.mark.parametrize(
+    ("text", "exposed"),
+    [
+        ('[[switches]]\nkind = "10.0.0.2:9559"\ninsecure = true', True),
+        ('[[switches]]\nlisten = "127.0.0.1:9559"\ninsecure = true', True),
+        ('[[switches]]\nkind = "bmv2"\ninsecure = true', True),
+        ("[[switches]]\ninsecure = true", False),
+        ('[[switches]]\nkind = "unix:/run/s.sock"', False),
+    ],
+)
+def test_switches_without_certificates_are_found(tmp_path, text, exposed):
+    path = tmp_path / "sdnator.toml"
+    path.write_text(text)
+    check = check_switches(config_file.load(path, {}), None)
+    assert (check.state == "exposed") is exposed
+    place = {
+        "address": "127.0.0.1:1" if exposed else "unix:/s",
+        "security": {"insecure": True},
+        "name": "mine",
+    }
+    found = running.Running(pid=1, started=1, updates="", archive="", coordinator="", switches=[place])
+    assert ("mine" in check_switches(config_file.load(path, {}), found).found) is exposed
+
+
+def test_a_page_without_users_is_told(state, tmp_path):
+    path = tmp_path / "sdnator.toml"
+    path.write_text("")
+    here = config_file.load(path, {})
+    assert "there are no users" in check_page_users(state, here).found
+    path.write_text('[dashboard]\nhost = "10.0.0.1"')
+    elsewhere = config_file.load(path, {})
+    assert check_page_users(state, elsewhere).state == "exposed"
+    Users(state).add("ada", "viewer", "correct horse battery")
+    assert check_page_users(state, elsewhere).state == "ok"
+    assert "1 user; operators: none" in check_page_users(state, here).found
+    (state / "users.json").write_text("{")
+    assert check_page_users(state, here).state == "exposed"
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,10 @@ def test_a_taken_port_means_a_free_one():
 
 def test_it_makes_nothing_but_instructions():
     """Everything else is for looking."""
-    assert [one.key for one in CAPABILITIES] == ["network.instruction.dashboard.firewall"]
+    assert [one.key for one in CAPABILITIES] == [
+        "network.instruction.dashboard.firewall",
+        "network.audit.dashboard.page",
+    ]
     assert "network.anomaly.kitsune.score" in {one.key for one in INTERESTS}
 
 

@@ -1,0 +1,74 @@
+"""`sdnator audit`: who did what, from Data Archives."""
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import typer
+
+from apps.messages import Instruction, MessageError
+from due import Item
+from sdnator.blocks.blocks_archive import find
+from sdnator.cli.plain_table import plain_table
+from sdnator.notation import instant_ns
+from sdnator.rights.audited_deed import AUDITED, AuditedDeed
+
+_INSTRUCTIONS = "network.instruction.*.firewall"
+_PAGE = "dashboard"
+"""Its instructions stand among the deeds, with the name of whoever gave them."""
+
+ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
+
+
+def audit(
+    *,
+    since: Annotated[
+        str, typer.Option(help="Since: 1h or 7d ago, or a local time such as 2024-05-01T12:00.")
+    ] = "7d",
+    who: Annotated[str, typer.Option(help="Of this user or app only.", metavar="NAME")] = "",
+    archive: ArchiveOption = "",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Show who signed in, was refused, and told the firewall what.
+
+    Oldest first. Users of the page stand by name; `operator` is whoever uses the command line, other names are apps.
+
+    Example: sdnator audit --since 24h
+    """
+    start = instant_ns(since, time.time_ns(), "--since") if since else 0
+    deeds = [one for one in _deeds(archive, start) if who in ("", one["who"])]
+    if as_json:
+        print(json.dumps({"deeds": deeds}))
+    elif not deeds:
+        print("nothing was done")
+    else:
+        rows = ((_clock(one["time"]), one["who"], one["source"] or "-", one["deed"]) for one in deeds)
+        print(plain_table(("time", "who", "from", "what"), rows))
+
+
+def _deeds(archive: str, start: int) -> Iterator[dict[str, Any]]:
+    query = {"timestamp": {"$gte": start}}
+    items = [item for key in (AUDITED, _INSTRUCTIONS) for item in find(archive, {"dataKey": key, **query})]
+    for item in sorted(items, key=lambda one: one.timestamp):
+        try:
+            found = _deed(item)
+        except MessageError:  # an app of somebody else wrote it
+            continue
+        if found is not None:
+            yield found
+
+
+def _deed(item: Item) -> dict[str, Any] | None:
+    if ".audit." in item.key:
+        one = AuditedDeed.from_value(item.value)
+        return {"time": item.timestamp, "who": one.who, "source": one.source, "deed": one.deed}
+    said = Instruction.from_value(item.value)
+    if item.app_id == _PAGE:
+        return None
+    words = " ".join(filter(None, (said.verb, said.subject, f"({said.reason})" if said.reason else "")))
+    return {"time": item.timestamp, "who": item.app_id, "source": "", "deed": words}
+
+
+def _clock(time_ns: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(time_ns / 1e9))
