@@ -14,6 +14,7 @@ from sdnator.cli.coordinator_commands import Url
 from sdnator.cli.due_commands import Archive, KeyArgument, Updates
 from sdnator.cli.plain_table import plain_table
 from sdnator.cli.plan_question import ask_plan, is_asked_of_adapter
+from sdnator.cli.switch_place import Insecure, place_of
 from sdnator.errors import PipelineError
 from sdnator.northbound import ask, latest
 from sdnator.notation import brief, local_time, typed_key
@@ -35,6 +36,7 @@ def explain(
         list[str] | None,
         typer.Option(help="HOST:PORT or name of a switch; default: all of the pipeline.", metavar="SWITCH"),
     ] = None,
+    insecure: Insecure = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Explain a key: who wants it, who makes it at what rate, its plan and cost, its results and their archive.
@@ -50,7 +52,7 @@ def explain(
         "key": wanted,
         "coordinator": _coordinator(url or _of(found).coordinator, wanted),
         "plan": _without_times(plan),
-        "switches": _switches(plan, switch) if plan.get("state") == "running" else [],
+        "switches": _switches(plan, switch, insecure) if plan.get("state") == "running" else [],
         "cost": _cost(told) if plan.get("state") == "running" else {},
         "archive": _archived(archive or _of(found).archive, output),
     }
@@ -105,17 +107,16 @@ def _without_times(plan: Section) -> Section:
     return {name: value for name, value in plan.items() if name not in ("monotonic_s", "adapter_cpu_s")}
 
 
-def _switches(plan: Mapping[str, Any], chosen: Sequence[str] | None) -> list[Section]:
+def _switches(plan: Mapping[str, Any], chosen: Sequence[str] | None, insecure: bool) -> list[Section]:
     """The entries of the plan in each switch, with handle and counter; a switch that does not answer says so."""
     from sdnator.cli.switch_commands import read_tables
-    from sdnator.cli.switch_place import place_of
 
     if chosen is None:
         found = running.need()
         chosen = [str(one["name"]) for one in (found.switches or [found.switch])]
     shown: list[Section] = []
     for name in chosen:
-        place = place_of(name, 1)
+        place = place_of(name, 1, insecure=insecure)
         try:
             rows = {
                 table: read_tables(place, table)[1]

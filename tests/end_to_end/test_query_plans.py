@@ -71,7 +71,15 @@ def test_explain_follows_a_key_from_the_wish_to_the_archive(stage):
     key = f"{PREFIX}.new_tcp:threshold=10,window=2s"
     results = Heard(engine, key)
     wait_for(lambda: states.items and states.items[-1].value["telemetry"] == ["q0"], 120, stage.log)
-    where = ["--updates", stage.server.url, "--archive", stage.archive, "--switch", stage.target.address]
+    where = [
+        "--updates",
+        stage.server.url,
+        "--archive",
+        stage.archive,
+        "--switch",
+        stage.target.address,
+        "--insecure",
+    ]
     where += ["--url", stage.processes[0].wait_ready()["http"]]
 
     def explained(*more):

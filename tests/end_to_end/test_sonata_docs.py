@@ -33,7 +33,8 @@ def test_commands_for_a_running_pipeline(tmp_path, monkeypatch):
         stage.controller()
         where = {"observe": ["--updates", stage.server.url], "get": ["--archive", stage.archive]}
         api = stage.processes[0].wait_ready()["http"]
-        where["explain"] = [*where["observe"], *where["get"], "--url", api, "--switch", stage.target.address]
+        switch = ["--url", api, "--switch", stage.target.address, "--insecure"]
+        where["explain"] = [*where["observe"], *where["get"], *switch]
         for line in commands():
             words = [named.get(word, word) for word in shlex.split(line)]
             more = where.get(words[0], ["--archive", stage.archive] if "--since" in words else [])

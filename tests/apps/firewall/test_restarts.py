@@ -36,7 +36,7 @@ def entries(stage) -> dict[str, int]:
     text = StringIO()
     try:
         with redirect_stdout(text):
-            tables(stage.target.address, as_json=True)
+            tables(stage.target.address, insecure=True, as_json=True)
     except PipelineError:
         return {}
     names = [
@@ -70,7 +70,15 @@ def panic_without_redis(stage) -> None:
     """The switch is clear, and stays so when its controller has taken its place again."""
     stage.server.kill()
     taken = stage.log().count("primary;")
-    arguments = ["panic", "--direct", "--archive", stage.archive, "--switch", stage.target.address]
+    arguments = [
+        "panic",
+        "--direct",
+        "--archive",
+        stage.archive,
+        "--switch",
+        stage.target.address,
+        "--insecure",
+    ]
     done = CliRunner().invoke(blocks, arguments)
     assert done.exception is None, done.output
     wait_for(lambda: stage.log().count("primary;") > taken, SECONDS, stage.log)

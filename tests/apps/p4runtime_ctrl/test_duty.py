@@ -9,7 +9,9 @@ from sdnator.testing.controller_run import PACKETS
 from sdnator.testing.product_program import P4INFO, PROGRAM
 
 SETTINGS = Settings(
-    switches=(SwitchSettings(name="s1", address="127.0.0.1:1"),), program=str(PROGRAM), p4info=str(P4INFO)
+    switches=(SwitchSettings(name="s1", address="127.0.0.1:1", insecure=True),),
+    program=str(PROGRAM),
+    p4info=str(P4INFO),
 )
 WANTED = (Assignment(key=PACKETS, capability=CAPABILITIES[0].key, frequency=None),)
 

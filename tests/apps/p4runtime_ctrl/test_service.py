@@ -308,10 +308,11 @@ def test_two_switches_are_kept_apart(stage, tmp_path):
     other = SwitchTarget("embedded", tmp_path, ports=(f"1=capture:{sockets}", "2=null"))
     other.start()
     try:
+        first = {"name": "s1", "address": stage.target.address, "insecure": True, "forward": {"1": 2}}
         stage.controller(
             switches=[
-                {"name": "s1", "address": stage.target.address, "forward": {"1": 2}},
-                {"name": "s2", "address": other.address, "forward": {"1": 2}, "base_us": 5_000_000},
+                first,
+                {**first, "name": "s2", "address": other.address, "base_us": 5_000_000},
             ]
         )
         engine = stage.engine(capabilities=(DECISIONS,))

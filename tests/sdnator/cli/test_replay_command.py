@@ -73,7 +73,7 @@ def test_bmv2_is_refused_where_it_cannot_run(monkeypatch, installed, user, words
 
 
 def test_any_p4runtime_switch_will_do_with_a_way_into_it():
-    options = options_of(request(switch="192.0.2.1:9559", inject="veth0", pace="10x"))
+    options = options_of(request(switch="192.0.2.1:9559", insecure=True, inject="veth0", pace="10x"))
     assert (options.switch, options.inject, options.pace) == ("192.0.2.1:9559", "veth0", 10.0)
 
 
