@@ -80,7 +80,9 @@ class Northbound:
 class Api:
     """The server, in a thread of its own.  Raises OSError if it cannot listen on the address."""
 
-    def __init__(self, northbound: Northbound, host: str, port: int, *, token: str = "") -> None:
+    def __init__(
+        self, northbound: Northbound, host: str, port: int, *, token: str = "", metrics_token: str = ""
+    ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.create_server((host, port), family=family)
         bound = self._socket.getsockname()[1]
@@ -88,7 +90,7 @@ class Api:
         self.url = f"http://{place}"
         self.url_with_token = f"http://viewer:{token}@{place}" if token else self.url
         config = uvicorn.Config(
-            application(northbound, host, token),
+            application(northbound, host, token, metrics_token),
             log_level="warning",
             lifespan="off",
             access_log=False,
@@ -114,11 +116,13 @@ class Api:
 
 
 class TokenGate:
-    """ASGI: refuses whoever does not bring the token; metrics are free for those who reach the port."""
+    """ASGI: refuses whoever does not bring the token; metrics have one of their own, or are free for those who reach the
+    port."""
 
-    def __init__(self, app: Any, token: str) -> None:
+    def __init__(self, app: Any, token: str, metrics_token: str = "") -> None:
         self._app = app
-        self._wanted = f"Bearer {token}".encode()
+        self._wanted = f"Bearer {token}".encode() if token else b""
+        self._metrics = f"Bearer {metrics_token}".encode() if metrics_token else b""
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """ASGI."""
@@ -133,20 +137,26 @@ class TokenGate:
             await answer(scope, receive, send)
 
     def _admits(self, scope: Any) -> bool:
-        if scope["path"] == "/metrics":
+        given: bytes = next((value for name, value in scope["headers"] if name == b"authorization"), b"")
+        if scope["path"] == "/metrics" and (not self._metrics or hmac.compare_digest(given, self._metrics)):
             return True
-        given = next((value for name, value in scope["headers"] if name == b"authorization"), b"")
+        if not self._wanted:
+            return bool(scope["path"] != "/metrics")
         return hmac.compare_digest(given, self._wanted)
 
 
-def application(northbound: Northbound, host: str = "127.0.0.1", token: str = "") -> Starlette:
+def application(
+    northbound: Northbound, host: str = "127.0.0.1", token: str = "", metrics_token: str = ""
+) -> Starlette:
     """The ASGI application; an empty token lets everybody read."""
     handlers = _Handlers(northbound)
     hosts = sorted({"127.0.0.1", "localhost", "[::1]", host})
     gates = [Middleware(TrustedHostMiddleware, allowed_hosts=hosts)]
     return Starlette(
         routes=handlers.routes(),
-        middleware=[*gates, Middleware(TokenGate, token=token)] if token else gates,
+        middleware=[*gates, Middleware(TokenGate, token=token, metrics_token=metrics_token)]
+        if token or metrics_token
+        else gates,
         exception_handlers={DueError: _explain, ValueError: _explain},
     )
 

@@ -64,6 +64,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """0 takes a free port; `health` and the log name it."""
     token: str = ""
     """What requests bring as `Authorization: Bearer …`, those of /metrics excepted; empty: everybody may read."""
+    metrics_token: str = ""
+    """What requests of /metrics bring so; empty: everybody may read them."""
     address_file: str = ""
     """Where to write the API's URL, with the token, once it listens; empty: nowhere."""
     selection: str = "random"
@@ -212,7 +214,11 @@ class CoordinatorService:
         )
         try:
             self._api = Api(
-                northbound, self._settings.http_host, self._settings.http_port, token=self._settings.token
+                northbound,
+                self._settings.http_host,
+                self._settings.http_port,
+                token=self._settings.token,
+                metrics_token=self._settings.metrics_token,
             )
         except OSError as error:
             where = f"{self._settings.http_host}:{self._settings.http_port}"

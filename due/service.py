@@ -37,7 +37,7 @@ from due.engine import Engine
 from due.errors import DueError, EngineFailed, InvalidOption
 from due.liveness import HeartbeatPipe, Liveness
 from due.messages import CONSUMER, PRODUCER, PUB_ONLY, Capability, Instances, Interest
-from due.status_server import StatusServer
+from due.status_server import StatusServer, metrics_token
 
 log = logging.getLogger("due.service")
 
@@ -92,6 +92,10 @@ class Announcing(Protocol):
         ...
 
 
+def _status_server(arguments: argparse.Namespace) -> StatusServer:
+    return StatusServer(arguments.metrics, metrics_token(arguments.metrics_token))
+
+
 def run(
     app_id: str,
     service: Callable[[Engine, Any], Service],
@@ -126,7 +130,7 @@ def run(
     try:
         heartbeat = HeartbeatPipe(arguments.heartbeat_fd) if arguments.heartbeat_fd >= 0 else None
         chosen = read_struct(arguments.settings, settings)
-        status = StatusServer(arguments.metrics) if arguments.metrics else None
+        status = _status_server(arguments) if arguments.metrics else None
         engine = Engine(_options(arguments))
         engine.when_failed = _end_soon
         chosen_instances = arguments.instances or instances
@@ -199,6 +203,12 @@ def _parser(app_id: str) -> argparse.ArgumentParser:
         default="",
         metavar="HOST:PORT",
         help="serve /metrics (Prometheus) and /healthz there; port 0 takes a free one, the ready line names it",
+    )
+    parser.add_argument(
+        "--metrics-token",
+        default="",
+        metavar="FILE",
+        help="what requests for /metrics bring as Authorization: Bearer …",
     )
     parser.add_argument(
         "--heartbeat-fd",

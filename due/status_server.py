@@ -8,12 +8,14 @@ Answers come from the last report and from what the engine knows of its threads:
 of the app.
 """
 
+import hmac
 import json
 import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 from due.errors import InvalidOption
@@ -22,13 +24,20 @@ from due.metrics import CONTENT_TYPE
 
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _REQUEST_SECONDS = 5.0
+_LEAST_TOKEN, _MOST_TOKEN = 16, 1024
 
 
 class StatusServer:
-    """Listens at once, answers from `start` on.  Raises `InvalidOption` if it cannot listen there."""
+    """Listens at once, answers from `start` on.  Raises `InvalidOption` if it cannot listen there.
 
-    def __init__(self, address: str) -> None:
+    Args:
+        address: HOST:PORT.
+        token: what requests for /metrics bring as `Authorization: Bearer …`; empty: nothing.
+    """
+
+    def __init__(self, address: str, token: str = "") -> None:
         host, port = parse_address(address)
+        self._wanted = f"Bearer {token}".encode() if token else b""
         self._text = ""
         self._state: Mapping[str, Any] = {}
         self._reported = time.monotonic()
@@ -58,6 +67,10 @@ class StatusServer:
         """Set the answer from now on."""
         self._text, self._state, self._reported = text, state, time.monotonic()
 
+    def admits(self, given: str) -> bool:
+        """Whether the header `Authorization` lets read the metrics."""
+        return not self._wanted or hmac.compare_digest(given.encode("latin-1", "replace"), self._wanted)
+
     def metrics(self) -> tuple[int, str, str]:
         """Status, content type and body of `/metrics`."""
         return 200, CONTENT_TYPE, self._text
@@ -76,6 +89,19 @@ class StatusServer:
         if self._thread.is_alive():
             self._server.shutdown()
         self._server.server_close()
+
+
+def metrics_token(file: str) -> str:
+    """The token in a file; empty where no file is named.  Raises `InvalidOption` for one that keeps nobody out."""
+    if not file:
+        return ""
+    try:
+        token = Path(file).read_text(encoding="ascii").strip()
+    except (OSError, ValueError) as error:
+        raise InvalidOption(f"--metrics-token {file}: {error}") from None
+    if not _LEAST_TOKEN <= len(token) <= _MOST_TOKEN or not token.isprintable():
+        raise InvalidOption(f"--metrics-token {file}: a token has {_LEAST_TOKEN} to {_MOST_TOKEN} characters")
+    return token
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -121,11 +147,16 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(400, "text/plain", "asked under another host's name\n")
         elif answer is None:
             self._send(404, "text/plain", "here are /metrics and /healthz\n")
+        elif answer == self.server.status.metrics and not self._admitted():
+            self._send(401, "text/plain", "bring the token of the metrics: Authorization: Bearer …\n")
         else:
             self._send(*answer())
 
     def log_message(self, *_arguments: Any) -> None:
         """No line for each request."""
+
+    def _admitted(self) -> bool:
+        return self.server.status.admits(self.headers.get("Authorization", ""))
 
     def _asked_properly(self) -> bool:
         asked = self.headers.get("Host", "")

@@ -49,7 +49,9 @@ PRODUCT_SECTIONS: Mapping[str, Section] = {
     "log": Section("sdnator.config.up_settings", "LogSettings"),
     "metrics": Section("sdnator.config.up_settings", "MetricsSettings"),
     "due": Section("due.config", "Options", {"updates": "", "archive": "", "directory": ""}),
-    "coordinator": Section("coordinator.service", "Settings", {"address_file": "", "token": ""}),
+    "coordinator": Section(
+        "coordinator.service", "Settings", {"address_file": "", "token": "", "metrics_token": ""}
+    ),
     "p4runtime_ctrl": Section(
         "apps.p4runtime_ctrl.settings", "Settings", {"switches": (), "program": "", "p4info": ""}
     ),

@@ -118,5 +118,8 @@ class MetricsSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     host: str = "127.0.0.1"
     """Address on which each app serves its metrics; empty: none."""
+    token_file: str = ""
+    """File with what requests for metrics bring as `Authorization: Bearer …`, 16 characters or more; empty: whoever
+    reaches the endpoints reads them."""
     targets: str = ""
     """File to which the endpoints are written for Prometheus (file_sd_configs); empty: none."""

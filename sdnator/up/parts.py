@@ -25,6 +25,7 @@ import msgspec
 
 from due.drivers.embedded_redis import EmbeddedServer
 from due.errors import InvalidOption
+from due.status_server import metrics_token
 from sdnator import p4_program
 from sdnator.app_catalogue import OURS
 from sdnator.config.planned_switches import PlannedSwitch
@@ -208,6 +209,7 @@ class UpParts:
             command += ["--log-format", plan.log_format]
         if plan.metrics_host and name != "coordinator":
             command += ["--metrics", f"{plan.metrics_host}:0"]
+            command += ["--metrics-token", plan.metrics_token_file] if plan.metrics_token_file else []
         environment = {_TOKEN: os.environ[_TOKEN]} if name == "dashboard" and _TOKEN in os.environ else {}
         return Child(name, command, self.logs, heartbeat=True, environment=environment)
 
@@ -227,7 +229,11 @@ class UpParts:
         """An app's settings, with the addresses of other parts."""
         own = self.plan.settings_of(name)
         if name == "coordinator":
-            return {**own, "address_file": str(self.address_file), "token": self._coordinator_token}
+            secrets_of_http = {
+                "token": self._coordinator_token,
+                "metrics_token": metrics_token(self.plan.metrics_token_file),
+            }
+            return {**own, "address_file": str(self.address_file), **secrets_of_http}
         if name == "dashboard":
             return {**(self.plan.dashboard or {}), **self._dashboard_places()}
         if name == "p4runtime_ctrl":

@@ -34,6 +34,8 @@ class StandingPlan:
     log_format: str = "console"
     metrics_host: str = ""
     """Address on which each app serves Prometheus metrics; empty: none does."""
+    metrics_token_file: str = ""
+    """File with what requests for metrics bring; empty: nothing."""
     metrics_targets: str = ""
     """File for Prometheus' target list; empty: none."""
     apps: tuple[str, ...] = OURS
@@ -83,7 +85,16 @@ def _has_model(settings: Mapping[str, Any]) -> bool:
     return bool(settings.get("load_model")) or (bool(kept) and Path(kept).exists())
 
 
-_FOR_NEXT_START = ("updates", "archive", "switches", "apps", "grants", "metrics_host", "supervisor")
+_FOR_NEXT_START = (
+    "updates",
+    "archive",
+    "switches",
+    "apps",
+    "grants",
+    "metrics_host",
+    "metrics_token_file",
+    "supervisor",
+)
 
 
 def _differs(part: str, old: StandingPlan, new: StandingPlan) -> bool:

@@ -81,6 +81,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
         log_level=log.level,
         log_format=log.format,
         metrics_host=metrics.host,
+        metrics_token_file=_checked_token(metrics.token_file),
         metrics_targets=metrics.targets,
         dashboard=_dashboard(config, state) if given.dashboard else None,
         supervisor=config.struct("supervisor"),
@@ -182,6 +183,18 @@ def _planned(plan: "SwitchPlan", controller: "Mapping[str, Any]") -> PlannedSwit
     except BadInput as error:
         raise BadInput(f"switch {plan.name}: {error}" if plan.name != "s1" else str(error)) from None
     return made
+
+
+def _checked_token(file: str) -> str:
+    """The same as an absolute path; raises BadInput for a file that cannot be a token's."""
+    from due.errors import InvalidOption
+    from due.status_server import metrics_token
+
+    try:
+        metrics_token(file)
+    except InvalidOption as error:
+        raise BadInput(f"metrics.token_file: {error}") from None
+    return str(Path(file).absolute()) if file else ""
 
 
 def _dashboard(config: "Config", state: Path) -> dict[str, Any] | None:

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from due.errors import DueError
-from due.status_server import StatusServer
+from due.status_server import StatusServer, metrics_token
 from sdnator.errors import BadInput
 from sdnator.northbound import without_user
 from sdnator.supervisor.metrics import part_metrics
@@ -34,7 +34,8 @@ class UpReport:
         self._server: StatusServer | None = None
         if host := pipeline.plan.metrics_host:
             try:
-                self._server = StatusServer(f"[{host}]:0" if ":" in host else f"{host}:0")
+                token = metrics_token(pipeline.plan.metrics_token_file)
+                self._server = StatusServer(f"[{host}]:0" if ":" in host else f"{host}:0", token)
             except DueError as error:
                 raise BadInput(str(error)) from None
             stack.callback(self._server.close)

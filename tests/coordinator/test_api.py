@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from coordinator import api
-from coordinator.api import Api, Northbound, application
+from coordinator.api import Api, Northbound, TokenGate, application
 from coordinator.openapi import document
 from coordinator.registry import Registry
 from due import Capability, Engine, Interest, Item, Options
@@ -306,3 +306,22 @@ def test_with_a_token_every_route_but_metrics_wants_it(given):
         assert httpx.get(f"{served.url}/openapi.json", headers=right).status_code == 200
     finally:
         served.stop()
+
+
+@pytest.mark.parametrize(("path", "given", "admitted"), [
+    ("/metrics", "", False), ("/metrics", "Bearer wrong", False), ("/metrics", "Bearer scrape", True),
+    ("/metrics", "Bearer secret", True), ("/openapi.json", "Bearer scrape", False), ("/openapi.json", "Bearer secret", True),
+])  # fmt: skip
+def test_metrics_may_have_a_token_of_their_own(path, given, admitted):
+    """It opens nothing else; the API's own opens metrics, too."""
+    asked: list[str] = []
+
+    async def app(scope, _receive, _send):
+        asked.append(scope["path"])
+
+    async def send(message):
+        assert message.get("status", 401) == 401
+
+    scope = {"type": "http", "path": path, "headers": [(b"authorization", given.encode())]}
+    asyncio.run(TokenGate(app, "secret", "scrape")(scope, None, send))
+    assert asked == ([path] if admitted else [])

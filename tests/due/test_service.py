@@ -85,8 +85,9 @@ def test_a_service_works_from_ready_to_sigterm(start, tmp_path, make_engine):
     wait_for(lambda: out == [21, "stopped"])
 
 
-def _fetch(address, path, host="localhost"):
-    request = urllib.request.Request(f"http://{address}{path}", headers={"Host": host})
+def _fetch(address, path, host="localhost", token=""):
+    rights = {"Authorization": f"Bearer {token}"} if token else {}
+    request = urllib.request.Request(f"http://{address}{path}", headers={"Host": host} | rights)
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         with opener.open(request, timeout=60) as answer:
@@ -96,10 +97,21 @@ def _fetch(address, path, host="localhost"):
             return error.code, error.read().decode()
 
 
+TOKEN = "a long enough token"  # noqa: S105
+
+
+def token_file(folder):
+    path = folder / "token"
+    path.write_text(TOKEN + "\n")
+    return path
+
+
 def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path):
     process = start(
         "--metrics",
         "127.0.0.1:0",
+        "--metrics-token",
+        str(token_file(tmp_path)),
         "--log-format",
         "json",
         "--log",
@@ -108,7 +120,8 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
         f"sqlite://{tmp_path / 'a.db'}",
     )
     address = json.loads(process.stdout.readline())["metrics"]
-    status, text = _fetch(address, "/metrics")
+    assert [_fetch(address, "/metrics", token=token)[0] for token in ("", "x" * 20)] == [401, 401]
+    status, text = _fetch(address, "/metrics", token=TOKEN)
     assert status == 200
     assert "doubler_ticks{" in text
     assert "# TYPE due_written_items_total counter" in text
@@ -127,6 +140,8 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
     ("arguments", "text"),
     [
         (["--metrics", "nonsense"], "HOST:PORT"),
+        (["--metrics", "127.0.0.1:0", "--metrics-token", "/nowhere"], "/nowhere"),
+        (["--metrics", "127.0.0.1:0", "--metrics-token", "/dev/null"], "16 to"),
         (["--metrics", "203.0.113.1:80"], "203.0.113.1:80"),
         (["--settings", "/nowhere.json"], "/nowhere.json"),
         (["--settings", "{folder}/wrong.json"], "factr"),

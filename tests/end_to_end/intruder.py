@@ -69,9 +69,13 @@ def _request(place: str, path: str, headers: Mapping[str, str], form: bytes | No
         raise http.client.HTTPException(str(status))
 
 
+def _bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"} if token else {}
+
+
 def _by_http(place: str, token: str) -> dict[str, str]:
     """Whole frames, and the query that once froze the Coordinator."""
-    rights = {"Authorization": f"Bearer {token}"} if token else {}
+    rights = _bearer(token)
     query = quote(json.dumps(_REGEX))
     return {
         "frames": _attempt(lambda: _request(place, f"/observe?key={FRAMES}", rights | _UPGRADE)),
@@ -181,6 +185,10 @@ def main() -> None:
     found = {
         "http": _by_http(told["coordinator"], token),
         "page": _by_page(told["page"]),
+        "metrics": {
+            part: _attempt(partial(_request, place, "/metrics", _bearer(token)))
+            for part, place in told["metrics"].items()
+        },
         "p4runtime": _by_p4runtime(told["switch"]),
         "updates": _by_updates(url),
         "looked": _looked(Path(told["folder"])),

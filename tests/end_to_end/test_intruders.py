@@ -22,6 +22,7 @@ from tests.end_to_end.test_up import Operator, until
 from tests.requirements import require_root
 
 _NOBODY = 65534
+_SCRAPED = secrets.token_urlsafe(24)
 _MARKER = "open-to-all"
 
 
@@ -38,6 +39,7 @@ class Pipeline:
         owned = [str(said["token_file"]), str(self.state / "coordinator.token")]
         self.secrets = [
             password,
+            _SCRAPED,
             *_passwords(identities),
             *(Path(each).read_text().strip() for each in owned),
         ]
@@ -51,6 +53,7 @@ class Pipeline:
             "credential": str(credential or ""),
             "token": token,
             "coordinator": without_user(self.found.coordinator).partition("://")[2],
+            "metrics": self.found.metrics,
             "page": self.found.dashboard.partition("://")[2].rstrip("/"),
             "switch": self.found.switch["address"],
             "folder": str(self.folder),
@@ -93,7 +96,10 @@ def pipeline():
         # in a file, as operators give it: arguments of `up` itself are for everybody to see
         config = Path(operator.environment["XDG_CONFIG_HOME"]) / "sdnator" / "sdnator.toml"
         config.parent.mkdir(mode=0o700, parents=True)
-        config.write_text(f'[up]\nupdates = "{url}"\n')
+        scraped = folder / "metrics.token"
+        scraped.touch(mode=0o600)
+        scraped.write_text(_SCRAPED)
+        config.write_text(f'[up]\nupdates = "{url}"\n\n[metrics]\ntoken_file = "{scraped}"\n')
         with operator.up(page=()) as (_, said):
             until(operator.well)
             yield Pipeline(operator, said, folder, password)
@@ -136,6 +142,12 @@ def test_the_owner_signs_in_by_a_link_and_what_was_refused_can_be_read(pipeline)
         until(told)
 
 
+def test_whoever_scrapes_has_a_token_for_that_alone(pipeline):
+    found = pipeline.attacked(_NOBODY, token=_SCRAPED)
+    assert set(found["metrics"].values()) == {THROUGH}
+    _refused(found["http"])
+
+
 def test_the_owner_goes_through_the_same_doors(pipeline):
     token = (pipeline.state / "coordinator.token").read_text().strip()
     found = pipeline.attacked(os.geteuid(), token=token)
@@ -159,6 +171,8 @@ def test_another_user_without_a_credential_gets_nothing(pipeline):
     assert all("UNAVAILABLE" in text and "ermission denied" in text for text in found["p4runtime"].values())
     _refused(found["updates"])
     refused_at_the_page(found["page"])
+    assert set(found["metrics"].values()) == {"HTTPException: 401"}
+    assert {"coordinator", "supervisor", "kitsune", "firewall"} <= found["metrics"].keys()
     assert found["looked"]["readable"] == [_MARKER]
     assert _wires(pipeline) == before
     until(pipeline.operator.well)
@@ -193,6 +207,7 @@ def test_an_enrolled_app_says_its_own_and_commands_nothing(pipeline):
     assert {f"publish {key}" for key in COMMANDS} <= found["updates"].keys()
     _refused(found["http"])
     refused_at_the_page(found["page"])
+    _refused(found["metrics"])
     _refused(found["p4runtime"])
     assert _wires(pipeline) == before
     until(pipeline.operator.well)

@@ -102,3 +102,18 @@ def test_logs_of_the_last_run_are_kept_beside(tmp_path):
     with pytest.raises(PipelineError), StandingPipeline(plan, print):
         pass
     assert (tmp_path / "logs" / "kitsune.log.1").read_text() == "before"
+
+
+def test_every_part_is_told_the_token_of_the_metrics_by_a_file(parts, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr("sdnator.up.parts.Child", lambda *given, **more: seen.append((given, more)))
+    file = tmp_path / "metrics.token"
+    secret = "hunter2" * 3
+    file.write_text(secret + "\n")
+    made = parts(metrics_host="127.0.0.1", metrics_token_file=str(file))
+    for name in ("kitsune", "coordinator"):
+        made._app(name)
+    assert str(file) in repr(seen[0])
+    assert "hunter2" not in repr(seen)
+    assert made.settings("coordinator")["metrics_token"] == secret
+    assert not parts().settings("coordinator")["metrics_token"]
