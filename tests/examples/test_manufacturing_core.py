@@ -132,7 +132,7 @@ def test_twins_have_a_faulty_printer_maintained_and_the_job_printed_again():
         printer.advance(step * STEP_S)
         fleet = twins.update([printer.report(step)])
     assert not printer.ruined
-    assert [attempts for attempts, _ in fleet.tried.values()] == [1]
+    assert [one.attempts for one in fleet.tried] == [1]
 
 
 def test_a_queue_is_brought_to_what_is_wanted():

@@ -1,13 +1,16 @@
 """The comparison: results that are kept and gone on with, the report's figures, and the command."""
 
 import json
+import re
 
 import msgspec
 import pytest
-from manufacturing.core.orders import SCENARIOS
+from manufacturing.core.orders import SCENARIOS, Scenario
 from manufacturing.criteria import FLEETS
 from manufacturing.running import report
 from manufacturing.running.command import main
+from manufacturing.running.in_process import InProcessProduction
+from manufacturing.running.verify import verify
 from manufacturing.scheduling import SCHEDULERS
 from manufacturing.statistics import CellResult, CellTable, cells
 
@@ -95,6 +98,20 @@ def test_run_ends_with_the_schedule_of_the_simulation(capsys):
     said = capsys.readouterr().out
     assert "live Gantt chart: http://127.0.0.1:" in said
     assert "schedule through REST and DUE as in the simulation: yes" in said
+
+
+def test_verify_names_the_first_print_that_differs():
+    """Held against the simulation of another scheduler than the one that ran."""
+
+    class Other(InProcessProduction):
+        def __init__(self, scenario, _name):
+            super().__init__(scenario, "fcfs")
+
+    cell = verify(Scenario(name="normal", seed=4, machines=2, orders=3, fraction=0.05), "baseline", Other)
+    assert not cell.same
+    assert re.fullmatch(
+        r"another schedule: on m0\d simulated job \S+ from \d+ s, found job \S+ from \d+ s", cell.problem
+    )
 
 
 def test_verify_goes_on_where_it_stopped(tmp_path, capsys):

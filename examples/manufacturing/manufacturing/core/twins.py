@@ -7,7 +7,7 @@
 A job that is neither done nor printing nor waiting is to be printed (again): nobody has to remember that.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -43,6 +43,16 @@ class MachineState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Why it is to be maintained; empty: it is not."""
 
 
+class TriedJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A job whose attempts came to nothing so far."""
+
+    order: int
+    number: int
+    attempts: int
+    machine: str
+    """Of the last attempt."""
+
+
 class FleetState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What schedulers know: the whole fleet at one moment."""
 
@@ -51,8 +61,8 @@ class FleetState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     machines: tuple[MachineState, ...]
     done: tuple[tuple[int, int], ...]
     """Jobs that were printed well, as (order, number)."""
-    tried: Mapping[str, tuple[int, str]]
-    """Jobs with attempts that came to nothing, `order-number` to (attempts, last machine)."""
+    tried: tuple[TriedJob, ...]
+    """In the order in which they failed first: schedulers print them again in this order, which a map does not keep."""
     maintain: tuple[str, ...]
     """Machines whose print is to be aborted, and which are to be maintained, from this step."""
 
@@ -201,7 +211,7 @@ class FleetTwin:
         self.step = reports[0].step
         return FleetState(
             self.step, reports[0].time, tuple(self._twins[report.machine].state(report) for report in reports),
-            tuple(self._done), {f"{o}-{n}": tried for (o, n), tried in self._tried.items()}, tuple(maintain),
+            tuple(self._done), tuple(TriedJob(*job, *tried) for job, tried in self._tried.items()), tuple(maintain),
         )  # fmt: skip
 
     def _note(self, twin: PrinterTwin) -> None:

@@ -4,13 +4,15 @@ scenario, scheduler, fleet ──► ProcessProduction ──► prints ══�
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from manufacturing.core.orders import SCENARIOS, Scenario, ScenarioName
+from manufacturing.core.printer import PrintRecord
 from manufacturing.core.simulation import simulate
 from manufacturing.running.in_process import InProcessProduction
 from manufacturing.running.processes import ProcessProduction
@@ -22,6 +24,7 @@ STEP_S: Final = 180.0
 MOST_S: Final = 4 * 3_600.0
 """Seconds of the wall clock that one run may take."""
 
+Prints = Mapping[str, Sequence[PrintRecord]]
 Production = type[InProcessProduction] | type[ProcessProduction]
 
 
@@ -37,7 +40,7 @@ class VerifiedCell(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
     """Of the wall clock."""
     problem: str = ""
-    """Why it did not end; empty where it did."""
+    """Why it did not end, or which print was another one; empty where all is the same."""
 
     @property
     def cell(self) -> tuple[str, str, int]:
@@ -60,15 +63,35 @@ def verify(scenario: Scenario, name: SchedulerName, production: Production) -> V
         except Stalled as error:
             problem = str(error)
         prints = running.watcher.prints()
+    problem = problem or _first_difference(simulate(scenario, scheduler(name)).prints, prints)
     return VerifiedCell(
         scenario=scenario.name,
         scheduler=name,
         machines=scenario.machines,
-        same=not problem and prints == simulate(scenario, scheduler(name)).prints,
+        same=not problem,
         prints=sum(map(len, prints.values())),
         seconds=round(time.monotonic() - begun, 1),
         problem=problem,
     )
+
+
+def _first_difference(wanted: Prints, found: Prints) -> str:
+    """The earliest print that is not as it was simulated; empty: there is none."""
+    places: list[tuple[float, str, PrintRecord | None, PrintRecord | None]] = []
+    for machine in sorted({*wanted, *found}):
+        for one, other in zip_longest(wanted.get(machine, ()), found.get(machine, ())):
+            if one != other:
+                start = min(each.started for each in (one, other) if each is not None)
+                places.append((start, machine, one, other))
+                break
+    if not places:
+        return ""
+    _, machine, one, other = min(places, key=lambda place: place[:2])
+    return f"another schedule: on {machine} simulated {_described(one)}, found {_described(other)}"
+
+
+def _described(record: PrintRecord | None) -> str:
+    return f"job {record.task.name} from {record.started:.0f} s" if record is not None else "no print"
 
 
 def verify_all(

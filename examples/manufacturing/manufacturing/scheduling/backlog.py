@@ -22,6 +22,7 @@ class Backlog:
 
     def __init__(self, orders: Sequence[Order], fleet: FleetState, *, recall: bool = False) -> None:
         self._fleet = fleet
+        self._attempts = {(one.order, one.number): (one.attempts, one.machine) for one in fleet.tried}
         self.placed = set(fleet.done)
         """Jobs that are done, printing or waiting."""
         for machine in fleet.machines:
@@ -52,14 +53,13 @@ class Backlog:
     def again(self) -> Iterator[tuple[str, Task]]:
         """Missing jobs that were tried before, each with the machine of the last attempt."""
         by_id = {order.id: order for order in self.orders}
-        for text in self._fleet.tried:
-            place, number = (int(part) for part in text.split("-"))
-            order = by_id.get(place)
-            if order is not None and (place, number) not in self.placed:
-                yield self._tried(order, number)[1], order.task(number, self.attempts(order, number))
+        for one in self._fleet.tried:
+            order = by_id.get(one.order)
+            if order is not None and (one.order, one.number) not in self.placed:
+                yield one.machine, order.task(one.number, one.attempts)
 
     def _tried(self, order: Order, number: int) -> tuple[int, str]:
-        return self._fleet.tried.get(f"{order.id}-{number}", (self._running_attempts(order, number), ""))
+        return self._attempts.get((order.id, number), (self._running_attempts(order, number), ""))
 
     def _running_attempts(self, order: Order, number: int) -> int:
         """A print that is about to be aborted counts as tried."""

@@ -111,7 +111,7 @@ class Dynamic:
 
 def _tries(fleet: FleetState) -> int:
     """Attempts that came to nothing, of jobs that are not done."""
-    return sum(attempts for attempts, _ in fleet.tried.values())
+    return sum(one.attempts for one in fleet.tried)
 
 
 def _loaded(machine: MachineState) -> int:
