@@ -163,11 +163,10 @@ def _instructions(record: RunRecord) -> Iterator[Violation]:
 
 
 def in_force(decisions: Sequence[Decided]) -> frozenset[str]:
-    """The addresses that are to be dropped after these decisions."""
-    wanted: set[str] = set()
-    for each in decisions:
-        (wanted.add if each.action == "block" else wanted.discard)(each.address)
-    return frozenset(wanted)
+    """The addresses that are to be dropped: those with a block that nothing has lifted, in whatever order the archive has
+    both, since clocks of writers jump."""
+    lifted = {each.id for each in decisions if each.action != "block"}
+    return frozenset(each.address for each in decisions if each.action == "block" and each.id not in lifted)
 
 
 def _switch(record: RunRecord) -> Iterator[Violation]:

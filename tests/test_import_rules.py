@@ -10,7 +10,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 OURS = {"due", "coordinator", "apps", "dataplane", "sdnator", "p4rt", "sdnator_due", "tests", "benchmarks"}
 CONTRACT = {
-    "apps", "apps.enforcement", "apps.evidence", "apps.incidents", "apps.intake", "apps.messages", "apps.packets", "apps.talkers",
+    "apps", "apps.enforcement", "apps.evidence", "apps.incidents", "apps.intake", "apps.messages", "apps.packets",
+    "apps.standing_decisions", "apps.talkers",
 }  # fmt: skip
 APPS = ("p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "enforcers")
 IO_MODULES = {"socket", "threading", "asyncio", "subprocess", "time", "redis", "pymongo", "grpc"}

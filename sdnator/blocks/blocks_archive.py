@@ -8,8 +8,9 @@ from urllib.parse import unquote, urlsplit
 from uuid import uuid4
 
 from apps.firewall.enforcement.switch_entries import KEPT, is_prefix, prefix_update
-from apps.firewall.evidence.history import DECISIONS, FAMILIES, decisions_in, in_force
+from apps.firewall.evidence.history import DECISIONS, FAMILIES, decisions_in
 from apps.messages import Decision, Instruction, TableCommand
+from apps.standing_decisions import in_force
 from due import DueError, Item
 from due.backends import open_archive
 from sdnator.errors import BadInput

@@ -17,12 +17,12 @@ from apps.firewall.evidence.history import (
     INSTRUCTIONS,
     allowed_by,
     carried_out,
-    in_force,
     instructions_in,
 )
 from apps.firewall.policy.instructions import target_in
 from apps.firewall.policy.rules import AllowList
 from apps.messages import Decision, Instruction
+from apps.standing_decisions import in_force
 from due import DueError
 from sdnator.asking import AppRequest, ask
 from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive

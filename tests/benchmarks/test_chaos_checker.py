@@ -2,7 +2,17 @@
 
 import pytest
 
-from benchmarks.chaos_checker import Asked, Decided, Passed, RunRecord, Word, check, gap_ms, longest_gaps
+from benchmarks.chaos_checker import (
+    Asked,
+    Decided,
+    Passed,
+    RunRecord,
+    Word,
+    check,
+    gap_ms,
+    in_force,
+    longest_gaps,
+)
 
 BLOCK = Decided("d1", "block", "20.0.7.9")
 LIFT = Decided("d1", "unblock", "20.0.7.9")
@@ -26,6 +36,11 @@ def clean():
 
 def kinds(record):
     return [each.kind for each in check(record)]
+
+
+def test_a_lift_ends_its_block_in_whatever_order_clocks_put_them():
+    assert in_force([LIFT, BLOCK]) == in_force([BLOCK, LIFT]) == frozenset()
+    assert in_force([LIFT, BLOCK, Decided("d2", "block", "20.0.7.9")]) == {"20.0.7.9"}
 
 
 def test_a_run_that_kept_every_promise_has_no_violation():

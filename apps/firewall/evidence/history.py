@@ -3,7 +3,7 @@
 from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from apps.messages import Action, Decision, FalseAlarm, FloodKind, Instruction, MessageError, Target
+from apps.messages import Action, Decision, FalseAlarm, Instruction, MessageError, Target
 from due import Item
 
 
@@ -49,8 +49,6 @@ FAMILIES: Final[dict[Action, str]] = {
     "unmeter": "meter",
 }
 """The segment of a decision's key by its action; prefixes are blocked under `block_prefix`."""
-STANDING: Final = ("block", "protect", "meter")
-"""Actions that put something in force; the others lift it."""
 ANSWERS: Final = "network.answer.firewall"
 """`<ANSWERS>.<who asked>`"""
 INSTRUCTIONS: Final = "network.instruction.*.firewall"
@@ -86,7 +84,7 @@ def carried_out(instructions: Iterable[Instruction], done: Container[str]) -> li
 
 
 def decisions_in(items: Iterable[Item]) -> list[Decision]:
-    """Archived decisions in the order they were written.
+    """Archived decisions in the order they were written, by the writers' clocks; `in_force` says which of them stand.
 
     Dry runs and malformed items are left out.
     """
@@ -100,22 +98,6 @@ def _readable(items: Iterable[Item]) -> Iterator[Decision]:
             yield Decision.from_value(item.value)
         except MessageError:
             continue
-
-
-def in_force(decisions: Iterable[Decision]) -> list[Decision]:
-    """Decisions in force: the latest for each target on each switch, unless it lifts.
-
-    Expired ones are included: the firewall decides whether to extend or lift them.
-    """
-    latest: dict[tuple[str, Target, tuple[FloodKind, int | None] | None], Decision] = {}
-    for decision in decisions:
-        limit = decision.limit
-        packets = None if limit is None else (limit.kind, limit.port)
-        key = (decision.switch, decision.target, packets)
-        latest.pop(key, None)
-        if decision.action in STANDING:
-            latest[key] = decision
-    return list(latest.values())
 
 
 def allowed_by(instructions: Iterable[Instruction], beforehand: Iterable[str] = ()) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from apps.firewall.arrivals import (
 )
 from apps.firewall.enforcement.switch_entries import KEPT, leftovers
 from apps.firewall.evidence.archive import MOST, Archive
-from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, LESSONS, in_force
+from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, LESSONS
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
 from apps.firewall.settings import Settings
 from apps.incidents import INCIDENTS, Incident
@@ -33,6 +33,7 @@ from apps.messages import (
     MessageError,
     TableUpdate,
 )
+from apps.standing_decisions import in_force
 from due import Item
 
 _PATIENCE_S: Final = 30.0

@@ -31,6 +31,8 @@ _GOING_ON = "still going on ({:.0f} dropped packets a second): "
 _FIRST_REASON = re.compile(r"^still going on \([0-9]+ dropped packets a second\): ")
 _MOST_PROBATION = 16_384
 _MOST_RECENT = 65_536
+_NEW_IDS = 256
+"""Of decisions by hand within the second in which firewall time may stand still."""
 
 
 @dataclass
@@ -83,6 +85,7 @@ class BlockLifecycle:
     """The cap that stops blocking; empty: none."""
     _recent: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_RECENT))
     _said: dict[str, int] = field(default_factory=dict)
+    _ids: deque[str] = field(default_factory=lambda: deque(maxlen=_NEW_IDS))
 
     def covering(self, sender: Sender) -> Block | None:
         """The block in force that already stops this sender."""
@@ -144,7 +147,7 @@ class BlockLifecycle:
         """
         level = min(offences, len(self.rules.durations_s) - 1)
         decision = Decision(
-            id=decision_id(switch, target, now),
+            id=self._new_id(switch, target, now),
             action="block",
             switch=switch,
             target=target,
@@ -160,6 +163,13 @@ class BlockLifecycle:
         self.blocks[decision.id] = block
         self._recent.append(now)
         return decision
+
+    def _new_id(self, switch: str, target: Target, now: int) -> str:
+        """An id that nothing had that was decided lately: a lift ends its id for good."""
+        while (name := decision_id(switch, target, now)) in self._ids:
+            now += 1
+        self._ids.append(name)
+        return name
 
     def blocks_address(self, address: str) -> bool:
         """Whether a block of this address, or of its prefix, is in force."""

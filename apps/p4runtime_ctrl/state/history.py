@@ -5,6 +5,7 @@ from typing import Final
 
 from apps.messages import Decision, Intake, TableCommand
 from apps.p4runtime_ctrl.arrivals import command_in, decision_in
+from apps.standing_decisions import STANDING, in_force
 from due import Item
 
 DECISIONS: Final = ("network.block.firewall.*", "network.protect.firewall.*", "network.meter.firewall.*")
@@ -16,16 +17,23 @@ LONGEST_S: Final = 31 * 86_400
 def decisions_for(
     switch: str, archived: Iterable[Item], recent: Sequence[Decision], since: int, intake: Intake
 ) -> list[Decision]:
-    """Decisions about a switch in their order: the archived ones written after `since` (ns), then the
-    recent ones that the archive does not have yet."""
+    """Decisions about a switch: those that lift, then those in force, oldest first.
+
+    Args:
+        switch: its name.
+        archived: items of decisions; of these, those written after `since`.
+        recent: decisions heard live, which the archive need not have yet.
+        since: ns since the epoch.
+        intake: counts what cannot be read.
+    """
     items = sorted(
         (item for item in archived if item.timestamp > since),
         key=lambda item: (item.timestamp, item.sequence),
     )
     found = [decision for item in items if (decision := intake.read("decision", decision_in, item))]
-    known = {decision.id for decision in found}
-    found += [decision for decision in recent if decision.id not in known]
-    return [decision for decision in found if is_for(decision, switch)]
+    heard = [each for each in [*found, *recent] if not each.dry_run]
+    lifts = [each for each in heard if each.action not in STANDING]  # of what this controller may still hold
+    return [each for each in [*lifts, *in_force(heard)] if is_for(each, switch)]
 
 
 def is_for(decision: Decision, switch: str) -> bool:

@@ -1,6 +1,6 @@
 """What archived decisions and instructions come to."""
 
-from apps.firewall.evidence.history import allowed_by, count_offences, decisions_in, in_force
+from apps.firewall.evidence.history import allowed_by, count_offences, decisions_in
 from apps.messages import Decision, Instruction, Target
 from due import Item
 from tests.apps.firewall.enforcement.test_eve import decision
@@ -10,16 +10,6 @@ ADDRESS = Target(kind="ip", address="192.0.2.1")
 
 def item(made: Decision, at: int) -> Item:
     return Item("network.block.firewall.ipv4", made.to_value(), at, at, "firewall", "i", at)
-
-
-def test_latest_decision_for_a_target_counts():
-    """Extended blocks count once, lifted ones not at all, guards beside blocks."""
-    extended, lifted = decision(expires=2), decision(action="unblock")
-    other = decision(id="d2", target=Target(kind="ip", address="192.0.2.2"))
-    guard = decision(id="d3", action="protect", target=Target(kind="ip", address="192.0.2.1", port=80))
-    assert in_force([decision(expires=1), extended, other, guard]) == [extended, other, guard]
-    assert in_force([decision(), other, lifted]) == [other]
-    assert in_force([decision(), lifted, decision(id="d4")]) == [decision(id="d4")]
 
 
 def test_decisions_are_read_in_the_order_of_writing():

@@ -39,6 +39,15 @@ def test_first_block_lasts_ten_minutes_and_later_ones_longer():
     assert lengths == [600, 3600, 86_400, 604_800, 604_800, 604_800]
 
 
+def test_a_block_after_a_lift_is_another_one_in_the_same_moment_too():
+    """By hand, while no switch says that time goes on: the lift in the archive must not end the second block."""
+    ledger = BlockLifecycle(Rules())
+    first = opened(ledger)
+    assert ledger.lift(first.id, first.event_time, "by hand") is not None
+    assert opened(ledger).id != first.id
+    assert opened(BlockLifecycle(Rules())).id == first.id, "the same in every replay"
+
+
 def test_block_covers_its_station_and_nobody_else():
     """A MAC block is of one port of one switch."""
     ledger = BlockLifecycle(Rules())
@@ -100,9 +109,10 @@ def test_drops_at_the_training_rate_do_not_extend():
 def test_block_refused_by_the_switch_is_not_in_force():
     """What failed does not count as covered: the next alert tries again."""
     ledger = BlockLifecycle(Rules())
-    ledger.confirm(confirmation(opened(ledger), "installed"))
+    made = opened(ledger)
+    ledger.confirm(confirmation(made, "installed"))
     assert ledger.covering(CAMERA) is not None
-    ledger.confirm(confirmation(opened(ledger), "failed"))
+    ledger.confirm(confirmation(made, "failed"))
     assert ledger.covering(CAMERA) is None
 
 

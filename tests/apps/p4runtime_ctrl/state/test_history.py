@@ -12,10 +12,10 @@ def intake():
     return Intake(logging.getLogger("test"))
 
 
-def decision(number, switch="s1"):
-    target = Target(kind="ip", address="10.0.0.1")
+def decision(number, switch="s1", action="block"):
+    target = Target(kind="ip", address=f"10.0.0.{number}")
     return Decision(
-        id=f"d{number}", action="block", switch=switch, target=target, reason="", event_time=1, expires=0
+        id=f"d{number}", action=action, switch=switch, target=target, reason="", event_time=1, expires=0
     )
 
 
@@ -36,6 +36,14 @@ def test_order_identity_and_age():
     recent = [decision(3), decision(9)]
     found = decisions_for("s1", archived, recent, since=96, intake=intake())
     assert [each.id for each in found] == ["d3", "d2", "d1", "d0", "d9"]
+
+
+def test_what_was_lifted_does_not_come_back():
+    """Neither where the archive has no lift yet, nor where a clock that was behind put it first."""
+    lift, block = decision(3, action="unblock"), decision(3)
+    archived = [item(block.to_value(), 50)]
+    assert decisions_for("s1", archived, [lift], 0, intake()) == [lift]
+    assert decisions_for("s1", [item(lift.to_value(), 7), *archived], [], 0, intake()) == [lift]
 
 
 def test_other_switches_and_all_switches():
