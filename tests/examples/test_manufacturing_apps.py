@@ -1,22 +1,16 @@
 """The five apps together, over real HTTP and DUE: the same schedule as in the pure simulation."""
 
-from contextlib import closing
-
 import msgspec
 import pytest
 from manufacturing.core.orders import HOUR, Order, Scenario
 from manufacturing.core.printer import STEP_S, Printer
 from manufacturing.core.simulation import simulate
-from manufacturing.core.twins import FleetState, FleetTwin, TriedJob
+from manufacturing.core.twins import FleetState, FleetTwin, MachineState, TriedJob
 from manufacturing.data_driver.step_keeper import StepKeeper
-from manufacturing.messages import FLEET as KEY
-from manufacturing.messages import FleetMessage, JobAssignment, PlanMessage, from_value, to_value
+from manufacturing.messages import FleetMessage, JobAssignment, PlanMessage
 from manufacturing.running.in_process import InProcessProduction
 from manufacturing.scheduling import SCHEDULERS, scheduler
 from manufacturing.scheduling.backlog import Backlog
-
-from due import NO_WAIT, Capability, Engine, Interest, Options
-from sdnator.testing.waiting import wait_for
 
 MACHINES = {"normal": 3, "anomalies": 1, "ppe": 2}
 ORDER = Order(id=0, at=0.0, kind=3, jobs=5, volume=6.0)
@@ -56,21 +50,16 @@ def test_a_step_is_carried_out_when_all_of_one_plan_is_there():
     assert keeper.complete() is None
 
 
-def test_jobs_are_printed_again_in_the_order_in_which_they_failed(tmp_path):
-    """Also after the way through DUE, where a map would not keep its order."""
-    failed = tuple(TriedJob(0, number, 1, f"m0{number}") for number in (3, 1, 2))
-    sent = FleetMessage("r", msgspec.structs.replace(FLEET, tried=failed))
-    heard = []
-    options = Options(coordinated=False, directory=str(tmp_path), updates="memory://tried", archive="")
-    with closing(Engine(options)) as engine:
-        engine.init("twins", interests=[Interest(KEY)], capabilities=[Capability(KEY)])
-        engine.observe(KEY).subscribe(heard.append)
-        engine.write(KEY, to_value(sent), [NO_WAIT])
-        wait_for(lambda: heard)
-    got = from_value(heard[0].value, FleetMessage)
-    assert [(machine, task.number) for machine, task in Backlog([ORDER], got.fleet).again()] == [
-        ("m03", 3), ("m01", 1), ("m02", 2),
-    ]  # fmt: skip
+def test_a_print_that_is_about_to_be_aborted_is_an_attempt():
+    """Printers refuse a job of the same name as the one that they are still printing."""
+    running = MachineState(
+        machine="m01", status="printing", loaded=3, free_at=0.0, finish=0.0, running=ORDER.task(1, 1), queue=(),
+        waited=0.0, prints=1, alarm="a part was found ruined",
+    )  # fmt: skip
+    fleet = msgspec.structs.replace(FLEET, machines=(running,), tried=(TriedJob(0, 1, 1, "m01"),))
+    assert [(machine, task.name) for machine, task in Backlog([ORDER], fleet).again()] == [
+        ("m01", ORDER.task(1, 2).name)
+    ]
 
 
 def test_maintenance_is_ordered_once_also_by_a_late_fleet():

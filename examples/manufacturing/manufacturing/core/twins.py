@@ -62,7 +62,7 @@ class FleetState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     done: tuple[tuple[int, int], ...]
     """Jobs that were printed well, as (order, number)."""
     tried: tuple[TriedJob, ...]
-    """In the order in which they failed first: schedulers print them again in this order, which a map does not keep."""
+    """In the order in which they failed first."""
     maintain: tuple[str, ...]
     """Machines whose print is to be aborted, and which are to be maintained, from this step."""
 

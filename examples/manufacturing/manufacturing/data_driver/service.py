@@ -79,6 +79,7 @@ class DataDriverService:
         """Whether the plan is carried out, and only the clock has to move."""
         self._unplanned = 0
         self._errors = 0
+        self._stopped = False
 
     def start(self) -> None:
         """Subscribe."""
@@ -94,6 +95,8 @@ class DataDriverService:
     def _guarded(self, handler: Callable[[Item], None]) -> Callable[[Item], None]:
         def handle(item: Item) -> None:
             with self._lock:
+                if self._stopped:
+                    return
                 try:
                     handler(item)
                 except msgspec.ValidationError as error:
@@ -111,7 +114,7 @@ class DataDriverService:
     def tick(self) -> None:
         """Repeat what was not answered; let time pass."""
         with self._lock:
-            if self._inventory is None:
+            if self._inventory is None or self._stopped:
                 return
             try:
                 self._go_on(time.monotonic())
@@ -221,7 +224,9 @@ class DataDriverService:
             self._read()
 
     def stop(self) -> None:
-        """Close the connections."""
+        """Finish the request in progress, and close the connections."""
+        with self._lock:
+            self._stopped = True
         self._client.close()
 
     def health(self) -> dict[str, Any]:

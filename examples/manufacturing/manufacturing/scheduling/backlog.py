@@ -22,7 +22,7 @@ class Backlog:
 
     def __init__(self, orders: Sequence[Order], fleet: FleetState, *, recall: bool = False) -> None:
         self._fleet = fleet
-        self._attempts = {(one.order, one.number): (one.attempts, one.machine) for one in fleet.tried}
+        self._attempts = {(one.order, one.number): one.attempts for one in fleet.tried}
         self.placed = set(fleet.done)
         """Jobs that are done, printing or waiting."""
         for machine in fleet.machines:
@@ -47,8 +47,8 @@ class Backlog:
         ]
 
     def attempts(self, order: Order, number: int) -> int:
-        """How often a job was tried without a good part."""
-        return self._tried(order, number)[0]
+        """How often a job was tried without a good part; a print that is about to be aborted counts."""
+        return max(self._attempts.get((order.id, number), 0), self._running_attempts(order, number))
 
     def again(self) -> Iterator[tuple[str, Task]]:
         """Missing jobs that were tried before, each with the machine of the last attempt."""
@@ -56,13 +56,9 @@ class Backlog:
         for one in self._fleet.tried:
             order = by_id.get(one.order)
             if order is not None and (one.order, one.number) not in self.placed:
-                yield one.machine, order.task(one.number, one.attempts)
-
-    def _tried(self, order: Order, number: int) -> tuple[int, str]:
-        return self._attempts.get((order.id, number), (self._running_attempts(order, number), ""))
+                yield one.machine, order.task(one.number, self.attempts(order, one.number))
 
     def _running_attempts(self, order: Order, number: int) -> int:
-        """A print that is about to be aborted counts as tried."""
         for machine in self._fleet.machines:
             running = machine.running
             if machine.alarm and running is not None and running.job == (order.id, number):
