@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from manufacturing.core import faults, process
+from manufacturing.core import faults, process, simulation
 from manufacturing.core.anomaly import AnomalyDetector, commissioning_prints
 from manufacturing.core.orders import HOUR, Order, Scenario
 from manufacturing.core.printer import MOST_QUEUED, STEP_S, Printer, QueueFull
 from manufacturing.core.simulation import reconcile
 from manufacturing.core.twins import FleetTwin
+from manufacturing.scheduling import SCHEDULERS, scheduler
 
 ORDER = Order(id=0, at=0.0, kind=3, jobs=5, volume=6.0)
 
@@ -133,6 +134,25 @@ def test_twins_have_a_faulty_printer_maintained_and_the_job_printed_again():
         fleet = twins.update([printer.report(step)])
     assert not printer.ruined
     assert [one.attempts for one in fleet.tried] == [1]
+
+
+@pytest.mark.parametrize("name", SCHEDULERS)
+def test_no_printer_is_given_a_name_that_it_had_before(name):
+    """Printers refuse such a job: also the plan of a job that has failed since names the next attempt."""
+    scenario = Scenario(name="anomalies", seed=0, machines=3, orders=20, fraction=0.3)
+    asked = []
+
+    class Watched(Printer):
+        def knows(self, task):
+            known = super().knows(task)
+            asked.append(known)
+            return known
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, "Printer", Watched)
+        found = simulation.simulate(scenario, scheduler(name))
+    assert found.aborted + found.ruined
+    assert not any(asked)
 
 
 def test_a_queue_is_brought_to_what_is_wanted():

@@ -96,12 +96,13 @@ def simulate(scenario: Scenario, scheduler: Scheduler) -> Outcome:
 
 
 def apply(printer: Printer, wanted: Sequence[Task]) -> None:
-    """Make a printer's queue hold what is wanted."""
+    """Make a printer's queue hold what is wanted; like the REST interface it leaves alone what it had before."""
     withdraw, add = reconcile(printer.queue, wanted)
     for name in withdraw:
         printer.withdraw(name)
     for place, task in add:
-        printer.enqueue(task, place)
+        if not printer.knows(task.name):
+            printer.enqueue(task, place)
 
 
 def outcome(

@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+import msgspec
+
 from manufacturing.core.orders import Order, Task
 from manufacturing.core.printer import STEP_S
 from manufacturing.core.twins import FleetState, MachineState
@@ -23,6 +25,10 @@ class Backlog:
     def __init__(self, orders: Sequence[Order], fleet: FleetState, *, recall: bool = False) -> None:
         self._fleet = fleet
         self._attempts = {(one.order, one.number): one.attempts for one in fleet.tried}
+        for machine in fleet.machines:
+            if machine.alarm and machine.running is not None:
+                job, attempts = machine.running.job, machine.running.attempt + 1
+                self._attempts[job] = max(self._attempts.get(job, 0), attempts)
         self.placed = set(fleet.done)
         """Jobs that are done, printing or waiting."""
         for machine in fleet.machines:
@@ -41,14 +47,18 @@ class Backlog:
     def tasks(self, order: Order) -> list[Task]:
         """Missing jobs of an order, with the number of the attempt."""
         return [
-            order.task(number, self.attempts(order, number))
+            order.task(number, self.attempts((order.id, number)))
             for number in range(order.jobs)
             if (order.id, number) not in self.placed
         ]
 
-    def attempts(self, order: Order, number: int) -> int:
+    def attempts(self, job: tuple[int, int]) -> int:
         """How often a job was tried without a good part; a print that is about to be aborted counts."""
-        return max(self._attempts.get((order.id, number), 0), self._running_attempts(order, number))
+        return self._attempts.get(job, 0)
+
+    def anew(self, task: Task) -> Task:
+        """A task of a plan that was made before, with the number of the attempt that it would be now."""
+        return msgspec.structs.replace(task, attempt=max(task.attempt, self.attempts(task.job)))
 
     def again(self) -> Iterator[tuple[str, Task]]:
         """Missing jobs that were tried before, each with the machine of the last attempt."""
@@ -56,14 +66,7 @@ class Backlog:
         for one in self._fleet.tried:
             order = by_id.get(one.order)
             if order is not None and (one.order, one.number) not in self.placed:
-                yield one.machine, order.task(one.number, self.attempts(order, one.number))
-
-    def _running_attempts(self, order: Order, number: int) -> int:
-        for machine in self._fleet.machines:
-            running = machine.running
-            if machine.alarm and running is not None and running.job == (order.id, number):
-                return running.attempt + 1
-        return 0
+                yield one.machine, order.task(one.number, self.attempts((one.order, one.number)))
 
 
 def hungry(fleet: FleetState) -> list[MachineState]:

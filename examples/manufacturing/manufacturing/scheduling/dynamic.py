@@ -103,7 +103,8 @@ class Dynamic:
         """The next jobs of each printer's plan; one that fails gets none."""
         wanted: dict[str, list[Task]] = {}
         for machine in fleet.machines:
-            tasks = [task for task in self._plan.get(machine.machine, ()) if task.job not in backlog.placed]
+            planned = self._plan.get(machine.machine, ())
+            tasks = [backlog.anew(task) for task in planned if task.job not in backlog.placed]
             self._plan[machine.machine] = tasks
             wanted[machine.machine] = [] if machine.alarm else tasks[:AHEAD]
         return wanted
