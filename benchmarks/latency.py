@@ -53,27 +53,30 @@ def _case(url: str, size: int, batch: int, count: int, rounds: int) -> dict[str,
     due: list[Latencies] = []
     raw: list[Latencies] = []
     for _ in range(rounds):
-        due.append(_run(url, size, batch, count, due=True))
-        raw.append(_run(url, size, batch, count, due=False))
-    p50, raw_p50 = _percentile(due, 0.5), _percentile(raw, 0.5)
+        due.append(one_way(url, size, batch, count, due=True))
+        raw.append(one_way(url, size, batch, count, due=False))
+    p50, raw_p50 = percentile(due, 0.5), percentile(raw, 0.5)
     return {
         "p50_us": p50,
-        "p99_us": _percentile(due, 0.99),
+        "p99_us": percentile(due, 0.99),
         "raw_p50_us": raw_p50,
-        "raw_p99_us": _percentile(raw, 0.99),
+        "raw_p99_us": percentile(raw, 0.99),
         "ratio_vs_raw": p50 / raw_p50,
     }
 
 
-def _percentile(rounds: list[Latencies], share: float) -> float:
+def percentile(rounds: Sequence[Latencies], share: float) -> float:
     """The median over the rounds."""
     return statistics.median(sorted(times)[int(share * (len(times) - 1))] for times in rounds)
 
 
-def _run(url: str, size: int, batch: int, count: int, *, due: bool) -> Latencies:
+def one_way(
+    url: str, size: int, batch: int, count: int, *, due: bool = True, consumers_url: str = ""
+) -> Latencies:
+    """Microseconds of each message; the consumer may have a credential of its own."""
     consumer, producer = (_due_consumer, _due_producer) if due else (_raw_consumer, _raw_producer)
     total = count // batch * batch * (1 if batch == 1 else 10)
-    with other_process(consumer, url, total) as pipe:
+    with other_process(consumer, consumers_url or url, total) as pipe:
         producer(url, size, batch, total)
         if not pipe.poll(60):
             raise RuntimeError(f"not all of {total} messages arrived within 60 s")

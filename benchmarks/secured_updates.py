@@ -1,65 +1,131 @@
-"""What rights cost: DUE over a server where everybody may do everything, and over one with a user for each app."""
+"""What rights and TLS cost: DUE over servers of one kind without and with them, in turns.
+
+embedded server, Unix socket:  everybody may do everything │ a user for each app      ─► secured_vs_open
+redis-server, loopback TCP:    users, in clear             │ users, TLS, certificates ─► tls_vs_tcp
+"""
 
 import secrets
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
+from benchmarks.latency import MESSAGES, Latencies, one_way, percentile
 from benchmarks.measure import interleaved, table
 from benchmarks.pairs import KEY, run_due
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_rights import Rights
 from sdnator.rights.identities import ADMIN, Identities, made
+from sdnator.testing.tls_redis import RedisMissing, TlsRedis
 
 SIZES = (100, 1000, 10_000)
 COUNTS = {100: 300_000, 1000: 150_000, 10_000: 30_000}
+_LATENCY_SIZE = 1000
 _OTHERS = 12
 """Keys that each app is granted beside the measured one, as a real app has several."""
 
 
+class _Way(NamedTuple):
+    """How a producer and a consumer reach their server."""
+
+    producers_url: str
+    consumers_url: str
+
+
 def secured_figures(rounds: int, scale: float) -> dict[str, object]:
-    """Messages a second without and with rights, in turns, and the ratios."""
-    figures: dict[str, dict[str, float]] = {"open": {}, "secured": {}}
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        EmbeddedServer(Path(folder) / "open") as free,
-        _guarded(Path(folder)) as (server, identities),
-    ):
-        producer, consumer = (identities.url(server.url, name) for name in ("producer", "consumer"))
-        for size in SIZES:
-            count = max(1000, int(COUNTS[size] * scale))
-            peers = {
-                "open": partial(run_due, free.url, size, count),
-                "secured": partial(run_due, producer, size, count, consumer),
-            }
-            for name, rate in interleaved(peers, rounds).items():
-                figures[name][str(size)] = rate
-    ratio = {size: figures["secured"][size] / figures["open"][size] for size in figures["open"]}
-    rows = [[size, figures["open"][size], figures["secured"][size], ratio[size]] for size in ratio]
-    table(["bytes", "without rights", "with rights", "ratio"], rows)
+    """Messages a second and latency without and with rights, in clear and with TLS, and the ratios."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        ways, without_tls = _ways(stack, Path(folder))
+        rates = _rates(ways, rounds, scale)
+        latency = _latencies(ways, rounds, scale)
+    rows = [[name, size, rate] for name, by_size in rates.items() for size, rate in by_size.items()]
+    table(["way", "bytes", "messages/s"], rows)
+    table(["way", "p50, µs", "p99, µs"], [[name, *found.values()] for name, found in latency.items()])
+    print(without_tls, end="")
     return {
-        "open_msgs_per_s": figures["open"],
-        "secured_msgs_per_s": figures["secured"],
-        "secured_vs_open": ratio,
+        **{f"{name}_msgs_per_s": by_size for name, by_size in rates.items()},
+        "secured_vs_open": _ratio(rates, "secured", "open"),
+        "tls_vs_tcp": _ratio(rates, "tls", "tcp"),
+        "latency_us": latency,
     }
 
 
-@contextmanager
-def _guarded(folder: Path) -> Iterator[tuple[EmbeddedServer, Identities]]:
-    """A server with a user for the producer and one for the consumer."""
+def _ways(stack: ExitStack, folder: Path) -> tuple[dict[str, _Way], str]:
+    """What is compared, by name, and why there is no TLS, if there is none."""
+    free = stack.enter_context(EmbeddedServer(folder / "open"))
+    server, identities = stack.enter_context(_guarded(folder / "secured"))
+    found = {"open": _Way(free.url, free.url), "secured": _of(identities, server.url)}
+    try:
+        encrypted, identities = stack.enter_context(_encrypted(folder / "tls"))
+    except RedisMissing as reason:
+        return found, f"nothing with TLS: {reason}\n"
+    found["tcp"] = _of(identities, encrypted.plain_url)
+    found["tls"] = _of(identities, encrypted.url)
+    return found, ""
+
+
+def _rates(ways: dict[str, _Way], rounds: int, scale: float) -> dict[str, dict[str, float]]:
+    rates: dict[str, dict[str, float]] = {name: {} for name in ways}
+    for size in SIZES:
+        count = max(1000, int(COUNTS[size] * scale))
+        peers = {
+            name: partial(run_due, way.producers_url, size, count, way.consumers_url)
+            for name, way in ways.items()
+        }
+        for name, rate in interleaved(peers, rounds).items():
+            rates[name][str(size)] = rate
+    return rates
+
+
+def _latencies(ways: dict[str, _Way], rounds: int, scale: float) -> dict[str, dict[str, float]]:
+    times: dict[str, list[Latencies]] = {name: [] for name in ways}
+    count = max(200, int(MESSAGES * scale))
+    for _ in range(rounds):
+        for name, way in ways.items():
+            times[name].append(
+                one_way(way.producers_url, _LATENCY_SIZE, 1, count, consumers_url=way.consumers_url)
+            )
+    return {name: {"p50": percentile(of, 0.5), "p99": percentile(of, 0.99)} for name, of in times.items()}
+
+
+def _ratio(rates: dict[str, dict[str, float]], of: str, to: str) -> dict[str, float] | None:
+    return {size: rates[of][size] / rates[to][size] for size in rates[to]} if to in rates else None
+
+
+def _identities(folder: Path) -> Identities:
+    """A user for the producer and one for the consumer."""
     others = tuple(f"bench.family{number}.app.*" for number in range(_OTHERS))
-    identities = made(
+    return made(
         folder,
         {
             "producer": Rights(app="producer", publish=(*others, KEY), observe=others),
             "consumer": Rights(app="consumer", publish=others, observe=(*others, KEY)),
         },
     )
-    password = secrets.token_urlsafe(24)
+
+
+def _of(identities: Identities, url: str) -> _Way:
+    return _Way(identities.url(url, "producer"), identities.url(url, "consumer"))
+
+
+@contextmanager
+def _guarded(folder: Path) -> Iterator[tuple[EmbeddedServer, Identities]]:
+    identities, password = _identities(folder), secrets.token_urlsafe(24)
     with EmbeddedServer(
-        folder / "secured",
+        folder / "server",
+        users=partial(identities.users_file, password),
+        admin=(identities.prefix + ADMIN, password),
+    ) as server:
+        yield server, identities
+
+
+@contextmanager
+def _encrypted(folder: Path) -> Iterator[tuple[TlsRedis, Identities]]:
+    identities, password = _identities(folder), secrets.token_urlsafe(24)
+    with TlsRedis(
+        folder / "server",
         users=partial(identities.users_file, password),
         admin=(identities.prefix + ADMIN, password),
     ) as server:

@@ -47,7 +47,9 @@ WHY_NOT_RAW = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
     parser = arguments("updates", __doc__, rounds=3)
-    parser.add_argument("--secured", action="store_true", help="compare instead DUE without and with rights")
+    parser.add_argument(
+        "--secured", action="store_true", help="compare instead DUE without and with rights and TLS"
+    )
     options = parser.parse_args(argv)
     if options.secured:
         costs = secured_figures(options.rounds, options.scale)

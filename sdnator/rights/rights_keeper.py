@@ -6,8 +6,10 @@ restarted; then they are made again.
 
 import logging
 import threading
+import time
 from collections import Counter, deque
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import redis
 
@@ -17,6 +19,10 @@ from sdnator.rights.identities import Identities
 
 _LOOK_SECONDS = 1.0
 _ENTRIES = 128
+_LIBRARY = "client|setinfo"
+"""A client library says its name with it and goes on where it may not; nothing is lost."""
+_GROUPED_SECONDS = 60.0
+"""The server counts a refusal in the entry of the one before for so long."""
 _TOLD = 200
 """Most refusals that wait to be told."""
 
@@ -40,7 +46,7 @@ class RightsKeeper:
         self._identities = identities
         self._commands: Any = None  # Any: redis-py types an answer by options it cannot see
         self._changed = 0
-        self._seen: dict[int, int] = {}
+        self._seen: dict[tuple[str, ...], _Refusal] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="rights", daemon=True)
         self._told: deque[str] = deque(maxlen=_TOLD)
@@ -101,8 +107,7 @@ class RightsKeeper:
                 f"users of Data Updates were gone and are made again: {', '.join(sorted(missing))}"
             )
             self._make()
-        for entry in reversed(self._commands.execute_command("ACL", "LOG", _ENTRIES)):
-            self._note({_text(k): v for k, v in zip(entry[::2], entry[1::2], strict=False)})
+        self._note(self._commands.execute_command("ACL", "LOG", _ENTRIES))
 
     def _run(self) -> None:
         while not self._ended.wait(_LOOK_SECONDS):
@@ -138,21 +143,57 @@ class RightsKeeper:
         if gone:
             self._commands.execute_command("ACL", "DELUSER", *sorted(gone))
 
-    def _note(self, entry: dict[str, Any]) -> None:
-        user = _text(entry.get("username", b""))
-        known = user.startswith(self._identities.prefix)
-        if not known and user != "default":
+    def _note(self, entries: list[list[Any]]) -> None:
+        """Count what is new in the server's log, which has the newest entry first."""
+        current: dict[tuple[str, ...], _Refusal] = {}
+        for entry in entries:
+            refusal = _Refusal.of({_text(k): v for k, v in zip(entry[::2], entry[1::2], strict=False)})
+            current.setdefault(refusal.key, refusal)
+        for key, refusal in reversed(current.items()):
+            self._tell(refusal, self._seen.get(key))
+        self._seen = current
+
+    def _tell(self, refusal: "_Refusal", before: "_Refusal | None") -> None:
+        user = refusal.user.removeprefix(self._identities.prefix)
+        known = user != refusal.user
+        if (not known and user != "default") or refusal.what == _LIBRARY:
             return
-        number, count = int(entry.get("entry-id", -1)), int(entry.get("count", 1))
-        fresh = count - self._seen.get(number, 0)
-        if fresh <= 0 or number < 0:
+        again = before is not None and refusal.at - before.at < _GROUPED_SECONDS
+        fresh = refusal.times - (before.times if before is not None and again else 0)
+        if fresh <= 0:
             return
-        if number not in self._seen:
-            who = user.removeprefix(self._identities.prefix) if known else "somebody without a credential"
-            what, why = _text(entry.get("object", b"")), _text(entry.get("reason", b""))
-            self._told.append(f"{who} was refused the {why} {what} on Data Updates")
-        self._seen[number] = count
-        self.refusals[user.removeprefix(self._identities.prefix)] += fresh
+        if not again:
+            who = user if known else "somebody without a credential"
+            self._told.append(f"{who} was refused the {refusal.why} {refusal.what} on Data Updates")
+        self.refusals[user] += fresh
+
+
+class _Refusal(NamedTuple):
+    """One entry of the server's log: refusals of one kind, each within a minute of the one before."""
+
+    number: str
+    """Empty before Redis 7.2: there the newest entry of a kind counts."""
+    user: str
+    why: str
+    what: str
+    times: int
+    at: float
+    """Monotonic time of the last of them, seconds."""
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any]) -> "_Refusal":
+        return cls(
+            number=_text(entry.get("entry-id", "")),
+            user=_text(entry.get("username", "")),
+            why=_text(entry.get("reason", "")),
+            what=_text(entry.get("object", "")),
+            times=int(entry.get("count", 1)),
+            at=time.monotonic() - float(entry.get("age-seconds", 0)),
+        )
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return (self.number,) if self.number else (self.user, self.why, self.what)
 
 
 def _text(value: Any) -> str:

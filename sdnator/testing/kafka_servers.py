@@ -8,7 +8,6 @@ import fcntl
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import time
 import uuid
@@ -18,6 +17,8 @@ from typing import Self
 
 from confluent_kafka import KafkaException
 from confluent_kafka.admin import AdminClient
+
+from sdnator.testing.ports import free_port
 
 KAFKA_VERSION = "3.9.1"
 _COPY_SECONDS = 600
@@ -99,7 +100,7 @@ class KafkaServers:
         self._folder = folder
         self._jars = kafka_jars()
         self._cluster = base64.urlsafe_b64encode(uuid.uuid4().bytes).decode().rstrip("=")
-        self._ports = [(_free_port(), _free_port()) for _ in range(brokers)]
+        self._ports = [(free_port(), free_port()) for _ in range(brokers)]
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
 
     @property
@@ -221,9 +222,3 @@ class KafkaServers:
 
     def _java(self, program: str, *arguments: object) -> list[str]:
         return ["java", _HEAP, *_QUICK_START, "-cp", f"{self._jars}/*", program, *map(str, arguments)]
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

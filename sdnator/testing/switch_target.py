@@ -2,9 +2,7 @@
 
 import os
 import signal
-import socket
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 from dataplane.bmv2 import Bmv2
@@ -94,10 +92,3 @@ class SwitchTarget:
         if self._process is None:
             raise RuntimeError(f"the {self.kind} switch does not run: start it first")
         os.kill(self._process.pid, number)
-
-
-def free_port() -> int:
-    """A TCP port of 127.0.0.1 on which nobody listens now."""
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

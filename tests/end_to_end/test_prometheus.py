@@ -8,7 +8,7 @@ import urllib.request
 
 import pytest
 
-from sdnator.testing.switch_target import free_port
+from sdnator.testing.ports import free_port
 from tests.end_to_end.test_up import Operator, until
 from tests.requirements import optional_program
 from tests.test_deploy import DEPLOY, PREFIXES, expressions

@@ -6,8 +6,8 @@ from apps.p4runtime_ctrl import watchdog
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.state.port_forwarding import wires_of
+from sdnator.testing.ports import free_port
 from sdnator.testing.product_program import P4INFO, PROGRAM, program
-from sdnator.testing.switch_target import free_port
 from tests.apps.p4runtime_ctrl.fake_switch import FakeSwitch
 from tests.apps.p4runtime_ctrl.test_targets import Attached
 

@@ -4,6 +4,7 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -11,43 +12,44 @@ from due.backends import open_updates
 from due.config import Options
 from due.drivers.base import Delivery, Receiver, UpdatesDriver
 from due.drivers.embedded_redis import EmbeddedServer
-from sdnator.testing.kafka_servers import KafkaServers
+from sdnator.testing.tls_redis import TlsRedis
 from tests.due.conftest import wait_for
+from tests.requirements import require_program
 
 _spaces = itertools.count()
 Open = Callable[..., UpdatesDriver]
 
 
-@pytest.fixture(params=["redis", "memory", "kafka"])
+@contextmanager
+def empty_place(kind: str, request: pytest.FixtureRequest) -> Iterator[str]:
+    """The URL of a place that nobody has used yet."""
+    name, folder = f"contract{next(_spaces)}", request.getfixturevalue("tmp_path") / "updates"
+    if kind == "redis":
+        with EmbeddedServer(folder) as server:
+            yield server.url
+    elif kind == "rediss":
+        require_program("redis-server")
+        with TlsRedis(folder) as encrypted:
+            yield encrypted.url
+    elif kind == "kafka":
+        yield f"{request.getfixturevalue('kafka_server').url}/{name}"
+    else:
+        yield f"memory://{name}"
+
+
+@pytest.fixture(params=["redis", "rediss", "memory", "kafka"])
 def open_driver(request: pytest.FixtureRequest) -> Iterator[Open]:
     """Opens drivers of one empty place."""
-    name = next(_spaces)
-    kafka: KafkaServers | None = None
-    server: EmbeddedServer | None = None
-    if request.param == "redis":
-        folder = request.getfixturevalue("tmp_path") / "updates"
-        server = EmbeddedServer(folder)
-        server.start()
-    if request.param == "kafka":
-        kafka = request.getfixturevalue("kafka_server")
-    url = (
-        server.url
-        if server is not None
-        else f"{kafka.url}/contract{name}"
-        if kafka is not None
-        else f"memory://contract{name}"
-    )
     opened: list[UpdatesDriver] = []
+    with empty_place(request.param, request) as url:
 
-    def make(**options: object) -> UpdatesDriver:
-        opened.append(open_updates(url, Options(**options)))
-        return opened[-1]
+        def make(**options: object) -> UpdatesDriver:
+            opened.append(open_updates(url, Options(**options)))
+            return opened[-1]
 
-    yield make
-    for driver in opened:
-        driver.close()
-    if server is not None:
-        server.stop()
+        yield make
+        for driver in opened:
+            driver.close()
 
 
 def received(receiver: Receiver, count: int, seconds: float = 30.0) -> list[Delivery]:

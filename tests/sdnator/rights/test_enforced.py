@@ -14,11 +14,14 @@ from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_leases import lease_name
 from due.drivers.redis_rights import Rights
 from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
-from due.drivers.redis_wire import client
+from due.drivers.redis_wire import Wire, client
+from due.errors import UpdatesUnavailable
 from sdnator.rights.granting import DANGEROUS, OPERATOR
 from sdnator.rights.identities import ADMIN, FILE, Identities, made, observable
 from sdnator.rights.rights_keeper import RightsKeeper, RightsRefused
+from sdnator.testing.tls_redis import TlsRedis
 from tests.due.conftest import wait_for
+from tests.requirements import require_program
 
 MINE = Rights(app="mine", publish=("network.anomaly.mine.**",), observe=("network.open.**",))
 OWN, FOREIGN = "network.anomaly.mine.score", "network.anomaly.kitsune.score"
@@ -28,18 +31,19 @@ _PATHS = (
 )
 
 
-@pytest.fixture
-def place(tmp_path: Path) -> Iterator[tuple[EmbeddedServer, Identities]]:
+@pytest.fixture(params=["embedded", "tls"])
+def place(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> Iterator[tuple[EmbeddedServer | TlsRedis, Identities]]:
     identities = made(
         tmp_path, {"mine": MINE, "kitsune": Rights(app="kitsune", publish=("network.anomaly.kitsune.*",))}
     )
     password = secrets.token_urlsafe(24)
-    server = EmbeddedServer(
-        tmp_path / "u",
-        users=partial(identities.users_file, password),
-        admin=(identities.prefix + ADMIN, password),
-    )
-    with server:
+    users, admin = partial(identities.users_file, password), (identities.prefix + ADMIN, password)
+    if request.param == "tls":
+        require_program("redis-server")
+    kind = {"embedded": EmbeddedServer, "tls": TlsRedis}[request.param]
+    with kind(tmp_path / "u", users=users, admin=admin) as server:
         yield server, identities
 
 
@@ -118,7 +122,7 @@ def test_an_app_can_say_and_see_nothing_but_its_own(place):
     keeper.close()
 
 
-def test_without_a_credential_there_is_nothing_but_an_answer_to_ping(place):
+def test_without_a_credential_there_is_nothing_but_an_answer_to_ping(place, tmp_path):
     server, identities = place
     commands = client(server.url)
     assert commands.ping()
@@ -126,7 +130,7 @@ def test_without_a_credential_there_is_nothing_but_an_answer_to_ping(place):
         with pytest.raises(redis.exceptions.NoPermissionError):
             commands.execute_command(*attempt)
     commands.close()
-    for path in (server.socket.parent / "users.acl", identities.path):
+    for path in (tmp_path / "u" / "users.acl", identities.path):
         assert path.stat().st_mode & 0o777 == 0o600
 
 
@@ -203,3 +207,13 @@ def test_a_damaged_file_of_identities_is_made_anew(tmp_path):
     (tmp_path / FILE).write_bytes(os.urandom(100))
     again = made(tmp_path, {"mine": MINE})
     assert again.all["mine"].password != first.all["mine"].password
+
+
+def test_over_tls_a_client_without_a_certificate_is_not_heard(tmp_path):
+    require_program("redis-server")
+    with TlsRedis(tmp_path / "u") as server:
+        assert client(server.url).ping()
+        with pytest.raises((redis.ConnectionError, redis.TimeoutError)):
+            client(server.url_without_certificate).ping()
+        with pytest.raises(UpdatesUnavailable, match=r"cannot be reached|connection"):
+            Wire(server.url_without_certificate).call("PING")
