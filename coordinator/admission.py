@@ -92,9 +92,9 @@ class Admission:
     def _crowded(self, app: str, instance: str) -> Iterator[str]:
         known = self._registry.known(app)
         if known is None and self._registry.app_count() >= MOST_APPS:
-            yield f"there are {MOST_APPS} apps already"
+            yield f"there are already {MOST_APPS} apps"
         if known is not None and instance not in known and len(known) >= MOST_INSTANCES:
-            yield f"the app has {MOST_INSTANCES} instances already"
+            yield f"the app already has {MOST_INSTANCES} instances"
 
     def _plausible(self, app: str, epoch: int) -> bool:
         return 0 <= epoch <= min(MOST_EPOCH, self._registry.epoch(app) + EPOCH_STEP)
@@ -106,7 +106,7 @@ class Admission:
         kind = type(message).__name__.lower()
         refusal = Refusal(message.app_id[:_MOST_TEXT], message.instance_id[:_MOST_TEXT], f"{kind}: {fault}")
         if refusal not in self.last:
-            log.error("refused of %r, instance %r: %s", *msgspec.structs.astuple(refusal))
+            log.error("refused a message of %r, instance %r: %s", *msgspec.structs.astuple(refusal))
         self.last.append(refusal)
         return False
 

@@ -6,12 +6,14 @@
     WebSocket /observe?key=…        live items; a slow reader misses some and is told how many
 
 Requests with the Host or Origin of another site are refused, so that web pages cannot read the API. Where there is
-a token, every request but that of /metrics brings it as `Authorization: Bearer …`.
+a token, every request but that of /metrics brings it as `Authorization: Bearer …`; an app that may read from the
+archive brings its own password instead, and gets /get with its keys, and nothing else.
 At most two archive queries run at a time, for at most 10 s each; an answer has at most 10,000 items or 16 MiB.
 """
 
 import asyncio
 import hmac
+import logging
 import socket
 import threading
 import time
@@ -36,10 +38,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from coordinator import views
 from coordinator.metrics import render
 from coordinator.openapi import document
+from coordinator.readers import ArchiveReader, ArchiveReaders
 from coordinator.registry import Registry
 from due import DueError, Engine, Item
 from due.drivers.query_time import time_limit
 from due.errors import BackendError, InvalidQuery, Timeout
+from due.logs import LogLimit
+
+log = logging.getLogger("coordinator.api")
 
 _MAX_ITEMS = 10_000
 _DEFAULT_ITEMS = 1000
@@ -61,7 +67,11 @@ _TRY_AGAIN_LATER = 1013
 _INT64_DIGITS = 20
 _JSON = {True: b"true", False: b"false"}
 _TYPE = "application/json"
-_NO_TOKEN = "bring the Coordinator's token: Authorization: Bearer …"  # noqa: S105 - no token
+_BEARER = b"Bearer "
+_NO_TOKEN = "send the Coordinator's token: Authorization: Bearer …"  # noqa: S105 - no token
+_NOT_GRANTED = "this app may not read that; grant its keys by `sdnator app enrol --read` or [[grants]]"
+Refused = Callable[[str, str, str], None]
+"""Is told the path, the address and why."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,14 @@ class Api:
     """The server, in a thread of its own.  Raises OSError if it cannot listen on the address."""
 
     def __init__(
-        self, northbound: Northbound, host: str, port: int, *, token: str = "", metrics_token: str = ""
+        self,
+        northbound: Northbound,
+        host: str,
+        port: int,
+        *,
+        token: str = "",
+        metrics_token: str = "",
+        readers: ArchiveReaders | None = None,
     ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.create_server((host, port), family=family)
@@ -89,8 +106,11 @@ class Api:
         place = f"{f'[{host}]' if ':' in host else host}:{bound}"
         self.url = f"http://{place}"
         self.url_with_token = f"http://viewer:{token}@{place}" if token else self.url
+        self.unauthorized = 0
+        """Requests without the token, or for what their app may not read, so far."""
+        self._told = LogLimit(log)
         config = uvicorn.Config(
-            application(northbound, host, token, metrics_token),
+            application(northbound, host, token, metrics_token, self._refused, readers),
             log_level="warning",
             lifespan="off",
             access_log=False,
@@ -114,22 +134,47 @@ class Api:
     def _run(self) -> None:
         self._server.run(sockets=[self._socket])
 
+    def _refused(self, path: str, source: str, why: str) -> None:
+        self.unauthorized += 1
+        self._told.error("a request of %.200r from %s was refused: %s", path, source, why)
+
 
 class TokenGate:
     """ASGI: refuses whoever does not bring the token; metrics have one of their own, or are free for those who reach the
-    port."""
+    port, and apps that may read from the archive reach /get with their password."""
 
-    def __init__(self, app: Any, token: str, metrics_token: str = "") -> None:
+    def __init__(
+        self,
+        app: Any,
+        token: str,
+        metrics_token: str = "",
+        refused: Refused | None = None,
+        readers: ArchiveReaders | None = None,
+    ) -> None:
         self._app = app
-        self._wanted = f"Bearer {token}".encode() if token else b""
-        self._metrics = f"Bearer {metrics_token}".encode() if metrics_token else b""
+        self._refused = refused
+        self._readers = readers or ArchiveReaders(None)
+        self._wanted = _BEARER + token.encode() if token else b""
+        self._metrics = _BEARER + metrics_token.encode() if metrics_token else b""
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """ASGI."""
         if scope["type"] not in ("http", "websocket") or self._admits(scope):
             await self._app(scope, receive, send)
-        elif scope["type"] == "websocket":
+            return
+        given = _given(scope)
+        reader = self._readers.of(given.removeprefix(_BEARER)) if given.startswith(_BEARER) else None
+        if reader is not None and (scope["type"], scope["path"]) == ("http", "/get"):
+            scope.setdefault("state", {})["reader"] = reader
+            await self._app(scope, receive, send)
+            return
+        why = "it had no token, or a wrong one" if reader is None else _only_get(reader[0])
+        if self._refused is not None:
+            self._refused(scope["path"], _source(scope), why)
+        if scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": _NO_TOKEN})
+        elif reader is not None:
+            await JSONResponse({"error": "Forbidden", "detail": _NOT_GRANTED}, 403)(scope, receive, send)
         else:
             answer = JSONResponse(
                 {"error": "Unauthorized", "detail": _NO_TOKEN}, 401, {"WWW-Authenticate": "Bearer"}
@@ -137,7 +182,7 @@ class TokenGate:
             await answer(scope, receive, send)
 
     def _admits(self, scope: Any) -> bool:
-        given: bytes = next((value for name, value in scope["headers"] if name == b"authorization"), b"")
+        given = _given(scope)
         if scope["path"] == "/metrics" and (not self._metrics or hmac.compare_digest(given, self._metrics)):
             return True
         if not self._wanted:
@@ -145,16 +190,37 @@ class TokenGate:
         return hmac.compare_digest(given, self._wanted)
 
 
+def _given(scope: Any) -> bytes:
+    found: bytes = next((value for name, value in scope["headers"] if name == b"authorization"), b"")
+    return found
+
+
+def _source(scope: Any) -> str:
+    return str((scope.get("client") or ("an unknown place",))[0])
+
+
+def _only_get(app: str) -> str:
+    return f"{app} may read some keys from the archive by /get, and nothing else"
+
+
 def application(
-    northbound: Northbound, host: str = "127.0.0.1", token: str = "", metrics_token: str = ""
+    northbound: Northbound,
+    host: str = "127.0.0.1",
+    token: str = "",
+    metrics_token: str = "",
+    refused: Refused | None = None,
+    readers: ArchiveReaders | None = None,
 ) -> Starlette:
     """The ASGI application; an empty token lets everybody read."""
-    handlers = _Handlers(northbound)
+    handlers = _Handlers(northbound, refused)
     hosts = sorted({"127.0.0.1", "localhost", "[::1]", host})
     gates = [Middleware(TrustedHostMiddleware, allowed_hosts=hosts)]
     return Starlette(
         routes=handlers.routes(),
-        middleware=[*gates, Middleware(TokenGate, token=token, metrics_token=metrics_token)]
+        middleware=[
+            *gates,
+            Middleware(TokenGate, token=token, metrics_token=metrics_token, refused=refused, readers=readers),
+        ]
         if token or metrics_token
         else gates,
         exception_handlers={DueError: _explain, ValueError: _explain},
@@ -168,8 +234,9 @@ async def _explain(_request: Request, error: Exception) -> Response:
 
 
 class _Handlers:
-    def __init__(self, northbound: Northbound) -> None:
+    def __init__(self, northbound: Northbound, refused: Refused | None) -> None:
         self._north = northbound
+        self._refused = refused
         self._queries = asyncio.Semaphore(_QUERIES)
         self._observers = 0
 
@@ -211,6 +278,14 @@ class _Handlers:
             query = {"$and": [query, {"dataKey": request.query_params["key"]}]} if query else _of_key(request)
         if not query:
             raise InvalidQuery("name a key (?key=…) or a query (?query={…})")
+        reader: tuple[str, ArchiveReader] | None = getattr(request.state, "reader", None)
+        if reader is not None:
+            name, rights = reader
+            if not all(map(rights.may_read, request.query_params.getlist("key"))):
+                if self._refused is not None:
+                    self._refused(str(request.url), _source(request.scope), f"{name} may not read that key")
+                return JSONResponse({"error": "Forbidden", "detail": _NOT_GRANTED}, 403)
+            query = rights.narrowed(query)
         async with self._turn():
             return await run_in_threadpool(self._answer, query, request)
 

@@ -100,7 +100,7 @@ def _incompatible(
         served.add(flow.interest.key)
         minimum, cap = least(flow.interest.frequency), most(flow.capability.frequency)
         if minimum is not None and cap is not None and minimum > cap:
-            reason = f"at least {minimum:g} Hz wanted, but {flow.producer} makes {flow.capability.key} at most at {cap:g} Hz"
+            reason = f"at least {minimum:g} Hz wanted, but {flow.producer} produces {flow.capability.key} at most at {cap:g} Hz"
             yield Incompatible(key=flow.interest.key, reason=reason)
     for interest in apps[app].interests:
         if interest.key not in served:

@@ -16,6 +16,7 @@ _COUNTERS = {
     "heartbeats": "Heartbeats received",
     "misunderstood": "Membership messages that could not be decoded",
     "refused": "Membership messages refused as implausible, or beyond the limits of apps, instances or keys",
+    "unauthorized": "Requests of the HTTP API that brought no token, a wrong one, or that of an app for what it may not read",
     "assignments_sent": "Assignments sent",
     "retention_deleted": "Items deleted from the archive because of its limits of age and size",
     "failovers": "Changes of the active instance because the former one was lost",
@@ -37,7 +38,7 @@ class _Snapshot(Collector):
         """The families."""
         yield GaugeMetricFamily(
             "sdnator_coordinator_leading",
-            "1 if this Coordinator leads",
+            "1 if this Coordinator is the active one",
             value=float(self._health["leading"]),
         )
         for name, text in _COUNTERS.items():

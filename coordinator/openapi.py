@@ -5,7 +5,7 @@ from typing import Any
 _LIMITS = (
     ("since", "integer", "UTC, ns: items written at this time or later"),
     ("until", "integer", "UTC, ns: items written before this time"),
-    ("limit", "integer", "number of youngest items at most; default 1,000, maximum 10,000"),
+    ("limit", "integer", "maximum number of items, the newest; default 1,000, at most 10,000"),
 )
 _PATHS: dict[str, tuple[str, str, tuple[tuple[str, str, str], ...]]] = {
     "/apps": ("Apps: the active instance, its epoch, instances by state", "List", ()),
@@ -17,7 +17,7 @@ _PATHS: dict[str, tuple[str, str, tuple[tuple[str, str, str], ...]]] = {
     "/health": ("State of the Coordinator, and the last health report of every app", "Map", ()),
     "/apps/{app_id}/history": ("Events of one app: joined, activated, lost …", "Items", _LIMITS),
     "/get": (
-        "Items from the archive, oldest first",
+        "Items from the archive, oldest first; an app's password gives those that it may read",
         "Items",
         (
             ("key", "string", "a DUE key, wildcards allowed"),

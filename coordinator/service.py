@@ -24,6 +24,7 @@ from coordinator.admission import Admission
 from coordinator.api import Api, Northbound
 from coordinator.checkpoint import Checkpoints
 from coordinator.leadership import Claim, Leadership
+from coordinator.readers import ArchiveReaders
 from coordinator.registry import Checkpoint, Registry
 from coordinator.retention import Retention
 from coordinator.selection import find as find_strategy
@@ -66,16 +67,18 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What requests bring as `Authorization: Bearer …`, those of /metrics excepted; empty: everybody may read."""
     metrics_token: str = ""
     """What requests of /metrics bring so; empty: everybody may read them."""
+    readers_file: str = ""
+    """Apps that may read keys from the archive by /get, with their own password as token; empty: none."""
     address_file: str = ""
     """Where to write the API's URL, with the token, once it listens; empty: nowhere."""
     selection: str = "random"
-    """How the working instance of a standby app is chosen: random, oldest, least_busy or `module:function`."""
+    """How the active instance of an app with standbys is chosen: random, oldest, least_busy or `module:function`."""
     missed_heartbeats: float = 4.0
     """An instance is unresponsive after this many missed heartbeats."""
     forget_s: float = 300.0
     """Seconds after which an instance that has ended is no longer listed."""
     leader_interval_s: float = 0.2
-    """Seconds between announcements; a leader silent for three of them is replaced."""
+    """Seconds between announcements; an active Coordinator silent for three of them is replaced."""
 
     retain_s: float = 0.0
     """Age in seconds from which items are deleted from the archive; 0: never."""
@@ -194,6 +197,7 @@ class CoordinatorService:
                 "instances": states,
                 "failovers": self._registry.failovers,
                 "http": self._api.url if self._api is not None else "",
+                "unauthorized": self._api.unauthorized if self._api is not None else 0,
                 "retention_deleted": self._retention.deleted,
                 "apps": self._registry.app_count(),
                 "declared_keys": self._registry.declared_keys(),
@@ -219,6 +223,9 @@ class CoordinatorService:
                 self._settings.http_port,
                 token=self._settings.token,
                 metrics_token=self._settings.metrics_token,
+                readers=ArchiveReaders(
+                    Path(self._settings.readers_file) if self._settings.readers_file else None
+                ),
             )
         except OSError as error:
             where = f"{self._settings.http_host}:{self._settings.http_port}"
@@ -234,12 +241,13 @@ class CoordinatorService:
         """Apply a change of leadership to the registry."""
         leading = self._leadership.leading
         if leading and not self._registry.leading:
-            log.info("this Coordinator leads")
+            log.info("this Coordinator is active")
             self._registry.lead()
         elif not leading and self._registry.leading:
             self._registry.follow()
         if led and not leading:
-            log.warning("another Coordinator (%s) leads: waiting", self._leadership.leader or "not yet known")
+            leader = self._leadership.leader or "not yet known"
+            log.warning("another Coordinator (%s) is active: this one is a standby", leader)
 
     def _recall(self, checkpoint: Checkpoint) -> None:
         with self._lock:
@@ -274,7 +282,9 @@ class CoordinatorService:
             self._leadership.heard(claim, time.monotonic())
             self._obey(led)
             if self._leadership.leader != leader and not led:
-                log.warning("another Coordinator (%s) leads: waiting", self._leadership.leader)
+                log.warning(
+                    "another Coordinator (%s) is active: this one is a standby", self._leadership.leader
+                )
 
     def _healthy(self, item: Item) -> None:
         with self._lock:

@@ -7,6 +7,7 @@ from due.config import Options
 from due.drivers.base import ArchiveDriver, Spool, UpdatesDriver
 from due.drivers.redis import RedisUpdates
 from due.errors import InvalidOption
+from due.logs import without_passwords
 
 
 def open_updates(url: str, options: Options) -> UpdatesDriver:
@@ -21,11 +22,13 @@ def open_updates(url: str, options: Options) -> UpdatesDriver:
             group_timeout=options.group_timeout,
             backlog=options.backlog_bytes,
         )
-    if url.startswith("kafka:"):
+    if url.startswith(("kafka:", "kafkas:")):
         try:
             from due.drivers.kafka import KafkaUpdates
         except ImportError:
-            raise InvalidOption(f"URL {url!r} needs Kafka's client: pip install 'sdnator[kafka]'") from None
+            raise InvalidOption(
+                f"URL {without_passwords(url)!r} needs Kafka's client: pip install 'sdnator[kafka]'"
+            ) from None
 
         return KafkaUpdates(
             url,
@@ -51,8 +54,9 @@ def open_archive(url: str) -> ArchiveDriver:
         return SqliteArchive(url)
     if url.startswith(("mongodb:", "mongodb+srv:")):
         from due.drivers.mongodb import MongoArchive
+        from due.drivers.mongodb_apps import MongoAppsArchive, has_app
 
-        return MongoArchive(url)
+        return MongoAppsArchive(url) if has_app(url) else MongoArchive(url)
     if url.startswith("memory:"):
         from due.drivers.memory_archive import MemoryArchive
 

@@ -302,7 +302,7 @@ def _checked(value: Any, levels: int) -> Any:
     if kind in (bytearray, memoryview):
         return bytes(value)
     raise UnsupportedValue(
-        f"{kind.__module__}.{kind.__qualname__} is no DUE type; use None, bool, int, float, str, bytes, "
+        f"{kind.__module__}.{kind.__qualname__} is not a DUE type; use None, bool, int, float, str, bytes, "
         "datetime, datetime64[ns], lists and maps of these, numpy arrays or RecordBatch"
     )
 
@@ -332,7 +332,7 @@ def _scalar(value: np.generic) -> Any:
         return msgspec.msgpack.Ext(_DATETIME64, _INT64.pack(int(ns)))
     if isinstance(value, np.bool_ | np.integer | np.floating | np.str_ | np.bytes_):
         return value.item() if not isinstance(value, np.longdouble) else float(value)
-    raise UnsupportedValue(f"numpy.{type(value).__name__} is no DUE type; send an array of it")
+    raise UnsupportedValue(f"numpy.{type(value).__name__} is not a DUE type; send an array of it")
 
 
 def _naive(value: dt.datetime) -> msgspec.msgpack.Ext:

@@ -38,7 +38,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     window_bytes: int = 16 << 20
     """Unacknowledged bytes that a producer keeps per reliable stream; beyond that `write` waits."""
     retain_bytes: int = 16 << 20
-    """Acknowledged bytes kept for replay, shared equally by the reliable streams of a process."""
+    """Acknowledged bytes kept to be resent to a server that restarts empty, shared equally by the reliable streams of a process."""
     group_timeout: float = 30.0
     """Readers whose lease has not changed for this long no longer hold a producer back, seconds."""
     backlog_bytes: int = 32 << 20
@@ -60,7 +60,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     archive_queue_bytes: int = 64 << 20
     """Bytes of frames that may wait for the archiver; beyond that `write` waits."""
     archive_batch: int = 1000
-    """Least number of items per archive transaction while enough are waiting."""
+    """Minimum number of items per archive transaction while enough are waiting."""
     archive_linger: float = 0.02
     """How long the archiver waits for a full batch, seconds."""
     spool_bytes: int = 1 << 30
@@ -79,13 +79,13 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return Path(text) if text else Path.home() / ".local" / "state" / "due"
 
     def with_credential(self) -> "Options":
-        """These options with what the file that $DUE_CREDENTIAL names says of Data Updates, unless they name it.
+        """These options; Data Updates are those of the credential file $DUE_CREDENTIAL, unless the options name them.
 
         Returns:
             The options to use.
 
         Raises:
-            InvalidOption: the file cannot be read, is malformed, or others than its owner can read it.
+            InvalidOption: the file cannot be read, is malformed, or somebody other than its owner can read it.
         """
         path = os.environ.get("DUE_CREDENTIAL", "")
         if not path or self.updates or os.environ.get("DUE_UPDATES"):

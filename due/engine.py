@@ -141,8 +141,8 @@ class Engine:
             app_id: name of the app, A-Z a-z 0-9 _ - only.
             role: PRODUCER, CONSUMER, or both.
             interests: the keys this app wants; `observe` adds more.
-            capabilities: the keys this app can write; other keys may be written, too.
-            instances: "standby": one instance works and the others wait; "shared": all of them work.
+            capabilities: the keys this app can write; other keys may be written as well.
+            instances: "standby": one instance is active, the others are standbys; "shared": all of them are active.
 
         Raises:
             InvalidKey: a key breaks the grammar.
@@ -193,8 +193,8 @@ class Engine:
 
         Raises:
             InvalidKey: the key breaks the grammar or has wildcards.
-            InvalidOption: the flags exclude each other, or the event time is out of bounds.
-            UnsupportedValue: the value is of no DUE type.
+            InvalidOption: the flags cannot be combined, or the event time is out of bounds.
+            UnsupportedValue: the value is not of a DUE type.
             NotAllowed: `init` was not given the role PRODUCER.
             NotInitialised: called before `init` or after `close`.
             EngineFailed: a thread of the engine has died.
@@ -206,7 +206,7 @@ class Engine:
             bits |= flag
         mode = _MODES[bits]
         if not mode:
-            raise InvalidOption(f"write({key!r}): PUB_ONLY and DB_ONLY exclude each other")
+            raise InvalidOption(f"write({key!r}): PUB_ONLY and DB_ONLY cannot be combined")
         if event_time is not None:
             event_time = checked_time(event_time)
         session = self._session or self._require()
@@ -241,14 +241,14 @@ class Engine:
 
     @property
     def connected(self) -> bool:
-        """Whether Data Updates have answered lately, and items of others can arrive."""
+        """Whether Data Updates have answered recently, so that items of other apps can arrive."""
         return self._require().connected
 
     @property
     def active(self) -> bool:
-        """Whether this instance is known to be one that works for its app.
+        """Whether this instance is known to be active.
 
-        False while it is a standby, and until the Coordinator has said who is active; what is written meanwhile may
+        False while it is a standby, and until the Coordinator has said which instance is active; items written meanwhile may
         be refused. Right after the death of an instance the Coordinator still names the dead one.
         """
         return self._require().active
@@ -264,7 +264,7 @@ class Engine:
 
         Args:
             key: wildcards and lists are allowed.
-            frequency: the rate that is wanted, Hz, or (least, most); None takes items as they come.
+            frequency: the wanted rate, Hz, or (minimum, maximum); None takes every item.
             since: replay a reliable key from this time (int ns, datetime) or stream id, as far as it is
                 retained.
 
@@ -286,7 +286,7 @@ class Engine:
 
         Args:
             query: a key (wildcards allowed), or a query in MongoDB's dialect.
-            limit: return at most this many, the youngest; None returns all.
+            limit: return at most this many, the newest; None returns all.
 
         Returns:
             Items, oldest first.

@@ -86,7 +86,7 @@ class BackendError(DueError):
 
 
 class UpdatesUnavailable(BackendError):
-    """The Data Updates server cannot be reached; the engine goes on trying."""
+    """The Data Updates server cannot be reached; the engine keeps trying."""
 
 
 class ArchiveUnavailable(BackendError):

@@ -187,7 +187,7 @@ class Peers:
         self._standby = registration.instances == "standby"
         self._beats: dict[str, tuple[float, Heartbeat]] = {}
         self.patience = _MISSED * registration.heartbeat
-        """A peer silent for so many seconds has ended, or will ask before it writes on."""
+        """A peer silent for this many seconds has ended, or will ask before it writes again."""
         self.known = False
         """Whether there has ever been another."""
 
@@ -403,7 +403,7 @@ class Member:
         return True
 
     def connection(self, now: float, *, works: bool) -> None:
-        """Whether Data Updates answers now: a question that nobody could hear is asked again, and waits anew."""
+        """Whether Data Updates answers now; a question that could not be heard is asked again, with a new wait."""
         if not works and self.phase is Phase.WAITING and self._peers.known:
             self._deadline = max(self._deadline, now + self._peers.patience)
         if not self._fenced or (works and not self._unheard):
@@ -448,7 +448,7 @@ class Member:
 
 
 def least(frequency: Frequency) -> float | None:
-    """The minimum rate an interest asks for; None: as it comes."""
+    """The minimum rate an interest asks for; None: every item."""
     return frequency[0] if isinstance(frequency, tuple) else frequency
 
 

@@ -17,7 +17,7 @@ Pacing = Literal["latest", "queue"]
 Instances = Literal["standby", "shared"]
 Frequency = float | tuple[float, float] | None
 """Hz.  A capability's number is the most it can make; an interest's number the least it wants; a pair is
-(least, most); None: as it comes."""
+(minimum, maximum); None: every item."""
 
 
 _LEAST_HZ = 1e-6
@@ -34,7 +34,7 @@ class Role(enum.Flag):
 class WriteFlag(int):
     """An option of one `write`, which otherwise publishes and archives, in a batch.
 
-    An int and no enum: flags are combined on the hot path.
+    An int rather than an enum: flags are combined on the hot path.
     """
 
     __slots__ = ()

@@ -30,7 +30,7 @@ class Observation(Subject[Item]):
 
     Args:
         key: the observed key.
-        frequency: the wanted rate, Hz, or (least, most): items above `most` are dropped here.
+        frequency: the wanted rate, Hz, or (minimum, maximum): items above the maximum are dropped here.
         start: stream id from which to replay a reliable key; empty for none.
         opened: called at the first subscription.
         closed: called when the last subscription is disposed.

@@ -1,7 +1,7 @@
 """Limiting a key to its assigned rate without a thread per key.  Pure: time is an argument (ns).
 
 `latest`: at most one item each period; a newer value replaces the one that waits.
-`queue`: items leave in order, one each period; `full` tells the writer to wait.
+`queue`: items leave in order, one each period; `full` makes the writer wait.
 """
 
 from collections import deque

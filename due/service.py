@@ -3,8 +3,8 @@
     python -m apps.kitsune.service --updates URL --archive URL --settings FILE.json
                                    [--metrics HOST:PORT] [--log-format console|json] [--heartbeat-fd N]
 
-The app prints one JSON line on standard output when it is ready, with "metrics": "HOST:PORT" where asked for
-and with what its `ready()` adds. Logs go to standard error. SIGTERM or SIGINT calls `stop()`, flushes, sends
+The app prints one JSON line on standard output when it is ready, with "metrics": "HOST:PORT" if requested,
+and with the fields that its `ready()` adds. Logs go to standard error. SIGTERM or SIGINT calls `stop()`, flushes, sends
 an offline heartbeat and exits with 0. The process ends when its parent ends (on Linux: the thread that
 started it).
 
@@ -122,7 +122,7 @@ def run(
     """
     arguments = _parser(app_id).parse_args(argv)
     logs.set_up(app_id, arguments.log, arguments.log_format)
-    # told by whoever starts us, for it may die while we are still importing
+    # told by our parent, which may die while we are still importing
     parent = int(os.environ.pop(PARENT_VARIABLE, "0")) or os.getppid()
     if not arguments.stay:
         die_with_parent(signal.SIGTERM)

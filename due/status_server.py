@@ -148,7 +148,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif answer is None:
             self._send(404, "text/plain", "here are /metrics and /healthz\n")
         elif answer == self.server.status.metrics and not self._admitted():
-            self._send(401, "text/plain", "bring the token of the metrics: Authorization: Bearer …\n")
+            self._send(401, "text/plain", "send the token of the metrics: Authorization: Bearer …\n")
         else:
             self._send(*answer())
 

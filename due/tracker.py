@@ -2,9 +2,9 @@
 
     begins where the last one ended      next: deliver
     begins later                         items are missing: count them, deliver
-    … by more than FAR                   no outage loses so many: refuse
+    … by more than FAR                   no outage loses that many: refuse
     begins earlier                       a repeat: drop
-    … by more than KEPT                  no producer keeps so many for resending: the earlier number was false;
+    … by more than KEPT                  no producer keeps that many for resending: the earlier number was false;
                                          deliver, and continue from here
     begins where a jump started          a producer never goes back, so the jump was false: deliver, too
 

@@ -33,7 +33,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 _START_TIMEOUT = 30.0
 _LONGEST_SOCKET_PATH = 100
 _USERS = "users.acl"
-_SUBSCRIBER_LIMIT = ("128mb", "64mb", "20")
+SUBSCRIBER_LIMIT = ("128mb", "64mb", "20")
 """The server drops a subscriber with more output pending, or with this much for this many seconds."""
 
 
@@ -92,7 +92,7 @@ class EmbeddedServer:
 
     @property
     def admin_url(self) -> str:
-        """For whoever makes users; `url` where there are none."""
+        """With the right to make users; `url` where there are none."""
         return as_user(self.url, *self._admin) if self._admin is not None else self.url
 
     @property
@@ -210,7 +210,7 @@ class EmbeddedServer:
             "appendfsync": "always",
             **({"aclfile": str(self._directory / _USERS)} if self._users is not None else {}),
         }
-        limit = ["--client-output-buffer-limit", "pubsub", *_SUBSCRIBER_LIMIT]
+        limit = ["--client-output-buffer-limit", "pubsub", *SUBSCRIBER_LIMIT]
         return [part for name, value in arguments.items() for part in (f"--{name}", value)] + limit
 
     def _wait(self) -> None:

@@ -3,7 +3,7 @@
 publish ──► producer that gives up after seconds ──► due.b.…   one partition, kept for a minute
 append  ──► idempotent producer, acks=all, for ever ──► due.r.…   until every living group has committed
                   ▲ window: bytes that some group has not committed
-due.control tells who reads; a consumer of each group, which never joins it, asks how far it has come
+due.control.<app> tells who reads; a consumer of each group, which never joins it, asks how far it has come
 """
 
 import logging
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from confluent_kafka import Consumer, KafkaError, KafkaException, Message, Producer, TopicPartition
 
 from due.drivers.kafka_control import ControlLog, topic_record
-from due.drivers.kafka_names import MOST_BYTES, KafkaAddress, parse_kafka_url, topic_prefix
+from due.drivers.kafka_names import MOST_BYTES, KafkaAddress, is_denied, parse_kafka_url, topic_prefix
 from due.drivers.kafka_progress import Partition, PathWindow, SentRecord
 from due.drivers.kafka_receiver import KafkaReceiver
 from due.errors import BackendError, DueError, Timeout, UpdatesUnavailable
@@ -29,6 +29,7 @@ _CALL_SECONDS = 2.0
 _TIDY_SECONDS = 60.0
 _SILENT_HOUR = 3600.0
 _POLL_SECONDS = 0.1
+_MOST_DENIED = 1024
 
 
 class KafkaUpdates:
@@ -61,9 +62,9 @@ class KafkaUpdates:
             )
         )
 
-    def publisher(self, app: str) -> "KafkaPublisher":  # noqa: ARG002 - announcements are topics
+    def publisher(self, app: str) -> "KafkaPublisher":
         """A new sending half."""
-        return KafkaPublisher(self._address, self._control, self._producer, self._limits)
+        return KafkaPublisher(app, self._address, self._control, self._producer, self._limits)
 
     def receiver(self, group: str, consumer: str, *, shared: bool = False) -> KafkaReceiver:
         """A new receiving half."""
@@ -126,8 +127,14 @@ class KafkaPublisher:
     """See `due.drivers.base.Publisher`."""
 
     def __init__(
-        self, address: KafkaAddress, control: ControlLog, reliable: Producer, limits: tuple[int, float]
+        self,
+        app: str,
+        address: KafkaAddress,
+        control: ControlLog,
+        reliable: Producer,
+        limits: tuple[int, float],
     ) -> None:
+        self._app = app
         self._address, self._control, self._reliable = address, control, reliable
         self._window, self._group_timeout = limits
         self._lock = threading.RLock()
@@ -141,7 +148,16 @@ class KafkaPublisher:
         """See `Publisher.answered`."""
         self._probe_wanted = threading.Event()
         self._probe_now = 0
-        self._counts = {"refused": 0, "lost_disconnected": 0, "reconnects": 0, "held_back": 0, "resent": 0}
+        self._denied: set[str] = set()
+        """Topics without a right to write them."""
+        self._counts = {
+            "refused": 0,
+            "denied": 0,
+            "lost_disconnected": 0,
+            "reconnects": 0,
+            "held_back": 0,
+            "resent": 0,
+        }
         self._connected = True
         self._failure: BaseException | None = None
         self._tidy_at = 0.0
@@ -166,6 +182,9 @@ class KafkaPublisher:
 
     def publish(self, path: str, *payloads: bytes) -> None:
         """See `Publisher.publish`."""
+        if self._is_denied(path, reliable=False):
+            self._counts["denied"] += len(payloads)
+            return
         try:
             topic = self._announced(path, reliable=False)
             self._check_connection()
@@ -182,6 +201,9 @@ class KafkaPublisher:
 
     def append(self, path: str, payload: bytes) -> None:
         """See `Publisher.append`."""
+        if path not in self._windows and self._is_denied(path, reliable=True):
+            self._counts["denied"] += 1
+            return
         window = self._windows.get(path) or self._open_window(path)
         with self._lock:
             if not window.has_room(len(payload)):
@@ -256,6 +278,31 @@ class KafkaPublisher:
         if not self._connected:
             raise UpdatesUnavailable(f"no connection to {self._address.servers}")
 
+    def _is_denied(self, path: str, *, reliable: bool) -> bool:
+        """Whether the right to write a path is missing: what was to be said is lost, and everything else goes on."""
+        topic = self._address.topic(path, reliable=reliable)
+        if topic in self._topics:
+            return False
+        if topic in self._denied:
+            return True
+        try:
+            self._announced(path, reliable=reliable)
+        except (UpdatesUnavailable, Timeout):
+            return False
+        except BackendError as error:
+            if not is_denied(error):
+                raise
+            reason = str(error)
+        else:
+            return False
+        if len(self._denied) >= _MOST_DENIED:
+            self._denied.clear()
+        self._denied.add(topic)
+        log.error(
+            "%s has no right to %s: %s; grant its key in [grants.%s]", self._app, path, reason, self._app
+        )
+        return True
+
     def _announced(self, path: str, *, reliable: bool) -> str:
         """The topic of a path; made and announced when it is used for the first time."""
         topic = self._address.topic(path, reliable=reliable)
@@ -264,6 +311,7 @@ class KafkaPublisher:
         self._check()
         if not self._control.knows(topic):
             self._control.make_topic(topic)
+            self._control.make_topic(self._address.control(self._app))
             self._say(*topic_record(topic, topic_prefix(path)))
         self._control.catch_up(_ANNOUNCE_SECONDS)
         partitions = self._control.partitions(topic)
@@ -272,7 +320,7 @@ class KafkaPublisher:
         return topic
 
     def _say(self, key: bytes, value: bytes) -> None:
-        self._reliable.produce(self._address.control, value, key)
+        self._reliable.produce(self._address.control(self._app), value, key)
         if self._reliable.flush(_ANNOUNCE_SECONDS):
             raise UpdatesUnavailable(f"Kafka at {self._address.servers} does not take records now")
 
@@ -391,8 +439,8 @@ class KafkaPublisher:
         if now < self._tidy_at:
             return
         self._tidy_at = now + _TIDY_SECONDS
-        for key in self._control.long_gone(now, _SILENT_HOUR):
-            self._reliable.produce(self._address.control, None, key)
+        for key in self._control.long_gone(self._app, now, _SILENT_HOUR):
+            self._reliable.produce(self._address.control(self._app), None, key)
 
     def _probe_brokers(self) -> None:
         while not self._closed:

@@ -1,7 +1,10 @@
-"""The control topic: which topics there are, and who reads what.
+"""The control topics: which topics there are, and who reads what.
 
-    publishers ──topic:NAME──►  due.control (one partition, compacted)  ──► ControlLog of every process
-    receivers  ──reader:…───►                                                topics, readers, listeners
+    publishers ──topic:NAME──►  due.control.<app> (one partition, compacted)  ──► ControlLog of every process
+    receivers  ──reader:…───►                                                      topics, readers, listeners
+
+Each app has one of its own, so that rights can be given by name: what stands there about another app's readers
+is not believed.
 
 Kafka's own group protocol is not used: a killed reader would keep its partitions for at least six seconds, and a
 group could not tell a standby from a reader that works.  Readers renew their record each second; one whose record
@@ -12,6 +15,7 @@ import functools
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 
 import msgspec
@@ -23,7 +27,7 @@ from confluent_kafka import (
     TopicCollection,
     TopicPartition,
 )
-from confluent_kafka.admin import AdminClient, NewTopic, OffsetSpec  # type: ignore[attr-defined]
+from confluent_kafka.admin import AdminClient, NewTopic, OffsetSpec
 
 from due.drivers.kafka_names import (
     MOST_BYTES,
@@ -41,6 +45,10 @@ SILENT_SECONDS = 3.0
 """A reader whose record has not changed for this long counts as dead."""
 _MOST_TOPICS = 8192
 _MOST_READERS = 8192
+_MOST_OF_ONE = 1024
+"""Topics, and readers, of one app."""
+_MOST_APPS = 4096
+_DISCOVER_SECONDS = 0.5
 _POLL_SECONDS = 0.2
 _BATCH = 1000
 _CALL_SECONDS = 5.0
@@ -49,7 +57,7 @@ _SHORT_MS = 60_000
 
 
 class ReaderRecord(msgspec.Struct, frozen=True, array_like=True):
-    """One member of a group of readers, as it stands in the control topic."""
+    """One member of a group of readers, as it stands in the control topic of its app."""
 
     group: str
     member: str
@@ -101,10 +109,14 @@ class ControlLog:
         self._read_on = threading.Condition(self._lock)
         self._admin = AdminClient(address.client())
         self._topics: dict[str, str] = {}
+        self._announced: Counter[str] = Counter()
+        """Topics by the app that announced them."""
         self._readers: dict[tuple[str, str], ReaderSeen] = {}
         self._listeners: list[Callable[[], None]] = []
         self._partitions: dict[str, list[int]] = {}
-        self._position = 0
+        self._positions: dict[str, int] = {}
+        """How far each control topic is read."""
+        self._discovering = threading.Lock()
         self.connected = False
         """Whether a broker has answered since all of them were away."""
         self._ready = False
@@ -171,13 +183,13 @@ class ControlLog:
                     found.add(group)
             return sorted(found)
 
-    def long_gone(self, now: float, seconds: float) -> list[bytes]:
-        """Keys of the records of readers that have been silent for so long."""
+    def long_gone(self, app: str, now: float, seconds: float) -> list[bytes]:
+        """Keys of the records of an app's readers that have been silent for this long."""
         with self._lock:
             return [
                 reader_key(group, member)
                 for (group, member), seen in self._readers.items()
-                if not seen.left and now - seen.changed_at > seconds
+                if group == app and not seen.left and now - seen.changed_at > seconds
             ]
 
     def make_topic(self, topic: str, *, timeout: float = _CALL_SECONDS) -> None:
@@ -190,7 +202,7 @@ class ControlLog:
         copies = self._address.replication or min(3, max(1, self._brokers(timeout)))
         settings = {"min.insync.replicas": str(2 if copies > 2 else 1), "max.message.bytes": str(MOST_BYTES)}
         partitions = 1
-        if topic == self._address.control:
+        if topic.startswith(self._address.controls):
             settings |= {
                 "cleanup.policy": "compact",
                 "segment.bytes": str(4 << 20),
@@ -260,18 +272,19 @@ class ControlLog:
         with self._lock:
             while not self._ready:
                 self._wait(deadline)
-        place = (self._address.control, 0)
-        end = 0
         while True:
             try:
-                end = self.ends([place])[place]
+                self._discover()
+                with self._lock:
+                    places = [(topic, 0) for topic in self._positions]
+                ends = self.ends(places) if places else {}
                 break
             except UpdatesUnavailable as error:
                 if time.monotonic() > deadline:
-                    raise Timeout(f"Kafka did not say where {place[0]} ends: {error}") from None
+                    raise Timeout(f"Kafka did not say where its control topics end: {error}") from None
                 time.sleep(0.05)
         with self._lock:
-            while self._position < end:
+            while any(self._positions[topic] < end for (topic, _), end in ends.items()):
                 self._wait(deadline)
 
     def ends(self, places: list[Partition]) -> dict[Partition, int]:
@@ -292,7 +305,7 @@ class ControlLog:
     def check(self) -> None:
         """Raise EngineFailed if the thread has died."""
         if self.failure is not None:
-            raise EngineFailed(f"the thread that reads {self._address.control} has died: {self.failure!r}")
+            raise EngineFailed(f"the thread that reads Kafka's control topics has died: {self.failure!r}")
 
     def close(self) -> None:
         """End the thread."""
@@ -311,42 +324,68 @@ class ControlLog:
     def _run(self) -> None:
         try:
             self._open()
+            look_at = time.monotonic() + _DISCOVER_SECONDS
             while not self._closed:
                 assert self._consumer is not None  # noqa: S101 - opened above
                 first = self._consumer.poll(_POLL_SECONDS)
                 if first is not None:
                     self._take([first, *self._consumer.consume(_BATCH, 0)])
+                if time.monotonic() >= look_at:
+                    self._discover_if_possible()
+                    look_at = time.monotonic() + _DISCOVER_SECONDS
         except BaseException as error:
             self.failure = error
-            log.exception("the thread that reads %s has died", self._address.control)
+            log.exception("the thread that reads Kafka's control topics has died")
         finally:
             if self._consumer is not None:
                 self._consumer.close()
 
     def _open(self) -> None:
-        while not self._closed:
-            try:
-                self.make_topic(self._address.control)
-                self.partitions(self._address.control)
-                break
-            except (UpdatesUnavailable, BackendError) as error:
-                log.debug("Kafka at %s: %s", self._address.servers, error)
-                time.sleep(0.1)
-        consumer = Consumer(
+        self._consumer = Consumer(
             self._address.client(
                 **{
-                    "group.id": self._address.group("control"),
+                    "group.id": self._address.group("control."),
                     "enable.auto.commit": False,
                     "fetch.wait.max.ms": 100,
                     "error_cb": self._client_error,
                 }
             )
         )
-        consumer.assign([TopicPartition(self._address.control, 0, OFFSET_BEGINNING)])
+        while not self._closed and not self._discover_if_possible():
+            # nothing is assigned yet that a poll could wait for
+            time.sleep(0.1)
         with self._lock:
-            self._consumer = consumer
             self._ready = self.connected = True
             self._read_on.notify_all()
+
+    def _discover_if_possible(self) -> bool:
+        try:
+            self._discover()
+        except (UpdatesUnavailable, BackendError) as error:
+            log.debug("Kafka at %s: %s", self._address.servers, error)
+            return False
+        return True
+
+    def _discover(self) -> None:
+        """Read the control topics of apps that came meanwhile, too.
+
+        Raises:
+            UpdatesUnavailable: a broker does not answer, or a topic has no leader yet.
+        """
+        with self._discovering:
+            # without a name it makes none
+            named = translated(lambda: self._admin.list_topics(timeout=_CALL_SECONDS).topics, "topics")
+            fresh = sorted(
+                name
+                for name in named
+                if name.startswith(self._address.controls) and name not in self._positions
+            )
+            for name in fresh[: _MOST_APPS - len(self._positions)]:
+                self.partitions(name)
+                with self._lock:
+                    assert self._consumer is not None  # noqa: S101 - opened before
+                    self._positions[name] = 0
+                    self._consumer.incremental_assign([TopicPartition(name, 0, OFFSET_BEGINNING)])
 
     def _client_error(self, error: KafkaError) -> None:
         if error.code() == KafkaError._ALL_BROKERS_DOWN:  # noqa: SLF001
@@ -359,13 +398,13 @@ class ControlLog:
                 error = message.error()
                 if error is not None:
                     if error.code() not in (*TOO_EARLY, KafkaError._PARTITION_EOF) and not error.retriable():  # noqa: SLF001
-                        log.warning("%s: %s", self._address.control, error)
+                        log.warning("%s: %s", message.topic(), error)
                     continue
                 try:
                     self._note(message, now)
                 except (msgspec.DecodeError, UnicodeDecodeError, ValueError):
                     self.refused += 1
-                self._position = int(message.offset() or 0) + 1
+                self._positions[str(message.topic())] = int(message.offset() or 0) + 1
             listeners = list(self._listeners)
             self._read_on.notify_all()
         for listener in listeners:
@@ -373,14 +412,14 @@ class ControlLog:
 
     def _note(self, message: Message, now: float) -> None:
         key, value, offset = bytes(message.key() or b""), message.value(), int(message.offset() or 0)
+        app = str(message.topic()).removeprefix(self._address.controls)
         kind, _, name = key.decode().partition(":")
         if kind == "topic" and value:
-            topic = msgspec.msgpack.decode(value, type=TopicRecord)
-            if topic.topic != name or len(self._topics) >= _MOST_TOPICS:
-                raise ValueError(name)
-            self._topics[topic.topic] = topic.prefix
+            self._note_topic(app, name, msgspec.msgpack.decode(value, type=TopicRecord))
         elif kind == "reader":
             group, _, member = name.partition("/")
+            if group != app:
+                raise ValueError(name)
             if not value:
                 seen = self._readers.get((group, member))
                 if seen is not None and not seen.left:
@@ -393,13 +432,24 @@ class ControlLog:
         else:
             raise ValueError(name)
 
+    def _note_topic(self, app: str, name: str, topic: TopicRecord) -> None:
+        if name in self._topics:
+            return
+        carries = (self._address.topic(topic.prefix, reliable=kind) for kind in (True, False))
+        full = len(self._topics) >= _MOST_TOPICS or self._announced[app] >= _MOST_OF_ONE
+        if topic.topic != name or name not in carries or full:
+            raise ValueError(name)
+        self._announced[app] += 1
+        self._topics[name] = topic.prefix
+
     def _note_reader(self, record: ReaderRecord, offset: int, now: float) -> None:
         name = (record.group, record.member)
         seen = self._readers.get(name)
         if seen is None:
             if len(self._readers) >= _MOST_READERS:
                 self._forget(now)
-            if len(self._readers) >= _MOST_READERS:
+            of_one = sum(group == record.group for group, _ in self._readers)
+            if len(self._readers) >= _MOST_READERS or of_one >= _MOST_OF_ONE:
                 raise ValueError(record.member)
             seen = ReaderSeen(record, record.since if record.since >= 0 else offset, now)
             self._readers[name] = seen

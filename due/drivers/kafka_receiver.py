@@ -24,9 +24,9 @@ from confluent_kafka import (
 
 from due.drivers.base import Delivery
 from due.drivers.kafka_control import ControlLog, ReaderRecord, reader_key, reader_record
-from due.drivers.kafka_names import MOST_BYTES, TOO_EARLY, KafkaAddress
+from due.drivers.kafka_names import MOST_BYTES, TOO_EARLY, KafkaAddress, is_denied
 from due.drivers.kafka_progress import Partition, PartitionProgress
-from due.errors import DueError, InvalidOption, Timeout, UpdatesUnavailable
+from due.errors import BackendError, DueError, InvalidOption, Timeout, UpdatesUnavailable
 from due.keys import Key
 
 log = logging.getLogger("due.updates")
@@ -75,6 +75,8 @@ class KafkaReceiver:
         self._leaving: dict[Partition, PartitionProgress] = {}
         """Partitions that are given up, but for entries that are still worked on."""
         self._claiming: set[Partition] = set()
+        self._denied: set[str] = set()
+        """Topics without a right to read them."""
         self._joined: set[str] = set()
         """Reliable topics of which the group has a position in each partition."""
         self._active, self._take_over, self._closed = True, False, False
@@ -85,6 +87,7 @@ class KafkaReceiver:
         self._said: ReaderRecord | None = None
         self._look_at = self._commit_at = 0.0
         self._counts = {"dropped_slow": 0, "reconnects": 0, "claimed": 0, "set_aside": 0, "misplaced": 0}
+        self._counts["paths_denied"] = 0
         self._consumer = Consumer(
             address.client(
                 **{
@@ -107,7 +110,7 @@ class KafkaReceiver:
             self._patterns[pattern] = self._patterns.get(pattern, 0) + 1
             try:
                 self._control.catch_up(_CALL_SECONDS)
-                self._listen(self._control.topics(pattern, reliable=False), late=False)
+                self._listen(self._topics(pattern, reliable=False), late=False)
             except (Timeout, UpdatesUnavailable) as error:
                 log.warning("%s is subscribed to when Kafka answers: %s", pattern, error)
                 self._changed.set()
@@ -129,8 +132,8 @@ class KafkaReceiver:
             self._tell()
             try:
                 self._control.catch_up(_CALL_SECONDS)
-                for topic in self._control.topics(pattern, reliable=True):
-                    self._join(topic, start, late=False)
+                for topic in self._topics(pattern, reliable=True):
+                    self._join_if_allowed(topic, start, late=False)
             except (Timeout, UpdatesUnavailable) as error:
                 log.warning("%s is followed when Kafka answers: %s", pattern, error)
             self._changed.set()
@@ -248,7 +251,9 @@ class KafkaReceiver:
             self._control.unlisten(self._changed.set)
             self._commit(wait=True)
             if self._said is not None:
-                self._producer.produce(self._address.control, None, reader_key(self._group, self._member))
+                self._producer.produce(
+                    self._address.control(self._group), None, reader_key(self._group, self._member)
+                )
                 self._producer.flush(_CALL_SECONDS)
         self._consumer.close()
 
@@ -263,7 +268,9 @@ class KafkaReceiver:
         first = self._said is None
         self._said = record
         key, value = reader_record(record)
-        self._producer.produce(self._address.control, value, key)
+        if first:
+            self._control.make_topic(self._address.control(self._group))
+        self._producer.produce(self._address.control(self._group), value, key)
         if first:
             self._producer.flush(_CALL_SECONDS)
         else:
@@ -292,10 +299,10 @@ class KafkaReceiver:
     def _assign(self, now: float) -> None:
         """Take up new topics, and the partitions that are this member's; give up the others."""
         for pattern in self._patterns:
-            self._listen(self._control.topics(pattern, reliable=False), late=True)
+            self._listen(self._topics(pattern, reliable=False), late=True)
         for pattern, start in self._followed.items():
-            for topic in self._control.topics(pattern, reliable=True):
-                self._join(topic, start, late=True)
+            for topic in self._topics(pattern, reliable=True):
+                self._join_if_allowed(topic, start, late=True)
         for place in [place for place, progress in self._leaving.items() if not progress.unfinished]:
             self._commit(wait=True)
             del self._leaving[place]
@@ -346,14 +353,40 @@ class KafkaReceiver:
         for topic in topics:
             if topic in self._listened:
                 continue
-            offset = 0
-            if not late:
-                offset = self._end(topic, 0)
+            try:
+                end = self._end(topic, 0)
+            except BackendError as error:
+                self._deny(topic, error)
+                continue
+            offset = 0 if late else end
             self._consumer.incremental_assign([TopicPartition(topic, 0, offset)])
             self._listened.add(topic)
 
+    def _topics(self, pattern: str, *, reliable: bool) -> list[str]:
+        return [t for t in self._control.topics(pattern, reliable=reliable) if t not in self._denied]
+
+    def _deny(self, topic: str, error: BackendError) -> None:
+        """A right is missing: this topic is left out, and the others are read on."""
+        if isinstance(error, UpdatesUnavailable) or not is_denied(error):
+            raise error
+        self._counts["paths_denied"] += 1
+        self._denied.add(topic)
+        log.error(
+            "%s has no right to read %s: %s; grant its key in [grants.%s]",
+            self._group,
+            topic,
+            error,
+            self._group,
+        )
+
+    def _join_if_allowed(self, topic: str, start: str, *, late: bool) -> None:
+        try:
+            self._join(topic, start, late=late)
+        except BackendError as error:
+            self._deny(topic, error)
+
     def _join(self, topic: str, start: str, *, late: bool) -> None:
-        """Give the group a position in each partition of a topic, if it has none, or if it begins anew."""
+        """Give the group a position in each partition of a topic, if it has none, or if it starts over."""
         again = bool(start) and not late
         if topic in self._joined and not again:
             return

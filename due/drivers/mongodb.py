@@ -5,6 +5,8 @@
     <collection>_keys    every dataKey, and how far apart the items of one of its documents may lie
     <collection>_parts   the rest of payloads that are larger than a document may be
 
+`?app=NAME` gives each app collections of its own: see `mongodb_apps`.
+
 A query narrows on the server by index on key and time; `query.matches` decides item by item.
 """
 
@@ -51,20 +53,26 @@ _SERVER_SELECTION_MS = "3000"
 
 
 class MongoArchive:
-    """`ArchiveDriver` over one collection; connects at the first call.  Raises InvalidOption for a wrong URL."""
+    """`ArchiveDriver` over one collection; connects at the first call.  Raises InvalidOption for a wrong URL.
 
-    def __init__(self, url: str) -> None:
+    Args:
+        url: of server, database and collection.
+        ending: of the names of the collection and its two companions.
+    """
+
+    def __init__(self, url: str, *, ending: str = "") -> None:
+        self._ending = ending
         parts = urlsplit(url)
         options = dict(parse_qsl(parts.query, keep_blank_values=True))
         self._collection = options.pop("collection", "items")
         self._database = parts.path.strip("/") or "due"
         options.setdefault("serverSelectionTimeoutMS", _SERVER_SELECTION_MS)
         self._url = urlunsplit(parts._replace(query=urlencode(options), path="/" + parts.path.strip("/")))
-        self._shown = f"{parts.scheme}://{parts.hostname}/{self._database}"
+        self.shown = f"{parts.scheme}://{parts.hostname}/{self._database}"
         if parts.scheme not in ("mongodb", "mongodb+srv") or not parts.netloc or "/" in self._database:
-            raise InvalidOption(f"archive URL {self._shown!r}: write mongodb://host:port/database")
+            raise InvalidOption(f"archive URL {self.shown!r}: write mongodb://host:port/database")
         if parts.scheme == "mongodb":
-            _check_options(self._url, self._shown)
+            _check_options(self._url, self.shown)
         self._lock = threading.Lock()
         self._client: MongoClient[Document] | None = None
         self._pid = 0
@@ -78,7 +86,7 @@ class MongoArchive:
 
     def insert(self, items: Sequence[Item]) -> None:
         """Store items, one document each."""
-        with self._errors():
+        with self.errors():
             self._insert([_item_document(item) for item in items], [])
 
     def insert_frames(self, frames: Sequence[PackedFrame]) -> None:
@@ -89,13 +97,13 @@ class MongoArchive:
                 documents += [_item_document(item) for item in unpack(frame)]
             else:
                 documents.append(_frame_document(frame))
-        with self._errors():
+        with self.errors():
             self._insert(documents, frames)
 
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
         """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
         parsed = parse(query)
-        with self._errors():
+        with self.errors():
             criteria = self._criteria(parsed)
             if limit is not None:
                 found = in_time(self._find(criteria, {"lastTimestamp": 1}))
@@ -107,7 +115,7 @@ class MongoArchive:
 
     def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
         """Delete documents that are wholly older than `before`, then the oldest down to `max_bytes`."""
-        with self._errors():
+        with self.errors():
             deleted = 0 if before is None else self._prune_older(before)
             if max_bytes is not None:
                 deleted += self._prune_larger(max_bytes)
@@ -124,14 +132,17 @@ class MongoArchive:
 
     # --- connection ----------------------------------------------------------------------------
 
-    def _table(self, suffix: str = "") -> Collection[Document]:
+    def _table(self, companion: str = "") -> Collection[Document]:
+        return self._named("_".join(filter(None, (self._collection, companion))) + self._ending)
+
+    def _named(self, name: str) -> Collection[Document]:
         if self._closed:
-            raise BackendError(f"archive {self._shown} is closed")
+            raise BackendError(f"archive {self.shown} is closed")
         with self._lock:
             if self._client is None or self._pid != os.getpid():
                 self._client, self._pid, self._spans = MongoClient(self._url), os.getpid(), {}
-                self._make_indexes(self._client[self._database][self._collection])
-            return self._client[self._database][self._collection + suffix]
+                self._make_indexes(self._client[self._database][self._collection + self._ending])
+            return self._client[self._database][name]
 
     def _make_indexes(self, table: Collection[Document]) -> None:
         try:
@@ -143,13 +154,14 @@ class MongoArchive:
             raise
 
     @contextmanager
-    def _errors(self) -> Iterator[None]:
+    def errors(self) -> Iterator[None]:
+        """Turn errors of the client library into ours."""
         try:
             yield
         except (ConnectionFailure, ExecutionTimeout) as error:
-            raise ArchiveUnavailable(f"archive {self._shown}: {_short(error)}") from error
+            raise ArchiveUnavailable(f"archive {self.shown}: {_short(error)}") from error
         except (PyMongoError, BSONError, OverflowError, UnicodeEncodeError) as error:
-            raise BackendError(f"archive {self._shown}: {_short(error)}") from error
+            raise BackendError(f"archive {self.shown}: {_short(error)}") from error
 
     # --- writing -------------------------------------------------------------------------------
 
@@ -188,7 +200,7 @@ class MongoArchive:
         large = [document for document in documents if len(document.get("payload", b"")) > _PART_BYTES]
         parts = [part for document in large for part in _split(document)]
         for one in parts:
-            self._table("_parts").replace_one({"_id": {"$eq": one["_id"]}}, one, upsert=True)
+            self._table("parts").replace_one({"_id": {"$eq": one["_id"]}}, one, upsert=True)
         if not documents:
             return
         try:
@@ -216,7 +228,7 @@ class MongoArchive:
                 continue
             spans = (2 * span, 2 * event)
             change = {"$max": {"timeSpan": Int64(spans[0]), "eventSpan": Int64(spans[1])}}
-            self._table("_keys").update_one({"_id": {"$eq": key}}, change, upsert=True)
+            self._table("keys").update_one({"_id": {"$eq": key}}, change, upsert=True)
             self._spans[key] = (max(spans[0], known[0]), max(spans[1], known[1])) if known else spans
 
     # --- reading -------------------------------------------------------------------------------
@@ -230,7 +242,7 @@ class MongoArchive:
                 if self.damaged == 1:
                     log.error(  # noqa: TRY400 - no trace needed
                         "archive %s: a document is damaged and left out: %r; further ones are only counted",
-                        self._shown,
+                        self.shown,
                         error,
                     )
 
@@ -241,7 +253,7 @@ class MongoArchive:
 
     def _criteria(self, query: ArchiveQuery) -> dict[str, Any]:
         named = list(query.conditions("dataKey"))
-        keys = list(self._table("_keys").find(_key_range(named)))
+        keys = list(self._table("keys").find(_key_range(named)))
 
         def lookup(condition: Condition) -> list[str]:
             matches = ArchiveQuery(condition).matches
@@ -262,14 +274,14 @@ class MongoArchive:
         if not count:
             return document
         names = [f"{document['_id']}#{n}" for n in range(count)]
-        parts = {d["_id"]: d["payload"] for d in self._table("_parts").find({"_id": {"$in": names}})}
+        parts = {d["_id"]: d["payload"] for d in self._table("parts").find({"_id": {"$in": names}})}
         return document | {"payload": b"".join(parts[name] for name in names if name in parts)}
 
     # --- retention -----------------------------------------------------------------------------
 
     def _prune_older(self, before: int) -> int:
         deleted = 0
-        for key in [document["_id"] for document in self._table("_keys").find({})]:
+        for key in [document["_id"] for document in self._table("keys").find({})]:
             old = {"dataKey": {"$eq": key}, "timestamp": {"$lt": before}, "lastTimestamp": {"$lt": before}}
             deleted += self._delete(list(self._table().find(old, {"count": 1, "parts": 1})))
         return deleted
@@ -290,7 +302,7 @@ class MongoArchive:
 
     def _prune_keys(self) -> None:
         """Remove keys that have had no document for a while; writers record theirs again each minute."""
-        now, keys = time.monotonic(), list(self._table("_keys").find({}))
+        now, keys = time.monotonic(), list(self._table("keys").find({}))
         empty = {}
         for entry in keys:
             name = {"dataKey": {"$eq": entry["_id"]}}
@@ -299,9 +311,9 @@ class MongoArchive:
             since = empty[entry["_id"]] = self._empty.get(entry["_id"], now)
             if now - since < _EMPTY_SECONDS:
                 continue
-            self._table("_keys").delete_one({"_id": {"$eq": entry["_id"]}})
+            self._table("keys").delete_one({"_id": {"$eq": entry["_id"]}})
             if self._table().find_one(name, {"_id": 1}) is not None:  # written meanwhile
-                self._table("_keys").replace_one({"_id": {"$eq": entry["_id"]}}, entry, upsert=True)
+                self._table("keys").replace_one({"_id": {"$eq": entry["_id"]}}, entry, upsert=True)
         self._empty = empty
 
     def _delete(self, documents: Sequence[Document]) -> int:
@@ -310,7 +322,7 @@ class MongoArchive:
             self._table().delete_many({"_id": {"$in": names}})
         parts = [f"{d['_id']}#{n}" for d in documents for n in range(_number(d, "parts"))]
         if parts:
-            self._table("_parts").delete_many({"_id": {"$in": parts}})
+            self._table("parts").delete_many({"_id": {"$in": parts}})
         return sum(_number(document, "count") for document in documents)
 
 

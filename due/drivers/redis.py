@@ -29,6 +29,7 @@ from due.drivers.redis_streams import (
     announced_name,
     next_pause,
     parse_id,
+    readers_name,
     stream_name,
 )
 from due.drivers.redis_wire import Wire, client
@@ -263,6 +264,15 @@ class RedisPublisher:
             if ledger.kept or ledger.written:
                 self._put_off(ledger)
             ledger.written = False
+            self._turn_away(ledger)
+
+    def _turn_away(self, ledger: StreamLedger) -> None:
+        """Remove names of readers that do not read: whoever may read can add as many as it likes."""
+        if ledger.strangers and self._wire is not None:
+            try:
+                self._command(b"SREM", readers_name(ledger.path), *ledger.strangers)
+            except UpdatesUnavailable as error:
+                self._lose(error)
 
     def _put_off(self, ledger: StreamLedger) -> None:
         """Announce the stream and renew its expiry; streams of lost producers expire."""
@@ -277,6 +287,7 @@ class RedisPublisher:
                 self._command(b"PUBLISH", self._announced, ledger.path)
                 self._command(b"EXPIRE", self._announced, LIFETIME_S)
                 self._command(b"EXPIRE", stream_name(ledger.path), LIFETIME_S)
+                self._command(b"EXPIRE", readers_name(ledger.path), LIFETIME_S)
             except UpdatesUnavailable as error:
                 self._lose(error)
                 return
@@ -369,6 +380,9 @@ class RedisPublisher:
         ledger = question.ledger
         ledger.asked = False
         ledger.acknowledged(question.answer())
+        for group in question.placed & ledger.places:
+            ledger.places.discard(group)
+            self._command(b"XGROUP", b"DESTROY", stream_name(ledger.path), group)
         if question.surprised:
             self._ask(ledger)
         point = ledger.trim_point(len(self._ledgers))
@@ -498,15 +512,17 @@ class RedisPublisher:
     def _restore_groups(self, wire: Wire, ledger: StreamLedger, done: int) -> None:
         """The groups that lived go on behind what they had all done, whether or not a member of them still lives.
 
-        A new member of a group that is not there would begin with what comes after it.
+        Their work lists are theirs alone to make; a place on the stream tells their next member where to begin, which
+        otherwise would begin with what comes after it.
         """
         groups = sorted(ledger.living_groups())
         if groups:
             name = stream_name(ledger.path)
             # what others have appended already may be new to the group
             start = "$" if self._called(wire, "XLEN", name) == done else "0"
+            ledger.places.update(groups)
             for group in groups:
-                # refused for a group that a member, or another producer, was quicker to make
+                # refused for a group whose place another producer was quicker to restore
                 self._called(wire, "XGROUP", "CREATE", name, group, start, "MKSTREAM")
 
     def _resend(self, wire: Wire, entries: Iterable[StreamEntry]) -> None:

@@ -1,4 +1,7 @@
-"""Reading reliable streams as a member of a group: XREADGROUP, XACK, and the pending work of the dead.
+"""Reading reliable streams as a member of a group, and the pending work of the dead.
+
+    XREAD: new payloads ──► ids onto the group's work list ──► XREADGROUP: which of them are ours ──► deliveries
+                                                                        └─ not read by us: XRANGE
 
 One request is outstanding at a time; acknowledgements travel with the next request.  Order: before
 reading what is new, a path's pending entries come first: our own after a reconnect, and those of
@@ -10,7 +13,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import hiredis
@@ -20,28 +23,48 @@ from due.backoff import Backoff
 from due.drivers.base import Delivery
 from due.drivers.redis_aside import Aside
 from due.drivers.redis_leases import LEFT, LeaseValue, LeaseWatch, lease_name
-from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
+from due.drivers.redis_streams import stream_name, wake_name, work_name
 from due.drivers.redis_upkeep import Upkeep
 from due.drivers.redis_wire import Wire, pack, understood
+from due.drivers.redis_work import (
+    COUNT,
+    MOST_GIVEN,
+    ReadRound,
+    ServerTime,
+    WorkLists,
+    announced_paths,
+    packed_done,
+    packed_ids,
+    packed_payload,
+    put_before,
+    seconds_of,
+)
 from due.errors import UpdatesUnavailable
 from due.logs import without_passwords
 
 log = logging.getLogger("due.updates")
 
-_COUNT = 16
 _BLOCK_MS = 1000
 _SILENT_SECONDS = 3.0
 """A member whose lease has not changed for this long counts as dead."""
 _LOOK_SECONDS = 1.0
 """Seconds between two checks of the other members; a single member checks less often."""
 _HOLD_SECONDS = 0.2
-_MOST_PRODUCERS = 4096
-"""Most apps whose announcements are read, because any program may name one."""
+_FRESH_SECONDS = 0.05
+"""What was read ahead is used within this time: another member may have moved the list since."""
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
 _TRIES = 3
-"""Immediate attempts to create a group, in case the connection was just lost."""
+"""Immediate attempts to make a list, in case the connection was just lost."""
+_STREAM, _WORK = stream_name(""), "due:work:"
 _SKIP_REPLY = pack((b"CLIENT", b"REPLY", b"SKIP"))
+
+
+_MOST_CLAIMED = 1000
+_Expected = tuple[str, str, str]
+"""Kind of an answer, path, id."""
+_ACK, _NEW, _AHEAD = ("ack", "", ""), ("new", "", ""), ("ahead", "", "")
+_OURS, _HISTORY = ("ours", "", ""), ("history", "", "")
 
 
 class StreamReader:
@@ -58,17 +81,24 @@ class StreamReader:
         """Held while leases are written; otherwise one could be renewed after it was given up."""
         self._paths: dict[str, str] = {}
         self._wire: Wire | None = None
-        self._wire_id = 0
-        self._expected: deque[str] = deque()
+        self._expected: deque[_Expected] = deque()
+        self._at: dict[str, str] = {}
+        """Up to where the ids of a stream are on the work list, as far as is known here."""
+        self._found = ReadRound()
+        self._ahead_at = 0.0
+        self._woken = "0-0"
+        self._listless = False
+        """A work list is gone."""
         self._acks: deque[tuple[str, str]] = deque()
         self._acks_sent: deque[tuple[str, str]] = deque()
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
         self._unmade: dict[str, tuple[str, bool, float]] = {}
-        """Groups that could not be created: start, and since when; their streams are not read before that."""
+        """Work lists that could not be made: start, and since when; their streams are not read before that."""
         self._lease = LeaseValue()
         self._watches: dict[str, LeaseWatch] = {}
+        self._lists = WorkLists(commands, group)
         self._upkeep = Upkeep(commands, group, consumer)
         self._aside = Aside(commands, group)
         self._server_time = ServerTime(commands)
@@ -84,23 +114,17 @@ class StreamReader:
         self._connected_before = False
         self._denied: set[str] = set()
         """Paths without a right to read them."""
-        self._counts = {"claimed": 0, "paths_refused": 0, "paths_denied": 0}
+        self._counts = {"claimed": 0, "vanished": 0, "paths_refused": 0, "paths_denied": 0}
 
     def known(self) -> list[str]:
         """Paths of all streams that producers announced."""
         try:
-            apps = sorted(self._commands.smembers(PRODUCERS))[:_MOST_PRODUCERS]
-            pipe = self._commands.pipeline(transaction=False)
-            for app in apps:
-                pipe.zrange(announced_name(app.decode("ascii", "replace")), 0, -1)
-            found = pipe.execute(raise_on_error=False)
-            paths = {path for one in found if isinstance(one, list) for path in one}
-            return sorted(path.decode("ascii", "replace") for path in paths)
+            return announced_paths(self._commands)
         except (redis.RedisError, OSError) as error:
             raise UpdatesUnavailable(str(error)) from None
 
     def add(self, path: str, start: str, *, reset: bool = False) -> None:
-        """Read this stream too; `start` counts if the group is new to it, or `reset`."""
+        """Read this stream too; `start` counts if the group has no work list of it, or `reset`."""
         with self._lock:
             if path in self._denied or (path in self._paths and not reset):
                 return
@@ -112,8 +136,9 @@ class StreamReader:
             self._held.add(path)
             self._look_at = 0.0
             self._stale = True
-        self._create_group(path, start, reset=reset)
+        self._make_list(path, start, reset=reset)
         self.renew()
+        self._register([path])
         self._interrupt()
 
     def leave(self, stays: Callable[[str], bool]) -> None:
@@ -122,6 +147,7 @@ class StreamReader:
             gone = [path for path in self._paths if not stays(path)]
             for path in gone:
                 del self._paths[path]
+                self._at.pop(path, None)
                 self._held.discard(path)
                 self._unmade.pop(path, None)
                 self._watches.pop(path, None)
@@ -235,17 +261,13 @@ class StreamReader:
         """A right is missing: this path is left out, and the others are read on."""
         with self._lock:
             self._paths.pop(path, None)
+            self._at.pop(path, None)
             self._held.discard(path)
             if len(self._denied) < _MOST_PATHS:
                 self._denied.add(path)
         self._counts["paths_denied"] += 1
-        log.error(
-            "%s has no right to read %s: %s; grant its key in [grants.%s]",
-            self._group,
-            path,
-            error,
-            self._group,
-        )
+        told = "%s has no right to read %s: %s; grant its key in [grants.%s]"
+        log.error(told, self._group, path, error, self._group)
 
     def _write_leases(self, paths: list[str], value: bytes) -> None:
         if not paths:
@@ -258,51 +280,51 @@ class StreamReader:
         except (redis.RedisError, OSError) as error:
             log.debug("leases could not be written: %s", error)
 
-    def _create_group(
-        self, path: str, start: str, *, reset: bool = False, since: float | None = None
-    ) -> None:
-        """`since`: when a group was first requested that could not be created then (s, monotonic)."""
+    def _make_list(self, path: str, start: str, *, reset: bool = False, since: float | None = None) -> None:
+        """`since`: when a list was first requested that could not be made then (s, monotonic)."""
+        self._at.pop(path, None)
         for _ in range(_TRIES):
             try:
                 begin = self._server_time.start(since) if start == "$" and since is not None else start
-                self._make_group(path, begin, reset=reset)
+                self._lists.make(path, begin, reset=reset)
             except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
                 failed = error
                 continue
             except redis.exceptions.NoPermissionError as error:
                 self._deny(path, error)
             self._unmade.pop(path, None)
+            self._at.pop(path, None)
             return
-        log.warning("group %s of %s cannot be created now: %s", self._group, path, failed)
-        # entries from now on are wanted, even if the group is created later
+        log.warning("%s has no place on %s now: %s", self._group, path, failed)
+        # entries from now on are wanted, even if the list is made later
         self._unmade[path] = (start, reset, time.monotonic() if since is None else since)
 
-    def _make_group(self, path: str, start: str, *, reset: bool) -> None:
+    def _register(self, paths: Sequence[str]) -> None:
         try:
-            self._commands.xgroup_create(stream_name(path), self._group, start, mkstream=True)
-        except redis.ResponseError as error:
-            if "BUSYGROUP" not in str(error):
-                raise
-            if reset:
-                self._commands.xgroup_setid(stream_name(path), self._group, start)
+            self._lists.register([path for path in paths if path in self._paths])
+        except (redis.RedisError, OSError) as error:
+            log.debug("readers could not be told: %s", error)
 
     def _interrupt(self) -> None:
         """Make the server answer the blocked request now, so that a new one goes out."""
         if self._wire is not None and self._expected:
             try:
-                self._commands.client_unblock(self._wire_id)
+                self._commands.xadd(wake_name(self._group), {"i": self._consumer}, maxlen=1)
             except (redis.RedisError, OSError) as error:
                 log.debug("the reader could not be interrupted: %s", error)
 
     def _connect(self) -> None:
         wire = Wire(self._url)
-        with understood("CLIENT ID and TIME"):
-            self._wire_id = int(wire.call("CLIENT", "ID"))
-            self._server_time.note(_seconds(wire.call("TIME")))
+        with understood("TIME"):
+            now = seconds_of(wire.call("TIME"))
+            self._server_time.note(now)
+            self._woken = f"{int(now * 1000) - 1}-0"
         self._quiet = wire.call("CLIENT", "REPLY", "ON") == b"OK"
         self._backoff.succeeded()
         self._wire = wire
         self._expected.clear()
+        self._found = ReadRound()
+        self._at.clear()
         self._acks.extendleft(reversed(self._acks_sent))
         self._acks_sent.clear()
         with self._lock:
@@ -325,14 +347,31 @@ class StreamReader:
             if not self._active:  # became a standby a moment ago
                 history = paths = ()
         command = self._packed_acks(quietly=self._quiet and bool(paths))
-        if paths:
-            self._requested = paths
-            wait = () if history or self._stale else (b"BLOCK", _BLOCK_MS)
-            head = (b"XREADGROUP", b"GROUP", self._group, self._consumer, b"COUNT", _COUNT, *wait, b"STREAMS")
-            command += pack((*head, *map(stream_name, paths), *((b"0" if history else b">",) * len(paths))))
-            self._expected.append("read")
+        self._requested = paths
+        at = {path: self._at.get(path, "") for path in paths}  # other threads forget places
+        unplaced = () if history else tuple(path for path, place in at.items() if not place)
+        if history:
+            command += self._packed_work(history, b"0")
+        elif unplaced:
+            command += self._packed_work(unplaced, b">")
+            for path in unplaced:
+                command += pack((b"XINFO", b"STREAM", work_name(self._group, path)))
+                self._expected.append(("place", path, ""))
+        elif paths:
+            wait = () if self._stale else (b"BLOCK", _BLOCK_MS)
+            names = (*map(stream_name, paths), wake_name(self._group))
+            places = (*at.values(), self._woken)
+            command += pack((b"XREAD", b"COUNT", COUNT, *wait, b"STREAMS", *names, *places))
+            self._expected.append(_NEW)
         if command:
             wire.send_packed(command)
+
+    def _packed_work(self, paths: Sequence[str], since: bytes) -> bytes:
+        """Ask the work lists for ids that wait, or with `0` for those that are ours already."""
+        self._expected.append(_HISTORY if since == b"0" else _OURS)
+        head = (b"XREADGROUP", b"GROUP", self._group, self._consumer, b"COUNT", MOST_GIVEN, b"STREAMS")
+        names = (work_name(self._group, path) for path in paths)
+        return pack((*head, *names, *((since,) * len(paths))))
 
     def _packed_acks(self, *, quietly: bool = False) -> bytes:
         """`quietly`: a read follows, so replies of their own would only cause wake-ups."""
@@ -343,11 +382,12 @@ class StreamReader:
             while self._acks and self._acks[0][0] == path:
                 self._acks_sent.append(self._acks[0])
                 tokens.append(self._acks.popleft()[1])
-            if quietly:
-                command += _SKIP_REPLY
-            else:
-                self._expected.append("ack")
-            command += pack((b"XACK", stream_name(path), self._group, *tokens))
+            for one in packed_done(self._group, path, tokens):
+                if quietly:
+                    command += _SKIP_REPLY
+                else:
+                    self._expected.append(_ACK)
+                command += one
         return command
 
     def _flush_acks(self) -> None:
@@ -359,58 +399,151 @@ class StreamReader:
             self._lose(error)
 
     def _reply(self, reply: Any) -> list[Delivery]:
-        kind = self._expected.popleft() if self._expected else "read"
+        expected = self._expected.popleft() if self._expected else _ACK
         if isinstance(reply, hiredis.ReplyError):
-            self._repair(reply)
-            return []
-        if "ack" not in self._expected:
+            self._refused(reply, expected)
+        else:
+            with understood("a request for entries"):
+                self._answered(reply, expected)
+        if _ACK not in self._expected:
             self._acks_sent.clear()
-        if kind == "ack":
+        if self._expected and list(self._expected) != [_AHEAD]:
             return []
-        with understood("a request for entries"):
-            found = [
-                Delivery(name.decode()[len("due:stream:") :], fields[1], token.decode())
-                for name, entries in reply or ()
-                for token, fields in entries
-                if fields
-            ]
-        if self._catch_up:
-            self._catch_up &= {delivery.path for delivery in found}
-        return found
+        if self._listless and not self._expected:
+            self._listless = False
+            self._begin_again()
+        return self._handed_out()
 
-    def _repair(self, error: Exception) -> None:
-        """A group or stream is gone because the server restarted empty: begin at its beginning."""
-        if "NOGROUP" in str(error) or "UNBLOCKED" in str(error):
-            with self._lock:
-                paths = list(self._paths)
-            for path in paths:
-                self._create_group(path, "0")
-            self.renew()
-            self._catch_up.clear()
+    def _answered(self, reply: Any, expected: _Expected) -> None:
+        kind, path, token = expected
+        if expected == _NEW or (expected == _AHEAD and time.monotonic() - self._ahead_at < _FRESH_SECONDS):
+            self._put(reply)
+        elif expected in (_OURS, _HISTORY):
+            self._given(reply, again=expected == _HISTORY)
+        elif kind == "place":
+            self._placed(path, reply)
+        elif kind == "payload" and reply:
+            self._found.payloads[path, token] = reply[0][1][1]
+
+    def _put(self, reply: Any) -> None:
+        """Put the ids of new entries on the work lists, and ask which of them are ours, and for what comes next."""
+        found: dict[str, list[str]] = {}
+        for name, entries in reply or ():
+            if name == wake_name(self._group).encode():
+                self._woken = entries[-1][0].decode()
+                self._at.clear()  # a list may have been moved
+                return
+            path = name.decode()[len(_STREAM) :]
+            if path not in self._at or path in self._held or not self._active:
+                self._at.pop(path, None)
+                continue
+            found[path] = [token.decode() for token, _ in entries]
+            for token, fields in entries:
+                self._found.payloads[path, token.decode()] = fields[1]
+        if not found or self._wire is None or self._listless:
             return
-        if str(error).startswith("NOPERM"):
+        command = self._packed_acks(quietly=self._quiet)
+        for path, tokens in found.items():
+            command += b"".join(packed_ids(self._group, path, tokens))
+            self._expected.extend([("put", path, "")] * len(tokens))
+            self._at[path] = tokens[-1]
+        command += self._packed_work(list(found), b">")
+        if not self._shared:  # in a shared group others would read the same
+            command += self._packed_ahead()
+        self._wire.send_packed(command)
+
+    def _packed_ahead(self) -> bytes:
+        """Ask for what comes next, to be there when the callbacks have returned; does not wait."""
+        at = {path: place for path in self._requested if (place := self._at.get(path))}
+        self._expected.append(_AHEAD)
+        self._ahead_at = time.monotonic()
+        return pack((b"XREAD", b"COUNT", COUNT, b"STREAMS", *map(stream_name, at), *at.values()))
+
+    def _given(self, reply: Any, *, again: bool) -> None:
+        """Note which ids are ours, and ask for payloads that others have put on the list."""
+        found = set()
+        for name, entries in reply or ():
+            path = name.decode().removeprefix(_WORK).partition(":")[2]
+            if entries:
+                found.add(path)
+            for token, fields in entries:
+                if fields:
+                    self._found.ours.append((path, token.decode()))
+                else:
+                    self._acks.append((path, token.decode()))  # somebody took it off the list
+            if len(entries) >= MOST_GIVEN:
+                self._at.pop(path, None)  # there may be more
+        if again:
+            self._catch_up &= found
+        missing = self._found.missing()
+        if missing and self._wire is not None:
+            self._expected.extend(("payload", path, token) for path, token in missing)
+            self._wire.send_packed(b"".join(map(packed_payload, missing)))
+
+    def _placed(self, path: str, reply: Any) -> None:
+        """What is not on the work list comes behind the last id that was."""
+        if path in self._paths:
+            self._at[path] = dict(zip(reply[::2], reply[1::2], strict=True))[b"last-generated-id"].decode()
+
+    def _handed_out(self) -> list[Delivery]:
+        """What is ours, in order; called when nothing is expected any more."""
+        found, self._found = self._found, ReadRound()
+        for path, token in found.missing():
+            self._vanished(path, token)
+        if self._shared and found.ours:
+            self._at.clear()  # others have put more on the lists while we process
+        return [
+            Delivery(path, found.payloads[path, token], token)
+            for path, token in found.ours
+            if (path, token) in found.payloads
+        ]
+
+    def _vanished(self, path: str, token: str) -> None:
+        """Its producer has deleted it, which waited for the group as long as it was told to."""
+        self._counts["vanished"] += 1
+        self._acks.append((path, token))
+
+    def _refused(self, error: Exception, expected: _Expected) -> None:
+        text = str(error)
+        if expected[0] == "put" and put_before(error):
+            return
+        if "NOGROUP" in text or "no such key" in text:
+            self._listless = True
+        elif text.startswith("NOPERM"):
             self._drop_denied()
-            return
-        raise UpdatesUnavailable(f"reading streams was refused: {error}")
+        else:
+            raise UpdatesUnavailable(f"reading streams was refused: {error}")
+
+    def _begin_again(self) -> None:
+        """A work list is gone because the server restarted empty: begin at the stream's beginning."""
+        with self._lock:
+            paths = list(self._paths)
+        for path in paths:
+            self._make_list(path, "0")
+        self.renew()
+        self._register(paths)
+        self._catch_up.clear()
+        self._at.clear()
 
     def _drop_denied(self) -> None:
         """Rights were taken away from one of the paths of a request: find it."""
         for path in self._requested:
             try:
-                self._commands.xinfo_consumers(stream_name(path), self._group)
+                self._lists.check_right(path)
             except redis.exceptions.NoPermissionError as error:
                 self._deny(path, error)
-            except (redis.RedisError, OSError) as error:
-                log.debug("%s: %s", path, error)
+            except (redis.RedisError, OSError):
+                continue  # it is found with the next request
 
     def _look_after_the_dead(self) -> None:
         with self._lock:
             paths = list(self._paths)
+        self._at.clear()  # a member may have died between putting ids on a list and asking for them
         self._alone = True
         for path in paths:
             unmade = self._unmade.get(path)
             if unmade is not None:
-                self._create_group(path, unmade[0], reset=unmade[1], since=unmade[2])
+                self._make_list(path, unmade[0], reset=unmade[1], since=unmade[2])
             try:
                 waits = self._claim(path)
             except (redis.RedisError, OSError) as error:
@@ -424,7 +557,8 @@ class StreamReader:
 
     def _claim(self, path: str) -> bool:
         """Take the pending entries of dead members; returns whether a live one has some."""
-        consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(stream_name(path), self._group)
+        work = work_name(self._group, path)
+        consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(work, self._group)
         others = [c for c in consumers if c["name"] != self._consumer.encode()]
         self._alone = self._alone and not others
         others = [c for c in others if c["pending"]]
@@ -445,49 +579,18 @@ class StreamReader:
         return waits
 
     def _claim_from(self, path: str, consumer: bytes) -> None:
-        name = stream_name(path)
         low = "-"
         while True:
             pending: list[dict[str, Any]] = self._commands.xpending_range(
-                name, self._group, low, "+", 1000, consumername=consumer
+                work_name(self._group, path), self._group, low, "+", _MOST_CLAIMED, consumername=consumer
             )
             if not pending:
                 return
             tries = {p["message_id"]: p["times_delivered"] + 1 for p in pending}
-            claimed: list[tuple[bytes, dict[bytes, bytes] | None]] = self._commands.xclaim(
-                name, self._group, self._consumer, 0, list(tries)
-            )
-            for token, fields in claimed:
-                if fields:
-                    self._counts["claimed"] += 1
-                    payload = fields.get(b"f", b"")  # the decoder refuses entries of other programs
-                    self._claimed.append(Delivery(path, payload, token.decode(), tries.get(token, 2)))
+            for token, payload in self._lists.take(path, self._consumer, tries):
+                if payload is None:
+                    self._vanished(path, token)
+                    continue
+                self._counts["claimed"] += 1
+                self._claimed.append(Delivery(path, payload, token, tries.get(token.encode(), 2)))
             low = "(" + pending[-1]["message_id"].decode()
-
-
-class ServerTime:
-    """Position of a stream at a time when the server could not be asked, by the server's own clock.
-
-    Both ways to compute it agree unless that clock jumped; the earlier result is used, so that a jump causes
-    repeated entries and never missing ones.
-    """
-
-    def __init__(self, commands: Any) -> None:
-        self._commands = commands
-        self._offset: float | None = None
-
-    def note(self, seconds: float) -> None:
-        """The server's clock now, s."""
-        self._offset = seconds - time.monotonic()
-
-    def start(self, since: float) -> str:
-        """The id behind which everything was appended after `since` (s, monotonic)."""
-        seconds, microseconds = self._commands.time()
-        at = seconds + microseconds / 1e6 - (time.monotonic() - since)
-        if self._offset is not None:
-            at = min(at, self._offset + since)
-        return str(max(0, int(at * 1000) - 1))
-
-
-def _seconds(reply: Any) -> float:
-    return int(reply[0]) + int(reply[1]) / 1e6

@@ -1,7 +1,7 @@
 """The receiving half on Redis: one pub/sub connection and one stream connection, read by one thread.
 
 receive() ──poll──┬─ bus:     SUBSCRIBE / PSUBSCRIBE due:<path>      (best effort; `drain` may help out)
-                  └─ streams: StreamReader, XREADGROUP … BLOCK       (reliable)
+                  └─ streams: StreamReader, XREAD … BLOCK            (reliable)
 """
 
 import logging

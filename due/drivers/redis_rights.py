@@ -1,8 +1,11 @@
 """Rights of one user of a Redis-protocol server: from key patterns to the rules of `ACL SETUSER`.  Pure.
 
-    publish a.b.*  ─►  PUBLISH due:a.b.* │ XADD … due:stream:a.b.* │ HGETALL due:lease:*:a.b.*
-    observe c.**   ─►  (P)SUBSCRIBE due:c, due:c.* │ XREADGROUP, XACK … due:stream:c, due:stream:c.*
-    its own        ─►  due:lease:<app>:*, due:poison:<app>, due:streams:<app>, its membership's channels
+    publish a.b.*  ─►  PUBLISH due:a.b.* │ XADD … due:stream:a.b.* │ who reads it, and how far they are
+    observe c.**   ─►  (P)SUBSCRIBE due:c, due:c.* │ XREAD … due:stream:c, due:stream:c.* │ SADD due:readers:c …
+    its own        ─►  due:work:<app>:*, due:lease:<app>:*, due:poison:<app>, due:streams:<app>, due:wake:<app>,
+                       its membership's channels
+
+Who observes writes nothing on a stream: how far a group is stands in its own list.
 
 Each line is a selector: a command passes only where one selector allows both the command and everything it names.
 In the server's patterns `*` also stands for dots, so that `a.*.c` gives `a.b.b.c`, too.
@@ -13,7 +16,14 @@ from collections.abc import Iterable, Sequence
 import msgspec
 
 from due.drivers.redis_leases import lease_name
-from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
+from due.drivers.redis_streams import (
+    PRODUCERS,
+    announced_name,
+    readers_name,
+    stream_name,
+    wake_name,
+    work_name,
+)
 from due.keys import ANY, ANY_NUMBER, Key
 
 EVERYTHING = "**"
@@ -32,29 +42,13 @@ _CONNECTION = [
     "+client|id",
     "+client|reply",
     "+client|setname",
-    "+client|unblock",
 ]
-_WRITES_STREAM = [
-    "+xadd",
-    "+expire",
-    "+xtrim",
-    "+exists",
-    "+xlen",
-    "+xgroup|create",
-    "+xinfo|groups",
-    "+xpending",
-]
-_READS_STREAM = [
-    "+xreadgroup",
-    "+xack",
-    "+xclaim",
-    "+xpending",
-    "+watch",
-    "+xinfo|consumers",
-    "+xgroup|create",
-    "+xgroup|setid",
-    "+xgroup|destroy",
-    "+xgroup|delconsumer",
+_WRITES_STREAM = ["+xadd", "+expire", "+xtrim", "+exists", "+xlen", "+xgroup|create", "+xgroup|destroy"]
+_KNOWS_READERS = ["+srandmember", "+srem", "+expire"]
+_READS_STREAM = ["+xread", "+xrange", "+exists", "+xinfo|stream", "+xinfo|groups", "+xpending"]
+_OWN_WORK = [
+    *("+xadd", "+xreadgroup", "+xack", "+xdel", "+xclaim", "+xpending", "+xsetid", "+watch", "+exists"),
+    *("+xinfo|consumers", "+xinfo|stream", "+xgroup|create", "+xgroup|delconsumer", "+expire", "+del"),
 ]
 _OWN_LEASES = ["+hset", "+hget", "+hdel", "+hexists", "+hgetall", "+expire", "+watch"]
 _OWN_ASIDE = ["+xadd", "+xrange", "+xtrim", "+xlen", "+expire", "+memory|usage"]
@@ -62,13 +56,15 @@ _OWN_ANNOUNCEMENTS = ["+zadd", "+zremrangebyscore", "+expire"]
 
 
 class Rights(msgspec.Struct, frozen=True, kw_only=True):
-    """What one app may say and see on Data Updates."""
+    """What one app may say and see."""
 
     app: str
     """Its id; `*`: any, for those who may use every id."""
     publish: tuple[str, ...] = ()
     """Key patterns; specs do not count."""
     observe: tuple[str, ...] = ()
+    read: tuple[str, ...] = ()
+    """Key patterns to read from Data Archives, beside what it wrote itself; nothing of it is for this server."""
 
 
 def channel_globs(pattern: str) -> tuple[str, ...]:
@@ -110,20 +106,31 @@ def covers(wide: str, narrow: str) -> bool:
     return len(left) == len(right)
 
 
+def with_membership(rights: Rights) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What an app may publish and observe, with its own registration, heartbeats and assignments."""
+    own = rights.app
+    told = (f"due.{kind}.{own}" for kind in ("registration", "heartbeat", "health"))
+    # from each other's heartbeats the instances of an app learn who works
+    return (*rights.publish, *told), (*rights.observe, f"due.assignment.{own}", f"due.heartbeat.{own}")
+
+
 def acl_rules(rights: Rights) -> list[str]:
     """The rules of `ACL SETUSER` after name and password; they replace all earlier ones."""
     own = rights.app
-    publish = [f"due.{kind}.{own}" for kind in ("registration", "heartbeat", "health")]
-    publish = _globs((*rights.publish, *publish))
-    # from each other's heartbeats the instances of an app learn who works
-    observe = _globs((*rights.observe, f"due.assignment.{own}", f"due.heartbeat.{own}"))
+    told, heard = with_membership(rights)
+    publish, observe = _globs(told), _globs(heard)
     return [
         *("resetkeys", "resetchannels", "clearselectors", "-@all", *_CONNECTION),
         _selector(["+publish"], _channels((*publish, f"streams:{own}"))),
         _selector(_WRITES_STREAM, _keys("~", map(stream_name, publish))),
         _selector(["+hgetall"], _keys("%R~", (lease_name("*", path) for path in publish))),
+        _selector(["+xinfo|groups", "+xpending"], _keys("%R~", (work_name("*", path) for path in publish))),
+        _selector(_KNOWS_READERS, _keys("~", map(readers_name, publish))),
         _selector(["+subscribe", "+psubscribe"], _channels((*observe, "streams:*"))),
-        _selector(_READS_STREAM, _keys("~", map(stream_name, observe))),
+        _selector(_READS_STREAM, _keys("%R~", (*map(stream_name, observe), wake_name(own)))),
+        _selector(["+sadd"], _keys("~", map(readers_name, observe))),
+        _selector(_OWN_WORK, [f"~{work_name(own, '*')}"]),
+        _selector(["+xadd", "+expire"], [f"~{wake_name(own)}"]),
         _selector(_OWN_LEASES, [f"~{lease_name(own, '*')}"]),
         _selector(_OWN_ASIDE, [f"~due:poison:{own}"]),
         _selector(_OWN_ANNOUNCEMENTS, [f"~{announced_name(own)}"]),

@@ -36,6 +36,21 @@ def stream_name(path: str) -> str:
     return f"due:stream:{path}"
 
 
+def work_name(group: str, path: str) -> str:
+    """The Redis stream of the ids of a stream that a group has to process: see `redis_work`."""
+    return f"due:work:{group}:{path}"
+
+
+def readers_name(path: str) -> str:
+    """The Redis set of the groups that read a stream."""
+    return f"due:readers:{path}"
+
+
+def wake_name(group: str) -> str:
+    """The Redis stream on which a group's members wake each other from waiting for entries."""
+    return f"due:wake:{group}"
+
+
 def announced_name(app: str) -> str:
     """Paths that are streams of an app, sorted by last use (unix s), and the channel where it announces them."""
     return f"due:streams:{app}"
@@ -77,7 +92,11 @@ class StreamLedger:
         self.groups: tuple[bytes, ...] = ()
         """Live groups of readers, as of the last answer."""
         self.known: tuple[bytes, ...] = ()
-        """Groups whose leases are asked for: those of the stream, and those that lived."""
+        """Groups whose leases are asked for: those that say they read the stream, and those that lived."""
+        self.strangers: tuple[bytes, ...] = ()
+        """Names among them that have no lease, where there are more names than apps."""
+        self.places: set[bytes] = set()
+        """Groups whose places were restored on the stream, until they have work lists again."""
         self.asked = False
         """A question about the readers is on its way."""
         self.asked_at = 0.0

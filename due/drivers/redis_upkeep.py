@@ -1,11 +1,12 @@
 """Housekeeping by readers on the server, so that nothing there grows without bound.
 
-    every minute   the end of the group's leases is put off           (they expire LIFETIME_S after that)
-                   leases of members that are gone, and their consumers in the group, are removed
-    a withdrawn    path's group is destroyed, unless another member of the group lives
+    every minute   the end of the group's leases and lists is put off  (they expire LIFETIME_S after that)
+                   the group says again which streams it reads
+                   leases of members that are gone, and what the lists keep of them, are removed
+    a withdrawn    path's list is deleted, unless another member of the group lives
 
 Belongs to the thread that renews leases. Each removal watches the keys, looks again and acts in one transaction: no
-script, for whoever may run scripts can stop the server with one.
+script, because a client that may run scripts can stop the server with one.
 """
 
 import logging
@@ -16,7 +17,8 @@ from typing import Any
 import redis
 
 from due.drivers.redis_leases import LEFT, LeaseWatch, lease_name
-from due.drivers.redis_streams import CARE_SECONDS, LIFETIME_S, stream_name
+from due.drivers.redis_streams import CARE_SECONDS, LIFETIME_S, stream_name, wake_name, work_name
+from due.drivers.redis_work import WorkLists
 
 log = logging.getLogger("due.updates")
 
@@ -36,6 +38,7 @@ class Upkeep:
         self._commands = commands  # Any: redis-py types an answer by options it cannot see
         self._group = group
         self._consumer = consumer
+        self._lists = WorkLists(commands, group)
         self._watches: dict[str, LeaseWatch] = {}
         self._withdrawn: dict[str, tuple[float, LeaseWatch]] = {}
         self._care_at = 0.0
@@ -47,7 +50,7 @@ class Upkeep:
         self._care_at = 0.0
 
     def withdrawn(self, paths: Sequence[str], now: float) -> None:
-        """These paths are not read any more; their group is removed a while later.  `now` as in `tick`."""
+        """These paths are not read any more; their lists are deleted a while later.  `now` as in `tick`."""
         for path in paths:
             self._withdrawn[path] = (now, LeaseWatch(_GONE_SECONDS))
             self._watches.pop(path, None)
@@ -61,18 +64,19 @@ class Upkeep:
             if now >= self._care_at and paths:
                 self._care_at = now + CARE_SECONDS
                 self._put_off(paths)
+                self._register(paths)
                 self._tidy(paths)
         except (redis.RedisError, OSError) as error:
             log.debug("housekeeping for the streams of %s failed: %s", self._group, error)
 
     def _drop_group(self, path: str, watch: LeaseWatch) -> bool:
-        """Remove a group; True if it is gone or another living member keeps it."""
+        """Delete a list; True if it is gone or another living member keeps it."""
         asked = time.monotonic()
         before = {field: watch.value(field) for field in watch.fields()}
         watch.look(self._leases(path), asked, time.monotonic())
         others = [field for field in watch.fields() if watch.silent(field) < _GONE_SECONDS]
         if not others:
-            self._commands.xgroup_destroy(stream_name(path), self._group)
+            self._lists.drop(path)
             return True
         return any(before.get(field, watch.value(field)) != watch.value(field) for field in others)
 
@@ -80,7 +84,16 @@ class Upkeep:
         pipe = self._commands.pipeline(transaction=False)
         for path in paths:
             pipe.expire(lease_name(self._group, path), LIFETIME_S)
+            pipe.expire(work_name(self._group, path), LIFETIME_S)
+        pipe.expire(wake_name(self._group), LIFETIME_S)
         pipe.execute()
+
+    def _register(self, paths: Sequence[str]) -> None:
+        """Only with streams that are there: their producers put off the end of both."""
+        pipe = self._commands.pipeline(transaction=False)
+        for path in paths:
+            pipe.exists(stream_name(path))
+        self._lists.register([path for path, there in zip(paths, pipe.execute(), strict=True) if there])
 
     def _tidy(self, paths: Sequence[str]) -> None:
         self._watches = {path: self._watches.get(path) or self._new_watch() for path in paths}
@@ -98,11 +111,11 @@ class Upkeep:
         return LeaseWatch(_FORGET_SECONDS, most_per_look=1.5 * CARE_SECONDS)
 
     def _forget_consumers(self, path: str, watch: LeaseWatch) -> None:
-        """Each instance that ever read is a consumer of the group, until it is removed."""
+        """Each instance that ever read is a consumer of the list, until it is removed."""
         known = set(watch.fields())
         try:
-            consumers = self._commands.xinfo_consumers(stream_name(path), self._group)
-        except redis.ResponseError:  # the stream or group is being created again
+            consumers = self._commands.xinfo_consumers(work_name(self._group, path), self._group)
+        except redis.ResponseError:  # the list is being made again
             return
         for one in consumers:
             name = one["name"]
@@ -120,15 +133,15 @@ class Upkeep:
         return self._transaction(act, lease)
 
     def _forget_consumer(self, path: str, name: bytes) -> None:
-        stream, lease = stream_name(path), lease_name(self._group, path)
+        work, lease = work_name(self._group, path), lease_name(self._group, path)
 
         def act(pipe: Any) -> None:
-            pending = pipe.xpending_range(stream, self._group, "-", "+", 1, consumername=name)
+            pending = pipe.xpending_range(work, self._group, "-", "+", 1, consumername=name)
             if not pending and not pipe.hexists(lease, name):
                 pipe.multi()
-                pipe.xgroup_delconsumer(stream, self._group, name)
+                pipe.xgroup_delconsumer(work, self._group, name)
 
-        self._transaction(act, stream, lease)
+        self._transaction(act, work, lease)
 
     def _transaction(self, act: Callable[[Any], None], *names: str) -> int:
         """Replies to what `act` queued while the keys stayed as it saw them."""

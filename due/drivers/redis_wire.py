@@ -25,6 +25,8 @@ _SEND_ROOM = 1 << 20
 """The default buffer of a Unix socket holds two frames, so a writer would wait at every third."""
 _JOIN_BELOW = 1 << 14
 _ANSWER_SECONDS = 5.0
+_RECORD = 1 << 14
+"""Most bytes of a TLS record."""
 _MOST_PARTS = 512
 """Buffers per sendmsg; Linux allows at most 1,024."""
 
@@ -50,7 +52,8 @@ def _redis_url(url: str) -> str:
 
 def as_user(url: str, name: str, password: str) -> str:
     """The URL of a server with this user and password; both have URL-safe characters only."""
-    scheme, _, rest = _redis_url(url).partition("://")
+    kafka = url.startswith(("kafka://", "kafkas://"))
+    scheme, _, rest = (url if kafka else _redis_url(url)).partition("://")
     head, slash, tail = rest.partition("/")
     return f"{scheme}://{name}:{password}@{head.rpartition('@')[2]}{slash}{tail}"
 
@@ -191,14 +194,32 @@ class Wire:
             raise UpdatesUnavailable(f"the server does not speak the Redis protocol: {error}") from None
 
     def _receive_now(self) -> int:
-        try:
+        if not isinstance(self._socket, ssl.SSLSocket):
             return self._socket.recv_into(self._buffer, 0, socket.MSG_DONTWAIT)
-        except ValueError:  # TLS sockets take no flags
-            self._socket.settimeout(0.0)
-            try:
-                return self._socket.recv_into(self._buffer)
-            finally:
-                self._socket.settimeout(None)
+        self._socket.settimeout(0.0)  # TLS sockets take no flags
+        try:
+            return self._receive_records(self._socket)
+        finally:
+            self._socket.settimeout(None)
+
+    def _receive_records(self, tls: ssl.SSLSocket) -> int:
+        """As many TLS records as are there: each read gives one at most, and a round for each is too slow.
+
+        Whole ones only: of the rest of a record, which OpenSSL has taken from the socket already, `select` knows nothing.
+        """
+        size = 0
+        with memoryview(self._buffer) as room:
+            while size <= len(room) - _RECORD:
+                try:
+                    found = tls.recv_into(room[size:])
+                except OSError:
+                    if size:  # the next read says it again
+                        break
+                    raise
+                if not found:
+                    break
+                size += found
+        return size
 
 
 def _parts(arguments: tuple[bytes | str | int, ...]) -> list[bytes]:

@@ -161,7 +161,7 @@ class SqliteFile:
         self._synchronous = synchronous
         self._closed = False
         self._written: sqlite3.Connection | None = None
-        """The connection whose transaction runs now: whoever runs it closes it where it was let go meanwhile."""
+        """The connection whose transaction runs now; its thread closes it if it was released meanwhile."""
         self._reset()
 
     def _reset(self) -> None:
@@ -298,7 +298,7 @@ class SqliteFile:
         self._let_go()
         return ArchiveUnavailable(
             f"archive {self._path} is damaged or not an archive ({error}): move it away, or put a copy there; "
-            f"until then what is to be archived waits in the spool"
+            f"until then items wait in the spool"
         )
 
     def _let_go(self) -> None:

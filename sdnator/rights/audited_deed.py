@@ -5,6 +5,8 @@ from collections import deque
 from apps.messages import Message, Name, Words
 
 AUDITED = "network.audit.*.*"
+COMMANDS = "network.audit.operator.command"
+"""What was done on the command line."""
 REFUSED = "refused to sign in"
 _MINUTE = 60.0
 
@@ -17,6 +19,8 @@ class AuditedDeed(Message, frozen=True, kw_only=True):
     deed: Words
     source: Name = ""
     """Address of the browser; empty: not known."""
+    instruction: Name = ""
+    """Id of the instruction that told an app to do it; empty: none did."""
     unnoted: int = 0
     """Refused sign-ins so far that were too many to be kept."""
 

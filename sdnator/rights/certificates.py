@@ -45,8 +45,8 @@ class CertificateFolder:
         """Make the CA.  Raises BadInput where there is one already, or the folder cannot be written."""
         if self._file(CA, "key").exists():
             raise BadInput(
-                f"{self.folder} holds a CA already: `sdnator cert add` makes more certificates of it; to begin anew, "
-                "remove the folder, which makes all of its certificates worthless"
+                f"{self.folder} already holds a CA: `sdnator cert add` issues more certificates from it; to start over, "
+                "remove the folder, which makes all of its certificates invalid"
             )
         key = ec.generate_private_key(ec.SECP256R1())
         name = _named("SDNator CA")

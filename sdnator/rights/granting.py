@@ -1,7 +1,7 @@
 """What an app is granted: interests and capabilities are requests, `[[grants]]` decides.  Pure.
 
 the product's parts ──────► what stands in the table below
-declared by other apps ───► granted, without the dangerous keys
+declared by other apps ───► granted, without the dangerous keys; of the archive, what they wrote themselves
 [[grants]] ───────────────► that as well, the dangerous keys included
 """
 
@@ -20,7 +20,7 @@ DANGEROUS = (
 )
 """Families of keys that command a switch, an enforcer or an app: only for apps that are granted them by name."""
 OPERATOR = "operator"
-"""Identity of whoever started the pipeline: any key, as any app."""
+"""Identity of the user who started the pipeline: any key, as any app."""
 _OWN = "network.*.{}.**"
 _DECISIONS = tuple(f"network.{family}.firewall.*" for family in ("block", "block_prefix", "protect", "meter"))
 _SWITCHES = "network.switch.p4runtime_ctrl.*"
@@ -30,7 +30,9 @@ _PRODUCT: dict[str, Rights] = {
         Rights(
             app="coordinator",
             publish=("due.assignment.*", "due.leader.coordinator", "due.event.coordinator"),
-            observe=(EVERYTHING,),  # its HTTP API shows any key
+            # its HTTP API shows any key
+            observe=(EVERYTHING,),
+            read=(EVERYTHING,),
         ),
         Rights(
             app="p4runtime_ctrl",
@@ -40,6 +42,7 @@ _PRODUCT: dict[str, Rights] = {
                 *(f"network.{family}.*.*" for family in ("p4_command", "telemetry", "cell_request")),
                 *(f"network.{family}.*.*" for family in ("packet_out", "clock")),
             ),
+            read=(*_DECISIONS, "network.p4_command.*.*", "network.telemetry.*.*"),
         ),
         Rights(
             app="kitsune",
@@ -59,6 +62,7 @@ _PRODUCT: dict[str, Rights] = {
                     for family in ("packets", "frames", "digests", "counts")
                 ),
             ),
+            read=(_SWITCHES, "network.training.*"),
         ),
         Rights(
             app="firewall",
@@ -72,6 +76,7 @@ _PRODUCT: dict[str, Rights] = {
                     for family in ("handshake", "traffic_query", "traffic_capture")
                 ),
             ),
+            read=("network.handshake.sonata.tcp", "network.instruction.*.firewall"),
         ),
         Rights(
             app="dashboard",
@@ -81,9 +86,15 @@ _PRODUCT: dict[str, Rights] = {
                 *("network.confirmation.*.*", "network.incident.firewall.*", "network.answer.*.dashboard"),
                 *("network.query_plan.sonata_adapter", "network.traffic.kitsune.*", "due.health.*"),
             ),
+            read=(EVERYTHING,),  # its page shows the archive
         ),
         *(
-            Rights(app=name, publish=(_OWN.format(name),), observe=(*_DECISIONS, "network.allowed.firewall"))
+            Rights(
+                app=name,
+                publish=(_OWN.format(name),),
+                observe=(*_DECISIONS, "network.allowed.firewall"),
+                read=(*_DECISIONS, "network.allowed.firewall"),
+            )
             for name in ENFORCERS
         ),
     )
@@ -101,8 +112,8 @@ class Granted:
 
 
 def operator() -> Rights:
-    """The rights of whoever started the pipeline."""
-    return Rights(app="*", publish=(EVERYTHING,), observe=(EVERYTHING,))
+    """The rights of the user who started the pipeline."""
+    return Rights(app="*", publish=(EVERYTHING,), observe=(EVERYTHING,), read=(EVERYTHING,))
 
 
 def granted(name: str, plans: Sequence[GrantPlan] = ()) -> Granted:
@@ -127,7 +138,8 @@ def _with(rights: Rights, plans: Sequence[GrantPlan]) -> Rights:
     own = [plan for plan in plans if plan.app == rights.app]
     publish = (*rights.publish, *(key for plan in own for key in plan.publish))
     observe = (*rights.observe, *(key for plan in own for key in plan.observe))
-    return Rights(app=rights.app, publish=_unique(publish), observe=_unique(observe))
+    read = (*rights.read, *(key for plan in own for key in plan.read))
+    return Rights(app=rights.app, publish=_unique(publish), observe=_unique(observe), read=_unique(read))
 
 
 def declared(

@@ -1,6 +1,7 @@
 """The identities of one installation: a user of Data Updates and a password for each app, kept in one file.
 
     identities.json (0600) ──► users_file(): rules of the embedded server
+                          ├──► readers.json: who may read what from the archive over HTTP
                           └──► rules():      ACL SETUSER on a given one
                           └──► url(app):     what the app's own 0600 file holds
 
@@ -9,6 +10,7 @@ User names carry the installation's number, so that several installations can sh
 
 import fcntl
 import hashlib
+import json
 import re
 import secrets
 from collections.abc import Iterator, Mapping
@@ -20,15 +22,17 @@ import msgspec
 
 from due.drivers.redis_rights import Rights, acl_rules
 from due.drivers.redis_wire import as_user
+from due.keys import Key
 from sdnator.errors import BadInput
 from sdnator.private_files import write_private
 from sdnator.rights.granting import OPERATOR, operator
 
 FILE = "identities.json"
+READERS = "readers.json"
 ADMIN = "admin"
 """AppIdentity that makes the others on the embedded server."""
 _PROBE = "user default on nopass resetkeys resetchannels clearselectors -@all +ping"
-"""Whoever has no credential learns whether the server answers, and nothing else."""
+"""Without a credential one learns whether the server answers, and nothing else."""
 _APP_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -77,6 +81,7 @@ class Identities:
                 self.reread()
                 yield
                 write_private(self.path, msgspec.json.format(msgspec.json.encode(self._book)).decode() + "\n")
+                write_private(self.path.with_name(READERS), json.dumps(self._readers()) + "\n")
         except OSError as error:
             raise BadInput(f"{self.path}: {error.strerror}") from None
 
@@ -114,18 +119,30 @@ class Identities:
         """The URL of a server with an identity's user and password."""
         return as_user(server, self.prefix + name, self._book.identities[name].password)
 
+    def _readers(self) -> dict[str, Any]:
+        return {
+            name: {
+                "digest": _digest(one.password),
+                "read": sorted({Key.parse(pattern).path for pattern in one.rights.read}),
+            }
+            for name, one in sorted(self._book.identities.items())
+            if one.rights.read and name != OPERATOR
+        }
+
     def rules(self, name: str) -> list[str]:
         """Arguments of `ACL SETUSER` for an identity."""
         one = self._book.identities[name]
-        digest = hashlib.sha256(one.password.encode()).hexdigest()
-        return [self.prefix + name, "on", "resetpass", f"#{digest}", *acl_rules(one.rights)]
+        return [self.prefix + name, "on", "resetpass", f"#{_digest(one.password)}", *acl_rules(one.rights)]
 
     def users_file(self, admin_password: str) -> str:
         """The ACL file of the embedded server."""
-        digest = hashlib.sha256(admin_password.encode()).hexdigest()
-        admin = f"user {self.prefix}{ADMIN} on #{digest} allkeys allchannels allcommands"
+        admin = f"user {self.prefix}{ADMIN} on #{_digest(admin_password)} allkeys allchannels allcommands"
         users = (" ".join(("user", *self.rules(name))) for name in self._book.identities)
         return "\n".join((_PROBE, admin, *users)) + "\n"
+
+
+def _digest(password: str) -> str:
+    return hashlib.sha256(password.encode()).hexdigest()
 
 
 def credential_file(url: str, archive: str, identity: AppIdentity) -> dict[str, Any]:
@@ -140,7 +157,7 @@ def observable(rights: Rights) -> dict[str, Any]:
 
 
 def made(folder: Path, rights: Mapping[str, Rights]) -> Identities:
-    """The identities of a pipeline's apps and of whoever starts it."""
+    """The identities of a pipeline's apps and of the user who starts it."""
     found = Identities(folder)
     with found.changing():
         found.keep_only({OPERATOR, *rights})

@@ -4,36 +4,35 @@ A thread with one connection: an administrator's. A server without an ACL file f
 restarted; then they are made again.
 """
 
-import logging
-import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import redis
 
+from due.drivers.redis_streams import PRODUCERS
 from due.drivers.redis_wire import client
-from sdnator.errors import PipelineError, SdnatorError
+from sdnator.errors import PipelineError
 from sdnator.rights.identities import Identities
+from sdnator.rights.watching_keeper import RightsRefused, WatchingKeeper
 
-_LOOK_SECONDS = 1.0
-_ENTRIES = 128
+_ENTRIES = 1024
+"""Kinds of refusals that the server keeps for us; 128 where it is not told."""
+_CROWD = 1024
+"""More producers than an installation has."""
 _LIBRARY = "client|setinfo"
 """A client library says its name with it and goes on where it may not; nothing is lost."""
+_LOG_LENGTH = "acllog-max-len"
+_NEWNESS = (b"entry-id", b"count", b"timestamp-last-updated")
 _GROUPED_SECONDS = 60.0
-"""The server counts a refusal in the entry of the one before for so long."""
+"""A kind of refusal is told again after this long without one."""
 _TOLD = 200
-"""Most refusals that wait to be told."""
-
-log = logging.getLogger(__name__)
+"""Most kinds of refusals that wait to be told; of the others their number is."""
 
 
-class RightsRefused(SdnatorError):
-    """The server lets this credential make no users."""
-
-
-class RightsKeeper:
+class RightsKeeper(WatchingKeeper):
     """Watches one server.
 
     Args:
@@ -41,28 +40,22 @@ class RightsKeeper:
         identities: who may do what.
     """
 
+    _away = (redis.RedisError, OSError)
+
     def __init__(self, url: str, identities: Identities) -> None:
+        super().__init__(identities)
         self._url = url
-        self._identities = identities
         self._commands: Any = None  # Any: redis-py types an answer by options it cannot see
-        self._changed = 0
+        self._newest: dict[bytes, Any] = {}
         self._seen: dict[tuple[str, ...], _Refusal] = {}
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="rights", daemon=True)
-        self._told: deque[str] = deque(maxlen=_TOLD)
-        self.refusals: Counter[str] = Counter()
-        """Refused commands by user."""
+        self._told: deque[str] = deque()
+        self._untold = 0
 
     def apply(self) -> None:
-        """Make every user now.
-
-        Raises:
-            RightsRefused: the credential may not.
-            PipelineError: the server does not answer.
-        """
+        """See `WatchingKeeper.apply`."""
         try:
             self._connect()
-            self._make()
+            self._take_up()
         except redis.ResponseError as error:  # NOPERM, or a server without ACLs
             self.close()
             raise RightsRefused(str(error)) from None
@@ -70,21 +63,14 @@ class RightsKeeper:
             self.close()
             raise PipelineError(f"Data Updates: {error}") from None
 
-    def start(self) -> None:
-        """Watch from now on."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread; the users stay."""
-        self._ended.set()
-        if self._thread.is_alive():
-            self._thread.join(20)
-
     def told(self) -> list[str]:
-        """What was refused since the last call, in words."""
+        """See `WatchingKeeper.told`."""
         found = []
         while self._told:
             found.append(self._told.popleft())
+        if self._untold:
+            found.append(f"{self._untold} further kinds of refusals on Data Updates")
+            self._untold = 0
         return found
 
     def close(self) -> None:
@@ -93,47 +79,44 @@ class RightsKeeper:
             self._commands.close()
             self._commands = None
 
-    def look(self) -> None:
+    def look(self) -> bool:
         """One look: users and refusals.  Raises redis.RedisError, OSError."""
         if self._commands is None:
             self._connect()
-        stamp = self._stamp()
-        if stamp != self._changed:
-            self._identities.reread()
-            self._make()
-            self._changed = stamp
-        elif missing := self._missing():
-            self._told.append(
-                f"users of Data Updates were gone and are made again: {', '.join(sorted(missing))}"
+        changed = super().look()
+        if not changed and (missing := self._missing()):
+            self._say(
+                f"users of Data Updates were gone and have been created again: {', '.join(sorted(missing))}"
             )
             self._make()
-        self._note(self._commands.execute_command("ACL", "LOG", _ENTRIES))
+        self._turn_away()
+        if self._is_news(self._commands.execute_command("ACL", "LOG", 1)):
+            self._note(self._commands.execute_command("ACL", "LOG", _ENTRIES))
+        return changed
 
-    def _run(self) -> None:
-        while not self._ended.wait(_LOOK_SECONDS):
-            try:
-                self.look()
-            except (redis.RedisError, OSError) as error:
-                log.debug("rights cannot be looked after now: %s", error)
-                self.close()
-        self.close()
+    def _turn_away(self) -> None:
+        """Remove made-up producers: whoever may say something at all can add names, and readers ask each of them."""
+        if self._commands.scard(PRODUCERS) <= _CROWD:
+            return
+        known = {name.encode() for name in self._identities.all}
+        strangers = sorted(self._commands.smembers(PRODUCERS) - known)
+        for first in range(0, len(strangers), _CROWD):
+            self._commands.srem(PRODUCERS, *strangers[first : first + _CROWD])
+        self._say(f"removed {len(strangers)} unknown producer names from Data Updates")
 
     def _connect(self) -> None:
         self._commands = client(self._url)
         self._seen.clear()
-
-    def _stamp(self) -> int:
-        try:
-            return self._identities.path.stat().st_mtime_ns
-        except OSError:
-            return self._changed
+        self._newest = {}
+        with suppress(redis.ResponseError):  # a service that lets nobody change its settings
+            if int(self._commands.config_get(_LOG_LENGTH).get(_LOG_LENGTH, _ENTRIES)) < _ENTRIES:
+                self._commands.config_set(_LOG_LENGTH, _ENTRIES)
 
     def _missing(self) -> set[str]:
         there = {_text(name) for name in self._commands.execute_command("ACL", "USERS")}
         return {self._identities.prefix + name for name in self._identities.all} - there
 
     def _make(self) -> None:
-        """Every identity is a user, and no other of this installation is."""
         prefix, names = self._identities.prefix, set(self._identities.all)
         for name in names:
             self._commands.execute_command("ACL", "SETUSER", *self._identities.rules(name))
@@ -143,12 +126,27 @@ class RightsKeeper:
         if gone:
             self._commands.execute_command("ACL", "DELUSER", *sorted(gone))
 
+    def _is_news(self, newest: list[list[Any]]) -> bool:
+        """Whether the log has changed: what is counted again comes first again.  Before Redis 7.2 nothing says so."""
+        entry = dict(zip(newest[0][::2], newest[0][1::2], strict=False)) if newest else {}
+        known, self._newest = self._newest, {name: entry.get(name) for name in _NEWNESS}
+        return bool(newest) and (None in self._newest.values() or known != self._newest)
+
+    def _say(self, text: str) -> None:
+        if len(self._told) < _TOLD:
+            self._told.append(text)
+        else:
+            self._untold += 1
+
     def _note(self, entries: list[list[Any]]) -> None:
         """Count what is new in the server's log, which has the newest entry first."""
         current: dict[tuple[str, ...], _Refusal] = {}
         for entry in entries:
             refusal = _Refusal.of({_text(k): v for k, v in zip(entry[::2], entry[1::2], strict=False)})
-            current.setdefault(refusal.key, refusal)
+            newer = current.get(refusal.key)
+            current[refusal.key] = (
+                refusal if newer is None else newer._replace(times=newer.times + refusal.times)
+            )
         for key, refusal in reversed(current.items()):
             self._tell(refusal, self._seen.get(key))
         self._seen = current
@@ -158,13 +156,12 @@ class RightsKeeper:
         known = user != refusal.user
         if (not known and user != "default") or refusal.what == _LIBRARY:
             return
-        again = before is not None and refusal.at - before.at < _GROUPED_SECONDS
-        fresh = refusal.times - (before.times if before is not None and again else 0)
+        fresh = refusal.times - (before.times if before is not None else 0)
         if fresh <= 0:
             return
-        if not again:
+        if before is None or refusal.at - before.at >= _GROUPED_SECONDS:
             who = user if known else "somebody without a credential"
-            self._told.append(f"{who} was refused the {refusal.why} {refusal.what} on Data Updates")
+            self._say(f"{who} was refused the {refusal.why} {refusal.what} on Data Updates")
         self.refusals[user] += fresh
 
 
@@ -172,7 +169,7 @@ class _Refusal(NamedTuple):
     """One entry of the server's log: refusals of one kind, each within a minute of the one before."""
 
     number: str
-    """Empty before Redis 7.2: there the newest entry of a kind counts."""
+    """Empty before Redis 7.2: there the entries of a kind are one."""
     user: str
     why: str
     what: str

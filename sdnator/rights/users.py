@@ -1,6 +1,6 @@
-"""People who may sign in to the page: names, roles and hashes of passwords, in one file of mode 0600.
+"""People who may sign in to the dashboard: names, roles and hashes of passwords, in one file of mode 0600.
 
-sdnator user add ──► users.json ──► the page asks it at every sign-in
+sdnator user add ──► users.json ──► the dashboard reads it at every sign-in
 """
 
 import fcntl

@@ -1,4 +1,4 @@
-"""Real Kafka brokers (KRaft) on loopback, from Kafka's own jars.
+"""Real Kafka brokers (KRaft) on loopback, from Kafka's own jars; secured ones have TLS, users and an authorizer.
 
 The jars are those of `$KAFKA_HOME/libs`; without it, Maven copies them once into a cache folder.
 """
@@ -6,6 +6,7 @@ The jars are those of `$KAFKA_HOME/libs`; without it, Maven copies them once int
 import base64
 import fcntl
 import os
+import secrets
 import shutil
 import signal
 import subprocess
@@ -14,10 +15,14 @@ import uuid
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+from urllib.parse import urlencode
 
 from confluent_kafka import KafkaException
 from confluent_kafka.admin import AdminClient
 
+from due.drivers.kafka_names import parse_kafka_url
+from sdnator.private_files import write_private
+from sdnator.rights.certificates import CA, CertificateFolder
 from sdnator.testing.ports import free_port
 
 KAFKA_VERSION = "3.9.1"
@@ -26,6 +31,9 @@ _START_SECONDS = 120
 _STOP_SECONDS = 20
 _HEAP = "-Xmx256m"
 _QUICK_START = ("-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xshare:auto")
+_ADMIN = "admin"
+_BROKER = "broker"
+_LOGIN = "org.apache.kafka.common.security"
 _POM = """<project xmlns="http://maven.apache.org/POM/4.0.0">
   <modelVersion>4.0.0</modelVersion>
   <groupId>org.sdnator</groupId><artifactId>kafka-for-tests</artifactId><version>1</version>
@@ -94,10 +102,12 @@ class KafkaServers:
     Args:
         folder: for settings, logs and data.
         brokers: how many, 1 to 5.
+        secured: clients need TLS and a user, and users rights; `admin_url` may do everything.
     """
 
-    def __init__(self, folder: Path, brokers: int = 1) -> None:
+    def __init__(self, folder: Path, brokers: int = 1, *, secured: bool = False) -> None:
         self._folder = folder
+        self._password = secrets.token_urlsafe(24) if secured else ""
         self._jars = kafka_jars()
         self._cluster = base64.urlsafe_b64encode(uuid.uuid4().bytes).decode().rstrip("=")
         self._ports = [(free_port(), free_port()) for _ in range(brokers)]
@@ -110,8 +120,16 @@ class KafkaServers:
 
     @property
     def url(self) -> str:
-        """For `set_pubsub`."""
-        return f"kafka://{self.servers}"
+        """For `set_pubsub`; without a user."""
+        if not self._password:
+            return f"kafka://{self.servers}"
+        certificate = self._folder / "certificates" / f"{CA}.pem"
+        return f"kafkas://{self.servers}?{urlencode({'ssl_ca_certs': certificate})}"
+
+    @property
+    def admin_url(self) -> str:
+        """The same with the credential of a super user."""
+        return self.url.replace("://", f"://{_ADMIN}:{self._password}@") if self._password else self.url
 
     def start(self) -> Self:
         """Format the brokers' folders, start them all and wait until each answers.
@@ -119,6 +137,8 @@ class KafkaServers:
         Raises:
             KafkaMissing: a broker ended, or did not answer in time; the text has its last words.
         """
+        if self._password:
+            self._make_certificates()
         for number in range(len(self._ports)):
             self._prepare(number)
             self.start_broker(number)
@@ -138,8 +158,8 @@ class KafkaServers:
             )
 
     def wait(self, brokers: int) -> None:
-        """Return when so many brokers are in the cluster."""
-        admin = AdminClient({"bootstrap.servers": self.servers, "log_level": 0})
+        """Return when this many brokers are in the cluster."""
+        admin = AdminClient(parse_kafka_url(self.admin_url).client(log_level=0))
         deadline = time.monotonic() + _START_SECONDS
         while time.monotonic() < deadline:
             ended = [number for number, process in self._processes.items() if process.poll() is not None]
@@ -210,15 +230,52 @@ class KafkaServers:
             "log.cleaner.dedupe.buffer.size": 4 << 20,
             "num.network.threads": 2,
             "num.io.threads": 2,
+            **(self._guarded(port, controller_port) if self._password else {}),
         }
         path = home / "server.properties"
-        path.write_text("".join(f"{name}={value}\n" for name, value in settings.items()))
+        write_private(path, "".join(f"{name}={value}\n" for name, value in settings.items()))
+        format_it = ["format", "-t", self._cluster, "-c", path]
+        if self._password:
+            format_it += ["--add-scram", f"SCRAM-SHA-512=[name={_ADMIN},password={self._password}]"]
         subprocess.run(
-            self._java("kafka.tools.StorageTool", "format", "-t", self._cluster, "-c", path),
+            self._java("kafka.tools.StorageTool", *format_it),
             check=True,
             capture_output=True,
             timeout=_START_SECONDS,
         )
+
+    def _make_certificates(self) -> None:
+        folder = CertificateFolder(self._folder / "certificates")
+        folder.make_ca()
+        folder.issue(_BROKER, hosts=["127.0.0.1", "localhost"])
+        parts = [(folder.folder / f"{_BROKER}.{kind}").read_text() for kind in ("key", "pem")]
+        write_private(self._folder / "broker.pem", "".join(parts))
+
+    def _guarded(self, port: int, controller_port: int) -> dict[str, object]:
+        """Settings of a broker that lets nobody do what it was not granted."""
+        known = f'username="{_ADMIN}" password="{self._password}"'
+        return {
+            "listeners": f"CLIENTS://127.0.0.1:{port},CONTROLLER://127.0.0.1:{controller_port}",
+            "advertised.listeners": f"CLIENTS://127.0.0.1:{port}",
+            "listener.security.protocol.map": "CLIENTS:SASL_SSL,CONTROLLER:SASL_SSL",
+            "inter.broker.listener.name": "CLIENTS",
+            "sasl.mechanism.inter.broker.protocol": "SCRAM-SHA-512",
+            "sasl.mechanism.controller.protocol": "PLAIN",
+            "listener.name.clients.sasl.enabled.mechanisms": "SCRAM-SHA-512",
+            "listener.name.clients.scram-sha-512.sasl.jaas.config": (
+                f"{_LOGIN}.scram.ScramLoginModule required {known};"
+            ),
+            "listener.name.controller.sasl.enabled.mechanisms": "PLAIN",
+            "listener.name.controller.plain.sasl.jaas.config": (
+                f'{_LOGIN}.plain.PlainLoginModule required {known} user_{_ADMIN}="{self._password}";'
+            ),
+            "ssl.keystore.type": "PEM",
+            "ssl.keystore.location": self._folder / "broker.pem",
+            "ssl.truststore.type": "PEM",
+            "ssl.truststore.location": self._folder / "certificates" / f"{CA}.pem",
+            "authorizer.class.name": "org.apache.kafka.metadata.authorizer.StandardAuthorizer",
+            "super.users": f"User:{_ADMIN}",
+        }
 
     def _java(self, program: str, *arguments: object) -> list[str]:
         return ["java", _HEAP, *_QUICK_START, "-cp", f"{self._jars}/*", program, *map(str, arguments)]

@@ -71,6 +71,7 @@ def north(engine: Engine, registry: Registry) -> Northbound:
             "assignments_sent",
             "failovers",
             "retention_deleted",
+            "unauthorized",
             "refused",
             "apps",
             "declared_keys",
@@ -302,6 +303,7 @@ def test_with_a_token_every_route_but_metrics_wants_it(given):
         live = served.url.replace("http", "ws") + "/observe?key=a"
         with pytest.raises(InvalidStatus), connect(live, additional_headers=headers):
             pass
+        assert served.unauthorized == len(paths - {"/metrics"}), "each is counted"
         right = {"authorization": "Bearer secret"}
         assert httpx.get(f"{served.url}/openapi.json", headers=right).status_code == 200
     finally:

@@ -103,7 +103,7 @@ def test_asking_for_more_than_there_is_is_answered_and_served_as_well_as_possibl
     (event,) = matched.incompatible["c"]
     assert event.key == "a.b"
     assert "50 Hz" in event.reason
-    assert "p makes a.b at most at 10 Hz" in event.reason
+    assert "p produces a.b at most at 10 Hz" in event.reason
 
 
 def test_a_variant_that_nobody_offers_is_answered() -> None:

@@ -93,7 +93,7 @@ def test_flags_choose_the_backend(make_engine):
     assert sorted(item.value for item in got) == [1, 2, 5]
     assert sorted(item.value for item in engine.get("t.flags.**")) == [1, 3, 4, 5]
     assert engine.health()["receiving"]["gaps"] == 0
-    with pytest.raises(InvalidOption, match="exclude each other"):
+    with pytest.raises(InvalidOption, match="cannot be combined"):
         engine.write("t.flags.both", 1, [PUB_ONLY, DB_ONLY])
 
 

@@ -67,7 +67,7 @@ def test_what_is_refused_in_a_stream_is_set_aside_once_and_the_rest_arrives(pair
     counts = consumer.health()["receiving"]
     assert (counts[cause], counts["repeats"], counts["fenced"]) == (2, 0, 0)
     assert bus.xlen(aside_name("con")) == before + 2
-    wait_for(lambda: bus.xpending(f"due:stream:{key}", "con")["pending"] == 0)
+    wait_for(lambda: bus.xpending(f"due:work:con:{key}", "con")["pending"] == 0)
     assert caplog.text.count("refused a frame") == 1
     assert bus.xrevrange(aside_name("con"), count=1)[0][1][b"reason"].startswith(cause.encode())
     assert all(

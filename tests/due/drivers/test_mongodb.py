@@ -156,7 +156,7 @@ def test_keys_go_a_while_after_their_last_document_and_come_back(
 ) -> None:
     archive.insert(items(3, key="gone"))
     archive.insert([Item("stays", 1, 2 * T0, 2 * T0, "app", "i", 1)])
-    keys = archive._table("_keys")
+    keys = archive._table("keys")
     assert archive.prune(before=T0 + 100) == 3
     assert {key["_id"] for key in keys.find({})} == {"gone", "stays"}, "not at once"
     monkeypatch.setattr(mongodb, "_EMPTY_SECONDS", 0.0)

@@ -4,6 +4,7 @@ from typing import Any
 
 from due import PUB_ONLY, Capability
 from due.drivers.embedded_redis import EmbeddedServer
+from due.drivers.redis_streams import work_name
 from due.drivers.redis_wire import Wire
 from tests.due.conftest import wait_for
 
@@ -87,7 +88,7 @@ def test_instances_of_a_shared_app_divide_a_stream(make_engine, monkeypatch):
     assert sorted(got["a"] + got["b"]) == list(range(number))
 
 
-def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path, monkeypatch):
+def test_a_withdrawn_interest_leaves_no_list_behind(make_engine, tmp_path, monkeypatch):
     monkeypatch.setattr("due.drivers.redis_upkeep._WITHDRAWN_SECONDS", 0.1)
     with EmbeddedServer(tmp_path / "u") as server:
         init = {"capabilities": [Capability("r.gone", delivery="reliable")]}
@@ -101,9 +102,9 @@ def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path, monk
         wait_for(lambda: got == [1])
         subscriptions[0].dispose()
         consumers[0].close()
-        assert _groups(server.url) == 1, "the other instance still reads"
+        assert _lists(server.url) == 1, "the other instance still reads"
         subscriptions[1].dispose()
-        wait_for(lambda: _groups(server.url) == 0)
+        wait_for(lambda: _lists(server.url) == 0)
         producer.write("r.gone", 2, [PUB_ONLY])
         producer.flush()
         consumers[1].observe("r.gone").subscribe(lambda item: got.append(item.value))
@@ -114,8 +115,8 @@ def test_a_withdrawn_interest_leaves_no_group_behind(make_engine, tmp_path, monk
             engine.close()
 
 
-def _groups(url: str) -> int:
+def _lists(url: str) -> int:
     wire = Wire(url)
-    groups = wire.call("XINFO", "GROUPS", "due:stream:r.gone")
+    lists = wire.call("EXISTS", work_name("consumer", "r.gone"))
     wire.close()
-    return len(groups)
+    return int(lists)

@@ -8,7 +8,7 @@ from due import PUB_ONLY, Capability
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_aside import _MOST_BYTES, Aside, aside_name
 from due.drivers.redis_leases import lease_name
-from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
+from due.drivers.redis_streams import PRODUCERS, announced_name, readers_name, stream_name, work_name
 from due.drivers.redis_wire import client
 from tests.due.conftest import wait_for
 
@@ -31,7 +31,8 @@ def test_garbage_leases_announcements_entries_and_consumers_stop_nobody(make_eng
         for name in NAMES:
             commands.hset(lease_name("consumer", "r.hostile"), name, "no number")
             commands.publish(announced_name("producer"), name)
-            commands.xgroup_createconsumer(stream_name("r.hostile"), "consumer", name)
+            commands.xgroup_createconsumer(work_name("consumer", "r.hostile"), "consumer", name)
+            commands.sadd(readers_name("r.hostile"), name)
         for fields in ({"f": "garbage"}, {"x": "y"}, {b"\xff": b"\xff", "f": b""}):
             commands.xadd(stream_name("r.hostile"), fields)
         commands.xadd(stream_name("r.hostile"), {"x": "pending of the dead"})
@@ -50,9 +51,10 @@ def test_foreign_entries_that_a_dead_member_left_stop_nobody(make_engine, tmp_pa
         commands, name = client(server.url), stream_name("r.hostile")
         commands.sadd(PRODUCERS, "producer")
         commands.zadd(announced_name("producer"), {"r.hostile": 2e9})
-        commands.xgroup_create(name, "consumer", "0", mkstream=True)
-        commands.xadd(name, {"x": "y"})
-        commands.xreadgroup("consumer", b"\xff dead", {name: ">"})
+        work = work_name("consumer", "r.hostile")
+        commands.xgroup_create(work, "consumer", "0", mkstream=True)
+        commands.xadd(work, {"i": ""}, id=commands.xadd(name, {"x": "y"}))
+        commands.xreadgroup("consumer", b"\xff dead", {work: ">"})
         producer = make_engine("producer", url=server.url, init=RELIABLE)
         consumer = make_engine("consumer", url=server.url)
         got: list[Any] = []

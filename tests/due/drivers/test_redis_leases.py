@@ -6,10 +6,10 @@ import pytest
 
 from due.drivers import redis_upkeep
 from due.drivers.redis_leases import LeaseValue, LeaseWatch, lease_name
-from due.drivers.redis_reader import ServerTime
-from due.drivers.redis_streams import LIFETIME_S, stream_name
+from due.drivers.redis_streams import LIFETIME_S, work_name
 from due.drivers.redis_upkeep import _FORGET_SECONDS, Upkeep
 from due.drivers.redis_wire import client
+from due.drivers.redis_work import ServerTime
 
 FIELD = b"group/one"
 
@@ -58,19 +58,19 @@ def test_values_never_repeat_when_the_clock_stands_or_goes_back(monkeypatch):
 def test_what_is_left_behind_is_forgotten_and_what_lives_is_not(server):
     commands, path = client(server.url), "r.upkeep.lives"
     leases = lease_name("group", path)
-    commands.xgroup_create(stream_name(path), "group", "$", mkstream=True)
+    commands.xgroup_create(work_name("group", path), "group", "$", mkstream=True)
     for consumer in ("one", "dead", "busy"):
         commands.hset(leases, consumer, "7")
-    commands.xadd(stream_name(path), {"f": "1"})
-    commands.xreadgroup("group", "busy", {stream_name(path): ">"})
-    commands.xgroup_createconsumer(stream_name(path), "group", "dead")
+    commands.xadd(work_name("group", path), {"f": "1"})
+    commands.xreadgroup("group", "busy", {work_name("group", path): ">"})
+    commands.xgroup_createconsumer(work_name("group", path), "group", "dead")
     upkeep, lease = Upkeep(commands, "group", "one"), LeaseValue()
     for minute in range(60):
         commands.hset(leases, "one", lease.next())
         upkeep.tick([path], 60.0 * minute)
         _grow_older(upkeep)
     assert set(commands.hkeys(leases)) == {b"one"}
-    names = {one["name"] for one in commands.xinfo_consumers(stream_name(path), "group")}
+    names = {one["name"] for one in commands.xinfo_consumers(work_name("group", path), "group")}
     assert names == {b"busy"}, "its entry is not lost"
     assert 0 < commands.ttl(leases) <= LIFETIME_S
     assert upkeep.counts["forgotten_leases"] == 2
@@ -90,7 +90,7 @@ def test_a_group_goes_when_the_others_of_it_are_gone_and_stays_while_one_lives(s
     commands, lease = client(server.url), LeaseValue()
     paths = {"r.left": b"0", "r.crashed": b"7", "r.alive": b"7"}
     for path, value in paths.items():
-        commands.xgroup_create(stream_name(path), "group", "$", mkstream=True)
+        commands.xgroup_create(work_name("group", path), "group", "$", mkstream=True)
         commands.hset(lease_name("group", path), "other", value)
     upkeep = Upkeep(commands, "group", "one")
     upkeep.withdrawn(list(paths), 0.0)
@@ -98,7 +98,7 @@ def test_a_group_goes_when_the_others_of_it_are_gone_and_stays_while_one_lives(s
     for second in range(1, 9):
         commands.hset(lease_name("group", "r.alive"), "other", lease.next())
         upkeep.tick([], float(second))
-        groups.append({path for path in paths if commands.xinfo_groups(stream_name(path))})
+        groups.append({path for path in paths if commands.exists(work_name("group", path))})
         for _, watch in upkeep._withdrawn.values():
             assert watch._looked is not None
             watch._looked -= 1.0

@@ -9,8 +9,9 @@ import redis
 from due.drivers.base import Delivery
 from due.drivers.redis_leases import lease_name
 from due.drivers.redis_reader import StreamReader
-from due.drivers.redis_streams import stream_name
+from due.drivers.redis_streams import stream_name, work_name
 from due.drivers.redis_wire import client
+from due.drivers.redis_work import COUNT, WorkLists
 from tests.due.conftest import wait_for
 
 PATH = "r.lease"
@@ -43,9 +44,11 @@ def test_what_was_acknowledged_is_pending_no_more(server, quiet):
         for delivery in _read(reader):
             assert delivery.payload == str(number).encode()
             reader.acknowledge(delivery)
-    assert commands.xpending(stream_name(path), "group")["pending"] == 1, "it goes with the next request"
+    assert commands.xpending(work_name("group", path), "group")["pending"] == 1, (
+        "it goes with the next request"
+    )
     reader.close()
-    assert commands.xpending(stream_name(path), "group")["pending"] == 0
+    assert commands.xpending(work_name("group", path), "group")["pending"] == 0
     commands.close()
 
 
@@ -59,8 +62,8 @@ def _read(reader: StreamReader) -> list[Delivery]:
     return found
 
 
-class _NoGroups:
-    """A client whose connection is cut whenever it makes a group."""
+class _NoLists:
+    """A client whose connection is cut whenever it makes a list."""
 
     def __init__(self, commands):
         self._commands = commands
@@ -68,22 +71,22 @@ class _NoGroups:
     def __getattr__(self, name):
         return getattr(self._commands, name)
 
-    def xgroup_create(self, *_details, **_more):
+    def pipeline(self, *_details, **_more):
         raise redis.ConnectionError("cut")
 
 
 @pytest.mark.parametrize(("start", "found"), [("0", [b"early", b"late"]), ("$", [b"late"])])
-def test_a_group_that_could_not_be_made_is_made_later(server, start, found):
+def test_a_list_that_could_not_be_made_is_made_later(server, start, found):
     """And nothing is lost from the moment it was asked for."""
     path, commands = f"r.unmade.{len(found)}", client(server.url)
     commands.xadd(stream_name(path), {"f": "early"})
     early_ms = int(commands.xinfo_stream(stream_name(path))["last-generated-id"].split(b"-")[0])
     wait_for(lambda: time.time() * 1000 > early_ms + 3)
-    reader = StreamReader(server.url, _NoGroups(commands), "group", "one", shared=False)
+    reader = StreamReader(server.url, _NoLists(commands), "group", "one", shared=False)
     reader.add(path, start)
     commands.xadd(stream_name(path), {"f": "late"})
     reader.care()
-    reader._commands = commands
+    reader._commands = reader._lists._commands = commands
     reader._look_at = 0.0
     assert [delivery.payload for delivery in _read(reader)] == found
     reader.close()
@@ -96,10 +99,35 @@ def test_alone_in_a_group_it_looks_after_the_dead_more_rarely(server):
     reader.add("r.alone", "0")
     reader.care()
     assert reader._alone
-    commands.xadd(stream_name("r.alone"), {"f": "1"})
-    commands.xreadgroup("alone", "other", {stream_name("r.alone"): ">"})
+    commands.xadd(work_name("alone", "r.alone"), {"i": ""})
+    commands.xreadgroup("alone", "other", {work_name("alone", "r.alone"): ">"})
     reader._look_at = 0.0
     reader.care()
     assert not reader._alone
+    reader.close()
+    commands.close()
+
+
+@pytest.mark.parametrize("fresh", [0.0, 600.0])
+def test_a_list_that_another_member_moves_is_read_from_there(server, monkeypatch, fresh):
+    """Also by a member that has read ahead, however long its callbacks take."""
+    monkeypatch.setattr("due.drivers.redis_reader._FRESH_SECONDS", fresh)
+    path, commands = f"r.moved.{int(fresh)}", client(server.url)
+    reader = StreamReader(server.url, commands, "group", "one", shared=False)
+    reader.add(path, "0")
+    wanted = [b"%d" % number for number in range(3 * COUNT)]
+    for payload in wanted:
+        commands.xadd(stream_name(path), {"f": payload})
+    first = _read(reader)
+    while first[-1].payload != wanted[-1]:
+        first += _read(reader)
+    assert [delivery.payload for delivery in first] == wanted
+    for delivery in first:
+        reader.acknowledge(delivery)
+    WorkLists(commands, "group").make(path, "0", reset=True)
+    again: list[bytes] = []
+    while not again or again[-1] != wanted[-1]:
+        again += [delivery.payload for delivery in _read(reader)]
+    assert again == wanted
     reader.close()
     commands.close()

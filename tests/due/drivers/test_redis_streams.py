@@ -128,7 +128,7 @@ _REPLIES = st.recursive(
 )
 
 
-@given(st.lists(_REPLIES, min_size=3, max_size=3))
+@given(st.lists(_REPLIES, min_size=4, max_size=4))
 def test_whatever_the_server_answers_nothing_is_forgotten_by_mistake(replies):
     ledger = _ledger()
     ledger.groups = ledger.known = (b"group",)

@@ -13,18 +13,26 @@ from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_leases import lease_name
 from due.drivers.redis_rights import Rights
-from due.drivers.redis_streams import PRODUCERS, announced_name, stream_name
+from due.drivers.redis_streams import (
+    PRODUCERS,
+    announced_name,
+    readers_name,
+    stream_name,
+    wake_name,
+    work_name,
+)
 from due.drivers.redis_wire import Wire, client
 from due.errors import UpdatesUnavailable
 from sdnator.rights.granting import DANGEROUS, OPERATOR
 from sdnator.rights.identities import ADMIN, FILE, Identities, made, observable
-from sdnator.rights.rights_keeper import RightsKeeper, RightsRefused
+from sdnator.rights.rights_keeper import RightsKeeper
+from sdnator.rights.watching_keeper import RightsRefused
 from sdnator.testing.tls_redis import TlsRedis
 from tests.due.conftest import wait_for
 from tests.requirements import require_program
 
 MINE = Rights(app="mine", publish=("network.anomaly.mine.**",), observe=("network.open.**",))
-OWN, FOREIGN = "network.anomaly.mine.score", "network.anomaly.kitsune.score"
+OWN, FOREIGN, OPEN = "network.anomaly.mine.score", "network.anomaly.kitsune.score", "network.open.door"
 _PATHS = (
     *(FOREIGN, "due.assignment.firewall", "network.frames.p4runtime_ctrl.s1.all"),
     *(f"network.{family}.firewall.ipv4" for family in DANGEROUS),
@@ -49,28 +57,64 @@ def place(
 
 def _attempts(path: str) -> Iterator[tuple[str | int, ...]]:
     """Every verb of the wire format on one path that is not the app's."""
-    stream, lease, set_aside = stream_name(path), lease_name("kitsune", path), "due:poison:kitsune"
+    stream = stream_name(path)
     yield ("PUBLISH", f"due:{path}", "x")
     yield ("PUBLISH", announced_name("kitsune"), path)
-    yield ("XADD", stream, "*", "f", "x")
-    yield ("XTRIM", stream, "MAXLEN", 0)
-    yield ("DEL", stream)
-    yield ("EXPIRE", stream, 1)
     yield ("XRANGE", stream, "-", "+")
     yield ("XREAD", "STREAMS", stream, "0")
-    yield ("XREADGROUP", "GROUP", "kitsune", "c", "STREAMS", stream, ">")
-    yield ("XACK", stream, "kitsune", "1-1")
-    yield ("XCLAIM", stream, "kitsune", "c", 0, "1-1")
-    for verb in ("CREATE", "SETID"):
-        yield ("XGROUP", verb, stream, "kitsune", "0")
-    yield ("XGROUP", "DESTROY", stream, "kitsune")
-    yield ("XGROUP", "DELCONSUMER", stream, "kitsune", "c")
     yield ("XINFO", "GROUPS", stream)
+    yield ("XINFO", "STREAM", stream)
+    yield ("XPENDING", stream, "kitsune")
+    yield ("SADD", readers_name(path), "mine")
+    yield from _as_a_writer(path)
+    yield from _as_kitsune(path)
+
+
+def _as_a_writer(path: str) -> Iterator[tuple[str | int, ...]]:
+    """What changes a stream or whom its producers wait for."""
+    stream, readers = stream_name(path), readers_name(path)
+    yield ("XADD", stream, "*", "f", "x")
+    yield ("XTRIM", stream, "MAXLEN", 0)
+    yield ("XDEL", stream, "1-1")
+    yield ("XSETID", stream, "9-9")
+    yield ("DEL", stream)
+    yield ("EXPIRE", stream, 1)
+    yield ("SREM", readers, "kitsune")
+    yield ("DEL", readers)
+    yield ("EXPIRE", readers, 1)
+
+
+def _on_list(name: str) -> Iterator[tuple[str | int, ...]]:
+    """What acknowledges, takes or moves something of a group, or ends it."""
+    yield ("XREADGROUP", "GROUP", "kitsune", "c", "STREAMS", name, ">")
+    yield ("XACK", name, "kitsune", "1-1")
+    yield ("XDEL", name, "1-1")
+    yield ("XCLAIM", name, "kitsune", "c", 0, "1-1")
+    yield ("XAUTOCLAIM", name, "kitsune", "c", 0, "0")
+    yield ("XADD", name, "9-9", "i", "")
+    yield ("XSETID", name, "9-9")
+    yield ("DEL", name)
+    for verb in ("CREATE", "SETID"):
+        yield ("XGROUP", verb, name, "kitsune", "0")
+    yield ("XGROUP", "DESTROY", name, "kitsune")
+    yield ("XGROUP", "CREATECONSUMER", name, "kitsune", "c")
+    yield ("XGROUP", "DELCONSUMER", name, "kitsune", "c")
+
+
+def _as_kitsune(path: str) -> Iterator[tuple[str | int, ...]]:
+    """What acknowledges, reads, lives or says something in another app's name."""
+    set_aside, lease = "due:poison:kitsune", lease_name("kitsune", path)
+    yield from _on_list(stream_name(path))
+    yield from _on_list(work_name("kitsune", path))
+    yield ("XPENDING", work_name("kitsune", path), "kitsune")
+    yield ("XINFO", "CONSUMERS", work_name("kitsune", path), "kitsune")
     yield ("HSET", lease, "c", "0")
     yield ("HDEL", lease, "c")
     yield ("HGETALL", lease)
     yield ("XADD", set_aside, "*", "f", "x")
     yield ("XRANGE", set_aside, "-", "+")
+    yield ("XADD", wake_name("kitsune"), "*", "i", "x")
+    yield ("XREAD", "STREAMS", wake_name("kitsune"), "0")
     yield ("ZADD", announced_name("kitsune"), 1, path)
     yield ("ZREM", announced_name("kitsune"), path)
     yield ("SREM", PRODUCERS, "kitsune")
@@ -90,6 +134,7 @@ _SERVER = (
     ("MONITOR",),
     ("CLIENT", "LIST"),
     ("CLIENT", "KILL", "TYPE", "normal"),
+    ("CLIENT", "UNBLOCK", 1),
     ("GET", "anything"),
     ("SET", "anything", "1"),
     ("PUBSUB", "CHANNELS"),
@@ -101,25 +146,77 @@ _SERVER = (
 )
 
 
-def test_an_app_can_say_and_see_nothing_but_its_own(place):
-    server, identities = place
-    keeper = RightsKeeper(server.admin_url, identities)
+def _refused(keeper: RightsKeeper, url: str) -> int:
+    """How many attempts of an app on what is not its own were refused: all."""
     keeper.look()
-    commands = client(identities.url(server.url, "mine"))
+    commands = client(url)
     tried = [attempt for path in _PATHS for attempt in _attempts(path)] + list(_SERVER)
+    tried += [*_as_a_writer(OPEN), *_as_kitsune(OPEN), *_on_list(work_name("kitsune", OWN))]
     for attempt in tried:
         with pytest.raises(redis.exceptions.NoPermissionError):
             commands.execute_command(*attempt)
     keeper.look()
+    commands.close()
+    return len(tried)
+
+
+def test_a_given_server_refuses_an_app_the_same(tmp_path):
+    """A Valkey that others have started, whose administrator's credential we are given."""
+    identities = made(tmp_path, {"mine": MINE, "kitsune": Rights(app="kitsune")})
+    with EmbeddedServer(tmp_path / "u") as server:
+        keeper = RightsKeeper(server.url, identities)
+        keeper.apply()
+        tried = _refused(keeper, identities.url(server.url, "mine"))
+        assert keeper.refusals["mine"] == tried, "each is counted"
+        keeper.close()
+
+
+def test_an_app_can_say_and_see_nothing_but_its_own(place):
+    server, identities = place
+    keeper = RightsKeeper(server.admin_url, identities)
+    tried = _refused(keeper, identities.url(server.url, "mine"))
+    commands = client(identities.url(server.url, "mine"))
     told = keeper.told()
-    assert any(f"mine was refused the channel due:{FOREIGN}" in text for text in told)
-    assert keeper.refusals["mine"] >= len(tried) / 2, "the server's log has room for 128 kinds"
+    assert len([text for text in told if "mine was refused the" in text]) > len(_PATHS)
+    assert keeper.refusals["mine"] == tried, "each is counted"
     for attempt in (("PUBLISH", f"due:{OWN}", "x"), ("XADD", stream_name(OWN), "*", "f", "x")):
         commands.execute_command(*attempt)
     for attempt in (("SUBSCRIBE", "due:network.open.door"), ("PSUBSCRIBE", "due:network.open.*")):
         client(identities.url(server.url, "mine")).execute_command(*attempt)
     commands.close()
     keeper.close()
+
+
+def test_who_may_read_a_stream_leaves_every_other_group_where_it_is(place):
+    """The only writes of a reader are on keys of its own, and its name among the readers."""
+    server, identities = place
+    url, work = identities.url(server.url, "mine"), work_name("mine", OPEN)
+    commands, admin = client(url), client(server.admin_url)
+    admin.xadd(stream_name(OPEN), {"f": "x"})
+    for attempt in (
+        ("XREAD", "STREAMS", stream_name(OPEN), wake_name("mine"), "0", "0"),
+        ("SADD", readers_name(OPEN), "mine"),
+        ("XGROUP", "CREATE", work, "mine", "0", "MKSTREAM"),
+        ("XADD", work, "9-9", "i", ""),
+        ("XREADGROUP", "GROUP", "mine", "c", "STREAMS", work, ">"),
+        ("XACK", work, "mine", "9-9"),
+    ):
+        commands.execute_command(*attempt)
+    assert admin.xlen(stream_name(OPEN)) == 1
+    assert admin.xinfo_groups(stream_name(OPEN)) == []
+    admin.close()
+    commands.close()
+
+
+def test_a_crowd_of_made_up_producers_is_removed(place):
+    server, identities = place
+    commands, keeper = client(identities.url(server.url, "mine")), RightsKeeper(server.admin_url, identities)
+    commands.sadd(PRODUCERS, "mine", *(f"nobody{number}" for number in range(2000)))
+    keeper.look()
+    assert commands.smembers(PRODUCERS) == {b"mine"}
+    assert any("2000 unknown producer names" in text for text in keeper.told())
+    keeper.close()
+    commands.close()
 
 
 def test_without_a_credential_there_is_nothing_but_an_answer_to_ping(place, tmp_path):

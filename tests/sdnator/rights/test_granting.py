@@ -72,6 +72,18 @@ def test_declared_keys_can_be_taken_away():
     assert (found.rights.publish, found.rights.observe) == (("a.b",), ())
 
 
+def test_reading_from_the_archive_is_a_grant_of_its_own():
+    """What an app declares to observe says nothing about what was."""
+    assert declared("mine", (), ("a.**",)).rights.read == ()
+    plan = GrantPlan(app="mine", read=("a.b",))
+    assert declared("mine", (), ("a.**",), [plan, GrantPlan(app="other", read=("c",))]).rights.read == (
+        "a.b",
+    )
+    assert "a.b" not in " ".join(acl_rules(Rights(app="mine", read=("a.b",)))), "nothing for Data Updates"
+    with pytest.raises(ValueError, match=r"read=a\.\.b"):
+        GrantPlan(app="mine", read=("a..b",))
+
+
 def test_rules_name_every_key_of_an_app_and_none_of_another():
     text = " ".join(acl_rules(Rights(app="mine", publish=("a.b.**",), observe=("c.*.d",))))
     for name in (
@@ -81,9 +93,12 @@ def test_rules_name_every_key_of_an_app_and_none_of_another():
         "&due:c.*.d",
         "&due:due.assignment.mine",
         "&due:due.heartbeat.mine",
-        "~due:stream:c.*.d",
+        "%R~due:stream:c.*.d",
+        "~due:readers:c.*.d",
+        "~due:work:mine:*",
         "~due:lease:mine:*",
     ):
         assert f" {name} " in text or f" {name})" in text
     assert "allchannels" not in text
     assert "+@all" not in text
+    assert " ~due:stream:c" not in text, "who observes writes nothing on a stream"
