@@ -17,12 +17,14 @@ import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import grpc
 
+from dataplane.compiler.c_build import compiler
 from dataplane.errors import DataplaneError
 from dataplane.faults import Faults
 from dataplane.heartbeat import LivenessPipe, Turning
@@ -40,6 +42,8 @@ from dataplane.stop import Stop
 
 _GC_ALLOCATIONS = 50_000
 _PR_SET_PDEATHSIG = 1
+_PRECEDENCE = 5
+"""Steps of nice value above the programs beside the switch."""
 
 
 def options() -> argparse.ArgumentParser:
@@ -55,7 +59,6 @@ def options() -> argparse.ArgumentParser:
     add("--device-id", type=int, default=1, help="P4Runtime device id (default 1)")
     add("--cpu-port", type=int, default=510, help="number of the port to the controller (default 510)")
     add("--port", action="append", default=[], metavar="N=KIND", help=f"a port; kinds: {FORMS}")
-    add("--backend", choices=("auto", "c", "python"), default="auto", help="compiler target of programs")
     add("--queue", type=int, default=4096, help="packet-ins that may wait for the controller (default 4096)")
     add("--tls-cert", type=Path, help="PEM certificate chain of the server; with --tls-key")
     add("--tls-key", type=Path, help="PEM private key of the server")
@@ -68,8 +71,12 @@ def options() -> argparse.ArgumentParser:
         help=f"rights of clients by the name (CN) of their certificate, some of {','.join(RIGHTS)}; default: "
         + " ".join(DEFAULT),
     )
-    add("--insecure", action="store_true", help="HOST:PORT without certificates: whoever reaches it commands")
-    add("--trust", action="append", default=[], metavar="SHA256", help="allow this program, too")
+    add(
+        "--insecure",
+        action="store_true",
+        help="HOST:PORT without certificates: anyone who reaches it controls the switch",
+    )
+    add("--trust", action="append", default=[], metavar="SHA256", help="also allow this program")
     add(
         "--trust-file",
         type=Path,
@@ -88,7 +95,7 @@ def options() -> argparse.ArgumentParser:
     add(
         "--spare",
         action="store_true",
-        help="prepare, and open ports and address when a byte comes on standard input",
+        help="prepare, and open ports and address when a byte arrives on standard input",
     )
     add("--state-json", metavar="FILE", help="write counters there at the end; - = standard output")
     return parser
@@ -107,6 +114,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> int:
+    if compiler() is None:
+        raise DataplaneError("no C compiler ($CC, cc, gcc, clang) to compile programs with: install gcc")
     clock = PacketClock(driven=captures(arguments.port), base_us=arguments.base_us)
     credentials, rights = _credentials(arguments), _rights(arguments)
     programs = TrustedPrograms(arguments.trust, arguments.trust_file)
@@ -114,10 +123,11 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     if arguments.spare and not (stop.readable_first(0) and os.read(0, 1)):
         return 0
     ports = open_ports(arguments.port, arguments.cpu_port, clock.now)
+    if not captures(arguments.port):
+        _raise_priority()
     device = Device(
         arguments.device_id,
         cpu_port=arguments.cpu_port,
-        backend=arguments.backend,
         queue=arguments.queue,
         ports=ports,
         clock=clock.now,
@@ -157,6 +167,12 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     return 1 if loop.failed or faults.died else 0
 
 
+def _raise_priority() -> None:
+    """Where the system allows it, forwarding has precedence over apps that score, plan and restart beside it."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) - _PRECEDENCE)
+
+
 def _prepared(
     arguments: argparse.Namespace, clock: PacketClock, programs: TrustedPrograms
 ) -> ForwardingPipeline | None:
@@ -164,9 +180,7 @@ def _prepared(
     try:
         config = read_program(own_program())
         programs.check(config)  # it computes a hash that is asked for again
-        return ForwardingPipeline(
-            verify(config), cpu_port=arguments.cpu_port, backend=arguments.backend, clock=clock.now
-        )
+        return ForwardingPipeline(verify(config), cpu_port=arguments.cpu_port, clock=clock.now)
     except (TrustError, InvalidArgument) as error:
         print(f"dataplane: not prepared: {error}", file=sys.stderr)
         return None

@@ -10,7 +10,7 @@ from typing import Any
 
 import cffi
 
-from dataplane.compiler.confined import compile_confined
+from dataplane.compiler.sandboxed_cc import compile_confined
 from dataplane.errors import CompilerError
 
 FLAGS = ("-std=gnu11", "-O2", "-fPIC", "-shared", "-fno-strict-aliasing", "-w")
@@ -35,7 +35,7 @@ def cache_directory() -> Path:
     for place in (directory.parent, directory):
         status = place.lstat()
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
-            raise PermissionError(f"{place} belongs to another user, or is no folder")
+            raise PermissionError(f"{place} belongs to another user, or is not a folder")
         if status.st_mode & (0o077 if place == directory else 0o022):
             place.chmod(0o700)
     return directory
@@ -48,9 +48,7 @@ def compiled_library(text: str, declarations: str) -> tuple[Any, Any]:
     """
     cc = compiler()
     if cc is None:
-        raise CompilerError(
-            "no C compiler found (tried $CC, cc, gcc, clang): install one or use backend=python"
-        )
+        raise CompilerError("no C compiler found (tried $CC, cc, gcc, clang): install gcc")
     digest = hashlib.sha256("\0".join([text, cc, *FLAGS]).encode()).hexdigest()[:32]
     ffi = cffi.FFI()
     ffi.cdef(declarations)

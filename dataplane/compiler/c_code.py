@@ -1,11 +1,12 @@
-"""Generated C: one unit of runtime_types.h, the program's state and functions, runtime_engine.h.
+"""Generated C: one unit of runtime_types.h, runtime_tables.h, the program's state and functions, runtime_engine.h.
 
     parse(m, p)    p->pkt -> headers, returns the parser's error code
     ingress(m, p), egress(m, p)
     deparse(m, p, out)    checksums, then the frame's bytes
 
-`phv` is one packet: the kept fields, validity, pointers to the bytes of extracted headers, and the
-engine's registers.  `machine` is the switch: tables, counters, meters, registers.
+`phv` is one packet: the kept fields, validity, pointers to the bytes of extracted headers, which headers the
+program may have changed, and the engine's registers.  Metadata of ingress or egress alone are variables of its
+function.  `machine` is the switch: tables, counters, meters, registers.
 """
 
 from importlib.resources import files
@@ -20,6 +21,8 @@ from dataplane.v1model import tree
 from dataplane.v1model.tree import Expression, FieldRef, Program
 
 _MAX_STATES = 4096
+_MEMBER_HEAD = 4
+"""Bytes in front of each member of a digest."""
 
 
 class CGenerator(CStatements):
@@ -97,8 +100,11 @@ class CGenerator(CStatements):
         self.fail("i & 7", "ParserInvalidArgument")
         self.fail("z - o < i >> 3", "PacketTooShort")
         self.line("o += (u32)(i >> 3);")
+        self.moved()
 
     def extract(self, op: tree.Extract) -> None:
+        if op in self.layout.out_of_order:
+            self.moved()
         if not op.stack:
             self.extract_into(op.header, op)
             return
@@ -145,7 +151,7 @@ class CGenerator(CStatements):
             text = f"bits_get{kind}({raw}, {f.offset}, {f.width})"
         if f.signed:
             text = self.e.wrapped(text, kind, f.width)
-        self.assign(FieldRef(header, f), text)
+        self.load(FieldRef(header, f), text)
 
     # -- leaving ------------------------------------------------------------------------------------
 
@@ -172,6 +178,9 @@ class CGenerator(CStatements):
             with self.block(f"if ({test})"):
                 self.digest_input(calculation)
                 self.assign64(checksum.target, f"hash_{calculation.algorithm}(b, n)")
+        with self.block("if (!p->changed)"):
+            self.line("memcpy(out, p->pkt, p->size);")
+            self.line("return p->size < p->truncate ? p->size : p->truncate;")
         self.line("u8 *o = out;")
         for header in self.program.deparser:
             with self.block(f"if ({self.valid(header)})"):
@@ -183,40 +192,86 @@ class CGenerator(CStatements):
     def emit(self, header: str) -> None:
         size = self.size(header)
         self.line(f"memcpy(o, {self.raw(header)}, {size});")
-        for f in self.layout.written[header]:
-            kind = kind_of(f.width)
-            text, own = self.leaf(FieldRef(header, f))
-            text = convert(text, own, kind, signed=False)
-            if f.offset % 8 == 0 and f.width in ALIGNED:
-                self.line(self.put(f"o + {f.offset // 8}", f.width, text))
-            else:
-                self.line(f"bits_put{kind}(o, {f.offset}, {f.width}, {text});")
+        if self.layout.written[header]:
+            with self.block(f"if (p->changed & {self.change(header)})"):
+                self.lay_over(header)
         self.line(f"o += {size};")
+
+    def lay_over(self, header: str) -> None:
+        """The fields that may have changed over the header's bytes, neighbours together where they fill bytes."""
+        run: list[tree.FieldType] = []
+        for f in self.layout.written[header]:
+            if run and (
+                run[-1].offset + run[-1].width != f.offset or f.offset + f.width - run[0].offset > 64
+            ):
+                self.lay_run(header, run)
+                run = []
+            run.append(f)
+            if (f.offset + f.width) % 8 == 0:
+                self.lay_run(header, run)
+                run = []
+        self.lay_run(header, run)
+
+    def lay_run(self, header: str, run: list[tree.FieldType]) -> None:
+        width = sum(f.width for f in run)
+        if len(run) > 1 and run[0].offset % 8 == 0 and width in ALIGNED:
+            shifts = [width - (f.offset - run[0].offset) - f.width for f in run]
+            parts = [f"({self.bits(header, f)} << {shift})" for f, shift in zip(run, shifts, strict=True)]
+            self.line(self.put(f"o + {run[0].offset // 8}", width, " | ".join(parts)))
+            return
+        for f in run:
+            self.lay_field(header, f)
+
+    def bits(self, header: str, f: tree.FieldType) -> str:
+        """A field of at most 64 bits, without its sign."""
+        text, own = self.leaf(FieldRef(header, f))
+        return self.e.cut(convert(text, own, 64, signed=False), 64, f.width)
+
+    def lay_field(self, header: str, f: tree.FieldType) -> None:
+        kind = kind_of(f.width)
+        text, own = self.leaf(FieldRef(header, f))
+        text = convert(text, own, kind, signed=False)
+        if f.offset % 8 == 0 and f.width in ALIGNED:
+            self.line(self.put(f"o + {f.offset // 8}", f.width, text))
+        elif f.offset % 8 == 0 and f.width % 64 == 0 and kind > 128:
+            for n in range(f.width // 64):
+                self.line(f"put8(o + {(f.offset + f.width) // 8 - 8 * (n + 1)}, ({text}).w[{n}]);")
+        else:
+            self.line(f"bits_put{kind}(o, {f.offset}, {f.width}, {text});")
 
     def digests(self) -> None:
         for number, spec in self.program.digests.items():
-            count = sum(words(w) for w in spec.widths)
+            most = sum(_MEMBER_HEAD + max(1, (width + 7) // 8) for width in spec.widths)
+            head = sample_head(most)
             with self.block(f"if (p->digest == {number})"):
-                self.line(f"u64 w[{count + 1}];")
-                limbs = ", ".join(str(words(w)) for w in spec.widths)
-                self.line(f"static const u8 limbs[] = {{{limbs or 0}}};")
-                at = 0
+                self.line(f"u8 *o = sample_begin(m, {most}, {head}), *to = o;")
                 for e, width in zip(spec.fields, spec.widths, strict=True):
-                    self.digest_field(e, width, at)
-                    at += words(width)
-                self.line(f"sample(m, {number}, w, limbs, {len(spec.widths)});")
+                    self.member(e, width)
+                self.line(f"sample_end(m, {number}, o, to, {head});")
 
-    def digest_field(self, e: Expression, width: int, at: int) -> None:
+    def member(self, e: Expression, width: int) -> None:
         kind = kind_of(width)
         text = self.e.at(simplify(e), kind)
         if isinstance(e, FieldRef) and e.field.signed:
             text = self.e.cut(text, kind, width)
         if kind == 64:
-            self.line(f"w[{at}] = {text};")
+            self.line(f"to = member64(to, {text});")
         elif kind == 128:
-            self.line(f"{{ u128 x = {text}; w[{at}] = (u64)x; w[{at + 1}] = (u64)(x >> 64); }}")
+            self.line(
+                f"{{ u128 x = {text}; u64 w[] = {{(u64)x, (u64)(x >> 64)}}; to = member_wide(to, w, 2); }}"
+            )
         else:
-            self.line(f"{CTYPE[kind]}_save(w + {at}, {text}, {words(width)});")
+            self.line(f"{{ {CTYPE[kind]} x = {text}; to = member_wide(to, x.w, {words(width)}); }}")
+
+
+def sample_head(most: int) -> int:
+    """Bytes in front of the members of a digest, which have at most `most` bytes: two tags, each with a length."""
+    inner = _varint_bytes(most)
+    return 1 + _varint_bytes(1 + inner + most) + 1 + inner
+
+
+def _varint_bytes(value: int) -> int:
+    return max(1, (value.bit_length() + 6) // 7)
 
 
 def _structures(g: CGenerator) -> list[str]:
@@ -236,32 +291,34 @@ def _structures(g: CGenerator) -> list[str]:
         "typedef struct { u32 count, length; replica to[]; } replicas;",
         "typedef struct {",
         "table t[N_TABLES + 1]; u64 *c[N_COUNTERS + 1]; meter *mt[N_METERS + 1];",
-        "u64 *reg[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;",
+        "u64 *reg[N_REGISTERS + 1], cells[N_REGISTERS + 1]; replicas **sessions, **groups; u8 ports[512]; u32 cpu_port;",
         "u64 stats[6], out_used, out_room, marks_used, marks_room, seed, *marks; u8 *out; u8 verdict; int budget; job *head, **tail;",
         "u64 out_of_range[N_COUNTERS + N_METERS + N_REGISTERS + 1];",
         "} machine;",
-        "PLAIN void sample(machine *m, u32 id, const u64 *w, const u8 *limbs, u32 members);",
+        "PLAIN u8 *sample_begin(machine *m, u32 most, u32 head);",
+        "PLAIN void sample_end(machine *m, u32 id, u8 *members, u8 *end, u32 head);",
         "#define STD(p, name) (p)->STD_##name",
     ]
     for name in ENGINE_FIELDS:
         ref = layout.standard(name)
         if ref is not None:
             lines += [f"#define HAS_{name} 1", f"#define STD_{name} {g.names[STANDARD, name]}"]
-    for n in sorted({key_places(s)[0] for s in program.tables.values() if s.keys}):
-        lines.append(
-            f"PLAIN entry *find{n}(const table *t, const u64 *k) {{ return table_find(t, k, {n}); }}"
-        )
     return lines
 
 
 def _packet(g: CGenerator) -> list[str]:
     """The type of one packet's state; metadata stand together so that they can be zeroed."""
     layout = g.layout
-    lines = ["typedef struct {", "const u8 *pkt; u64 now;", "u32 size, offset, length, arrived, truncate;"]
+    lines = [
+        "typedef struct {",
+        "const u8 *pkt; u64 now, changed;",
+        "u32 size, offset, length, arrived, truncate;",
+    ]
     lines += ["u32 clone, clone_list, digest, resubmit, recirculate, exit;", "struct {"]
     for header in layout.metadata:
         for f in layout.fields[header]:
-            lines.append(f"{storage(f)} {g.names[header, f.name].removeprefix('m.')};")
+            if (header, f.name) not in g.locals:
+                lines.append(f"{storage(f)} {g.names[header, f.name].removeprefix('m.')};")
     lines.append("} m;")
     for header in layout.packet_headers:
         number = g.numbers[header]
@@ -286,7 +343,8 @@ def _start(g: CGenerator) -> None:
             size = 1 if array.table else max(array.size, 1)
             g.line(f"m->mt[{g.index['mt'][name]}] = calloc({size}, sizeof(meter));")
         for name, array in program.registers.items():
-            g.line(f"m->reg[{g.index['reg'][name]}] = calloc({array.size * words(array.width) + 1}, 8);")
+            number, count = g.index["reg"][name], array.size * words(array.width) + 1
+            g.line(f"m->reg[{number}] = cells_new({count}); m->cells[{number}] = {count};")
 
 
 def _keep_list(g: CGenerator) -> None:
@@ -298,13 +356,15 @@ def _keep_list(g: CGenerator) -> None:
                 for ref in refs:
                     name = g.names[ref.header, ref.field.name]
                     g.line(f"to->{name} = from->{name};")
+                    if ref.header in g.numbers:
+                        g.line(f"to->changed |= {g.change(ref.header)};")
                 g.line("break;")
 
 
 def generate(program: Program, layout: Layout) -> str:
     """The whole unit."""
     if not all(h.type.width % 8 == 0 for h in program.headers.values() if not h.metadata):
-        raise Unsupported("a header that is no whole number of bytes")
+        raise Unsupported("a header that is not a whole number of bytes")
     g = CGenerator(program, layout)
     g.lines += _structures(g)
     with g.block("static int parse(machine *m, phv *p)"):
@@ -313,6 +373,8 @@ def generate(program: Program, layout: Layout) -> str:
     for name, pipeline in (("ingress", program.ingress), ("egress", program.egress)):
         with g.block(f"static void {name}(machine *m, phv *p)"):
             g.line("i64 a; const u64 *d; int h; u64 i; (void)m; (void)p; (void)a; (void)d; (void)h; (void)i;")
+            for ref in layout.private[name]:
+                g.line(f"{storage(ref.field)} {g.field(ref)} = {'{{0}}' if ref.field.width > 128 else '0'};")
             g.pipeline(pipeline)
     with g.block("static u32 deparse(machine *m, phv *p, u8 *out)"):
         g.line("(void)m;")
@@ -323,7 +385,8 @@ def generate(program: Program, layout: Layout) -> str:
     _keep_list(g)
     _start(g)
     runtime = files("dataplane.compiler")
-    types = runtime.joinpath("runtime_types.h").read_text()
-    engine = runtime.joinpath("runtime_engine.h").read_text()
+    types, tables, engine = (
+        runtime.joinpath(f"runtime_{part}.h").read_text() for part in ("types", "tables", "engine")
+    )
     most = max((key_places(s)[0] for s in program.tables.values() if s.keys), default=1)
-    return "\n".join([f"#define KEY_WORDS {most}", types, *g.lines, engine])
+    return "\n".join([f"#define KEY_WORDS {most}", types, tables, *g.lines, engine])

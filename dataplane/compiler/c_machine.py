@@ -46,6 +46,8 @@ uint64_t *dp_register(void *h, uint32_t array, uint64_t limb);
 _NONE = 0xFFFFFFFF
 _BLOCK = 256
 _OUT_PORT, _OUT_CPU, _OUT_DIGEST = 1, 2, 3
+_FEW = 32
+"""Frames for which columns cost more than they save."""
 _RECORD = struct.Struct("<III4x")
 _WORD = (1 << 64) - 1
 _Rates = tuple[int, int, int, int]
@@ -220,8 +222,6 @@ class CRegisters:
 class CMachine:
     """See machine.Machine."""
 
-    backend = "c"
-
     def __init__(self, program: Program, cpu_port: int) -> None:
         """Raises CompilerError, Unsupported."""
         self.text = generate(program, layouts.make(program))
@@ -249,29 +249,47 @@ class CMachine:
                 table.know_action(number, tuple(words(p.width) for p in params))
 
     def run(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult:
-        ffi = self._native.ffi
-        lengths = ffi.new("uint32_t[]", [len(f) for f in frames])
-        times = ffi.new("uint64_t[]", [t & _WORD for t in times_us])
-        data = frames[0] if len(frames) == 1 else b"".join(frames)
-        records, verdicts = self._run(port, data, lengths, times, len(frames))
-        batch = BatchResult(verdicts=verdicts)
-        self._collect(batch, records)
-        return batch
+        count, ffi = len(frames), self._native.ffi
+        if count < _FEW:
+            lengths = ffi.new("uint32_t[]", [len(f) for f in frames])
+            times = ffi.new("uint64_t[]", [t & _WORD for t in times_us])
+            data = frames[0] if count == 1 else b"".join(frames)
+            return self._collected(*self._run(port, data, lengths, times, count))
+        places = self._places(np.fromiter(map(len, frames), "u4", count), np.fromiter(times_us, "i8", count))
+        records, verdicts = self._run(port, b"".join(frames), *places, count)
+        kinds, slices = self._sorted_out(records)
+        reported = slices.of(kinds == _OUT_DIGEST)
+        names = [self._digests[number] for number in reported.ports.tolist()]
+        return BatchResult(
+            outputs=list(slices.of(kinds == _OUT_PORT)),
+            packet_ins=slices.of(kinds == _OUT_CPU).frames(),
+            digests=list(map(Digest, names, reported.frames())),
+            verdicts=verdicts,
+        )
 
     def run_block(
         self, port: int, data: bytes, lengths: NDArray[np.uint32], times_us: NDArray[np.int64]
     ) -> BatchResult:
-        ffi, sizes, times = self._native.ffi, np.require(lengths, "u4", "C"), np.require(times_us, "i8", "C")
+        sizes, times = np.require(lengths, "u4", "C"), np.require(times_us, "i8", "C")
         if int(sizes.sum(dtype=np.int64)) > len(data) or len(times) != len(sizes):
             raise DataplaneError(f"{len(sizes)} frames do not fit into a block of {len(data)} bytes")
-        places = ffi.cast("uint32_t *", sizes.ctypes.data), ffi.cast("uint64_t *", times.ctypes.data)
-        records, verdicts = self._run(port, data, *places, len(sizes))
-        to = ffi.new("const uint64_t **")
-        count = self._native.lib.dp_marks(self._native.handle, to)
-        if not count:
+        records, verdicts = self._run(port, data, *self._places(sizes, times), len(sizes))
+        if not records:
             return BatchResult(verdicts=verdicts)
-        marks = np.frombuffer(ffi.buffer(to[0], 8 * count), np.uint64).astype(np.int64)
-        return self._sorted_out(records, marks, verdicts)
+        kinds, slices = self._sorted_out(records)
+        reported = slices.of(kinds == _OUT_DIGEST)
+        samples = {name: reported.to(number).frames() for number, name in self._digests.items()}
+        return BatchResult(
+            outputs=slices.of(kinds == _OUT_PORT),
+            packet_ins=slices.of(kinds == _OUT_CPU).frames(),
+            samples={name: found for name, found in samples.items() if found},
+            verdicts=verdicts,
+        )
+
+    def _places(self, lengths: NDArray[np.uint32], times_us: NDArray[np.int64]) -> tuple[Any, Any]:
+        """Both as C sees them; the arrays have to live as long."""
+        ffi = self._native.ffi
+        return ffi.from_buffer("uint32_t[]", lengths), ffi.from_buffer("uint64_t[]", times_us)
 
     def _run(self, port: int, data: bytes, lengths: Any, times: Any, count: int) -> tuple[bytes, bytes]:
         """Records and verdicts."""
@@ -281,29 +299,18 @@ class CMachine:
         records = bytes(ffi.buffer(lib.dp_output(self._native.handle), used)) if used else b""
         return records, bytes(ffi.buffer(verdicts, count))
 
-    def _sorted_out(self, records: bytes, marks: NDArray[np.int64], verdicts: bytes) -> BatchResult:
-        """Records by kind, each kind in their order; frames that left stay where they are."""
-        words, at = np.frombuffer(records, "<u4"), marks >> 2
-        kinds, numbers, begins = words[at], words[at + 1].astype(np.int64), marks + _RECORD.size
-        ends = begins + words[at + 2]
+    def _sorted_out(self, records: bytes) -> tuple[NDArray[np.uint32], FrameSlices]:
+        """The kinds of the last run's records, and where each stands; `ports` are the records' numbers."""
+        ffi, to = self._native.ffi, self._native.ffi.new("const uint64_t **")
+        count = self._native.lib.dp_marks(self._native.handle, to)
+        marks = np.frombuffer(ffi.buffer(to[0], 8 * count), np.uint64) if count else np.empty(0, np.uint64)
+        begins = marks.astype(np.int64) + _RECORD.size
+        words, at = np.frombuffer(records, "<u4"), begins - _RECORD.size >> 2
+        numbers, ends = words[at + 1].astype(np.int64), begins + words[at + 2]
+        return words[at], FrameSlices(numbers, begins, ends, records)
 
-        def slices(rows: NDArray[np.bool_]) -> FrameSlices:
-            return FrameSlices(numbers[rows], begins[rows], ends[rows], records)
-
-        reported = kinds == _OUT_DIGEST
-        samples = {}
-        for number, name in self._digests.items():
-            mine = reported & (numbers == number)
-            if mine.any():
-                samples[name] = slices(mine).frames()
-        return BatchResult(
-            outputs=slices(kinds == _OUT_PORT),
-            packet_ins=slices(kinds == _OUT_CPU).frames(),
-            samples=samples,
-            verdicts=verdicts,
-        )
-
-    def _collect(self, batch: BatchResult, records: bytes) -> None:
+    def _collected(self, records: bytes, verdicts: bytes) -> BatchResult:
+        batch = BatchResult(verdicts=verdicts)
         at, end = 0, len(records)
         unpack, outputs = _RECORD.unpack_from, list[tuple[int, bytes]]()
         batch.outputs = outputs
@@ -317,6 +324,7 @@ class CMachine:
             else:
                 batch.digests.append(Digest(self._digests[number], records[at : at + length]))
             at += (length + 7) & ~7
+        return batch
 
     def set_clone_session(self, session: int, replicas: Replicas | None, packet_length: int) -> None:
         count, pairs = self._pairs(replicas)

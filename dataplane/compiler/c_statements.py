@@ -17,6 +17,10 @@ ALIGNED = {8: "be1", 16: "be2", 32: "be4", 48: "be6", 64: "be8", 128: "be16"}
 _PUT = {16: "put2", 32: "put4", 48: "put6", 64: "put8", 128: "put16"}
 
 
+OTHER_HEADERS = 63
+"""Bit of `changed`: headers were added, removed or moved."""
+
+
 def words(width: int) -> int:
     """64-bit words that hold `width` bits."""
     return (width + 63) // 64
@@ -79,6 +83,12 @@ class CStatements(Generator):
             for f in fields:
                 # the program's own names never get into the source: they may be any text
                 self.names[header, f.name] = f"{place}f{len(self.names)}"
+        self.locals = {
+            (ref.header, ref.field.name): self.names[ref.header, ref.field.name].removeprefix("m.")
+            for refs in layout.private.values()
+            for ref in refs
+        }
+        """Fields that are local variables of the function of their pipeline."""
         self.numbers = {h: i for i, h in enumerate(layout.packet_headers)}
         self.index = {
             kind: {name: i for i, name in enumerate(names)}
@@ -128,7 +138,8 @@ class CStatements(Generator):
     # -- leaves -------------------------------------------------------------------------------------
 
     def field(self, ref: FieldRef) -> str:
-        return "p->" + self.names[ref.header, ref.field.name]
+        key = ref.header, ref.field.name
+        return self.locals.get(key) or "p->" + self.names[key]
 
     def valid(self, header: str) -> str:
         return f"p->v{self.numbers[header]}"
@@ -207,9 +218,27 @@ class CStatements(Generator):
         self.assign(target, text)
 
     def assign(self, target: FieldRef, text: str) -> None:
+        self.load(target, text)
+        self.changed(target.header)
+
+    def load(self, target: FieldRef, text: str) -> None:
+        """Into the field's slot, as it stands in the header's bytes."""
         kind = storage(target.field)
         cast = "" if kind.startswith("W") else f"({kind})"
         self.line(f"{self.field(target)} = {cast}{text};")
+
+    def changed(self, header: str) -> None:
+        """The header's bytes are no longer what its fields say."""
+        if header in self.numbers:
+            self.line(f"p->changed |= {self.change(header)};")
+
+    def change(self, header: str) -> str:
+        """The bit of a header in `changed`: headers beyond the 62nd share one."""
+        return f"1ull << {min(self.numbers[header], OTHER_HEADERS - 1)}"
+
+    def moved(self) -> None:
+        """The frame has other headers than those that came."""
+        self.line(f"p->changed |= 1ull << {OTHER_HEADERS};")
 
     def assign64(self, target: FieldRef, text: str) -> None:
         """A u64 cut to the target's width."""
@@ -235,9 +264,11 @@ class CStatements(Generator):
         self.line(f"{self.raw(target)} = {self.raw(source)};")
         if self.program.headers[target].type.max_bytes:
             self.line(f"{self.size(target)} = {self.size(source)};")
+        self.changed(target)
 
     def do_copyheader(self, s: tree.CopyHeader) -> None:
         self.line(f"{self.valid(s.target)} = {self.valid(s.source)};")
+        self.moved()
         with self.block(f"if ({self.valid(s.source)})"):
             self.copied(s.target, s.source)
 
@@ -252,15 +283,18 @@ class CStatements(Generator):
             if kind.max_bytes:
                 self.line(f"{self.size(s.header)} = {kind.width // 8};")
             self.line(f"p->length += {kind.width // 8};")
+            self.moved()
 
     def do_removeheader(self, s: tree.RemoveHeader) -> None:
         with self.block(f"if ({self.valid(s.header)})"):
             self.line(f"{self.valid(s.header)} = 0;")
             self.line(f"p->length -= {self.size(s.header)};")
+            self.moved()
 
     def do_shiftstack(self, s: tree.ShiftStack) -> None:
         members = self.program.stacks[s.stack].headers
         size, by = len(members), s.by
+        self.moved()
         for i in range(size) if by < 0 else range(size - 1, -1, -1):
             if 0 <= i - by < size:
                 self.copied(members[i], members[i - by])
@@ -385,12 +419,12 @@ class CStatements(Generator):
         if not spec.keys:
             return
         size, places = key_places(spec)
-        with self.block(""):
+        with self.block(f"if ({table}.count)"):
             parts: list[list[str]] = [[] for _ in range(size)]
             for key, target, mask, place in zip(spec.keys, node.keys, node.key_masks, places, strict=True):
                 self.key_field(parts, target, key.width, mask, place)
             self.line(f"u64 k[{size}] = {{{', '.join(' | '.join(p) or '0' for p in parts)}}};")
-            self.line(f"entry *e = find{size}(&{table}, k);")
+            self.line(f"entry *e = table_find(&{table}, k);")
             with self.block("if (e)"):
                 self.line("e->packets++; e->bytes += p->arrived; e->hit = p->now; h = 1; a = e->action;")
                 self.line(f"d = {table}.params + (u64)(e - {table}.entries) * {table}.stride;")

@@ -1,7 +1,8 @@
 """Which parts of a packet's state the generated code keeps, and in which slot.
 
-A field has a slot only if the program reads or writes it.  A header that was extracted keeps its bytes;
-it leaves as those bytes with the fields that the program may have written laid over them.
+A field has a slot only if the program reads or writes it, and is a local variable of generated C where one
+pipeline alone does.  A header that was extracted keeps its bytes; it leaves as those bytes with the fields that
+the program may have written laid over them.
 """
 
 import dataclasses
@@ -54,6 +55,10 @@ class Layout:
     written: dict[str, tuple[FieldType, ...]] = field(default_factory=dict)
     packet_headers: tuple[str, ...] = ()
     metadata: tuple[str, ...] = ()
+    private: dict[str, tuple[FieldRef, ...]] = field(default_factory=dict)
+    """Metadata that ingress, or egress, alone looks at: 0 whenever it begins."""
+    out_of_order: frozenset[tree.Extract] = frozenset()
+    """Extractions after which a frame may not leave as it came, though nothing in it was changed."""
 
     def has(self, ref: FieldRef) -> bool:
         return ref.field in self.fields[ref.header]
@@ -88,6 +93,53 @@ def _live_parts(program: Program) -> list[Any]:
     ]
 
 
+def _fields(program: Program, parts: Any) -> set[FieldRef]:
+    """Fields that parts of the tree read or write; of a stack's last header, all that it may be."""
+    found: set[FieldRef] = set()
+    for node in walk(parts):
+        if isinstance(node, FieldRef):
+            found.add(node)
+        elif isinstance(node, tree.StackLast):
+            found.update(FieldRef(header, node.field) for header in program.stacks[node.stack].headers)
+        elif isinstance(node, tree.Hash):
+            found |= _fields(program, program.calculations[node.calculation])
+    return found
+
+
+def _pipeline_fields(program: Program, pipeline: tree.Pipeline) -> set[FieldRef]:
+    """Fields that the tables, conditions and actions of a pipeline read or write."""
+    parts: list[Any] = [pipeline.nodes]
+    for node in pipeline.nodes.values():
+        if isinstance(node, tree.TableNode):
+            parts += [program.actions[number] for number in node.actions]
+            if node.hidden_action is not None:
+                parts.append(program.actions[node.hidden_action])
+            if node.meter:
+                parts.append(program.meters[node.meter])
+    return _fields(program, parts)
+
+
+def _private(program: Program, layout: Layout, linked: list[set[str]]) -> dict[str, tuple[FieldRef, ...]]:
+    """Metadata of one pipeline alone.
+
+    Nothing carries it to the next pass of a packet or out of the switch: no list of fields that a copy
+    keeps, no digest, no checksum, no parser.
+    """
+    elsewhere = _fields(
+        program, [program.parser.states, program.checksums, program.digests, program.field_lists]
+    )
+    for checksum in program.checksums:
+        elsewhere |= _fields(program, program.calculations[checksum.calculation])
+    elsewhere |= {ref for name in ENGINE_FIELDS if (ref := layout.standard(name))}
+    copied = set().union(*linked)
+    candidates = [FieldRef(h, f) for h in layout.metadata if h not in copied for f in layout.fields[h]]
+    ingress, egress = (_pipeline_fields(program, each) for each in (program.ingress, program.egress))
+    return {
+        name: tuple(ref for ref in candidates if ref in mine and ref not in others and ref not in elsewhere)
+        for name, mine, others in (("ingress", ingress, egress), ("egress", egress, ingress))
+    }
+
+
 def _linked(program: Program, parts: list[Any]) -> list[set[str]]:
     """Sets of headers whose contents move between one another."""
     groups = [set(s.headers) for s in program.stacks.values()]
@@ -98,6 +150,52 @@ def _linked(program: Program, parts: list[Any]) -> list[set[str]]:
         merged = [g for g in merged if not g & group]
         merged.append(group.union(*touching))
     return merged
+
+
+def _emission_ranks(program: Program) -> dict[str, int]:
+    """Where the deparser emits a header, or a stack: -1 where it does not, or not in one piece."""
+    direct = {
+        op.header
+        for state in program.parser.states.values()
+        for op in state.ops
+        if isinstance(op, tree.Extract) and not op.stack
+    }
+    emitted = {name: rank for rank, name in enumerate(program.deparser)}
+    ranks = {name: -1 if program.deparser.count(name) > 1 else rank for name, rank in emitted.items()}
+    for stack in program.stacks.values():
+        places = [ranks.get(name, -1) for name in stack.headers]
+        together = places == list(range(places[0], places[0] + len(places))) and places[0] >= 0
+        if not together or direct & set(stack.headers):
+            ranks |= dict.fromkeys(stack.headers, -1)
+        for name in stack.headers[1:]:
+            ranks[name] = ranks.get(stack.headers[0], -1)
+    return ranks
+
+
+def _out_of_order(program: Program) -> frozenset[tree.Extract]:
+    """Extractions after which the deparser may not emit the extracted headers as they stood in the frame."""
+    ranks, states = _emission_ranks(program), program.parser.states
+
+    def rank(op: tree.Extract) -> int:
+        return ranks.get(program.stacks[op.stack].headers[0] if op.stack else op.header, -1)
+
+    highest = dict.fromkeys(states, -1)  # what may stand before a state
+    wrong: set[tree.Extract] = set()
+    waiting = list(states)
+    while waiting:
+        state = states[waiting.pop()]
+        most = highest[state.name]
+        for op in state.ops:
+            if isinstance(op, tree.Extract):
+                least = max(0, most) if op.stack else most + 1
+                if rank(op) < least:
+                    wrong.add(op)
+                most = max(most, rank(op))
+        for following in {*(case.next for case in state.cases), state.default}:
+            if following is not None and highest[following] < most:
+                highest[following] = most
+                waiting.append(following)
+    return frozenset(wrong)
 
 
 def make(program: Program) -> Layout:
@@ -116,7 +214,8 @@ def make(program: Program) -> Layout:
             written[target.header].add(target.field.name)
             used[target.header].add(target.field.name)
     used.get(STANDARD, set()).update(ENGINE_FIELDS)
-    for group in _linked(program, parts):
+    linked = _linked(program, parts)
+    for group in linked:
         for table in (used, written):
             everything = set().union(*(table[h] for h in group))
             for header in group:
@@ -128,4 +227,6 @@ def make(program: Program) -> Layout:
         layout.written[name] = tuple(f for f in fields if f.name in written[name] and not f.varbit)
     layout.packet_headers = tuple(n for n, h in program.headers.items() if not h.metadata)
     layout.metadata = tuple(n for n, h in program.headers.items() if h.metadata)
+    layout.out_of_order = _out_of_order(program)
+    layout.private = _private(program, layout, linked)
     return layout

@@ -1,10 +1,9 @@
 """What a back end offers the switch: the loaded program with its state, without names or checks.
 
-Two make it: `python_machine.PythonMachine` and `c_machine.CMachine`.  Callers hold the switch's lock and
-have checked every number; tables are addressed by slots that `tables.Table` hands out.
+`c_machine.CMachine` makes it.  Callers hold the switch's lock and have checked every number; tables are addressed by slots that `tables.Table` hands out.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -52,7 +51,10 @@ class FrameSlices:
 
     def to(self, port: int) -> "FrameSlices":
         """Those of one port."""
-        rows = self.ports == port
+        return self.of(self.ports == port)
+
+    def of(self, rows: NDArray[np.bool_]) -> "FrameSlices":
+        """Those of the rows that are true."""
         return FrameSlices(self.ports[rows], self.begins[rows], self.ends[rows], self.data)
 
 
@@ -145,7 +147,6 @@ class RegisterStore(Protocol):
 class Machine(Protocol):
     """A program with its state, ready to run."""
 
-    backend: str
     text: str
     """What was generated."""
 
@@ -184,6 +185,10 @@ class Machine(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+MachineMaker = Callable[[Program, int], Machine]
+"""Makes a machine for a program and the number of the port to the controller."""
 
 
 def array_names(program: Program) -> tuple[str, ...]:

@@ -35,43 +35,18 @@ static void record(machine *m, u32 kind, u32 id, u64 length) {
     m->out_used += 16 + ((length + 7) & ~7ull);
 }
 
-static u8 *varint(u8 *to, u64 value) {
-    for (; value > 0x7F; value >>= 7) *to++ = (u8)(value | 0x80);
-    *to++ = (u8)value;
-    return to;
-}
-static u32 varint_size(u64 value) {
-    u32 n = 1;
-    while (value >>= 7) n++;
-    return n;
-}
+PLAIN u8 *sample_begin(machine *m, u32 most, u32 head) { return arena(m, 16 + head + most + 16) + 16 + head; }
 
-/* A digest as samples.py has it.  w: the members, each of so many limbs, the lowest first. */
-PLAIN void sample(machine *m, u32 id, const u64 *w, const u8 *limbs, u32 members) {
-    u8 sizes[members + 1];
-    u64 inner = 0, at = 0;
-    for (u32 i = 0; i < members; at += limbs[i++]) {
-        u32 top = limbs[i];
-        while (top > 1 && !w[at + top - 1]) top--;
-        u64 x = w[at + top - 1];
-        sizes[i] = (u8)(8 * (top - 1) + (x ? (71 - (u32)__builtin_clzll(x)) / 8 : 1));
-        inner += 4 + sizes[i];
-    }
-    u64 outer = 1 + varint_size(inner) + inner;
-    u8 *start = arena(m, 16 + 11 + outer + 8) + 16, *to = start;
-    *to++ = 0x1A;
-    to = varint(to, outer);
-    *to++ = 0x2A;
-    to = varint(to, inner);
-    for (u32 i = 0; i < members; w += limbs[i++]) {
-        u32 size = sizes[i];
-        *to++ = 0x0A;
-        *to++ = (u8)(2 + size);
-        *to++ = 0x0A;
-        *to++ = (u8)size;
-        while (size--) *to++ = (u8)(w[size / 8] >> 8 * (size % 8));
-    }
-    record(m, OUT_DIGEST, id, (u64)(to - start));
+PLAIN void sample_end(machine *m, u32 id, u8 *members, u8 *end, u32 head) {
+    u8 *start = members - head;
+    u64 inner = (u64)(end - members), outer = 1 + varint_size(inner) + inner;
+    u32 needed = 1 + varint_size(outer) + 1 + varint_size(inner);
+    if (needed < head) memmove(start + needed, members, inner);
+    *start = 0x1A;
+    u8 *to = varint(start + 1, outer);
+    *to = 0x2A;
+    varint(to + 1, inner);
+    record(m, OUT_DIGEST, id, needed + inner);
 }
 
 static void ingress_pass(machine *m, phv *p, u32 port);
@@ -119,8 +94,7 @@ static job *enqueue(machine *m, u32 port, int to_ingress) {
     return j;
 }
 
-static void copy_for(phv *copy, const phv *p, const replicas *r, u32 i) {
-    *copy = *p;
+static void set_for(phv *copy, const replicas *r, u32 i) {
     copy->clone = copy->digest = copy->resubmit = copy->recirculate = 0;
     copy->truncate = r->length ? r->length : KEEP_ALL;
 #ifdef HAS_egress_rid
@@ -128,12 +102,18 @@ static void copy_for(phv *copy, const phv *p, const replicas *r, u32 i) {
 #endif
 }
 
-static void replicate(machine *m, const phv *p, const replicas *r) {
-    phv copy;
-    for (u32 i = 0; i < r->count; i++) {
-        copy_for(&copy, p, r, i);
-        egress_pass(m, &copy, r->to[i].port);
-    }
+static __attribute__((noinline)) void replica_of(machine *m, const phv *p, const replicas *r, u32 i) {
+    phv copy = *p;
+    set_for(&copy, r, i);
+    egress_pass(m, &copy, r->to[i].port);
+}
+
+/* the last one is the packet itself, which nobody needs any more */
+static void replicate(machine *m, phv *p, const replicas *r) {
+    if (!r->count) return;
+    for (u32 i = 0; i + 1 < r->count; i++) replica_of(m, p, r, i);
+    set_for(p, r, r->count - 1);
+    egress_pass(m, p, r->to[r->count - 1].port);
 }
 
 static __attribute__((noinline)) void clone_ingress(machine *m, phv *p, u32 port, u32 length) {
@@ -227,7 +207,8 @@ static __attribute__((noinline)) void leave_with_clone(machine *m, phv *p, u32 p
     leave(m, p, port);
     for (u32 i = 0; r && i < r->count; i++) {
         job *j = enqueue(m, r->to[i].port, 0);
-        copy_for(&j->p, &copy, r, i);
+        j->p = copy;
+        set_for(&j->p, r, i);
     }
 }
 
@@ -283,7 +264,7 @@ void dp_free(void *h) {
     for (u32 i = 0; i < N_TABLES; i++) table_free(&m->t[i]);
     for (u32 i = 0; i < N_COUNTERS; i++) free(m->c[i]);
     for (u32 i = 0; i < N_METERS; i++) free(m->mt[i]);
-    for (u32 i = 0; i < N_REGISTERS; i++) free(m->reg[i]);
+    for (u32 i = 0; i < N_REGISTERS; i++) cells_free(m->reg[i], m->cells[i]);
     for (u32 i = 0; i < 0x8000; i++) free(m->sessions[i]);
     for (u32 i = 0; i < 0x10000; i++) free(m->groups[i]);
     free(m->sessions);

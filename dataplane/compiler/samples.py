@@ -4,7 +4,7 @@
     data       struct     └ members    bitstring
 
 The back ends write samples so at once: of a list of hundreds with thirty members each, nothing but the
-joining is left to do (runtime_engine.h has the same in C).
+joining is left to do (runtime_types.h has the same in C).
 """
 
 from collections.abc import Iterable

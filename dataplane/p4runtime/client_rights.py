@@ -78,4 +78,4 @@ class CertificateRights:
         """Let a client stand for primary of a P4Runtime role.  Raises Denied."""
         name = self.name_of(peer)
         if TABLES not in self._rights[name] and role != name:
-            raise Denied(f"the certificate of {name!r} lets claim the role {name!r} only")
+            raise Denied(f"the certificate of {name!r} allows the role {name!r} only")

@@ -14,6 +14,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from dataplane.compiler.c_machine import CMachine
+from dataplane.compiler.machine import MachineMaker
 from dataplane.p4runtime import messages, pipeline_config
 from dataplane.p4runtime.arbitration import DEFAULT_ROLE, Arbitration, ArbitrationUpdate
 from dataplane.p4runtime.pipeline import ForwardingPipeline, verify
@@ -30,7 +32,7 @@ from dataplane.p4runtime.status import (
 from dataplane.p4runtime.streams import ControllerStream, PacketQueue
 from dataplane.p4runtime.trust import TrustedPrograms
 from dataplane.p4runtime.writes import Writer
-from dataplane.v1model.switch import Backend, FrameResult
+from dataplane.v1model.switch import FrameResult
 from dataplane.v1model.tables import Table, TableEntry
 from p4rt import p4runtime
 
@@ -47,7 +49,7 @@ class Device:
 
     device_id: 64 bits, the controller must name it
     cpu_port: number of the port that packet-ins leave by
-    backend: see Switch
+    maker: see Switch
     ports: the ports that exist; None = all
     queue: packet-ins and digest lists that may wait for each role's primary
     clock: the packets' clock, µs
@@ -61,7 +63,7 @@ class Device:
         device_id: int,
         *,
         cpu_port: int = 510,
-        backend: Backend = "auto",
+        maker: MachineMaker = CMachine,
         queue: int = 4096,
         ports: Iterable[int] | None = None,
         clock: Callable[[], int],
@@ -78,7 +80,7 @@ class Device:
         self.on_packet_out: Callable[[bytes], None] = _nothing_with
         self.crowded: Callable[[], bool] = _never
         """Whether a packet-out would have to wait for others."""
-        self._cpu_port, self._backend, self._capacity, self._clock = cpu_port, backend, queue, clock
+        self._cpu_port, self._maker, self._capacity, self._clock = cpu_port, maker, queue, clock
         self._ports = None if ports is None else tuple(ports)
         self._programs = TrustedPrograms() if programs is None else programs
         self._roles = {DEFAULT_ROLE, *roles}
@@ -220,7 +222,7 @@ class Device:
             pipeline = None
         if pipeline is None:
             pipeline = ForwardingPipeline(
-                verify(config), cpu_port=self._cpu_port, backend=self._backend, clock=self._clock
+                verify(config), cpu_port=self._cpu_port, maker=self._maker, clock=self._clock
             )
         pipeline.switch.set_ports(self._ports)
         return pipeline

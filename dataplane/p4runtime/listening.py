@@ -1,6 +1,6 @@
 """Where P4Runtime is served: a Unix socket that only its user can connect to, or HOST:PORT if that was asked for.
 
-Whoever connects can become primary and set tables, so a socket file of mode 0600 in a folder of mode 0700 is
+Any client that connects can become primary and set tables, so a socket file of mode 0600 in a folder of mode 0700 is
 the default; a TCP port is open to everybody who reaches it, on 127.0.0.1 to every user of the machine.
 
 DataplaneError
@@ -43,7 +43,7 @@ def default_address(name: str) -> str:
         base = Path(runtime) if runtime else Path(state or Path.home() / ".local" / "state")
     except RuntimeError as error:
         raise ServerError(
-            "there is no home and no XDG_RUNTIME_DIR: say with --grpc where to listen"
+            "there is neither a home folder nor XDG_RUNTIME_DIR: give an address with --grpc"
         ) from error
     path = base / "sdnator" / "run" / name
     if len(os.fsencode(path)) > _LONGEST:
@@ -89,7 +89,7 @@ def ready_to_bind(address: str) -> Iterator[None]:
     except OSError as error:
         raise ServerError(f"cannot listen on {address}: {error.strerror or error}") from error
     if not stat.S_ISSOCK(status.st_mode) or stat.S_IMODE(status.st_mode) & 0o177:
-        raise ServerError(f"{path} is no socket of mode 0600: others could connect to it")
+        raise ServerError(f"{path} is not a socket of mode 0600: others could connect to it")
 
 
 def _make_room(path: Path) -> None:
@@ -103,12 +103,12 @@ def _make_room(path: Path) -> None:
     open_to_all = folder.st_mode & _OTHERS_WRITE and not folder.st_mode & stat.S_ISVTX
     if open_to_all or folder.st_uid not in (0, os.geteuid()):
         raise ServerError(
-            f"others could exchange sockets in {path.parent}: give a folder of mode 0700 of your own"
+            f"others could replace sockets in {path.parent}: use a folder of your own with mode 0700"
         )
     if not os.path.lexists(path):
         return
     if not stat.S_ISSOCK(path.lstat().st_mode):
-        raise ServerError(f"cannot listen on {UNIX}{path}: a file is there that is no socket")
+        raise ServerError(f"cannot listen on {UNIX}{path}: there is a file that is not a socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         try:
             probe.connect(str(path))

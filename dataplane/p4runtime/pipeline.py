@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from dataplane.compiler.c_machine import CMachine
+from dataplane.compiler.machine import MachineMaker
 from dataplane.errors import DataplaneError, ProgramError
 from dataplane.p4runtime.array_entities import ArrayEntities
 from dataplane.p4runtime.digests import DigestLists
@@ -16,7 +18,7 @@ from dataplane.p4runtime.schema import Schema, bind
 from dataplane.p4runtime.status import InvalidArgument
 from dataplane.p4runtime.table_entities import TableEntities
 from dataplane.v1model.program import load
-from dataplane.v1model.switch import Backend, Switch
+from dataplane.v1model.switch import Switch
 from dataplane.v1model.tree import Program
 
 
@@ -49,19 +51,19 @@ class ForwardingPipeline:
     """A verified configuration in force.
 
     cpu_port: number of the port that packet-ins leave by
-    backend: see Switch
+    maker: see Switch
     clock: the packets' clock, µs
 
     Raises InvalidArgument where the program cannot be compiled.
     """
 
     def __init__(
-        self, verified: Verified, *, cpu_port: int, backend: Backend = "auto", clock: Callable[[], int]
+        self, verified: Verified, *, cpu_port: int, maker: MachineMaker = CMachine, clock: Callable[[], int]
     ) -> None:
         self.config = verified.config
         self.schema = verified.schema
         try:
-            self.switch = Switch(verified.program, cpu_port=cpu_port, backend=backend)
+            self.switch = Switch(verified.program, cpu_port=cpu_port, maker=maker)
         except DataplaneError as error:
             raise InvalidArgument(f"p4_device_config: {error}") from error
         self.tables = TableEntities(self.schema, self.switch, clock)

@@ -280,7 +280,7 @@ def _header(name: str, p4info: Any, program: Program, faults: list[str]) -> tupl
                 f" 1..{_WIDEST} bits"
             )
         if bits % 8:
-            faults.append(f"header {name} has {bits} bits, which is no whole number of bytes")
+            faults.append(f"header {name} has {bits} bits, which is not a whole number of bytes")
         have = program.headers.get(name)
         if have is not None and [field.width for field in fields] != [
             field.width for field in have.type.fields

@@ -159,7 +159,7 @@ class ControllerStream:
 
     async def _next(self) -> tuple[PacketQueue | None, list[bytes]]:
         while True:
-            # set before looking: whoever adds something later sees it and wakes us
+            # set before looking: a thread that adds something later sees it and wakes us
             self._sleeping = True
             found = self._look()
             if found is not None:

@@ -4,7 +4,7 @@
                                        │ sha256 of BMv2 JSON and p4info
                                        └ the product's own, --trust, or a line of the operator's file
 
-A compiled program runs with the switch's rights, so whoever reaches the P4Runtime port must not choose it.
+A compiled program runs with the switch's rights, so a client that merely reaches the P4Runtime port must not choose it.
 
 DataplaneError
 └── TrustError      the operator's file cannot be used

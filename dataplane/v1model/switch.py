@@ -14,8 +14,8 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dataplane.compiler import Backend, build
-from dataplane.compiler.machine import DROP_PORT, BatchResult, Digest, FrameSlices, Replicas
+from dataplane.compiler.c_machine import CMachine
+from dataplane.compiler.machine import DROP_PORT, BatchResult, Digest, FrameSlices, MachineMaker, Replicas
 from dataplane.errors import DataplaneError
 from dataplane.frame_block import FrameBlock
 from dataplane.v1model.externs import CounterArray, MeterArray, RegisterArray
@@ -23,7 +23,7 @@ from dataplane.v1model.program import Program
 from dataplane.v1model.tables import Table, TableEntry
 from dataplane.v1model.tree import TableNode
 
-__all__ = ["DROP_PORT", "Backend", "Digest", "FrameResult", "Replica", "Switch"]
+__all__ = ["DROP_PORT", "Digest", "FrameResult", "Replica", "Switch"]
 
 _MAX_SESSION = 0x7FFF
 _MAX_GROUP = 0xFFFF
@@ -59,7 +59,7 @@ class Switch:
 
     program: from `dataplane.v1model.program.load`
     cpu_port: frames sent there become packet-ins, and `packet_out` enters there
-    backend: "c" (generated C, needs gcc), "python", or "auto": C where a compiler is
+    maker: what turns the program into something that runs
     """
 
     tables: Mapping[str, Table]
@@ -67,15 +67,14 @@ class Switch:
     meters: Mapping[str, MeterArray]
     registers: Mapping[str, RegisterArray]
 
-    def __init__(self, program: Program, *, cpu_port: int = 510, backend: Backend = "auto") -> None:
-        """Raises CompilerError where backend="c" and the C cannot be built, Unsupported where the program
+    def __init__(self, program: Program, *, cpu_port: int = 510, maker: MachineMaker = CMachine) -> None:
+        """Raises CompilerError where the C cannot be built, Unsupported where the program
         needs wider integers than there are."""
         self.program = program
         self.cpu_port = cpu_port
         self.lock = threading.RLock()
         self._now = 0
-        self._machine = build(program, cpu_port, backend)
-        self.backend = self._machine.backend
+        self._machine = maker(program, cpu_port)
         numbers = {a.spec.name: a.number for a in program.actions}
         self.tables = {
             name: Table(
@@ -176,11 +175,6 @@ class Switch:
             if self._sessions.pop(session, None) is not None:
                 self._machine.set_clone_session(session, None, 0)
 
-    def clone_sessions(self) -> dict[int, tuple[tuple[Replica, ...], int]]:
-        """session -> (replicas, packet_length)."""
-        with self.lock:
-            return dict(self._sessions)
-
     def set_multicast_group(self, group: int, replicas: Iterable[Replica]) -> None:
         """Install or replace a group; copies are made in the order given.
 
@@ -198,11 +192,6 @@ class Switch:
         with self.lock:
             if self._groups.pop(group, None) is not None:
                 self._machine.set_multicast_group(group, None)
-
-    def multicast_groups(self) -> dict[int, tuple[Replica, ...]]:
-        """group -> replicas."""
-        with self.lock:
-            return dict(self._groups)
 
     def statistics(self) -> dict[str, int]:
         """Counts since the start: frames, parser_errors (one per pass), dropped (frames that made neither

@@ -1,7 +1,6 @@
 """Fixtures of the contract suite: every target that this machine has, and controllers for it."""
 
 import itertools
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,25 +8,25 @@ import grpc
 import pytest
 
 from dataplane.bmv2 import PROGRAM
+from dataplane.compiler.c_machine import CMachine
 from p4rt import p4runtime
 from sdnator.testing.p4runtime_client import EntryBuilder, P4RuntimeClient, program_config
 from tests.contract.targets import Bmv2Target, EmbeddedTarget, Target
+from tests.naive.p4.python_machine import PythonMachine
 from tests.requirements import optional_program
 
 PROGRAMS = Path(__file__).resolve().parents[1] / "dataplane" / "programs"
 _ids = itertools.count(10, 10)
 
 
-@pytest.fixture(scope="module", params=["embedded-python", "embedded-c", "bmv2"])
+@pytest.fixture(scope="module", params=["embedded", "oracle", "bmv2"])
 def target(request: pytest.FixtureRequest) -> Iterator[Target]:
     made: Target
     if request.param == "bmv2":
         optional_program(PROGRAM)
         made = Bmv2Target()
     else:
-        if request.param == "embedded-c" and shutil.which("gcc") is None and shutil.which("cc") is None:
-            pytest.skip("no C compiler")
-        made = EmbeddedTarget("c" if request.param == "embedded-c" else "python")
+        made = EmbeddedTarget(CMachine if request.param == "embedded" else PythonMachine)
     yield made
     made.close()
 

@@ -24,9 +24,9 @@ DIFFERENCES = {
     ),
     "device-ids": Difference("a stream for any device id is accepted", "NOT_FOUND", _SPECIFIED),
     "empty-program": Difference(
-        "JSON that is no program, and a p4info that does not fit, are accepted",
+        "JSON that is not a program, and a p4info that does not match, are accepted",
         "both are refused with INVALID_ARGUMENT",
-        "what is wrong is said where it is wrong, not in a later write",
+        "an error is reported where it is made, not at a later write",
     ),
     "metadata-limit": Difference(
         "the details of batches with more than about 80 failures are lost",
@@ -46,7 +46,7 @@ DIFFERENCES = {
     "atomicity": Difference(
         "CONTINUE_ON_ERROR only",
         "also ROLLBACK_ON_ERROR and DATAPLANE_ATOMIC",
-        "half a batch is nobody's wish",
+        "nobody wants half a batch",
     ),
     "cell-index": Difference(
         "array indices out of range have codes of their own",
@@ -63,13 +63,13 @@ DIFFERENCES = {
         "a packet-out that lacks a field is sent with 0 in its place", "it is refused", _SPECIFIED
     ),
     "digest-lists": Difference(
-        "two layers of buffers: samples from before the configuration may arrive, lists may wait; equal samples "
+        "two layers of buffers: samples from before the configuration may arrive, lists may be delayed; equal samples "
         "may be suppressed at any time",
-        "lists by size and time-out; a sample equal to one that waits, or is not acknowledged, is left out",
+        "lists by size and time-out; a sample equal to one that is waiting, or not acknowledged, is left out",
         _SPECIFIED,
     ),
     "save-and-reconcile": Difference(
-        "RECONCILE_AND_COMMIT keeps no entries, COMMIT swaps late", "both do what they say", _SPECIFIED
+        "RECONCILE_AND_COMMIT keeps no entries, COMMIT swaps late", "both do what their names say", _SPECIFIED
     ),
     "clocks": Difference(
         "meters, idle time-outs and time stamps run on the wall clock",

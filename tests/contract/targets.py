@@ -10,8 +10,8 @@ import grpc
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from dataplane.bmv2 import Bmv2
+from dataplane.compiler.machine import MachineMaker
 from dataplane.p4runtime.trust import AnyProgram
-from dataplane.v1model.switch import Backend
 from sdnator.testing.switch_double import SwitchDouble
 
 _WAIT_S = 60.0
@@ -34,9 +34,9 @@ class Target(Protocol):
 class EmbeddedTarget:
     """The product's own switch, in this process."""
 
-    def __init__(self, backend: Backend) -> None:
-        self.name = f"embedded-{backend}"
-        self._switch = SwitchDouble(programs=AnyProgram(), backend=backend)
+    def __init__(self, maker: MachineMaker) -> None:
+        self.name = "embedded"
+        self._switch = SwitchDouble(programs=AnyProgram(), maker=maker)
         self.address = self._switch.address
 
     def inject(self, port: int, *frames: bytes) -> None:

@@ -385,12 +385,11 @@ def _meter(names, index, *config):
 
 def test_meters_colour_packets(target, controller, names):
     forward(names, controller)
-    controller.write(modify(_meter(names, 2, 1, 1, 1, 2)))
-    assert controller.read(_meter(names, 2)) == [_meter(names, 2, 1, 1, 1, 2)]
+    bursts = _meter(names, 2, 0, 1, 0, 2)  # no rates: BMv2's clock is the wall's, and frames may come late
+    controller.write(modify(bursts))
+    assert controller.read(_meter(names, 2)) == [bursts]
     target.inject(1, *[frame(5, a=2)] * 4)
-    colours = [sent[16] for sent in target.sent(2, 4)]
-    assert colours[0] == 0
-    assert colours[-1] == 2
+    assert [sent[16] for sent in target.sent(2, 4)] == [0, 1, 2, 2]
     controller.write(modify(_meter(names, 2)))
     target.inject(1, *[frame(5, a=2)] * 4)
     assert [sent[16] for sent in target.sent(2, 4)] == [0] * 4

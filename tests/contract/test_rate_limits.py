@@ -89,8 +89,9 @@ def test_meters_are_read_back_and_changed(target, limited):
     asked.table_entry.meter_config.SetInParent()
     (found,) = controller.read(asked)
     assert found.table_entry.meter_config == limit.table_entry.meter_config
-    target.inject(1, *[frame(number) for number in range(6)])
-    assert len(target.sent(2, 5)) == 5
+    answers, last = [frame(number) for number in range(6)], frame(30, port=123)
+    target.inject(1, *answers, last)
+    assert target.sent(2, 6) == [*answers[:5], last]  # the sixth is dropped before the meter is changed
     direct = p4runtime.Entity()
     direct.direct_meter_entry.table_entry.CopyFrom(limit.table_entry)
     direct.direct_meter_entry.table_entry.ClearField("action")

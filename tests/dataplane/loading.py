@@ -3,13 +3,16 @@
 from functools import cache
 from pathlib import Path
 
+from dataplane.compiler.c_machine import CMachine
+from dataplane.compiler.machine import MachineMaker
 from dataplane.v1model.program import load
-from dataplane.v1model.switch import Backend
 from dataplane.v1model.tree import Program
+from tests.naive.p4.python_machine import PythonMachine
 from tests.requirements import shared_data
 
 _HERE = Path(__file__).resolve().parent
-BACKENDS: tuple[Backend, ...] = ("python", "c")
+MAKERS: tuple[MachineMaker, ...] = (PythonMachine, CMachine)
+"""The compiler, and the oracle of the tests."""
 
 
 @cache

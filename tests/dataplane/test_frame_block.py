@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from dataplane.frame_block import FrameBlock
 from dataplane.v1model.switch import Switch
 from sdnator.testing.switch_traffic import Chooser, feature_frame
-from tests.dataplane.loading import BACKENDS, features
+from tests.dataplane.loading import MAKERS, features
 from tests.dataplane.test_twins import fill
 
 FRAMES = st.lists(st.tuples(st.integers(0, 1 << 48), st.binary(max_size=60), st.integers(0, 20)), max_size=20)
@@ -32,10 +32,10 @@ def test_parts_and_padding(given_frames, first, end):
     assert list(block.frames()) == [data for _, data, _ in given_frames]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_block_leads_to_what_its_frames_lead_to(backend):
+@pytest.mark.parametrize("maker", MAKERS)
+def test_a_block_leads_to_what_its_frames_lead_to(maker):
     """Random entries and frames, one of them longer than any that is processed."""
-    switches = [Switch(features(), backend=backend) for _ in range(2)]
+    switches = [Switch(features(), maker=maker) for _ in range(2)]
     fill(Chooser(3), switches)
     data = [*(feature_frame(Random(seed)) for seed in range(60)), bytes(70_000), b""]
     block = FrameBlock.of(range(len(data)), [len(each) for each in data], data)

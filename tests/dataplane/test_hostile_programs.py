@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataplane.compiler import c_code, layout, python_code
+from dataplane.compiler import c_code, layout
 from dataplane.errors import DataplaneError, ProgramError, Unsupported
 from dataplane.v1model import bmv2_json
 from dataplane.v1model.program import load
+from tests.naive.p4 import python_code
 
 HERE = Path(__file__).resolve().parent
 SMALL = (HERE / "programs" / "features.json").read_text()

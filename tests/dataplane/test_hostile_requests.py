@@ -19,18 +19,16 @@ from sdnator.testing.p4runtime_client import (
     program_config,
 )
 from sdnator.testing.switch_entities import every_entity
-from tests.requirements import require_program
+from tests.dataplane.loading import MAKERS
 
 PROGRAM = Path(__file__).parent / "programs" / "features"
 TRIES = 1500
 
 
-@pytest.fixture(params=["python", "c"])
+@pytest.fixture(params=MAKERS)
 def controlled(request):
     """A device, and the stream of its primary controller."""
-    if request.param == "c":
-        require_program("gcc")
-    made: Any = Device(1, backend=request.param, clock=lambda: 0, programs=AnyProgram())
+    made: Any = Device(1, maker=request.param, clock=lambda: 0, programs=AnyProgram())
     update = p4runtime.MasterArbitrationUpdate(device_id=1)
     update.election_id.low = 1
     stream = made.open_stream()

@@ -17,7 +17,7 @@ from dataplane.ports.capture_port import CaptureFeed
 from dataplane.ports.pcap_port import PcapReader, PcapWriter
 from p4rt import P4RuntimeStub, p4runtime
 from sdnator.testing.p4runtime_client import TIMEOUT_S, EntryBuilder, P4RuntimeClient, insert, program_config
-from tests.requirements import require_program
+from tests.requirements import require_program, require_root
 
 PROGRAM = Path(__file__).parent / "programs" / "features"
 
@@ -45,6 +45,14 @@ def ended(process, number=signal.SIGTERM):
     process.send_signal(number)
     out, err = process.communicate(timeout=TIMEOUT_S)
     return process.returncode, out, err
+
+
+def test_live_ports_have_precedence_over_other_programs():
+    require_root()
+    process = start("--port", "1=null")
+    assert json.loads(process.stdout.readline())["ready"]
+    assert os.getpriority(os.PRIO_PROCESS, process.pid) < os.getpriority(os.PRIO_PROCESS, 0)
+    assert ended(process)[0] == 0
 
 
 def test_it_serves_and_ends_with_its_counts(tmp_path):
@@ -130,7 +138,7 @@ def test_a_folder_that_others_can_write_is_refused(tmp_path):
     folder.chmod(0o777)
     process = start("--grpc", f"unix:{folder}/s.sock")
     _, err = process.communicate(timeout=TIMEOUT_S)
-    assert (process.returncode, "others could exchange sockets" in err) == (2, True)
+    assert (process.returncode, "others could replace sockets" in err) == (2, True)
 
 
 def test_roles_are_those_that_were_configured():

@@ -6,11 +6,11 @@ import pytest
 
 from dataplane.v1model.externs import CounterValue
 from dataplane.v1model.switch import Switch
-from tests.dataplane.loading import BACKENDS, sdnator
+from tests.dataplane.loading import MAKERS, sdnator
 from tests.p4.sdnator_switch import made
 
 
-@pytest.fixture(scope="session", params=BACKENDS)
+@pytest.fixture(scope="session", params=MAKERS)
 def standing_switch(request) -> Iterator[Switch]:
     made_switch = made(sdnator(), request.param)
     yield made_switch

@@ -1,6 +1,7 @@
 """p4/sdnator.p4 on the embedded switch, and frames for it."""
 
-from dataplane.v1model.switch import Backend, Replica, Switch
+from dataplane.compiler.machine import MachineMaker
+from dataplane.v1model.switch import Replica, Switch
 from dataplane.v1model.tables import TableEntry
 from dataplane.v1model.tree import Program
 
@@ -10,9 +11,9 @@ PACKET_IN_BYTES = 52
 _DIGEST = ("mac", "port", "timestamp", "vid")
 
 
-def made(program: Program, backend: Backend) -> Switch:
+def made(program: Program, maker: MachineMaker) -> Switch:
     """Ports 1 to 3; group 1 floods all of them, group 2 (for VLAN 10) the first two; copies go to the CPU."""
-    switch = Switch(program, cpu_port=CPU, backend=backend)
+    switch = Switch(program, cpu_port=CPU, maker=maker)
     switch.set_ports([1, 2, 3])
     switch.set_clone_session(1, [Replica(CPU, 1)])
     switch.set_multicast_group(FLOOD, [Replica(port, port) for port in (1, 2, 3)])

@@ -13,7 +13,7 @@ from dataplane.v1model.switch import Switch
 from dataplane.v1model.tables import TableError
 from sdnator.testing import counting_traffic, hostile_traffic
 from sdnator.testing.switch_traffic import Chooser, network_frame
-from tests.dataplane.loading import BACKENDS, sdnator
+from tests.dataplane.loading import MAKERS, sdnator
 from tests.p4.counting_switch import (
     ADDS,
     ask,
@@ -33,7 +33,7 @@ _MAX_ENTRIES = 6
 _RECIPROCALS = (0, 1 << 32, (1 << 64) - 1, *map(hostile_traffic.reciprocal, (10, 1_000, 3_600_000_000)))
 
 
-@pytest.fixture(scope="module", params=BACKENDS)
+@pytest.fixture(scope="module", params=MAKERS)
 def scribbled(request: pytest.FixtureRequest) -> Iterator[Switch]:
     """A switch of its own: hypothesis runs many cases on one, and leaves registers as it likes."""
     made_switch = made(sdnator(), request.param)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.dataplane.loading import BACKENDS, sdnator
+from tests.dataplane.loading import MAKERS, sdnator
 from tests.p4.counting_switch import (
     ADDS,
     ANSWERS,
@@ -38,7 +38,7 @@ EVENTS = st.tuples(
 """Port, host, µs since the event before, bytes that its frame is longer."""
 
 
-@pytest.fixture(scope="module", params=BACKENDS)
+@pytest.fixture(scope="module", params=MAKERS)
 def twin(request):
     """A switch of its own: hypothesis runs many cases on one."""
     switch = made(sdnator(), request.param)

@@ -19,7 +19,7 @@ from tests.dataplane.compiler.expressions import (
     program,
     random_expression,
 )
-from tests.dataplane.loading import BACKENDS
+from tests.dataplane.loading import MAKERS
 from tests.naive.expressions import evaluate, stored
 
 _EXPRESSIONS = 60
@@ -69,13 +69,13 @@ def test_both_languages_compute_what_the_evaluator_does(seed):
             chosen.append((size, e))
     fields = layout([size for size, _ in chosen], "r")
     targets = [(f, chosen[i][1] if i < len(chosen) else None) for i, f in enumerate(fields)]
-    switches = [Switch(program(targets), backend=backend) for backend in BACKENDS]
+    switches = [Switch(program(targets), maker=maker) for maker in MAKERS]
     for _ in range(_INPUTS):
         values = random_values(random)
         expected = {f.name: stored(evaluate(e, values), f) for f, e in targets if e is not None}
-        for switch in switches:
+        for maker, switch in zip(MAKERS, switches, strict=True):
             result = switch.process(1, pack(INPUTS, values), 0)
-            assert result.outputs == [(1, pack(fields, expected))], switch.backend
+            assert result.outputs == [(1, pack(fields, expected))], maker
     for switch in switches:
         switch.close()
 

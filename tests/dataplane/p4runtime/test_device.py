@@ -10,7 +10,7 @@ from dataplane.ports.port import MemoryPort
 from dataplane.v1model.switch import FrameResult
 from sdnator.testing.p4runtime_client import TIMEOUT_S, EntryBuilder, P4RuntimeClient, insert, program_config
 from sdnator.testing.switch_double import SwitchDouble
-from tests.requirements import require_program
+from tests.dataplane.loading import MAKERS
 
 PUNT = 15
 PROGRAM = Path(__file__).parents[1] / "programs" / "features"
@@ -183,14 +183,12 @@ def test_time_comes_with_the_frames(lossless):
         assert told.table_entry[0].idle_timeout_ns == 60 * 10**9
 
 
-@pytest.mark.parametrize("backend", ["python", "c"])
-def test_an_entry_s_age_begins_when_it_is_written(backend):
+@pytest.mark.parametrize("maker", MAKERS)
+def test_an_entry_s_age_begins_when_it_is_written(maker):
     """Also on a pipeline that has not seen a frame yet, in the middle of a capture."""
     port = MemoryPort(lossless=True)
-    if backend == "c":
-        require_program("gcc")
     with (
-        SwitchDouble(programs=AnyProgram(), ports={1: port}, driven=True, backend=backend) as switch,
+        SwitchDouble(programs=AnyProgram(), ports={1: port}, driven=True, maker=maker) as switch,
         primary(switch) as controller,
     ):
         config = program_config(PROGRAM)

@@ -9,7 +9,7 @@ from dataplane.p4runtime.pipeline_config import plan
 from dataplane.p4runtime.status import InvalidArgument
 from p4rt import p4runtime
 from sdnator.testing.p4runtime_client import program_config
-from tests.dataplane.loading import BACKENDS
+from tests.dataplane.loading import MAKERS
 
 _FEATURES = Path(__file__).resolve().parents[1] / "programs" / "features"
 
@@ -22,12 +22,12 @@ def reconcile(config):
     return request
 
 
-@pytest.fixture(params=BACKENDS)
+@pytest.fixture(params=MAKERS)
 def make(request):
     made = []
 
     def new(config):
-        made.append(ForwardingPipeline(verify(config), cpu_port=510, backend=request.param, clock=lambda: 0))
+        made.append(ForwardingPipeline(verify(config), cpu_port=510, maker=request.param, clock=lambda: 0))
         return made[-1]
 
     yield new

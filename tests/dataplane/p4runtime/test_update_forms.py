@@ -12,6 +12,7 @@ from dataplane.p4runtime.update_forms import UpdateForms
 from dataplane.p4runtime.writes import Writer
 from p4rt import p4runtime
 from sdnator.testing.p4runtime_client import EntryBuilder, program_config
+from tests.naive.p4.python_machine import PythonMachine
 
 PROGRAM = Path(__file__).parents[3] / "p4" / "sdnator"
 CONFIG = program_config(PROGRAM)
@@ -29,7 +30,7 @@ class Unlearned(UpdateForms):
 
 
 def pipeline(forms):
-    made = ForwardingPipeline(VERIFIED, cpu_port=510, backend="python", clock=lambda: 0)
+    made = ForwardingPipeline(VERIFIED, cpu_port=510, maker=PythonMachine, clock=lambda: 0)
     made.tables._forms = forms
     return made
 

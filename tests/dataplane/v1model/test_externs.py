@@ -5,10 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataplane.errors import DataplaneError, InvalidIndex
-from dataplane.v1model.externs import GREEN, HASHES, RED, YELLOW, CounterValue, Meter, MeterConfig
+from dataplane.v1model.externs import HASHES, CounterValue, MeterConfig
 from dataplane.v1model.switch import Switch
 from sdnator.testing.switch_traffic import frame
-from tests.dataplane.loading import BACKENDS, features, fields
+from tests.dataplane.loading import MAKERS, features, fields
+from tests.naive.p4.meter import GREEN, RED, YELLOW, Meter
 
 _CHECK = b"123456789"
 
@@ -75,9 +76,9 @@ def test_meter_equals_a_bucket_filled_microsecond_by_microsecond(rate, burst, ga
         assert (meter.execute(1, now) == GREEN) == passes
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_arrays_read_what_was_written(backend):
-    switch = Switch(features(), backend=backend)
+@pytest.mark.parametrize("maker", MAKERS)
+def test_arrays_read_what_was_written(maker):
+    switch = Switch(features(), maker=maker)
     seen, rate, wide = switch.counters["I.seen"], switch.meters["I.rate"], switch.registers["I.wide_cells"]
     seen.write(3, CounterValue(5, 700))
     assert seen.read(3) == CounterValue(5, 700)
@@ -100,10 +101,10 @@ def test_arrays_read_what_was_written(backend):
     switch.close()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_accesses_beyond_an_array_are_counted_and_change_nothing(backend):
+@pytest.mark.parametrize("maker", MAKERS)
+def test_accesses_beyond_an_array_are_counted_and_change_nothing(maker):
     """features.p4: 21 reads and writes its arrays at d without a look at their sizes."""
-    switch = Switch(features(), backend=backend)
+    switch = Switch(features(), maker=maker)
     switch.registers["I.cells"].write(7, 5)
     assert switch.process(1, frame(21, d=3), 0).outputs
     assert switch.out_of_range() == {}

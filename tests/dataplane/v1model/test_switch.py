@@ -9,12 +9,12 @@ from dataplane.v1model.externs import MeterConfig, crc16, csum16
 from dataplane.v1model.switch import Digest, Replica, Switch
 from dataplane.v1model.tables import Exact, Lpm, Range, TableEntry, Ternary
 from sdnator.testing.switch_traffic import ethernet, frame
-from tests.dataplane.loading import BACKENDS, features, fields, shared
+from tests.dataplane.loading import MAKERS, features, fields, shared
 
 
-@pytest.fixture(params=BACKENDS)
+@pytest.fixture(params=MAKERS)
 def switch(request):
-    made = Switch(features(), backend=request.param)
+    made = Switch(features(), maker=request.param)
     made.tables["I.ports"].insert(TableEntry((Exact(1),), "I.forward", (2,)))
     yield made
     made.close()
@@ -344,9 +344,9 @@ def test_oversized_frames_are_counted(switch):
     assert switch.statistics()["oversized"] == 1
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_small_program_punts_clones_and_learns(backend):
-    switch = Switch(shared("small"), backend=backend)
+@pytest.mark.parametrize("maker", MAKERS)
+def test_small_program_punts_clones_and_learns(maker):
+    switch = Switch(shared("small"), maker=maker)
     acl = switch.tables["I.acl"]
     data = ethernet(0x0800, ipv4()[14:] + b"\0\x50\0\x51" + b"\0" * 16)
     any_ = Ternary(0, 0)

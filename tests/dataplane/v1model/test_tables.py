@@ -24,13 +24,13 @@ from dataplane.v1model.tables import (
     Ternary,
 )
 from sdnator.testing.switch_traffic import frame
-from tests.dataplane.loading import BACKENDS, features, fields
+from tests.dataplane.loading import MAKERS, features, fields
 from tests.naive.matching import Naive
 
 
-@pytest.fixture(params=BACKENDS)
+@pytest.fixture(params=MAKERS)
 def switch(request):
-    made = Switch(features(), backend=request.param)
+    made = Switch(features(), maker=request.param)
     yield made
     made.close()
 
@@ -175,10 +175,10 @@ keys = st.one_of(
     removed=st.sets(st.integers(0, 29), max_size=15),
     asked=st.lists(st.tuples(st.integers(0, 40), st.integers(0, 15), st.integers(0, 2)), max_size=20),
 )
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_lookup_equals_a_list_read_from_the_top(backend, entries, removed, asked):
+@pytest.mark.parametrize("maker", MAKERS)
+def test_lookup_equals_a_list_read_from_the_top(maker, entries, removed, asked):
     """Tuple-space search against the obvious: every entry tried, best priority first, then the oldest slot."""
-    switch = Switch(features(), backend=backend)
+    switch = Switch(features(), maker=maker)
     switch.tables["I.ports"].set_default("I.forward", (2,))
     table, naive = switch.tables["I.flows"], Naive()
     known: list[tuple[Match, int]] = []
@@ -201,9 +201,9 @@ def test_lookup_equals_a_list_read_from_the_top(backend, entries, removed, asked
     switch.close()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_many_entries_stay_findable_through_growth_and_removal(backend):
-    switch = Switch(features(), backend=backend)
+@pytest.mark.parametrize("maker", MAKERS)
+def test_many_entries_stay_findable_through_growth_and_removal(maker):
+    switch = Switch(features(), maker=maker)
     route = switch.tables["I.route"]
     for n in range(64):
         route.insert(TableEntry((Lpm(n << 8, 24),), "I.counted", (n,)))
@@ -216,12 +216,12 @@ def test_many_entries_stay_findable_through_growth_and_removal(backend):
     switch.close()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_hundreds_of_masks_find_what_a_list_finds(backend):
+@pytest.mark.parametrize("maker", MAKERS)
+def test_hundreds_of_masks_find_what_a_list_finds(maker):
     """More groups than a word of the sieve has bits, while entries come and go."""
     program = features()
     wide = replace(program.tables["I.flows"], size=512)
-    switch = Switch(replace(program, tables={**program.tables, "I.flows": wide}), backend=backend)
+    switch = Switch(replace(program, tables={**program.tables, "I.flows": wide}), maker=maker)
     switch.tables["I.ports"].set_default("I.forward", (2,))
     table, naive, random = switch.tables["I.flows"], Naive(), Random(4)
     known: list[TableEntry] = []

@@ -127,7 +127,9 @@ def _run(command: Sequence[str], text: str, folder: Path, environment: Mapping[s
         try:
             _, said = process.communicate(text, TIMEOUT_S)
         except subprocess.TimeoutExpired as error:
-            raise CompilerError(f"the compiler was not done within {TIMEOUT_S} s and was ended") from error
+            raise CompilerError(
+                f"the compiler did not finish within {TIMEOUT_S} s and was stopped"
+            ) from error
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -168,5 +170,5 @@ def _library(path: Path, user: int) -> bytes:
     except OSError as error:
         raise CompilerError(f"the compiler left no {path.name}: {error.strerror}") from error
     if len(data) > LIBRARY_BYTES or not data.startswith((_ELF, *_MACHO)):
-        raise CompilerError("the compiler made something that is no library")
+        raise CompilerError("the compiler produced something that is not a library")
     return data

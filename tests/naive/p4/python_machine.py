@@ -16,16 +16,16 @@ from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
 from dataplane.compiler import samples
 from dataplane.compiler.machine import BatchResult, Replicas
-from dataplane.compiler.python_code import generate
-from dataplane.compiler.python_statements import NO_TRUNCATION, Slots
-from dataplane.compiler.python_tables import (
+from dataplane.v1model import externs
+from dataplane.v1model.tree import Program
+from tests.naive.p4.python_code import generate
+from tests.naive.p4.python_statements import NO_TRUNCATION, Slots
+from tests.naive.p4.python_tables import (
     PythonCounters,
     PythonMeters,
     PythonRegisters,
     PythonTable,
 )
-from dataplane.v1model import externs
-from dataplane.v1model.tree import Program
 
 _Packet = list[Any]
 
@@ -61,8 +61,6 @@ def _names() -> dict[str, Any]:
 
 class PythonMachine:
     """See machine.Machine."""
-
-    backend = "python"
 
     def __init__(self, program: Program, cpu_port: int) -> None:
         self.program = program

@@ -12,10 +12,10 @@ gets into the text.
 
 from dataplane.compiler.control import state_order
 from dataplane.compiler.layout import Layout
-from dataplane.compiler.python_statements import PythonStatements, Slots
 from dataplane.errors import Unsupported
 from dataplane.v1model import tree
 from dataplane.v1model.tree import Expression, FieldRef, Program
+from tests.naive.p4.python_statements import PythonStatements, Slots
 
 _MAX_STATES = 4096
 
@@ -232,6 +232,6 @@ class PythonGenerator(PythonStatements):
 def generate(program: Program, layout: Layout) -> tuple[str, Slots]:
     """The module's text and where the packet's parts are in its list."""
     if not all(h.type.width % 8 == 0 for h in program.headers.values() if not h.metadata):
-        raise Unsupported("a header that is no whole number of bytes")
+        raise Unsupported("a header that is not a whole number of bytes")
     generator = PythonGenerator(program, layout)
     return generator.module(), generator.slots

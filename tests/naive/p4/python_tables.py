@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from operator import attrgetter
 
 from dataplane.compiler.machine import KeyPlace, RangePart, Rule
-from dataplane.v1model.externs import Meter
 from dataplane.v1model.tree import ArraySpec, TableSpec
+from tests.naive.p4.meter import Meter
 
 _Rates = tuple[int, int, int, int]
 
