@@ -6,7 +6,7 @@
     enforcer ──EnforcementReport─────► firewall, page    network.enforced.<enforcer>.<place>
 
 An enforcer adds and removes blocks, lists what really stands (read back, not remembered), confirms each decision
-under its id, and ends a block at its end even if nobody tells it to.  A *place* is where it does so: a switch, a host.
+under its id, and ends a block when it expires even without being told.  A *place* is where it does so: a switch, a host.
 The P4Runtime controller speaks the same contract; its report is the state of the switch
 (`network.switch.p4runtime_ctrl.<switch>`), and a block there ends by the firewall's word.
 """
@@ -37,7 +37,7 @@ class AllowedEntries(Message, frozen=True, kw_only=True):
 
 
 class HeldBlock(Message, frozen=True, kw_only=True):
-    """A block that stands, as read back."""
+    """A block in force, as read back."""
 
     id: Name
     """The decision's."""
@@ -48,13 +48,13 @@ class HeldBlock(Message, frozen=True, kw_only=True):
 
 
 class EnforcementReport(Message, frozen=True, kw_only=True):
-    """`network.enforced.<enforcer>.<place>`: what stands there; written when it changes, and every ten seconds."""
+    """`network.enforced.<enforcer>.<place>`: what is in force there; written when it changes, and every ten seconds."""
 
     enforcer: Name
     place: Name
     working: bool
     problem: Text = ""
-    """Why it does not work, or what was found and put right; empty: nothing."""
+    """Why it does not work, or what was found and repaired; empty: nothing."""
     blocks: Annotated[tuple[HeldBlock, ...], Meta(max_length=MOST_HELD)] = ()
     waiting: Number = 0
     """Decisions that are not carried out yet."""

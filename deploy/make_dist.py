@@ -9,6 +9,7 @@ Wheels are built from the sdist, so that a file which the sdist lacks is noticed
 
 import argparse
 import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -20,6 +21,8 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
+
+from sdnator import __version__
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 KERNEL: Final = "apps/kitsune/_kernel.so"
@@ -88,6 +91,16 @@ def empty_environment(base: Path, wheel: Path) -> Path:
     return base / "bin"
 
 
+def bill_of(python: Path, bill: Path) -> None:
+    """Write what an environment holds as CycloneDX; the release is its main component, with its version."""
+    described = (python, "--pyproject", ROOT / "pyproject.toml", "--output-file", bill)
+    run(sys.executable, "-m", "cyclonedx_py", "environment", *described)
+    told = json.loads(bill.read_text(encoding="utf-8"))
+    # the project's file has no version: it stands in the code
+    told["metadata"]["component"]["version"] = __version__
+    bill.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+
+
 def check_sums(files: Sequence[Path], out: Path) -> None:
     """Write SHA256SUMS in the form that `sha256sum --check` reads."""
     lines = (f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}\n" for file in sorted(files))
@@ -110,7 +123,7 @@ def make(out: Path, *, demo: bool) -> None:
             wheel_for("aarch64", sdist, out)
         scripts = empty_environment(base / "environment", here)
         bill = out / f"{sdist.name.removesuffix('.tar.gz')}.cdx.json"
-        run(sys.executable, "-m", "cyclonedx_py", "environment", scripts / "python", "--output-file", bill)
+        bill_of(scripts / "python", bill)
         run(scripts / "sdnator", "--version", folder=base)
         if demo:
             run(scripts / "sdnator", "demo", folder=base)

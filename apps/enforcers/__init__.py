@@ -1,6 +1,6 @@
 """Enforcers beside the switches, each an app of its own, and what they share.
 
-decisions ──► EnforcerDesk (one worker thread) ──► Enforcer: nftables, a webhook, …
-                   │  WishList: what shall stand, and until when (pure)
+decisions ──► EnforcementWorker (one worker thread) ──► Enforcer: nftables, a webhook, …
+                   │  DesiredBlocks: what shall stand, and until when (pure)
                    └─► confirmations, reports
 """

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from apps.enforcement import AllowedEntries
-from apps.enforcers.wishes import AllowedSenders
+from apps.enforcers.desired_blocks import AllowedSenders
 from apps.messages import Decision, Intake, MessageError, sender_of
 from apps.standing_decisions import STANDING
 from due import Item

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from apps.enforcers.wishes import Wish
+from apps.enforcers.desired_blocks import DesiredBlock
 
 
 class EnforcerAway(Exception):
@@ -22,7 +22,7 @@ class HeldCount:
 class Enforcer(Protocol):
     """Adds, removes, lists back; called from one thread.  Every method raises `EnforcerAway` only."""
 
-    def change(self, add: Sequence[Wish], remove: Sequence[Wish]) -> Mapping[str, str]:
+    def change(self, add: Sequence[DesiredBlock], remove: Sequence[DesiredBlock]) -> Mapping[str, str]:
         """Add and remove blocks; adding what stands changes its end.
 
         Args:
@@ -38,10 +38,10 @@ class Enforcer(Protocol):
         """Senders that no block may touch, whatever else stands: the whole list, in force with the next `change`."""
         ...
 
-    def held(self, wishes: Sequence[Wish]) -> Mapping[str, HeldCount]:
+    def held(self, desired: Sequence[DesiredBlock]) -> Mapping[str, HeldCount]:
         """Read back which of these stand; what else stands is removed."""
         ...
 
-    def end(self, wishes: Sequence[Wish]) -> None:
+    def end(self, desired: Sequence[DesiredBlock]) -> None:
         """The app ends; what stands is left or removed, as the settings say."""
         ...

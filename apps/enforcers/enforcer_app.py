@@ -11,7 +11,7 @@ from typing import Any, Final
 import due
 from apps.enforcement import ALLOWED, CONFIRMED, ENFORCED, EnforcementReport
 from apps.enforcers.arrivals import DECISIONS, allowed_in, decision_in, last_of_each
-from apps.enforcers.desk import EnforcerDesk, Spoken
+from apps.enforcers.enforcement_worker import EnforcementWorker, Spoken
 from apps.enforcers.enforcer import Enforcer
 from apps.messages import LONGEST_BLOCK_S, Confirmation, Decision, Intake, one_line, youngest
 from due import Capability, DueError, Engine, Interest, Item
@@ -43,14 +43,14 @@ def place_name(given: str) -> str:
 
 
 class EnforcerApp:
-    """Between DUE and an `EnforcerDesk`.
+    """Between DUE and an `EnforcementWorker`.
 
     Args:
         engine: initialised.
         app: the app's id.
         place: where it enforces, a segment of keys.
         enforcer: what does it.
-        options: further arguments of `EnforcerDesk`.
+        options: further arguments of `EnforcementWorker`.
     """
 
     def __init__(self, engine: Engine, app: str, place: str, enforcer: Enforcer, **options: Any) -> None:
@@ -58,7 +58,7 @@ class EnforcerApp:
         self._app = app
         self._place = place
         self._intake = Intake(log)
-        self._desk = EnforcerDesk(enforcer, (app, place), self._confirm, self._report, **options)
+        self._desk = EnforcementWorker(enforcer, (app, place), self._confirm, self._report, **options)
         self._looked_at = time.monotonic()
         self._lifted_since = time.time_ns()
         self._archive_away = 0

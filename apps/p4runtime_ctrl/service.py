@@ -58,7 +58,9 @@ CAPABILITIES = (
 _OFFERS: Final = "network.telemetry.*.*"
 _DATA: Final = tuple(key_of(kind, "*", "*") for kind in KINDS)
 _LOG = logging.getLogger(__name__)
-_START_S: Final = 10.0
+_START_S: Final = 30.0
+"""For the first connections. A switch that has to compile its program takes long on a busy machine, and `up` says
+afterwards that the pipeline runs."""
 _OFFERS_READ: Final = 10_000
 """Most archived packet requests restored at a start."""
 _LOOK_EVERY_S: Final = 0.25
@@ -86,7 +88,7 @@ class P4RuntimeCtrlService:
         self._looked_at = 0.0
 
     def start(self) -> None:
-        """Returns when every switch is connected, or its first connection attempt has failed."""
+        """Returns when every switch is connected, or its first connection attempt has failed; a standby does not wait."""
         while self._engine.health()["phase"] == "waiting":
             time.sleep(0.01)
         self._active = bool(self._engine.health()["active"])
@@ -108,7 +110,15 @@ class P4RuntimeCtrlService:
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
-            agent.settled.wait(max(0.0, deadline - time.monotonic()))
+            if self._active:
+                agent.wait_settled(deadline)
+
+    def ready(self) -> dict[str, str]:
+        """For the ready line: switches that are not under control, and why."""
+        if not self._active:
+            return {}
+        away = [f"{name}: {agent.problem}" for name, agent in self._agents.items() if agent.problem]
+        return {"uncontrolled": "; ".join(away)} if away else {}
 
     def _agent(self, mine: SwitchSettings, pipeline: CompiledProgram) -> SwitchWorker:
         settings = self._settings

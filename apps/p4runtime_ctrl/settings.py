@@ -50,7 +50,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Source of the packets' record batches: copied frames, or digests with the header fields; auto: digests of
     embedded switches, which send them in lists, and copied frames of others."""
     batch: int = 1024
-    """Most packets in one record batch."""
+    """Maximum number of packets in one record batch."""
     linger_ms: float = 2.0
     """How long the first packet of a batch waits for others."""
     rank: int = 1
@@ -60,16 +60,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     cpu_port: int = 510
     """Number of the switch's port to the controller."""
     tls_ca: str = ""
-    """CA certificate that signed the switches' certificates, a file; TLS is used where the address is no Unix
-    socket and the switch not `insecure`."""
+    """CA certificate that signed the switches' certificates, a file; TLS is used unless the address is a Unix
+    socket or the switch is `insecure`."""
     tls_certificate: str = ""
-    """Controller's own certificate, a file; its name (CN) says its role to the embedded switch."""
+    """Controller's own certificate, a file; its name (CN) determines its role at the embedded switch."""
     tls_key: str = ""
     """Key of that certificate, a file."""
     timeout_s: float = 5.0
     """Seconds without an answer to a call after which the connection to a switch is closed and opened again."""
     counters_ms: int = 20
-    """Least wall time between two reads of the block counters."""
+    """Minimum wall time between two reads of the block counters."""
     restore: bool = True
     """Restore decisions and commands from Data Archives at the start."""
     restore_since: int = 0

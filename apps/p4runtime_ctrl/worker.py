@@ -27,6 +27,7 @@ from apps.p4runtime_ctrl.southbound.connection import Connection, Listener
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
 from apps.p4runtime_ctrl.southbound.session import P4RuntimeSession
+from apps.p4runtime_ctrl.state.decision_ends import DecisionEnds
 from apps.p4runtime_ctrl.state.desired_state import check_entry
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
@@ -39,6 +40,7 @@ from due import NO_WAIT, PUB_ONLY, Engine, Item, RecordBatch
 
 _LOG = logging.getLogger(__name__)
 _JOBS: Final = 10_000
+_LOOK_S: Final = 0.1
 _RESTORED: Final = 100_000
 """Most archived decisions of a kind, and commands, that are read at a start, the newest."""
 _ALIVE_S: Final = 1.0
@@ -60,6 +62,9 @@ _Job = Callable[[], None]
 
 class SwitchWorker:
     """Keeps one switch as desired, and publishes what it sends."""
+
+    problem: str = "no answer yet"
+    """Why the switch is not under control; empty: it is, or another controller controls it."""
 
     def __init__(
         self,
@@ -110,6 +115,7 @@ class SwitchWorker:
         self._recent: deque[Decision] = deque(maxlen=_JOBS)
         self._urgent: deque[Decision] = deque()
         """Decisions to carry out, before any other work."""
+        self._ends = DecisionEnds()
         self._clock = LiveClock(mine.clock, time.time_ns() // 1000 if mine.clock == "own" else 0)
         self._readings = Readings()
         self._publishing = threading.Lock()
@@ -170,7 +176,7 @@ class SwitchWorker:
         self._put(partial(self._send, frames))
 
     def clock_reached(self, event_time: int) -> None:
-        """The program that feeds a switch whose packets alone move its time says how far that is, ns."""
+        """The program that feeds a switch reports the capture time reached, ns; for switches whose time is moved by packets alone."""
         if self._mine.clock == "packets":
             self._put(partial(self._pass_time, event_time // 1000))
 
@@ -178,9 +184,22 @@ class SwitchWorker:
         """Publish the state again for a new consumer: it is best effort and published on change only."""
         self._put(self._write_state)
 
+    @property
+    def _works(self) -> bool:
+        return self._worker.is_alive() and self._connection.works
+
+    def wait_settled(self, deadline: float) -> None:
+        """Return when the first attempt to reach the switch has succeeded or failed, or a thread has died.
+
+        Args:
+            deadline: s, monotonic; return then at the latest.
+        """
+        while self._works and time.monotonic() < deadline and not self.settled.wait(_LOOK_S):
+            pass
+
     def tick(self) -> None:
         """Periodic work by wall clock: check that the switch answers, read counters, publish state changes."""
-        if not self._worker.is_alive() or not self._connection.works:
+        if not self._works:
             raise ControllerError(f"{self.name}: a thread has ended with an error; the log has the reason")
         now = time.monotonic()
         if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
@@ -189,11 +208,14 @@ class SwitchWorker:
         if now - self._counted_at > (_CALM_S if self._uncounted else 1):
             self._count_soon()
         self._settle(now)
+        ends_us = self._ends.next_us
         time_us = self._clock.look(
-            self._progress.time_us, self._progress.received + self._progress.reported, now
+            self._progress.time_us, self._progress.received + self._progress.reported, now, ends_us
         )
         if time_us is not None:
             self._put(partial(self._pass_time, time_us))
+        elif 0 < ends_us <= self._progress.time_us and self._mine.clock != "packets":
+            self._put(self._say_ends)
         if self._switch.guards and now - self._secret_at > self._settings.guard.rotate_s:
             self._secret_at = now
             self._put(self._change_secret)
@@ -301,7 +323,9 @@ class SwitchWorker:
         began = time.monotonic()
         try:
             report = self._switch.bring_up(session)
-        except SwitchError:
+            self.problem = ""
+        except SwitchError as error:
+            self.problem = str(error)
             self._connection.break_off()
             raise
         finally:
@@ -318,6 +342,7 @@ class SwitchWorker:
         self._connected = True
         self._was_backup = True
         self._session = None
+        self.problem = ""
         self.settled.set()
         self._say("backup: another controller is primary")
 
@@ -325,6 +350,7 @@ class SwitchWorker:
         if self._connected:
             _LOG.warning("%s: lost: %s", self.name, cause)
         self._connected = False
+        self.problem = cause
         self.settled.set()
         self._say(f"lost: {cause}")
 
@@ -335,6 +361,8 @@ class SwitchWorker:
     def _decide(self) -> None:
         decisions = [self._urgent.popleft() for _ in range(len(self._urgent))]
         if decisions:
+            for decision in decisions:
+                self._ends.add(decision)
             self._confirm(self._switch.decide(decisions, self._session))
             self._uncounted = True
             if time.monotonic() - self._counted_at > _CALM_S:
@@ -378,7 +406,13 @@ class SwitchWorker:
 
     def _pass_time(self, time_us: int) -> None:
         self._progress.time_us = max(self._progress.time_us, time_us)
+        self._ends.pass_until(self._progress.time_us)
         self._write_state()
+
+    def _say_ends(self) -> None:
+        """Decisions have ended: the firewall lifts them as soon as it hears the time."""
+        if self._ends.pass_until(self._progress.time_us):
+            self._write_state(PUB_ONLY)
 
     def _send_out(self, packets: Sequence[Any], what: str) -> None:
         """Best effort, like frames; what cannot be sent is counted."""
@@ -532,6 +566,8 @@ class SwitchWorker:
         decisions = decisions_for(self.name, items, list(self._recent), since, self._intake)
         decisions = [] if self._mine.mirror else decisions
         archived = self._archived(f"network.p4_command.*.{self.name}", since)
+        for decision in decisions:
+            self._ends.add(decision)
         for problem in self._switch.restore(decisions, commands_of(archived, since, self._intake)):
             _LOG.warning("%s: not restored: %s", self.name, one_line(problem))
 

@@ -15,7 +15,7 @@ _NO_RIGHT: Final = ("Operation not permitted", "must be root", "Permission denie
 _NOT_THERE: Final = ("No such file or directory", "does not exist")
 NEEDS_RIGHT: Final = (
     "nftables may not be changed: this process lacks CAP_NET_ADMIN; give it that one capability (systemd: "
-    "AmbientCapabilities=CAP_NET_ADMIN, docker: --cap-add NET_ADMIN), nothing else of root is needed"
+    "AmbientCapabilities=CAP_NET_ADMIN, docker: --cap-add NET_ADMIN), no other root privilege is needed"
 )
 
 
@@ -54,7 +54,7 @@ class NftProgram:
         try:
             found: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise EnforcerAway(f"nft listed {FAMILY} {name} as something that is no JSON: {error}") from None
+            raise EnforcerAway(f"nft listed {FAMILY} {name} as something other than JSON: {error}") from None
         return found
 
     def _run(self, arguments: Sequence[str], text: str) -> str:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal
 
+from apps.enforcers.desired_blocks import DesiredBlock
 from apps.enforcers.enforcer import EnforcerAway, HeldCount
 from apps.enforcers.nftables.nft_program import NftProgram, TransactionRefused
 from apps.enforcers.nftables.ruleset import (
@@ -16,7 +17,6 @@ from apps.enforcers.nftables.ruleset import (
     listing_in,
     outermost,
 )
-from apps.enforcers.wishes import Wish
 
 AtEnd = Literal["keep", "remove"]
 _NONE: Final = HeldCount()
@@ -37,24 +37,24 @@ class NftTable:
         self._plan = plan
         self._nft = program
         self._at_end: AtEnd = at_end
-        self._wishes: dict[str, Wish] = {}
+        self._desired: dict[str, DesiredBlock] = {}
         self._allowed: tuple[str, ...] = ()
         self._shape: str | None = None
         """As it was right after it was made; None: it is to be made."""
         self._before: dict[Element, HeldCount] = {}
         """What elements had counted before they were made anew."""
 
-    def change(self, add: Sequence[Wish], remove: Sequence[Wish]) -> Mapping[str, str]:
+    def change(self, add: Sequence[DesiredBlock], remove: Sequence[DesiredBlock]) -> Mapping[str, str]:
         """Add and remove in one transaction; nothing is refused for good."""
-        wanted = {**self._wishes, **{wish.id: wish for wish in add}}
-        for wish in remove:
-            wanted.pop(wish.id, None)
-        old, new = elements_of(self._wishes.values()), elements_of(wanted.values())
+        wanted = {**self._desired, **{desired_block.id: desired_block for desired_block in add}}
+        for desired_block in remove:
+            wanted.pop(desired_block.id, None)
+        old, new = elements_of(self._desired.values()), elements_of(wanted.values())
         if self._shape is None:
             self._make(new)
         else:
             self._differ(old, new)
-        self._wishes = wanted
+        self._desired = wanted
         self._before = {each: count for each, count in self._before.items() if each in new}
         return {}
 
@@ -63,29 +63,31 @@ class NftTable:
         self._allowed = tuple(entries)
         self._shape = None
 
-    def held(self, wishes: Sequence[Wish]) -> Mapping[str, HeldCount]:
+    def held(self, desired: Sequence[DesiredBlock]) -> Mapping[str, HeldCount]:
         """Read back.  Nothing stands in a table that lacks a rule: it is made anew with the next change."""
         listing = self._read()
         if listing is None or listing.shape != self._shape:
             if self._shape is not None:
-                log.error("table inet %s was changed by somebody else; it is made anew", self._plan.name)
-            self._shape, self._wishes = None, {}
-            if not wishes:
+                log.error("table inet %s was changed by somebody else; it is written again", self._plan.name)
+            self._shape, self._desired = None, {}
+            if not desired:
                 self._make({})
             return {}
-        wanted = elements_of(wishes)
+        wanted = elements_of(desired)
         standing = listing.elements
         held = {
-            wish.id: self._count(element, standing[element])
-            for wish in wishes
-            if (element := outermost(element_of(wish.target), wanted)) in standing
+            desired_block.id: self._count(element, standing[element])
+            for desired_block in desired
+            if (element := outermost(element_of(desired_block.target), wanted)) in standing
         }
-        self._wishes = {wish.id: wish for wish in wishes if wish.id in held}
+        self._desired = {
+            desired_block.id: desired_block for desired_block in desired if desired_block.id in held
+        }
         if foreign := [each for each in standing if each not in wanted]:
             self._remove_foreign(foreign)
         return held
 
-    def end(self, wishes: Sequence[Wish]) -> None:
+    def end(self, desired: Sequence[DesiredBlock]) -> None:
         """Leave the table, whose elements end by their time-outs, or remove it."""
         if self._at_end == "remove":
             try:
@@ -93,7 +95,7 @@ class NftTable:
             except TransactionRefused as error:
                 raise EnforcerAway(f"table inet {self._plan.name} stays: {error}") from None
         else:
-            log.info("table inet %s stays with %d blocks", self._plan.name, len(wishes))
+            log.info("table inet %s stays with %d blocks", self._plan.name, len(desired))
 
     def _count(self, element: Element, now: HeldCount) -> HeldCount:
         before = self._before.get(element, _NONE)
@@ -109,7 +111,7 @@ class NftTable:
         try:
             self._nft.apply(commands)
         except TransactionRefused as error:
-            log.warning("changed by somebody else? %s; the table is made anew", error)
+            log.warning("changed by somebody else? %s; the table is written again", error)
             self._make(new)
 
     def _make(self, elements: Mapping[Element, int]) -> None:
@@ -124,7 +126,9 @@ class NftTable:
         self._shape = made.shape if made is not None else None
 
     def _remove_foreign(self, elements: Sequence[Element]) -> None:
-        log.error("table inet %s: elements of somebody else are removed: %s", self._plan.name, elements[:10])
+        log.error(
+            "table inet %s: removed elements that somebody else added: %s", self._plan.name, elements[:10]
+        )
         try:
             self._nft.apply(self._plan.change({}, elements, {}, time.time_ns()))
         except TransactionRefused:

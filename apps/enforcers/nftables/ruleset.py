@@ -16,8 +16,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from apps.enforcers.desired_blocks import DesiredBlock
 from apps.enforcers.enforcer import HeldCount
-from apps.enforcers.wishes import Wish
 from apps.messages import Target
 
 Command = dict[str, Any]
@@ -154,17 +154,17 @@ def element_of(target: Target) -> Element:
     return name, str(network.network_address if alone else network)
 
 
-def elements_of(wishes: Iterable[Wish]) -> dict[Element, int]:
+def elements_of(desired: Iterable[DesiredBlock]) -> dict[Element, int]:
     """Elements that make all of these blocks stand, with their ends.
 
     Two decisions about one target are one element; of prefixes in each other the outermost stands, because
     intervals of a set must not overlap.
     """
     found: dict[Element, int] = {}
-    for wish in wishes:
-        element = element_of(wish.target)
+    for desired_block in desired:
+        element = element_of(desired_block.target)
         before = found.get(element, -1)
-        found[element] = 0 if 0 in (before, wish.until) else max(before, wish.until)
+        found[element] = 0 if 0 in (before, desired_block.until) else max(before, desired_block.until)
     inner = {element for element in found if outermost(element, found) != element}
     return {element: end for element, end in found.items() if element not in inner}
 
@@ -198,7 +198,7 @@ def listing_in(document: Mapping[str, Any]) -> TableListing:
     elements: dict[Element, HeldCount] = {}
     parts = document.get("nftables")
     if not isinstance(parts, list):
-        raise ValueError("no listing of nftables")  # noqa: TRY004 - as of other malformed ones
+        raise ValueError("not an nftables listing")  # noqa: TRY004 - as of other malformed ones
     for part in parts:
         for kind, one in part.items():
             if kind == "metainfo":

@@ -13,7 +13,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Options of the enforcer."""
 
     place: str = ""
-    """Name of this host in keys and on the page; empty: its host name."""
+    """Name of this host in keys and on the dashboard; empty: its host name."""
     table: str = "sdnator"
     """Name of the table, of family inet; it belongs to this app alone."""
     hooks: tuple[Literal["input", "forward", "prerouting"], ...] = ("input", "forward")
@@ -23,7 +23,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     at_end: Literal["keep", "remove"] = "keep"
     """When the app ends in order: keep the table, whose blocks end by their own time-outs, or remove it."""
     check_s: float = 1.0
-    """Seconds between two readings of the table; what somebody else has removed is put back."""
+    """Seconds between two readings of the table; what somebody else removed is put back."""
     patience_s: float = 10.0
     """Seconds after which a block that cannot be written is answered as failed."""
     program: str = "nft"

@@ -2,6 +2,7 @@
 
 POST URL    {"id", "action": "block"|"unblock", "target": {"kind", "address", "port"}, "expires", "reason", …}
             200 {"state": "installed"|"exists"|"removed"|"failed", "cause": "…"}
+            An unblock of something that the server lists and SDNator does not know (any more) has the id alone.
 GET URL     200 {"blocks": [{"id": "…", "packets": 0, "bytes": 0}, …]}
 
 SDNator-Timestamp: 1700000000
@@ -18,8 +19,8 @@ import msgspec
 from msgspec import Meta
 
 from apps.enforcement import MOST_HELD
+from apps.enforcers.desired_blocks import DesiredBlock
 from apps.enforcers.enforcer import HeldCount
-from apps.enforcers.wishes import Wish
 from apps.messages import MessageError, Name, Number, Text
 
 FAILED_FOR_NOW: Final = frozenset({408, 425, 429})
@@ -53,20 +54,20 @@ class WebhookListing(msgspec.Struct, frozen=True):
         return {each.id: HeldCount(each.packets, each.bytes) for each in self.blocks}
 
 
-def body_of(wish: Wish, verb: Verb, round_: int = 0) -> bytes:
+def body_of(desired_block: DesiredBlock, verb: Verb, round_: int = 0) -> bytes:
     """A block, or its end, as JSON.
 
     Args:
-        wish: the block.
+        desired_block: the block.
         verb: what is asked.
         round_: how often it was lost there, so that asking again is another request.
     """
-    decision, target = wish.decision, wish.target
+    decision, target = desired_block.decision, desired_block.target
     said = {
         "id": decision.id,
         "action": verb,
         "target": {"kind": target.kind, "address": target.address, "port": target.port},
-        "expires": wish.until,
+        "expires": desired_block.until,
         "reason": decision.reason,
         "switch": decision.switch,
         "round": round_,

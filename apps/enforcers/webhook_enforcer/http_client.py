@@ -103,9 +103,9 @@ class SignedHttpClient:
         while piece := answer.read1(_PIECE):
             found += piece
             if len(found) > _MOST_BYTES:
-                raise http.client.HTTPException(f"an answer of over {_MOST_BYTES:,} bytes")
+                raise http.client.HTTPException(f"an answer of more than {_MOST_BYTES:,} bytes")
             if time.monotonic() > deadline:
-                raise TimeoutError(f"no whole answer within {self._timeout_s:g} s")
+                raise TimeoutError(f"no complete answer within {self._timeout_s:g} s")
         answer.close()  # read to its end: the connection may be used again
         if answer.will_close:
             self.close()

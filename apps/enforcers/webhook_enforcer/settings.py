@@ -15,7 +15,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     url: str = ""
     """Where blocks are posted to and listed from: https://…, or http://… on this machine."""
     place: str = ""
-    """Name of what it enforces, in keys and on the page; empty: the host of the URL."""
+    """Name of what it enforces, in keys and on the dashboard; empty: the host of the URL."""
     secret_file: str = ""
     """File with the secret that signs requests, at least 16 bytes, readable by its owner only."""
     ca_file: str = ""
@@ -23,7 +23,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     timeout_s: float = 5.0
     """Seconds for one request and its answer."""
     check_s: float = 30.0
-    """Seconds between two listings; what is missing is posted again, what should not stand is lifted."""
+    """Seconds between two listings; what is missing is posted again, what should not be in force is lifted."""
     patience_s: float = 60.0
     """Seconds of attempts after which a block is answered as failed."""
     queue: int = 10_000

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from apps.enforcers.desired_blocks import DesiredBlock
 from apps.enforcers.enforcer import EnforcerAway, HeldCount
 from apps.enforcers.webhook_enforcer.exchange import (
     FAILED_FOR_NOW,
@@ -12,7 +13,6 @@ from apps.enforcers.webhook_enforcer.exchange import (
     unblock_body,
 )
 from apps.enforcers.webhook_enforcer.http_client import SignedHttpClient
-from apps.enforcers.wishes import Wish
 from apps.messages import MessageError, one_line
 
 
@@ -25,17 +25,20 @@ class Webhook:
         """How often a listing lacked a block that was confirmed."""
         self._listings = 0
 
-    def change(self, add: Sequence[Wish], remove: Sequence[Wish]) -> Mapping[str, str]:
+    def change(self, add: Sequence[DesiredBlock], remove: Sequence[DesiredBlock]) -> Mapping[str, str]:
         """One POST for each; where one cannot be sent all come again, which is why each has an idempotency key."""
-        for wish in remove:
-            self._post(body_of(wish, "unblock", self._lost.pop(wish.id, 0)))
-        answers = {wish.id: self._post(body_of(wish, "block", self._lost[wish.id])) for wish in add}
+        for desired_block in remove:
+            self._post(body_of(desired_block, "unblock", self._lost.pop(desired_block.id, 0)))
+        answers = {
+            desired_block.id: self._post(body_of(desired_block, "block", self._lost[desired_block.id]))
+            for desired_block in add
+        }
         return {name: cause for name, cause in answers.items() if cause}
 
     def allow(self, entries: Sequence[str]) -> None:
-        """The desk blocks nobody of the list; the server need not know it."""
+        """The enforcement worker blocks nobody of the list; the server need not know it."""
 
-    def held(self, wishes: Sequence[Wish]) -> Mapping[str, HeldCount]:
+    def held(self, desired: Sequence[DesiredBlock]) -> Mapping[str, HeldCount]:
         """Ask for the listing; what stands there and should not is lifted."""
         status, body = self._client.ask("GET")
         if status != 200:
@@ -45,14 +48,14 @@ class Webhook:
         except MessageError as error:
             raise EnforcerAway(f"the webhook's listing: {error}") from None
         self._listings += 1
-        wanted = {wish.id for wish in wishes}
+        wanted = {desired_block.id for desired_block in desired}
         for name in counts:
             if name not in wanted:
                 self._post(unblock_body(name, self._listings))
         self._lost.update(wanted - counts.keys())
         return {name: count for name, count in counts.items() if name in wanted}
 
-    def end(self, wishes: Sequence[Wish]) -> None:  # noqa: ARG002 - part of the interface
+    def end(self, desired: Sequence[DesiredBlock]) -> None:  # noqa: ARG002 - part of the interface
         """What stands there stays until its end, which the server was told."""
         self._client.close()
 

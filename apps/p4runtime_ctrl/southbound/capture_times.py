@@ -42,7 +42,7 @@ class CaptureTimes:
         except (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError) as error:
             raise CaptureTimesError(f"times of the capture: {path} cannot be read: {error}") from None
         if not isinstance(found, np.ndarray) or found.dtype != np.int64 or found.ndim != 1:
-            raise CaptureTimesError(f"times of the capture: {path} is no list of int64")
+            raise CaptureTimesError(f"times of the capture: {path} is not a list of int64")
         if not 0 < len(found) <= MOST_FRAMES:
             raise CaptureTimesError(
                 f"times of the capture: {path} has {len(found):,} of 1 to {MOST_FRAMES:,}"

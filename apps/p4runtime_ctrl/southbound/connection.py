@@ -96,7 +96,7 @@ class Connection:
         ]
 
     def open(self) -> None:
-        """Start; the listener is told of success and failure."""
+        """Start; the listener is notified of success and failure."""
         for thread in self._threads:
             thread.start()
 

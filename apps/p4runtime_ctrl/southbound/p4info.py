@@ -98,7 +98,7 @@ class ProgramInfo:
             raise P4InfoError(f"not a p4info in text format: {error}") from error
         except KeyError as error:
             raise P4InfoError(
-                f"not a whole p4info: a table has action {error}, which is not there"
+                f"an incomplete p4info: a table has action {error}, which is not there"
             ) from error
 
     def table(self, name: str) -> TableInfo:
@@ -270,7 +270,7 @@ def _pair(value: Any, default: Any, where: str) -> tuple[Any, Any]:
     """`[value, mask]` as it is, `10.0.0.0/8` cut in two, anything else with the default."""
     if isinstance(value, (list, tuple)):
         if len(value) != 2:
-            raise EntryError(f"{where}: {value!r} is no pair")
+            raise EntryError(f"{where}: {value!r} is not a pair")
         return value[0], value[1]
     if isinstance(value, str) and "/" in value:
         first, _, second = value.partition("/")

@@ -38,7 +38,7 @@ def parse(value: object, width: int, *, where: str) -> int:
     elif isinstance(value, str):
         found = _parse_text(value.strip(), where)
     else:
-        raise EntryError(f"{where}: {value!r} is neither number, text nor bytes")
+        raise EntryError(f"{where}: {value!r} is not a number, text or bytes")
     if found < 0 or found >> width:
         raise EntryError(f"{where}: {value!r} does not fit into {width} bits")
     return found
@@ -52,7 +52,7 @@ def _parse_text(text: str, where: str) -> int:
             return int(ipaddress.ip_address(text))
         return int(text, 0)
     except ValueError:
-        raise EntryError(f"{where}: {text!r} is no number, MAC or IP address") from None
+        raise EntryError(f"{where}: {text!r} is not a number, MAC or IP address") from None
 
 
 def is_ipv4(value: object) -> bool:
@@ -80,7 +80,7 @@ def parse_prefix(value: object, length: object, width: int, *, where: str) -> tu
     if bits > width:
         raise EntryError(f"{where}: prefix length {bits} is over the width of {width} bits")
     if found & ((1 << (width - bits)) - 1):
-        raise EntryError(f"{where}: {value!r} has bits behind its prefix of {bits}; clear them")
+        raise EntryError(f"{where}: {value!r} has bits beyond its prefix length {bits}; clear them")
     return found, bits
 
 

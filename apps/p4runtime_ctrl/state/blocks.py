@@ -52,4 +52,4 @@ def _is_ipv4(target: Target) -> int:
     try:
         return int(ipaddress.ip_address(target.address).version == 4)
     except ValueError:
-        raise EntryError(f"target {target.address!r} is no IP address") from None
+        raise EntryError(f"target {target.address!r} is not an IP address") from None

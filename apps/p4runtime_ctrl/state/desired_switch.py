@@ -1,6 +1,8 @@
 """The desired state of one switch: its entries, who asked for them, and reconciliation.
 
-All that the controller wants of a switch is kept here, connected or not.  While there is a `Transport`
+    decisions, commands ─► entry_updates: changes ─► the desired state ─► Transport.write (southbound/session.py)
+
+Everything that a switch should hold is kept here, whether it is connected or not.  While there is a `Transport`,
 changes are written at once; after a lost connection `bring_up` reads the entries of the switch and writes the
 difference.  It has no thread, clock or socket: the worker calls it from one thread.
 """

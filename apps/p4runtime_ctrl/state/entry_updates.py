@@ -19,7 +19,7 @@ _KINDS: Final = {"insert": INSERT, "modify": MODIFY, "delete": DELETE}
 
 @dataclass(frozen=True)
 class Owner:
-    """Who asked for an entry, for confirmations."""
+    """The decision or command behind an entry, for confirmations."""
 
     id: str
     action: str
@@ -34,7 +34,7 @@ def owner_of(decision: Decision) -> Owner:
 
 @dataclass(frozen=True)
 class EntryUpdate:
-    """Changes that belong together; the last insert or the first delete stands for them in confirmations."""
+    """Changes that belong together; confirmations name the last insert or the first delete."""
 
     owner: Owner
     changes: tuple[Change, ...]
@@ -43,7 +43,7 @@ class EntryUpdate:
 
     @property
     def main(self) -> Change:
-        """The change that stands for the update in confirmations."""
+        """The change that confirmations name for the update."""
         return self.changes[0] if self.changes[0].kind == DELETE else self.changes[-1]
 
     @cached_property

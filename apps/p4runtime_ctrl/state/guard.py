@@ -79,7 +79,7 @@ def service_of(target: Target) -> Service:
     try:
         return str(ipaddress.ip_address(target.address)), target.port
     except ValueError:
-        raise EntryError(f"protect {target.address!r}: that is no IP address") from None
+        raise EntryError(f"protect {target.address!r}: that is not an IP address") from None
 
 
 def protection(program: ProgramInfo, service: Service, slot: int, settings: GuardSettings) -> list[Change]:

@@ -111,4 +111,6 @@ def _network(target: Target) -> Any:
     try:
         return ipaddress.ip_network(target.address)
     except ValueError:
-        raise EntryError(f"rate limit towards {target.address!r}: that is no IP address or prefix") from None
+        raise EntryError(
+            f"rate limit towards {target.address!r}: that is not an IP address or prefix"
+        ) from None

@@ -1,7 +1,7 @@
 """A live switch's time while no packet comes.  Pure.
 
-The switch tells its time with its packets only.  In between, the controller's clock carries it on, so that blocks
-end and seconds are closed on a network where nobody says anything.
+The time of a switch comes with its packets only.  In between, the controller's clock advances it, so that blocks
+end and seconds are closed on a silent network.
 """
 
 from typing import Final, Literal
@@ -13,7 +13,7 @@ _UNDER_WAY_US: Final = 100_000
 
 
 class LiveClock:
-    """Ticks once a second while no packet comes.
+    """Ticks once a second while no packet comes, and at a time that somebody waits for.
 
     Args:
         kind: "packets" never ticks; "heard" ticks after the first packet, "own" also before it.
@@ -27,13 +27,14 @@ class LiveClock:
         self._started_us = started_us if kind == "own" else 0
         self._ticked = float("-inf")
 
-    def look(self, time_us: int, heard: int, now: float) -> int | None:
+    def look(self, time_us: int, heard: int, now: float, awaited_us: int = 0) -> int | None:
         """Time that has passed silently, us; None: the packets tell it, or a tick is not due.
 
         Args:
             time_us: newest time of the switch.
             heard: how many packets it has sent so far.
             now: the caller's monotonic clock, seconds.
+            awaited_us: a time at which a tick is due, us; 0: none.
         """
         if not self._ticks:
             return None
@@ -42,8 +43,11 @@ class LiveClock:
             time_us = time_us or self._started_us
             self._anchor = (time_us, now) if time_us else None
             return None
-        if self._anchor is None or now - self._ticked < _EVERY_S:
+        if self._anchor is None:
+            return None
+        base_us, since = self._anchor
+        passed_us = base_us + int((now - since) * _SECOND_US) - _UNDER_WAY_US
+        if now - self._ticked < _EVERY_S and not 0 < awaited_us <= passed_us:
             return None
         self._ticked = now
-        base_us, since = self._anchor
-        return base_us + int((now - since) * _SECOND_US) - _UNDER_WAY_US
+        return passed_us

@@ -160,5 +160,5 @@ def _by_digest(
 
 def _is_wanted(kind: Kind, switch: str, which: str, keys: list[Key]) -> bool:
     concrete = Key.parse(key_of(kind, switch, which))
-    # a wildcard in the last segment stands for `all` alone
+    # a wildcard in the last segment matches `all` only
     return any(key.matches(concrete) for key in keys if which in (ALL, key.segments[-1]))

@@ -152,7 +152,7 @@ def _pair(value: Any, default: Any, where: str) -> tuple[Any, Any]:
     if not isinstance(value, (list, tuple)):
         return value, default
     if len(value) != 2:
-        raise EntryError(f"{where}: {str(value)[:80]} is no pair")
+        raise EntryError(f"{where}: {str(value)[:80]} is not a pair")
     return value[0], value[1]
 
 

@@ -270,7 +270,7 @@ def test_idle_entries_are_removed_by_the_capture_clock(stage):
     good, bad = heard.values("confirmation")
     assert (good["id"], good["state"]) == ("c1", "installed")
     assert (bad["id"], bad["state"]) == ("c2", "failed")
-    assert "ingress.block_src src: '10.0.0.300' is no number" in bad["cause"]
+    assert "ingress.block_src src: '10.0.0.300' is not a number" in bad["cause"]
     feed = stage.feed()
     for second in range(8):
         feed.send([second * 1_000_000], [60], [frame(2)])

@@ -34,8 +34,8 @@ def test_saved_times_are_read_back(tmp_path):
     ("held", "text"),
     [
         (np.array([], np.int64), "has 0 of 1"),
-        (TIMES_US.astype(float), "no list of int64"),
-        (TIMES_US.reshape(1, 5), "no list of int64"),
+        (TIMES_US.astype(float), "not a list of int64"),
+        (TIMES_US.reshape(1, 5), "not a list of int64"),
         (np.array([-1]), "before 1970"),
         (np.array([1 << 62]), "after 2116"),
         (np.array(["x"], object), "cannot be read"),

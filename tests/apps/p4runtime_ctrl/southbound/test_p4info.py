@@ -64,7 +64,7 @@ def test_a_modify_without_match_is_the_default_action():
         (insert("block", {"dport": 1}, "drop_frame"), "priority of at least 1"),
         (insert("forward_port", {"ingress_port": 1}, "to_port"), "port: the parameter needs a value"),
         (insert("telemetry_dport", {"dport": [9, 3]}, "match_dport", 1, queries=0), "range 9..3 is empty"),
-        (insert("block", {"dport": [1, 2, 3]}, "drop_frame", 1), "is no pair"),
+        (insert("block", {"dport": [1, 2, 3]}, "drop_frame", 1), "is not a pair"),
         (TableUpdate(kind="modify", table="block_src", action="drop_src"), "default action is constant"),
         (
             TableUpdate(

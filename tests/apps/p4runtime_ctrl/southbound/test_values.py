@@ -39,9 +39,9 @@ def test_parse(value, width, number):
         (512, 9, "does not fit into 9 bits"),
         (-1, 9, "does not fit"),
         ("::1:0:0:0:0", 32, "does not fit into 32 bits"),
-        ("no address", 32, "no number"),
-        (1.5, 9, "neither number"),
-        ("1.2.3.400", 32, "no number"),
+        ("no address", 32, "not a number"),
+        (1.5, 9, "not a number, text or bytes"),
+        ("1.2.3.400", 32, "not a number, MAC"),
     ],
 )
 def test_parse_refuses(value, width, reason):
@@ -53,7 +53,7 @@ def test_ipv4_prefixes_and_masks_count_from_the_low_bits():
     assert values.parse_prefix("10.0.0.0", 8, 128, where="x") == (0x0A000000, 104)
     found = values.parse_masked("10.0.0.0", "255.0.0.0", 128, where="x")
     assert found == (0x0A000000, (1 << 128) - (1 << 24))
-    with pytest.raises(EntryError, match="bits behind its prefix of 104"):
+    with pytest.raises(EntryError, match="bits beyond its prefix length 104"):
         values.parse_prefix("10.0.0.1", 8, 128, where="x")
     with pytest.raises(EntryError, match="over 32"):
         values.parse_prefix("10.0.0.0", 33, 128, where="x")

@@ -34,5 +34,5 @@ def test_block_and_unblock_are_one_entry(target, handle):
 
 
 def test_a_target_that_is_no_address():
-    with pytest.raises(EntryError, match=r"'10.0.0' is no IP address"):
+    with pytest.raises(EntryError, match=r"'10.0.0' is not an IP address"):
         table_update(decision("block", Target(kind="ip", address="10.0.0")), program())

@@ -157,7 +157,7 @@ def test_a_refused_block_is_failed_with_its_name_and_not_tried_for_ever():
     assert answer.cause == f"{block_name('10.0.0.1')}: table is full"
     assert not switch.blocks
     (answer,) = switch.decide([decision(2, address="nonsense")], held)
-    assert (answer.state, answer.cause) == ("failed", "target 'nonsense' is no IP address")
+    assert (answer.state, answer.cause) == ("failed", "target 'nonsense' is not an IP address")
 
 
 def test_decisions_made_while_the_switch_is_away_are_carried_out_later():

@@ -27,3 +27,11 @@ def test_only_a_switch_of_ours_has_a_time_before_its_first_packet(kind, begins):
 
 def test_a_replay_stands_between_packets():
     assert ticks(LiveClock("packets", NOW_US), NOW_US, [(5, 10.0), (5, 1000.0)]) == [None, None]
+
+
+def test_a_time_that_is_waited_for_is_told_when_it_comes():
+    """Not at the next whole second: a block in a switch ends by it."""
+    clock = LiveClock("heard")
+    found = [clock.look(NOW_US, 5, now, NOW_US + 300_000) for now in (10.0, 10.25, 10.5)]
+    passed = [None if each is None else each - NOW_US for each in found]
+    assert passed == [None, None, 400_000]

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from apps.enforcement import EnforcementReport, HeldBlock
+from apps.enforcers.desired_blocks import AllowedSenders, DesiredBlock, DesiredBlocks, desired_block_of
 from apps.enforcers.enforcer import Enforcer, EnforcerAway, HeldCount
-from apps.enforcers.wishes import AllowedSenders, Wish, WishList, wish_of
 from apps.messages import Confirmation, Decision, State, one_line
 
 _FIRST_PAUSE_S: Final = 0.2
@@ -58,7 +58,7 @@ class _Outlook:
     """Since when a decision waits."""
 
 
-class EnforcerDesk:
+class EnforcementWorker:
     """Between the messages and one enforcer.
 
     Args:
@@ -92,7 +92,7 @@ class EnforcerDesk:
         self._patience_s = patience_s
         self._limit = limit
         self._jobs: queue.Queue[Job] = queue.Queue(size)
-        self._wishes = WishList()
+        self._desired = DesiredBlocks()
         self._allowed = AllowedSenders()
         self._held: Mapping[str, HeldCount] = {}
         self._outlook = _Outlook()
@@ -123,11 +123,11 @@ class EnforcerDesk:
         except queue.Full:
             if isinstance(job, Spoken):
                 self._counts["refused_full"] += 1
-                self._answer(job.decision, "failed", f"{self._jobs.maxsize:,} decisions wait already")
+                self._answer(job.decision, "failed", f"{self._jobs.maxsize:,} decisions are already waiting")
 
     def knows(self, decision_id: str) -> bool:
         """Whether a block of this id stands or waits to be carried out; may be a moment old."""
-        return decision_id in self._wishes.standing or decision_id in self._wishes.adding
+        return decision_id in self._desired.standing or decision_id in self._desired.adding
 
     def check(self) -> None:
         """Raises `RuntimeError` if the worker thread has ended with an error."""
@@ -145,7 +145,7 @@ class EnforcerDesk:
         """Counters for the operator and for Prometheus."""
         return {
             "blocks": len(self._held),
-            "waiting": self._jobs.qsize() + len(self._wishes.adding) + len(self._wishes.removing),
+            "waiting": self._jobs.qsize() + len(self._desired.adding) + len(self._desired.removing),
             "working": not self._outlook.problem,
             "problem": self._outlook.problem,
             **self._counts,
@@ -160,7 +160,7 @@ class EnforcerDesk:
         self._take(0.0)
         self._step(last=True)
         try:
-            self._enforcer.end(list(self._wishes.standing.values()))
+            self._enforcer.end(list(self._desired.standing.values()))
         except EnforcerAway as error:
             log.warning("at the end: %s", one_line(str(error)))
 
@@ -170,12 +170,12 @@ class EnforcerDesk:
         moments = [outlook.check_at, outlook.report_at]
         if self._waits():
             moments.append(outlook.try_at)
-        if (end := self._wishes.next_end()) and not self._wishes.removing:
+        if (end := self._desired.next_end()) and not self._desired.removing:
             moments.append(now + (end - time.time_ns()) / 1e9)
         return max(0.0, min(moments) - now)
 
     def _waits(self) -> bool:
-        return bool(self._wishes.adding or self._wishes.removing or self._allow_again)
+        return bool(self._desired.adding or self._desired.removing or self._allow_again)
 
     def _take(self, wait_s: float) -> None:
         """Everything that has come, after waiting for the first of it."""
@@ -192,37 +192,37 @@ class EnforcerDesk:
         if isinstance(job, tuple):
             self._allowed.replace(job)
             self._allow_again = True
-            for wish in [*self._wishes.standing.values(), *self._wishes.adding.values()]:
-                if self._allowed.cover(wish.target):
-                    self._wishes.remove(wish.id)
+            for desired_block in [*self._desired.standing.values(), *self._desired.adding.values()]:
+                if self._allowed.cover(desired_block.target):
+                    self._desired.remove(desired_block.id)
         elif job is not None and not job.decision.dry_run:
             self._decide(job)
 
     def _decide(self, spoken: Spoken) -> None:
         decision = spoken.decision
         if decision.action == "unblock":
-            if not self._wishes.remove(decision.id):
+            if not self._desired.remove(decision.id):
                 self._answer(decision, "removed", "it was not in force here")
             return
         if decision.action != "block":
             return
-        wish = wish_of(decision, min(spoken.written, time.time_ns()))
-        if self._allowed.cover(wish.target):
+        desired_block = desired_block_of(decision, min(spoken.written, time.time_ns()))
+        if self._allowed.cover(desired_block.target):
             self._answer(decision, "failed", "it is on the allow-list")
-        elif not wish.lasts(time.time_ns()):
+        elif not desired_block.lasts(time.time_ns()):
             if not spoken.restored:
-                self._answer(decision, "failed", "its end had passed when it arrived")
-        elif len(self._wishes) >= self._limit and decision.id not in self._wishes.standing:
-            self._answer(decision, "failed", f"{self._limit:,} blocks stand already")
-        elif self._wishes.add(wish):
-            self._outlook.since.setdefault(wish.id, time.monotonic())
+                self._answer(decision, "failed", "it had expired when it arrived")
+        elif len(self._desired) >= self._limit and decision.id not in self._desired.standing:
+            self._answer(decision, "failed", f"{self._limit:,} blocks are already in force")
+        elif self._desired.add(desired_block):
+            self._outlook.since.setdefault(desired_block.id, time.monotonic())
         else:
             self._answer(decision, "exists")
 
     def _step(self, *, last: bool = False) -> None:
         now, outlook = time.monotonic(), self._outlook
-        for name in self._wishes.ended(time.time_ns()):
-            self._wishes.remove(name)
+        for name in self._desired.ended(time.time_ns()):
+            self._desired.remove(name)
         try:
             if self._waits() and (last or now >= outlook.try_at):
                 self._carry_out()
@@ -235,12 +235,12 @@ class EnforcerDesk:
     def _carry_out(self) -> None:
         if self._allow_again:
             self._enforcer.allow(self._allowed.entries)
-        adding, removing = dict(self._wishes.adding), dict(self._wishes.removing)
+        adding, removing = dict(self._desired.adding), dict(self._desired.removing)
         refused = self._enforcer.change(list(adding.values()), list(removing.values()))
         self._allow_again = False
-        stood = set(self._wishes.standing)
-        self._wishes.carried_out(refused)
-        self._held = {name: self._held.get(name, HeldCount()) for name in self._wishes.standing}
+        stood = set(self._desired.standing)
+        self._desired.carried_out(refused)
+        self._held = {name: self._held.get(name, HeldCount()) for name in self._desired.standing}
         self._answer_all(adding, removing, refused, stood)
         self._works()
 
@@ -252,35 +252,41 @@ class EnforcerDesk:
 
     def _answer_all(
         self,
-        adding: Mapping[str, Wish],
-        removing: Mapping[str, Wish],
+        adding: Mapping[str, DesiredBlock],
+        removing: Mapping[str, DesiredBlock],
         refused: Mapping[str, str],
         stood: set[str],
     ) -> None:
         now = time.time_ns()
-        for name, wish in removing.items():
+        for name, desired_block in removing.items():
             if name not in adding:
-                self._answer(wish.decision, "removed" if wish.lasts(now) else "expired")
-        for name, wish in adding.items():
+                self._answer(desired_block.decision, "removed" if desired_block.lasts(now) else "expired")
+        for name, desired_block in adding.items():
             self._outlook.since.pop(name, None)
             state: State = "failed" if name in refused else "exists" if name in stood else "installed"
-            self._answer(wish.decision, state, refused.get(name, ""))
+            self._answer(desired_block.decision, state, refused.get(name, ""))
 
     def _read_back(self) -> None:
         self._outlook.check_at = time.monotonic() + self._check_s
         wanted = {
-            name: wish for name, wish in self._wishes.standing.items() if name not in self._wishes.removing
+            name: desired_block
+            for name, desired_block in self._desired.standing.items()
+            if name not in self._desired.removing
         }
         held = self._enforcer.held(list(wanted.values()))
         now = time.time_ns()
-        missing = [wish for name, wish in wanted.items() if name not in held and wish.lasts(now)]
+        missing = [
+            desired_block
+            for name, desired_block in wanted.items()
+            if name not in held and desired_block.lasts(now)
+        ]
         said = ""
         if missing:
             self._enforcer.change(missing, ())
             self._counts["restored"] += len(missing)
             said = f"restored {len(missing)} of {len(wanted)} blocks that somebody else had removed"
             log.error("%s", said)
-            held = {**held, **{wish.id: HeldCount() for wish in missing}}
+            held = {**held, **{desired_block.id: HeldCount() for desired_block in missing}}
         self._outlook.found = said
         self._held = held
         self._works()
@@ -297,10 +303,10 @@ class EnforcerDesk:
         for name, since in list(outlook.since.items()):
             if now - since >= self._patience_s:
                 del outlook.since[name]
-                wish = self._wishes.adding.pop(name, None)
-                if wish is not None:
-                    self._wishes.standing.pop(name, None)
-                    self._answer(wish.decision, "failed", cause)
+                desired_block = self._desired.adding.pop(name, None)
+                if desired_block is not None:
+                    self._desired.standing.pop(name, None)
+                    self._answer(desired_block.decision, "failed", cause)
 
     def _answer(self, decision: Decision, state: State, cause: str = "") -> None:
         if state in self._counts:
@@ -320,15 +326,15 @@ class EnforcerDesk:
 
     def _report(self) -> None:
         now, outlook = time.monotonic(), self._outlook
-        standing = self._wishes.standing
+        standing = self._desired.standing
         held = [(standing[name], count) for name, count in self._held.items() if name in standing]
-        waiting = len(self._wishes.adding) + len(self._wishes.removing)
+        waiting = len(self._desired.adding) + len(self._desired.removing)
         problem = outlook.problem or outlook.found
-        what = (problem, tuple((wish.id, count) for wish, count in held), waiting)
+        what = (problem, tuple((desired_block.id, count) for desired_block, count in held), waiting)
         if what == outlook.told and now < outlook.report_at:
             return
         outlook.told, outlook.report_at = what, now + _REPORT_EVERY_S
-        blocks = tuple(_held_block(wish, count) for wish, count in held)
+        blocks = tuple(_held_block(desired_block, count) for desired_block, count in held)
         self._tell(
             EnforcementReport(
                 enforcer=self._app,
@@ -348,5 +354,7 @@ def place_handle(app: str, decision: Decision) -> str:
     return f"{app} {decision.target.kind} {decision.target.address}"
 
 
-def _held_block(wish: Wish, count: HeldCount) -> HeldBlock:
-    return HeldBlock(id=wish.id, target=wish.target, packets=count.packets, bytes=count.bytes)
+def _held_block(desired_block: DesiredBlock, count: HeldCount) -> HeldBlock:
+    return HeldBlock(
+        id=desired_block.id, target=desired_block.target, packets=count.packets, bytes=count.bytes
+    )

@@ -12,7 +12,7 @@ from apps.messages import Decision, Target
 
 
 @dataclass(frozen=True)
-class Wish:
+class DesiredBlock:
     """One block that shall stand."""
 
     decision: Decision
@@ -34,9 +34,9 @@ class Wish:
         return not self.until or self.until > now
 
 
-def wish_of(decision: Decision, written: int) -> Wish:
-    """The wish of a block that was written at a wall time (ns)."""
-    return Wish(decision, written + decision.expires - decision.event_time if decision.expires else 0)
+def desired_block_of(decision: Decision, written: int) -> DesiredBlock:
+    """The desired_block of a block that was written at a wall time (ns)."""
+    return DesiredBlock(decision, written + decision.expires - decision.event_time if decision.expires else 0)
 
 
 @dataclass
@@ -66,20 +66,20 @@ class AllowedSenders:
         return any(network.overlaps(each) for each in self._networks)
 
 
-class WishList:
-    """All wishes by decision id: those that wait to be carried out, and those that stand."""
+class DesiredBlocks:
+    """All desired by decision id: those that wait to be carried out, and those that stand."""
 
     def __init__(self) -> None:
-        self.standing: dict[str, Wish] = {}
-        self.adding: dict[str, Wish] = {}
-        self.removing: dict[str, Wish] = {}
+        self.standing: dict[str, DesiredBlock] = {}
+        self.adding: dict[str, DesiredBlock] = {}
+        self.removing: dict[str, DesiredBlock] = {}
 
-    def add(self, wish: Wish) -> bool:
+    def add(self, desired_block: DesiredBlock) -> bool:
         """A block shall stand; False if it stands already with the same end."""
-        self.removing.pop(wish.id, None)
-        if self.standing.get(wish.id) == wish:
+        self.removing.pop(desired_block.id, None)
+        if self.standing.get(desired_block.id) == desired_block:
             return False
-        self.adding[wish.id] = wish
+        self.adding[desired_block.id] = desired_block
         return True
 
     def remove(self, decision_id: str) -> bool:
@@ -95,11 +95,19 @@ class WishList:
     def ended(self, now: int) -> list[str]:
         """Ids of the blocks whose end has come, and which are not being removed."""
         every = {**self.standing, **self.adding}
-        return [name for name, wish in every.items() if not wish.lasts(now) and name not in self.removing]
+        return [
+            name
+            for name, desired_block in every.items()
+            if not desired_block.lasts(now) and name not in self.removing
+        ]
 
     def next_end(self) -> int:
         """Wall time of the next end, ns; 0 = none."""
-        ends = [wish.until for wish in (*self.standing.values(), *self.adding.values()) if wish.until]
+        ends = [
+            desired_block.until
+            for desired_block in (*self.standing.values(), *self.adding.values())
+            if desired_block.until
+        ]
         return min(ends, default=0)
 
     def carried_out(self, refused: Iterable[str]) -> None:

@@ -8,9 +8,9 @@ import pytest
 
 from apps.enforcement import AllowedEntries, EnforcementReport
 from apps.enforcers.arrivals import allowed_in, decision_in
-from apps.enforcers.desk import EnforcerDesk, Spoken
+from apps.enforcers.desired_blocks import AllowedSenders
+from apps.enforcers.enforcement_worker import EnforcementWorker, Spoken
 from apps.enforcers.enforcer import EnforcerAway, HeldCount
-from apps.enforcers.wishes import AllowedSenders
 from apps.messages import Confirmation, Decision, MessageError, Target
 from due import Item
 from sdnator.testing.waiting import wait_for
@@ -40,25 +40,35 @@ class Obedient:
         self.gate.wait(60)
         if self.away:
             raise EnforcerAway(self.away)
-        self.standing |= {wish.id: wish for wish in add if wish.target.address != "192.0.2.66"}
-        for wish in remove:
-            self.standing.pop(wish.id, None)
-        return {wish.id: "not this one" for wish in add if wish.target.address == "192.0.2.66"}
+        self.standing |= {
+            desired_block.id: desired_block
+            for desired_block in add
+            if desired_block.target.address != "192.0.2.66"
+        }
+        for desired_block in remove:
+            self.standing.pop(desired_block.id, None)
+        return {
+            desired_block.id: "not this one"
+            for desired_block in add
+            if desired_block.target.address == "192.0.2.66"
+        }
 
     def allow(self, entries):
         self.allowed = entries
 
-    def held(self, wishes):
+    def held(self, desired):
         if self.away:
             raise EnforcerAway(self.away)
-        return {wish.id: HeldCount() for wish in wishes if wish.id in self.standing}
+        return {
+            desired_block.id: HeldCount() for desired_block in desired if desired_block.id in self.standing
+        }
 
-    def end(self, wishes):
-        self.ended = [wish.id for wish in wishes]
+    def end(self, desired):
+        self.ended = [desired_block.id for desired_block in desired]
 
 
 class Told:
-    """A desk, its enforcer, and what it says."""
+    """An enforcement worker, its enforcer, and what it says."""
 
     def __init__(self, **options):
         self.enforcer = Obedient()
@@ -66,10 +76,10 @@ class Told:
         self.reports: list[EnforcementReport] = []
         chosen = {"check_s": 0.05, "patience_s": 0.2, **options}
         names = ("app", "place")
-        self.desk = EnforcerDesk(self.enforcer, names, self.said.append, self.reports.append, **chosen)
+        self.worker = EnforcementWorker(self.enforcer, names, self.said.append, self.reports.append, **chosen)
 
     def tell(self, decision):
-        self.desk.put(Spoken(decision, time.time_ns()))
+        self.worker.put(Spoken(decision, time.time_ns()))
         return decision
 
     def wait_for(self, decision, state):
@@ -79,23 +89,23 @@ class Told:
 @pytest.fixture
 def told():
     made = Told()
-    made.desk.start()
+    made.worker.start()
     yield made
-    made.desk.close()
+    made.worker.close()
 
 
 def test_what_does_not_fit_into_the_queue_is_answered_and_counted():
     """Nobody waits for a slow enforcer."""
     told = Told(size=5)
     told.enforcer.gate.clear()
-    told.desk.start()
+    told.worker.start()
     made = [told.tell(block(f"192.0.2.{n}")) for n in range(1, 40)]
-    refused = told.desk.health()["refused_full"]
+    refused = told.worker.health()["refused_full"]
     assert refused >= len(made) - 5 - 5 - 1
     assert len([each for each in told.said if each.state == "failed"]) == refused
     told.enforcer.gate.set()
     wait_for(lambda: len(told.said) == len(made))
-    told.desk.close()
+    told.worker.close()
 
 
 def test_one_that_is_away_gets_it_later_or_fails(told):
@@ -105,7 +115,7 @@ def test_one_that_is_away_gets_it_later_or_fails(told):
     assert told.said[-1].cause == "asleep"
     told.enforcer.away = ""
     told.wait_for(told.tell(block()), "installed")
-    assert told.desk.health()["problem"] == ""
+    assert told.worker.health()["problem"] == ""
 
 
 def test_a_refusal_is_one_decision_s_alone(told):
@@ -126,22 +136,22 @@ def test_a_block_ends_by_itself(told):
     ("decision", "state", "cause"),
     [
         (block(action="unblock"), "removed", "was not in force"),
-        (block(event_time=1, expires=2), "failed", "its end had passed"),
+        (block(event_time=1, expires=2), "failed", "it had expired"),
     ],
 )
 def test_what_cannot_be_is_answered(told, decision, state, cause):
-    told.desk.put(Spoken(decision, time.time_ns() - 10**9))
+    told.worker.put(Spoken(decision, time.time_ns() - 10**9))
     told.wait_for(decision, state)
     assert cause in told.said[-1].cause
 
 
 def test_a_limit_of_blocks_holds():
     told = Told(limit=2)
-    told.desk.start()
+    told.worker.start()
     made = [told.tell(block(f"192.0.2.{n}")) for n in range(1, 4)]
     told.wait_for(made[2], "failed")
     assert len(told.enforcer.standing) == 2
-    told.desk.close()
+    told.worker.close()
 
 
 def test_guards_and_dry_runs_are_none_of_its_business(told):
@@ -154,7 +164,7 @@ def test_guards_and_dry_runs_are_none_of_its_business(told):
 
 def test_at_the_end_what_waits_is_carried_out(told):
     made = [told.tell(block(f"192.0.2.{n}")) for n in range(1, 50)]
-    told.desk.close()
+    told.worker.close()
     assert set(told.enforcer.ended) == {each.id for each in made}
 
 
@@ -162,9 +172,9 @@ def test_at_the_end_what_waits_is_carried_out(told):
 def test_a_dead_worker_is_noticed(told):
     """An error of the enforcer that is none of its errors ends the thread, and then the app."""
     told.enforcer.held = None
-    wait_for(lambda: not told.desk._thread.is_alive())
+    wait_for(lambda: not told.worker._thread.is_alive())
     with pytest.raises(RuntimeError, match="has ended"):
-        told.desk.check()
+        told.worker.check()
 
 
 @pytest.mark.parametrize(
