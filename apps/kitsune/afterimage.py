@@ -13,12 +13,12 @@ by more than 2e-11; on three generated infections the AUC agrees to six digits a
 same.  Where dozens of hosts all talk to each other, covariances differ visibly, the rest in rounding.
 """
 
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, Columns, Kernel, contiguous
+from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, Columns, Kernel, contiguous, load_kernel
 
 WIDTH: Final = 100
 _TOO_SHORT: Final = -2
@@ -30,14 +30,6 @@ HORIZON_S: Final = 3_000.0
 """After this idle time a stream's weight at the slowest scale is below 1e-9."""
 
 
-class FeatureEngine(Protocol):
-    """Computes features: the C kernel or its Python twin."""
-
-    def update(self, columns: Columns, out: npt.NDArray[np.float64]) -> None: ...
-
-    def counts(self) -> tuple[int, int, int, int]: ...
-
-
 class AfterImage:
     """Turns record batches into rows of features; the state grows with the traffic seen.
 
@@ -47,7 +39,7 @@ class AfterImage:
             cost per packet does not grow with the number of a host's peers.  Its clock never runs
             backwards.  Features differ in rounding where a host has missed many packets of a busy
             peer, and in covariance where two hosts each talk to many busy ones.
-        kernel: None uses the Python twin.
+        kernel: None loads the one that was built.
     """
 
     def __init__(
@@ -61,14 +53,9 @@ class AfterImage:
     ) -> None:
         if max_streams < 2 or max_links < 1:
             raise ValueError(f"max_streams={max_streams}, max_links={max_links}: need at least 2 and 1")
-        bounded = mode == "bounded"
-        self._engine: FeatureEngine
-        if kernel is not None:
-            self._engine = _KernelEngine(kernel, bounded, max_streams, max_links, horizon)
-        else:
-            from apps.kitsune.afterimage_bounded import PythonEngine
-
-            self._engine = PythonEngine(bounded, max_streams, max_links, horizon)
+        self._engine = _KernelEngine(
+            kernel or load_kernel(), mode == "bounded", max_streams, max_links, horizon
+        )
 
     def update(self, batch: Columns) -> npt.NDArray[np.float64]:
         """Features of each packet of the batch, in order: float64, shape (packets, 100).
@@ -90,7 +77,7 @@ class AfterImage:
 
 
 def _columns(batch: Columns) -> dict[str, npt.NDArray[Any]]:
-    """The columns that the engines read, checked for equal length."""
+    """The columns that the kernel reads, checked for equal length."""
     try:
         found = {name: contiguous(batch[name], kind) for name, _, kind in PACKET_FIELDS if name != "time"}
         found["time"] = seconds(batch)

@@ -25,12 +25,35 @@ static int64_t flooded(const Ended *ended)
     return ended->service;
 }
 
-static void contact_views(Behaviour *b, const Ended *ended, int block)
+/* Whether a contact failed because nobody reaches the outside; follows them. */
+static int is_outside_down(Behaviour *b, const Ended *ended, int block)
+{
+    if (is_inside(ended->target) || !is_inside(address_in(&ended->sender)))
+        return 0;
+    if (!ended->failed) {
+        table_clear(&b->in_vain);
+        b->outside_reached |= block >= 0;
+        return 0;
+    }
+    if (block >= 0)
+        return 0;
+    if (b->in_vain.live && ended->time - b->in_vain_since > b->limits.in_vain_s)
+        table_clear(&b->in_vain);
+    if (!b->in_vain.live)
+        b->in_vain_since = ended->time;
+    if (b->in_vain.live <= b->limits.others && table_find(&b->in_vain, &ended->sender) == NONE)
+        added(b, &b->in_vain, &ended->sender);
+    return (b->silence >= 0 && ended->time - b->outside_last > b->silence)
+           || (b->outside_reached && b->in_vain.live > b->limits.others);
+}
+
+/* What ended, by the service that it counts for. */
+static void contact_views(Behaviour *b, const Ended *ended, int64_t service, int counts, int block)
 {
     const Subject *sender = &ended->sender;
     int inside = is_inside(address_in(sender));
-    int64_t protocol = protocol_of(ended->service);
-    int64_t named = (ended->service & 0xFFFF) < b->limits.chosen ? ended->service : protocol | b->limits.chosen;
+    int64_t protocol = protocol_of(service);
+    int64_t named = (service & 0xFFFF) < b->limits.chosen ? service : protocol | b->limits.chosen;
     Subject whose = with_more(*sender, (uint64_t)protocol, NOBODY);
     struct {
         Subject subject;
@@ -40,12 +63,11 @@ static void contact_views(Behaviour *b, const Ended *ended, int block)
     } view[3] = {
         {whose, kind_of(protocol, inside), NOBODY, NO_SERVICE},
         {with_more(*sender, 0, ended->target), kind_of(protocol, inside), ended->target, NO_SERVICE},
-        {with_more(*sender, (uint64_t)ended->service, NOBODY), kind_of(named, inside), NOBODY, ended->service},
+        {with_more(*sender, (uint64_t)service, NOBODY), kind_of(named, inside), NOBODY, service},
     };
-    /* hosts answer echo requests of everybody: that they do makes up for nothing */
-    int counts = ended->failed || ended->service == ECHO, which = NONE;
+    int which = NONE;
     Seen best = {0};
-    for (int what = CONTACTS; what <= TARGETS; what++) {
+    for (int what = service == UNANSWERED ? TARGETS : CONTACTS; what <= TARGETS; what++) {
         double sums[MOST_WINDOWS];
         if (count(b, what, &view[what].subject, ended->time, counts ? 1.0 : -1.0, sums))
             return;
@@ -64,6 +86,17 @@ static void contact_views(Behaviour *b, const Ended *ended, int block)
     best.nats = found_added(&b->failures, &b->limits, sender, best.total, ended->time);
     if (best.nats)
         found(b, which, sender, view[which].victim, view[which].single, &best, ended->time, ended->arrival);
+}
+
+static void contact_made(Behaviour *b, const Ended *ended, int block)
+{
+    if (is_outside_down(b, ended, block))
+        return;
+    int pinged = ended->service == ECHO;
+    /* hosts answer echo requests of everybody: that they do makes up for nothing */
+    contact_views(b, ended, ended->service, ended->failed || pinged, block);
+    if (ended->failed && pinged)
+        contact_views(b, ended, UNANSWERED, 1, block);
 }
 
 static void count_stranger(Behaviour *b, Address victim, int64_t what, const Ended *ended, int block)
@@ -125,7 +158,8 @@ static void callback(Behaviour *b, const Ended *ended)
     Visit visit = *(Visit *)payload(&b->visits, at);
     if (ended->time - visit.time > b->limits.soon_s)
         return;
-    Seen seen = {found_added(&b->called, &b->limits, &visit.sender, b->callback_nats, ended->time), b->callback_nats, 1, ended->time - visit.time, b->callback_usual};
+    double after = ended->time - visit.time, added = found_added(&b->called, &b->limits, &visit.sender, b->callback_nats, ended->time);
+    Seen seen = {added, b->callback_nats, 1, after, b->callback_usual, ended->time - after};
     if (seen.nats)
         found(b, CALLBACKS, &visit.sender, host, visit.service, &seen, ended->time, ended->arrival);
 }
@@ -147,7 +181,7 @@ static void contact_ended(Behaviour *b, const Ended *ended, int block)
 {
     int is_reflected = protocol_of(flooded(ended)) == FROM_UDP && !is_inside(address_in(&ended->sender));
     if (!(ended->failed && ended->half_open) && !is_reflected)
-        contact_views(b, ended, block);
+        contact_made(b, ended, block);
     if (ended->failed)
         strange(b, ended, block);
     else if (block < 0)
@@ -272,7 +306,7 @@ static Exchange *begun_exchange(Behaviour *b, const Row *row, Exchange *half, in
 
 static void learn_one_way(Turn *t, int64_t kind, int64_t alone)
 {
-    int number = kind == TCP ? 0 : kind == UDP ? 1 : kind == ECHO ? 2 : NONE;
+    int number = kind == TCP ? 0 : kind == UDP ? 1 : kind == ECHO ? 2 : kind == OPENING ? 3 : NONE;
     double sums[MOST_WINDOWS] = {(double)alone};
     if (number != NONE) { /* of a block only the highest counts matter */
         double *most = &t->b->one_way_most[number][t->block];
@@ -302,22 +336,27 @@ static void one_way(Turn *t)
     if (!here)
         return;
     if (here->second != row->second) {
+        here->before = here->second == row->second - 1 ? here->back : 0;
         here->second = row->second;
-        here->out = here->back = here->due = 0;
+        here->out = here->back = here->due = here->syns = here->syns_due = 0;
     }
-    here->out++;
-    int64_t alone = here->out - b->limits.replies_count * here->back, kind = protocol_of(row->service);
+    int opening = row->is_tcp && row->flags & SYN;
+    int64_t *due = opening ? &here->syns_due : &here->due, kind = opening ? OPENING : protocol_of(row->service);
+    ++*(opening ? &here->syns : &here->out);
+    int64_t alone = opening ? here->syns - here->out : here->out - b->limits.replies_count * (here->back + here->before);
     if (t->block >= 0) {
         learn_one_way(t, kind, alone);
         return;
     }
-    if (alone < here->due)
+    if (alone < *due)
         return;
-    here->due = alone + (alone >= 8 ? alone / 8 : 1);
+    *due = alone + (alone >= 8 ? alone / 8 : 1);
     double sums[MOST_WINDOWS] = {(double)alone};
     Subject whose = with_more(t->sender, (uint64_t)kind, NOBODY);
-    Seen seen;
-    if (weighed(b, ONE_WAY, &whose, sums, (uint64_t)kind << 1 | 1, row->time, &seen))
+    Seen seen = counter_measure(&b->counter[ONE_WAY], &b->limits, &whose, sums, (uint64_t)kind << 1 | 1);
+    seen.nats = found_added(&b->counter[ONE_WAY].reported, &b->limits, &t->sender, seen.total, row->time);
+    seen.begun = (double)row->second;
+    if (seen.nats)
         found(b, ONE_WAY, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
 }
 
@@ -420,7 +459,7 @@ static void over(Turn *t, double score)
     if (!time)
         return;
     *time = row->time;
-    Seen seen = {0, 0, score, 0, 0};
+    Seen seen = {0, 0, score, 0, 0, row->time};
     BehaviourEvent *event = found(b, THRESHOLD, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
     if (event)
         event->supporting = 1;
@@ -476,6 +515,20 @@ static int train(Turn *t)
     return block < b->limits.blocks ? (int)block : b->limits.blocks - 1;
 }
 
+/* The longest silence of the outside, while training lasts. */
+static void hear_outside(Turn *t)
+{
+    Behaviour *b = t->b;
+    const Row *row = t->row;
+    if (b->outside_last == -INFINITY)
+        b->outside_last = row->time;
+    if (!is_some(row->source) || is_inside(row->source))
+        return;
+    b->outside_heard = 1;
+    b->outside_gap = fmax(b->outside_gap, row->time - b->outside_last);
+    b->outside_last = fmax(b->outside_last, row->time);
+}
+
 static void follow(Turn *t)
 {
     Ended ended;
@@ -488,7 +541,10 @@ static void follow(Turn *t)
     ping(t);
     arp(t);
     spoke(t);
+    hear_outside(t);
 }
+
+#include "ledger_ahead.h"
 
 /* ---- the interface */
 
@@ -498,9 +554,15 @@ int behaviour_add(Behaviour *b, const PacketRows *rows, long n, long first, long
     if (first < 0 || last < first || last > n)
         return -2;
     b->event_count = 0;
+    Ahead ahead[AHEAD];
+    for (long i = first; i < last && i < first + AHEAD; i++)
+        look_ahead(b, rows, i, &ahead[i % AHEAD]);
     for (long i = first; i < last && !b->failed; i++) {
-        Row row;
-        read_row(rows, i, &row);
+        if (i + AHEAD / 2 < last)
+            fetch_entries(b, &ahead[(i + AHEAD / 2) % AHEAD]);
+        Row row = ahead[i % AHEAD].row;
+        if (i + AHEAD < last)
+            look_ahead(b, rows, i + AHEAD, &ahead[i % AHEAD]);
         Turn turn = {b, &row, sender_of(number, &row, row.source, 0), -1};
         if (!logs)
             turn.block = train(&turn);

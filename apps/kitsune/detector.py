@@ -14,22 +14,20 @@ from apps.kitsune.accused import LEAST_NATS, Accused
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
 from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS
 from apps.kitsune.behaviour.findings import Finding
-from apps.kitsune.behaviour.native import behaviour_of, restored_behaviour
+from apps.kitsune.behaviour.native import NativeBehaviour
 from apps.kitsune.behaviour.rows import parts_of
 from apps.kitsune.drift import TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
 from apps.kitsune.evidence import evidence_of
-from apps.kitsune.kernel import Columns, Kernel
+from apps.kitsune.kernel import Columns, Kernel, load_kernel
 from apps.kitsune.kitnet import KitNet
 from apps.kitsune.ledger import KernelRows
 from apps.kitsune.model_file import Model, NotAModelError, save_model
 from apps.kitsune.names import ip_text, mac_text
-from apps.kitsune.native_senders import restored_senders, senders_of
-from apps.kitsune.native_victims import restored_victims, victims_of
 from apps.kitsune.reasons import Explanations, reason
-from apps.kitsune.senders import AnomalousSecond
+from apps.kitsune.senders import AnomalousSecond, Senders
 from apps.kitsune.threshold import Benign, Calibration
 from apps.kitsune.training_check import TrainingCheck
-from apps.kitsune.victims import UsualTraffic
+from apps.kitsune.victims import UsualTraffic, VictimRates
 from apps.messages import Alert, Sender
 
 TRAIN: Final = 0
@@ -44,20 +42,20 @@ class DetectorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     ad_grace: int = 50_000
     """Packets from which the autoencoders learn, after the feature map."""
     max_ae: int = 10
-    """Most features of one autoencoder."""
+    """Maximum number of features per autoencoder."""
     mode: Mode = "bounded"
     """`reference`: exact as published, state and cost grow; `bounded`: both are limited."""
     threshold: float = 1.0
-    """Packets that score this much or more are above the threshold (1.0 is the paper's)."""
+    """Score from which a packet is anomalous (1.0 is the paper's)."""
     false_alarms_per_hour: float = 0.0
     """Greater than 0: once enough packets are scored, the threshold is set so that this many benign packets an
     hour are expected above it; until then `threshold` applies."""
     calibration_packets: int = 10_000
     """Scored packets after training that are assumed to be benign and set the threshold."""
     max_streams: int = MAX_STREAMS
-    """Bounded mode: most streams in each of four tables."""
+    """Bounded mode: maximum number of streams in each of four tables."""
     max_links: int = MAX_LINKS
-    """Bounded mode: most links in each of two tables."""
+    """Bounded mode: maximum number of links in each of two tables."""
     horizon: float = HORIZON_S
     """Bounded mode: seconds after which an idle stream is forgotten."""
     clip: float = 1e6
@@ -104,8 +102,8 @@ class Scored:
     features: npt.NDArray[np.float64]
     """The 100 features of each packet."""
     over: int
-    """Packets above the threshold."""
-    line: float
+    """Packets at or above the threshold."""
+    threshold: float
     """The threshold that was applied."""
 
 
@@ -116,7 +114,7 @@ class Detector:
         settings: all options.
         model: a saved model; then nothing is trained.
         retrain: go on training the saved model, with its feature map, on the first packets.
-        kernel: None uses the Python twins.
+        kernel: None loads the one that was built.
     """
 
     def __init__(
@@ -128,6 +126,7 @@ class Detector:
         kernel: Kernel | None = None,
     ) -> None:
         self.settings = settings
+        kernel = kernel or load_kernel()
         self.afterimage = AfterImage(
             settings.mode,
             max_streams=settings.max_streams,
@@ -139,9 +138,9 @@ class Detector:
         self._check = TrainingCheck()
         self._trained_at_us = 0
         self._kernel = kernel
-        self.senders = senders_of(kernel)
-        self.behaviour = behaviour_of(settings.fm_grace + settings.ad_grace + 1, kernel)
-        self.victims = victims_of(kernel)
+        self.senders = Senders(kernel)
+        self.behaviour = NativeBehaviour(settings.fm_grace + settings.ad_grace + 1, kernel)
+        self.victims = VictimRates(kernel)
         self._evidence: list[Evidence] = []
         self._tail: deque[npt.NDArray[np.float64]] = deque()
         """Features of the last packets of training."""
@@ -150,9 +149,9 @@ class Detector:
         self.calibration = Calibration(settings.calibration_packets)
         self.accused = Accused()
         self.drift: Drift | None = None
-        """None while training goes on."""
+        """None during training."""
         self.drift_changed = False
-        """Scores have drifted, or no longer do; whoever tells people sets it back."""
+        """Scores have drifted, or have returned; reset once this is published."""
         self.trained_for: dict[str, Any] = {}
         """What the model belongs to; kept in its file."""
         self._knows_behaviour = True
@@ -169,7 +168,7 @@ class Detector:
             self.model.retrain(settings.fm_grace, settings.ad_grace)
         else:
             self._take(model)
-        self.line = self._line()
+        self.threshold = self._threshold()
 
     @property
     def trained(self) -> int:
@@ -186,8 +185,7 @@ class Detector:
             switch: where they were seen.
             features: of each packet, where another detector has measured them; its statistics are then in use.
         """
-        if self._kernel is not None:
-            batch = KernelRows(self._kernel, batch)
+        batch = KernelRows(self._kernel, batch)
         if features is None:
             features = self.afterimage.update(batch)
         before = self.model.trained
@@ -200,12 +198,14 @@ class Detector:
             self._keep_sample(features[:trained], before)
         state = np.full(len(scores), SCORED, dtype=np.uint8)
         state[:trained] = TRAIN
-        line = self.line
+        threshold = self.threshold
 
         def explain(rows: npt.NDArray[np.int32]) -> Explanations:
             return Explanations(features[rows], errors[rows - trained])
 
-        hot = self.senders.add(batch, switch, scores=scores, trained=trained, line=line, evidence=explain)
+        anomalous = self.senders.add(
+            batch, switch, scores=scores, trained=trained, threshold=threshold, evidence=explain
+        )
         self.victims.add(batch, trained)
         findings: list[Finding] = []
         if self._knows_behaviour:
@@ -215,17 +215,17 @@ class Detector:
                 scores,
                 trained,
                 self._rescored,
-                line,
+                threshold,
                 self.senders.blocked,
             )
         self._evidence += [self._as_evidence(finding) for finding in findings]
         self._follow_drift(batch, scores, trained, findings)
-        over = int(np.count_nonzero(~(scores[trained:] < line)))
+        over = int(np.count_nonzero(~(scores[trained:] < threshold)))
         if trained and self.model.is_trained:
             self.training_warnings = self._check.warnings(self.senders.known())
         if self.calibration.add(scores[trained:], seconds(batch)[trained:]):
-            self.line = self._line()
-        return Scored(scores, state, features, over, line), [self._alert(second) for second in hot]
+            self.threshold = self._threshold()
+        return Scored(scores, state, features, over, threshold), [self._alert(second) for second in anomalous]
 
     def take_evidence(self) -> list[Evidence]:
         """What was found since the last call."""
@@ -259,7 +259,7 @@ class Detector:
     def _follow_drift(
         self, batch: Columns, scores: npt.NDArray[np.float64], trained: int, findings: list[Finding]
     ) -> None:
-        """Benign scores only: those of senders that nothing speaks against."""
+        """Benign scores only: those of senders without evidence against them."""
         for finding in findings:
             if finding.sender is not None and not finding.supporting and finding.total >= LEAST_NATS:
                 self.accused.accuse(finding.sender[2], finding.time)
@@ -278,10 +278,13 @@ class Detector:
             usual = self.victims.usual(finding.victim, finding.service)
             rate, training_rate = usual.rate, usual.training_rate
         else:
+            if finding.statistic == "one_way":
+                usual = self.victims.usual(finding.victim, finding.service)
             switch, port, mac, address = finding.sender
             rate, training_rate = self.senders.rates((switch, port, mac, parts_of(address)))
             proven = self.behaviour.proven(address)
             forged = self.behaviour.forged(finding.sender)
+            forged |= self.senders.roles.is_borrowed(mac, parts_of(address))
         return evidence_of(
             finding,
             self.senders.roles,
@@ -320,11 +323,11 @@ class Detector:
         notes = model.notes
         try:
             benign = Benign(**notes["benign"]) if notes.get("benign") else None
-            self.senders = restored_senders(notes.get("senders"), self._kernel)
+            self.senders = Senders.from_state(notes.get("senders"), self._kernel)
             self._knows_behaviour = bool(notes.get("behaviour"))
             if self._knows_behaviour:
-                self.behaviour = restored_behaviour(notes["behaviour"], self._kernel)
-            self.victims = restored_victims(notes.get("victims", ()), self._kernel)
+                self.behaviour = NativeBehaviour.restored(notes["behaviour"], self._kernel)
+            self.victims = VictimRates.from_state(notes.get("victims", ()), self._kernel)
             if notes.get("drift"):
                 self.drift = Drift.from_state(notes["drift"])
             self.trained_for = dict(notes.get("trained_for") or {})
@@ -334,35 +337,35 @@ class Detector:
                 self.training_warnings.append(_SCORES_ONLY)
         except (KeyError, TypeError, ValueError) as error:
             raise NotAModelError(
-                f"the model's notes are damaged ({error}); train again and save it anew"
+                f"the model's notes are damaged ({error}); train again and save the result"
             ) from error
         self.calibration = Calibration(self.settings.calibration_packets, benign)
 
-    def _line(self) -> float:
+    def _threshold(self) -> float:
         benign = self.calibration.benign
         if self.settings.false_alarms_per_hour and benign is not None:
-            return benign.line(self.settings.false_alarms_per_hour)
+            return benign.threshold(self.settings.false_alarms_per_hour)
         return self.settings.threshold
 
     def finish(self) -> list[Alert]:
         """End of the packets: returns the alerts of the second that was still open."""
         return [self._alert(second) for second in self.senders.finish()]
 
-    def _alert(self, hot: AnomalousSecond) -> Alert:
-        switch, port, mac, address = hot.record.identity
+    def _alert(self, second: AnomalousSecond) -> Alert:
+        switch, port, mac, address = second.record.identity
         sender = Sender(switch=switch, port=port, mac=mac_text(mac), ip=ip_text(*address))
         return Alert(
-            id=f"kitsune-{switch}-{port}-{sender.mac}-{sender.ip}-{hot.second}",
+            id=f"kitsune-{switch}-{port}-{sender.mac}-{sender.ip}-{second.second}",
             sender=sender,
-            event_time=(hot.second + 1) * 1_000_000_000,
-            first_packet=hot.tally.first_over,
-            packets=hot.tally.packets,
-            over=hot.tally.over,
-            peak_score=hot.tally.peak,
-            anomalous_seconds=hot.anomalous_seconds,
-            rate=float(hot.tally.packets),
-            training_rate=float(hot.record.training_rate),
+            event_time=(second.second + 1) * 1_000_000_000,
+            first_packet=second.tally.first_over,
+            packets=second.tally.packets,
+            over=second.tally.over,
+            peak_score=second.tally.peak,
+            anomalous_seconds=second.anomalous_seconds,
+            rate=float(second.tally.packets),
+            training_rate=float(second.record.training_rate),
             mac_addresses=self.senders.roles.addresses(mac),
             role=self.senders.roles.role(mac, address),
-            reason=reason(hot, self.model, self.line),
+            reason=reason(second, self.model, self.threshold),
         )

@@ -46,7 +46,7 @@ class DriftReading:
 
     drifted: bool
     share: float
-    """Of packets over the line, averaged over half hours."""
+    """Of packets over the threshold, averaged over half hours."""
     least: float
     """Lower end of what resampling yields."""
     limit: float
@@ -58,15 +58,15 @@ class Drift:
     """Follows benign scores after training.
 
     Args:
-        line: the score that one packet of training in a hundred exceeds.
+        threshold: the score that one packet of training in a hundred exceeds.
         limit: share over it that is still no drift.
     """
 
-    def __init__(self, line: float, limit: float) -> None:
-        self.line = line
+    def __init__(self, threshold: float, limit: float) -> None:
+        self.threshold = threshold
         self.limit = limit
         self._blocks: OrderedDict[int, list[int]] = OrderedDict()
-        """By half hour: packets, and those over the line."""
+        """By half hour: packets, and those over the threshold."""
         self.reading: DriftReading | None = None
         """None until there are enough half hours."""
 
@@ -106,13 +106,14 @@ class Drift:
             return False
         numbers = (seconds // BLOCK_S).astype(np.int64)
         changed = False
-        for number in np.unique(numbers).tolist():
+        least, most = int(numbers.min()), int(numbers.max())
+        for number in [least] if least == most else np.unique(numbers).tolist():
             if number not in self._blocks:
                 changed |= self._close(number)
                 self._blocks[number] = [0, 0]
-            here = scores[numbers == number]
+            here = scores if least == most else scores[numbers == number]
             self._blocks[number][0] += len(here)
-            self._blocks[number][1] += int(np.count_nonzero(~(here <= self.line)))
+            self._blocks[number][1] += int(np.count_nonzero(~(here <= self.threshold)))
         return changed
 
     def _close(self, number: int) -> bool:
@@ -140,7 +141,7 @@ class Drift:
         """Plain values for the model file."""
         drifted = self.reading is not None and self.reading.drifted
         blocks = [[number, *counts] for number, counts in self._blocks.items()]
-        return {"line": self.line, "limit": self.limit, "blocks": blocks, "drifted": drifted}
+        return {"line": self.threshold, "limit": self.limit, "blocks": blocks, "drifted": drifted}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Self:
@@ -150,8 +151,8 @@ class Drift:
             KeyError, TypeError, ValueError: the state is not one.
         """
         self = cls(float(state["line"]), float(state["limit"]))
-        if not (np.isfinite(self.line) and 0 < self.limit <= _MOST_LIMIT):
-            raise ValueError(f"drift: line {self.line}, limit {self.limit}")
+        if not (np.isfinite(self.threshold) and 0 < self.limit <= _MOST_LIMIT):
+            raise ValueError(f"drift: threshold {self.threshold}, limit {self.limit}")
         for number, count, over in state["blocks"]:
             self._blocks[int(number)] = [int(count), int(over)]
         if state["drifted"]:

@@ -2,7 +2,7 @@
 
 start ─► is there a file? ─► was it trained for these switches, ports and settings? ─► taken up
               │ no                    │ no: the reason in one line, the file is kept beside
-              └───────────────────────┴─► train anew, write the file when training ends and at the stop
+              └───────────────────────┴─► train again, write the file when training ends and at the stop
 """
 
 import time
@@ -17,7 +17,7 @@ from apps.kitsune.kernel import LAMBDAS, Kernel
 from apps.kitsune.model_file import Model, ModelFileError, load_model
 
 SCHEMA: Final = 1
-"""Version of what training teaches beside the network; a model of another one is trained anew."""
+"""Version of what training yields besides the network; a model of another version is trained again."""
 MOST_ASIDE: Final = 5
 """Older models that are kept beside."""
 _OF_TRAINING: Final = ("fm_grace", "ad_grace", "max_ae", "mode", "max_streams", "max_links", "horizon")
@@ -89,9 +89,9 @@ class KeptModel:
         self.path = path
         self._here = dict(here)
         self.text = ""
-        """What became of the file at the start, in one line."""
+        """What happened to the file at the start, in one line."""
 
-    def detector(self, settings: DetectorSettings, kernel: Kernel | None) -> Detector | None:
+    def detector(self, settings: DetectorSettings, kernel: Kernel) -> Detector | None:
         """A detector with the kept model; None where there is none of use, and `text` says why."""
         if not self.path.exists():
             self.text = f"no model is kept yet; it will be in {self.path}"
@@ -103,10 +103,10 @@ class KeptModel:
         except ModelFileError as error:
             found, why = None, str(error)
         if found is not None:
-            self.text = f"took up the model of {day(found.trained_at_us)} from {self.path}"
+            self.text = f"using the kept model of {day(found.trained_at_us)} from {self.path}"
             return found
         aside = self.set_aside()
-        self.text = f"training anew: {why}; the old model is kept as {aside}"
+        self.text = f"training again: {why}; the old model is kept as {aside}"
         return None
 
     def set_aside(self) -> Path | None:

@@ -1,7 +1,6 @@
-"""Loads the C kernel if it was built; otherwise the slower Python twins are used."""
+"""Loads the C kernel: features, autoencoders and ledgers of packets."""
 
 import functools
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,7 +15,7 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 4
+VERSION: Final = 5
 """Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
@@ -68,8 +67,8 @@ _LEDGERS: Final = (
     typedef struct {
         int32_t most_subjects, kept, most_contacts, calibration;
         double grace_s, least_nats, most_nats, least_step, least_share, deciding_nats, half_life_s,
-            neighbours_share, least_scale_share, asked_s, present_s, theft, again_s, soon_s;
-        int32_t refused_bytes, replies_count, chosen, blocks, most_logins;
+            neighbours_share, least_scale_share, asked_s, present_s, theft, again_s, soon_s, in_vain_s;
+        int32_t refused_bytes, replies_count, chosen, blocks, most_logins, others;
     } BehaviourLimits;
     typedef struct { int32_t windows, own, rates; double window[4], least_scale; } CounterSettings;
     typedef struct {
@@ -77,7 +76,7 @@ _LEDGERS: Final = (
         uint64_t who[4], victim[2];
         int64_t service;
         uint64_t kind;
-        double nats, total, count, window, usual, time;
+        double nats, total, count, window, usual, begun, time;
         uint64_t arrival;
         int32_t has_sender, supporting;
         double sums[4];
@@ -91,6 +90,7 @@ _LEDGERS: Final = (
     int behaviour_calibrate(Behaviour *, const double *logs, long n, int32_t blocks);
     const BehaviourEvent *behaviour_events(const Behaviour *, long *count);
     long behaviour_tail(const Behaviour *);
+    long behaviour_subjects(const Behaviour *);
     void behaviour_training(const Behaviour *, double *out);
     void behaviour_close_training(Behaviour *);
     int behaviour_baseline(Behaviour *, int32_t what, int32_t own, const uint64_t *keys, const double *counts, long n);
@@ -99,12 +99,14 @@ _LEDGERS: Final = (
                        const uint64_t *contacts, long k);
     long behaviour_contacts(const Behaviour *, int32_t training, uint64_t *out, long room);
     void behaviour_callbacks(Behaviour *, double nats, double usual);
+    void behaviour_outside(Behaviour *, double silence, int32_t reached);
+    void behaviour_arp_grace(Behaviour *, double seconds);
     int behaviour_proven(const Behaviour *, int32_t six, uint64_t hi, uint64_t lo);
     int behaviour_blocks(Behaviour *, const uint64_t *rows, long n);
     typedef struct {
         int64_t most_senders;
-        int32_t most_conversations, hot_packets, replies_per_packet;
-        double hot_share;
+        int32_t most_conversations, anomalous_packets, replies_per_packet;
+        double anomalous_share;
     } SenderLimits;
     typedef struct {
         int32_t what, kept_in, kept_at, row;
@@ -116,7 +118,7 @@ _LEDGERS: Final = (
     Senders *senders_new(const SenderLimits *, int32_t training, uint64_t seed);
     void senders_free(Senders *);
     int senders_add(Senders *, const PacketRows *, long n, long trained, uint16_t number, const double *scores,
-                    double line, int32_t *peaks, long *kept);
+                    double threshold, int32_t *peaks, long *kept);
     int senders_finish(Senders *);
     const SenderEvent *senders_events(const Senders *, long *count);
     int senders_know(Senders *, const uint64_t *who, int64_t rate, int64_t destinations);
@@ -163,6 +165,10 @@ class ColumnError(ValueError):
     """A column of a batch is missing, has another length, or holds no numbers."""
 
 
+class KernelMissing(RuntimeError):
+    """The C kernel was not built, or belongs to another version."""
+
+
 class Kernel(NamedTuple):
     """The loaded library and its cffi instance."""
 
@@ -170,13 +176,24 @@ class Kernel(NamedTuple):
     lib: Any
 
     def pointer(self, kind: str, array: npt.NDArray[Any]) -> Any:
-        """A C pointer to the array's data; the array must be contiguous and outlive the call."""
-        return self.ffi.cast(f"{kind} *", array.__array_interface__["data"][0])
+        """The array's data for a parameter or field that points to `kind`; the array must be contiguous and
+        outlive the call."""
+        return self.ffi.from_buffer(_array_type(kind), array)
 
 
 @functools.cache
-def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
-    """The kernel, or None with one warning when it was not built (no C compiler at installation)."""
+def _array_type(kind: str) -> Any:
+    """A type of C, which takes longer to read than a column to hand over."""
+    return cffi.FFI().typeof(f"{kind}[]")
+
+
+@functools.cache
+def load_kernel(path: Path = _LIBRARY) -> Kernel:
+    """The kernel.
+
+    Raises:
+        KernelMissing: it cannot be loaded.
+    """
     ffi = cffi.FFI()
     ffi.cdef(_DECLARATIONS + _LEDGERS)
     try:
@@ -186,13 +203,9 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel | None:
         problem = f"{path} belongs to another version"
     except (OSError, AttributeError) as error:
         problem = str(error)
-    warnings.warn(
-        f"Kitsune runs on its Python twin, dozens of times slower: {problem}. "
-        "Install a C compiler and reinstall SDNator (pip install) to get the kernel.",
-        RuntimeWarning,
-        stacklevel=3,
+    raise KernelMissing(
+        f"Kitsune's kernel cannot be loaded: {problem}; install a C compiler (gcc) and reinstall SDNator with pip"
     )
-    return None
 
 
 def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:
@@ -202,4 +215,6 @@ def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:
     """
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufb":
         raise ColumnError(f"a column holds {getattr(array, 'dtype', type(array).__name__)}, not numbers")
+    if array.dtype == kind and array.flags.c_contiguous and array.flags.aligned:
+        return array
     return np.require(array, kind, ("C_CONTIGUOUS", "ALIGNED"))

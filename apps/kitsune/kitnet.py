@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.kitsune.feature_map import FeatureMapper
-from apps.kitsune.kernel import Kernel, contiguous
+from apps.kitsune.kernel import Kernel, contiguous, load_kernel
 
 _Array = npt.NDArray[np.float64]
 _SEED = 1234
-_BLOCK = 1024
 _UNSOUND = "KitNET: the layers do not fit each other or the features; train again"
 _LANES = 16
 """Rows that the kernel scores at a time."""
@@ -26,7 +25,7 @@ _LANES = 16
 
 @dataclass
 class Layer:
-    """Autoencoders of one layer, padded to a common size; `mask_*` are 1 where a unit exists."""
+    """Autoencoders of one layer, padded to a common size."""
 
     inputs: tuple[tuple[int, ...], ...]
     """Feature numbers of each autoencoder's inputs."""
@@ -38,18 +37,14 @@ class Layer:
     index: npt.NDArray[np.int32] = field(init=False)
     visible_of: npt.NDArray[np.int32] = field(init=False)
     hidden_of: npt.NDArray[np.int32] = field(init=False)
-    visible_mask: _Array = field(init=False)
-    hidden_mask: _Array = field(init=False)
 
     def __post_init__(self) -> None:
-        count, visible, hidden = self.weights.shape
+        count, visible, _ = self.weights.shape
         self.visible_of = np.array([len(group) for group in self.inputs], dtype=np.int32)
         self.hidden_of = hidden_units(self.visible_of)
         self.index = np.zeros((count, visible), dtype=np.int32)
         for row, group in zip(self.index, self.inputs, strict=True):
             row[: len(group)] = group
-        self.visible_mask = (np.arange(visible) < self.visible_of[:, None]).astype(float)
-        self.hidden_mask = (np.arange(hidden) < self.hidden_of[:, None]).astype(float)
 
     @classmethod
     def fresh(cls, inputs: Sequence[Sequence[int]]) -> "Layer":
@@ -66,42 +61,10 @@ class Layer:
         low, high = np.full((count, visible), np.inf), np.full((count, visible), -np.inf)
         return cls(groups, weights, np.zeros((count, hidden)), np.zeros((count, visible)), low, high)
 
-    def train_one(self, row: _Array, rate: float) -> _Array:
-        """One step of gradient descent for all autoencoders; returns their RMSE before the step."""
-        values = row[self.index]
-        self.low = np.where(values < self.low, values, self.low)
-        self.high = np.where(values > self.high, values, self.high)
-        x = (values - self.low) / (self.high - self.low + 1e-16) * self.visible_mask
-        y = _sigmoid(np.matmul(x[:, None], self.weights)[:, 0] + self.hidden_bias) * self.hidden_mask
-        z = _sigmoid(np.matmul(self.weights, y[..., None])[..., 0] + self.visible_bias)
-        e = (x - z) * self.visible_mask
-        gradient = np.matmul(e[:, None], self.weights)[:, 0] * y * (1 - y)
-        self.weights += rate * (x[..., None] * gradient[:, None] + e[..., None] * y[:, None])
-        self.hidden_bias += rate * gradient
-        self.visible_bias += rate * e
-        return np.asarray(np.sqrt((e**2).sum(axis=1) / self.visible_of))
-
-    def errors(self, rows: _Array, clip: float) -> _Array:
-        """RMSE of each autoencoder for rows of inputs, shape (rows, autoencoders)."""
-        values = rows[:, self.index].transpose(1, 0, 2)
-        x = (values - self.low[:, None]) / (self.high - self.low + 1e-16)[:, None]
-        if clip:
-            x = np.clip(x, -clip, clip)
-        x = np.where(self.visible_mask[:, None] > 0, x, 0.0)
-        y = _sigmoid(np.matmul(x, self.weights) + self.hidden_bias[:, None])
-        z = _sigmoid(np.matmul(y, self.weights.transpose(0, 2, 1)) + self.visible_bias[:, None])
-        e = (x - z) * self.visible_mask[:, None]
-        return np.asarray(np.sqrt((e**2).sum(axis=2) / self.visible_of[:, None]).T)
-
 
 def hidden_units(visible: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     """Three quarters of the inputs, rounded up."""
     return np.array([math.ceil(0.75 * size) for size in visible.tolist()], dtype=np.int32)
-
-
-def _sigmoid(x: _Array) -> _Array:
-    with np.errstate(over="ignore"):
-        return np.asarray(1.0 / (1.0 + np.exp(-x)))
 
 
 class KitNet:
@@ -116,7 +79,7 @@ class KitNet:
             train on all `fm_grace` + 1 + `ad_grace` packets, as published.
         clip: limit of scaled inputs when scoring; 0 = none, as published (a feature that was constant
             in training then scores near 1e16 when it first moves).
-        kernel: None uses the Python twin.
+        kernel: None loads the one that was built.
     """
 
     learning_rate = 0.1
@@ -138,7 +101,7 @@ class KitNet:
         self.fm_grace, self.ad_grace, self.max_ae = fm_grace, ad_grace, max(1, max_ae)
         self.clip = clip
         self.trained = 0
-        self._kernel = kernel
+        self._kernel = kernel or load_kernel()
         self._mapper = FeatureMapper(width)
         self.feature_map: list[list[int]] = []
         self.ensemble: Layer | None = None
@@ -189,15 +152,7 @@ class KitNet:
         self._check_width(features)
         if not len(features):
             return np.zeros(0), np.zeros((0, len(self.feature_map)))
-        ensemble, output = self._layers()
-        if self._kernel is not None:
-            return self._score_in_kernel(self._kernel, contiguous(features, "f8"))
-        blocks = [
-            ensemble.errors(features[start : start + _BLOCK], self.clip)
-            for start in range(0, len(features), _BLOCK)
-        ]
-        errors = np.concatenate(blocks)
-        return output.errors(errors, self.clip)[:, 0], errors
+        return self._score(contiguous(features, "f8"))
 
     def _check_width(self, features: _Array) -> None:
         if features.ndim != 2 or features.shape[1] != self.width:
@@ -218,10 +173,6 @@ class KitNet:
 
     def _train(self, features: _Array) -> None:
         ensemble, output = self._layers()
-        if self._kernel is None:
-            for row in features:
-                output.train_one(ensemble.train_one(row, self.learning_rate), self.learning_rate)
-            return
         kernel = self._kernel
         scratch = self._scratch()
         layers = [_c_layer(kernel, layer) for layer in (ensemble, output)]
@@ -230,7 +181,8 @@ class KitNet:
         if kernel.lib.kitnet_train(*layers, rows, len(features), self.width, self.learning_rate, work):
             raise ValueError(_UNSOUND)
 
-    def _score_in_kernel(self, kernel: Kernel, features: _Array) -> tuple[_Array, _Array]:
+    def _score(self, features: _Array) -> tuple[_Array, _Array]:
+        kernel = self._kernel
         layers = [_c_layer(kernel, layer) for layer in self._layers()]
         count = len(features)
         spare = -count % _LANES

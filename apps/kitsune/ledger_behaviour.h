@@ -18,7 +18,7 @@ typedef struct {
     uint64_t who[4], victim[2];
     int64_t service;
     uint64_t kind;
-    double nats, total, count, window, usual, time;
+    double nats, total, count, window, usual, begun, time;
     uint64_t arrival;
     int32_t has_sender, supporting;
     double sums[MOST_WINDOWS];
@@ -47,13 +47,19 @@ typedef struct {
     Subject contact;
 } Due;
 
+/* A ring; ends of grace periods in order. */
+typedef struct {
+    Due *due;
+    int64_t from, count, room;
+} Dues;
+
 typedef struct {
     Subject sender;
     double time;
 } Trained;
 
 typedef struct {
-    int64_t second, out, back, due;
+    int64_t second, out, back, before, due, syns, syns_due;
     int32_t is_there;
 } Exchange;
 
@@ -82,17 +88,21 @@ typedef struct {
     double callback_nats, callback_usual;
     Table pending, known, vain, proven;    /* by contact; `known` holds a generation */
     Table senders, owners, owner_macs;     /* of training; `owners` when one spoke, `owner_macs` its number */
-    Table exchanges, asked, logins, strangers, told, blocked;
+    Table exchanges, asked, logins, strangers, told, blocked, in_vain;
     uint8_t login_ports[65536 / 8];
-    Due *due;
-    int64_t due_from, due_count, due_room;
+    Dues dues[2];                          /* of ARP requests, of all others */
+    double arp_grace, slowest_arp;         /* seconds */
+    int64_t arp_replies;
     Trained *tail;
     int64_t tail_from, tail_count;
     uint32_t generation;
     int64_t young, exchange_halves;
     int64_t packets, per_block;
     double begun, seconds;
-    double one_way_most[3][MOST_BLOCKS];
+    double one_way_most[4][MOST_BLOCKS];
+    double outside_last, outside_gap, silence; /* seconds; `silence` < 0: it means nothing */
+    double in_vain_since;
+    int outside_heard, outside_reached;
     int learning, failed, in_switch;
     BehaviourEvent *events;
     long event_count, event_room;
@@ -184,25 +194,43 @@ static void remember(Behaviour *b, const Subject *contact)
     }
 }
 
-static void push_due(Behaviour *b, double deadline, const Subject *contact)
+static double grace_of(const Behaviour *b, const Subject *contact)
 {
-    if (b->due_count == b->due_room) {
-        int64_t room = b->due_room ? b->due_room * 2 : 1024;
+    return (int64_t)contact->word[0] == ARP ? b->arp_grace : b->limits.grace_s;
+}
+
+static void push_due(Behaviour *b, double time, const Subject *contact)
+{
+    Dues *dues = &b->dues[(int64_t)contact->word[0] != ARP];
+    if (dues->count == dues->room) {
+        int64_t room = dues->room ? dues->room * 2 : 1024;
         Due *due = malloc((size_t)room * sizeof *due);
         if (!due) {
             b->failed = 1;
             return;
         }
-        for (int64_t i = 0; i < b->due_count; i++)
-            due[i] = b->due[(b->due_from + i) & (b->due_room - 1)];
-        free(b->due);
-        b->due = due;
-        b->due_room = room;
-        b->due_from = 0;
+        for (int64_t i = 0; i < dues->count; i++)
+            due[i] = dues->due[(dues->from + i) & (dues->room - 1)];
+        free(dues->due);
+        dues->due = due;
+        dues->room = room;
+        dues->from = 0;
     }
-    Due *last = &b->due[(b->due_from + b->due_count++) & (b->due_room - 1)];
-    last->deadline = deadline;
+    Due *last = &dues->due[(dues->from + dues->count++) & (dues->room - 1)];
+    last->deadline = time + grace_of(b, contact);
     last->contact = *contact;
+}
+
+/* The queue whose turn it is at `now`, if there is one. */
+static Dues *dues_at(Behaviour *b, double now)
+{
+    Dues *first = NULL;
+    for (int which = 0; which < 2; which++) {
+        Dues *dues = &b->dues[which];
+        if (dues->count && (!first || dues->due[dues->from].deadline < first->due[first->from].deadline))
+            first = dues;
+    }
+    return first && first->due[first->from].deadline <= now ? first : NULL;
 }
 
 static void end_contact(Behaviour *b, const Subject *contact, int32_t at, double time, int failed, Ended *ended)
@@ -223,14 +251,14 @@ static void end_contact(Behaviour *b, const Subject *contact, int32_t at, double
 /* The next contact whose grace period is over at `now`. */
 static int next_due(Behaviour *b, double now, Ended *ended)
 {
-    while (b->due_count && b->due[b->due_from].deadline <= now) {
-        Subject contact = b->due[b->due_from].contact;
-        b->due_from = (b->due_from + 1) & (b->due_room - 1);
-        b->due_count--;
+    for (Dues *dues; (dues = dues_at(b, now));) {
+        Subject contact = dues->due[dues->from].contact;
+        dues->from = (dues->from + 1) & (dues->room - 1);
+        dues->count--;
         int32_t at = table_find(&b->pending, &contact);
         if (at != NONE) {
             double since = ((Pending *)payload(&b->pending, at))->time;
-            end_contact(b, &contact, at, since + b->limits.grace_s, 1, ended);
+            end_contact(b, &contact, at, since + grace_of(b, &contact), 1, ended);
             return 1;
         }
     }
@@ -242,6 +270,10 @@ static int answered(Behaviour *b, const Row *row, const Subject *contact, int32_
     if (row->is_tcp && !(row->flags & RST) && (row->flags & (SYN | ACK)) == (SYN | ACK)) {
         ((Pending *)payload(&b->pending, at))->half_open = 1;
         return 0;
+    }
+    if (b->learning && row->service == ARP) {
+        b->arp_replies++;
+        b->slowest_arp = fmax(b->slowest_arp, row->time - ((Pending *)payload(&b->pending, at))->time);
     }
     end_contact(b, contact, at, row->time, row->is_tcp && row->flags & RST, ended);
     return 1;
@@ -274,7 +306,7 @@ static int follow_contact(Behaviour *b, const Row *row, const Subject *sender, E
         if (pending) {
             Pending begun = {row->time, *sender, row->arrival, row->reverse, (row->flags & SYN) != 0, 0};
             *pending = begun;
-            push_due(b, row->time + b->limits.grace_s, &there);
+            push_due(b, row->time, &there);
         }
     }
     return 0;

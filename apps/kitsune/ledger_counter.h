@@ -8,13 +8,14 @@
 
 #define MOST_WINDOWS 4
 #define MOST_EVENTS 1024
+#define FORGOTTEN_AT_A_TIME 2
 
 /* Limits and constants, set by Python from the modules that define them. */
 typedef struct {
     int32_t most_subjects, kept, most_contacts, calibration;
     double grace_s, least_nats, most_nats, least_step, least_share, deciding_nats, half_life_s, neighbours_share,
-        least_scale_share, asked_s, present_s, theft, again_s, soon_s;
-    int32_t refused_bytes, replies_count, chosen, blocks, most_logins;
+        least_scale_share, asked_s, present_s, theft, again_s, soon_s, in_vain_s;
+    int32_t refused_bytes, replies_count, chosen, blocks, most_logins, others;
 } BehaviourLimits;
 
 typedef struct {
@@ -35,11 +36,12 @@ typedef struct {
     CounterSettings set;
     int usable;
     double own_scale, shared_scale, rarity;
+    double begun[MOST_WINDOWS]; /* by window: the first event of the last sums, seconds; 0 where nothing is summed */
     Table events, shared, highest, reported;
 } Counter;
 
 typedef struct {
-    double nats, total, count, window, usual;
+    double nats, total, count, window, usual, begun;
 } Seen;
 
 static int counter_start(Counter *counter, const CounterSettings *set, uint64_t seed)
@@ -100,6 +102,25 @@ static int events_grow(Events *events)
     return 0;
 }
 
+static void forget_oldest(Table *table)
+{
+    events_end(payload(table, table->oldest));
+    table_drop(table, table->oldest);
+}
+
+/* Those that were quiet for longer than the longest window: their sums are 0, as are those of nobody. */
+static void forget_quiet(Counter *counter, double time)
+{
+    Table *table = &counter->events;
+    double since = time - counter->set.window[counter->set.windows - 1];
+    for (int i = 0; i < FORGOTTEN_AT_A_TIME && table->oldest != NONE; i++) {
+        const Events *events = payload(table, table->oldest);
+        if (!events->count || events->times[events->count - 1] >= since)
+            return;
+        forget_oldest(table);
+    }
+}
+
 static Events *events_of(Counter *counter, const Subject *subject, int32_t most)
 {
     Table *table = &counter->events;
@@ -108,10 +129,8 @@ static Events *events_of(Counter *counter, const Subject *subject, int32_t most)
         table_renew(table, at);
         return payload(table, at);
     }
-    if (table->live >= most) {
-        events_end(payload(table, table->oldest));
-        table_drop(table, table->oldest);
-    }
+    if (table->live >= most)
+        forget_oldest(table);
     at = table_add(table, subject);
     return at == NONE ? NULL : payload(table, at);
 }
@@ -119,6 +138,7 @@ static Events *events_of(Counter *counter, const Subject *subject, int32_t most)
 /* Adds an event; the sums within the windows go to `out`.  -1 when memory is short. */
 static int counter_add(Counter *counter, const Subject *subject, double time, double weight, int32_t most, double *out)
 {
+    forget_quiet(counter, time);
     Events *events = events_of(counter, subject, most);
     if (!events || events_grow(events))
         return -1;
@@ -136,15 +156,18 @@ static int counter_add(Counter *counter, const Subject *subject, double time, do
         memmove(events->times, events->times + aged, (size_t)n * sizeof *events->times);
         memmove(events->sums, events->sums + aged, ((size_t)n + 1) * sizeof *events->sums);
     }
-    for (int32_t i = 0; i < counter->set.windows; i++)
-        out[i] = events->sums[n] - events->sums[first_not_before(events->times, n, time - counter->set.window[i])];
+    for (int32_t i = 0; i < counter->set.windows; i++) {
+        int32_t first = first_not_before(events->times, n, time - counter->set.window[i]);
+        out[i] = events->sums[n] - events->sums[first];
+        counter->begun[i] = events->times[first];
+    }
     return 0;
 }
 
-static void weigh_more(Seen *best, double nats, double count, double window, double usual)
+static void weigh_more(const Counter *counter, int window, Seen *best, double nats, double count, double usual)
 {
     if (nats > best->total) {
-        Seen more = {0, nats, count, window, usual};
+        Seen more = {0, nats, count, counter->set.window[window], usual, counter->begun[window]};
         *best = more;
     }
 }
@@ -168,16 +191,16 @@ static Seen counter_measure(const Counter *counter, const BehaviourLimits *limit
 {
     Subject by_kind = {{kind, 0, 0, 0, 0, 0}};
     const double *shared = counts_of(&counter->shared, &by_kind), *own = counts_of(&counter->highest, whose);
-    Seen best = {0, 0, sums[0], counter->set.window[0], 0};
+    Seen best = {0, 0, sums[0], counter->set.window[0], 0, counter->begun[0]};
     for (int i = 0; i < counter->usable; i++) {
         double count = sums[i], most = shared ? shared[i] : 0;
         if (count > most)
-            weigh_more(&best, counter->rarity + counter_excess(counter, count, most), count, counter->set.window[i], most);
+            weigh_more(counter, i, &best, counter->rarity + counter_excess(counter, count, most), count, most);
         if (own) {
             double usual = fmax(own[i], limits->neighbours_share * most);
             if (count > usual) {
                 double scale = fmax(fmax(counter->set.least_scale, counter->own_scale * usual), limits->least_scale_share * most);
-                weigh_more(&best, (count - usual) / scale, count, counter->set.window[i], usual);
+                weigh_more(counter, i, &best, (count - usual) / scale, count, usual);
             }
         }
     }

@@ -86,6 +86,7 @@ static BehaviourEvent *found(Behaviour *b, int what, const Subject *sender, Addr
     event->count = seen->count;
     event->window = seen->window;
     event->usual = seen->usual;
+    event->begun = seen->begun;
     event->time = time;
     event->arrival = arrival;
     return event;

@@ -12,6 +12,8 @@
 #define FROM_UDP (4LL << 24)
 #define STRAY_TCP (5LL << 24)
 #define ANY_UDP (6LL << 24)
+#define OPENING (7LL << 24) /* SYNs, as a kind of one-way traffic */
+#define UNANSWERED (8LL << 24) /* echo requests without a reply, beside all of them */
 #define TCP (6LL << 16)
 #define UDP (17LL << 16)
 #define FIN 0x01

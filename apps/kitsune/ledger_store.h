@@ -10,10 +10,11 @@ void behaviour_free(Behaviour *b)
     for (int what = 0; what < STATISTICS; what++)
         counter_end(&b->counter[what]);
     Table *tables[] = {&b->failures, &b->called, &b->visits, &b->pending, &b->known, &b->vain, &b->proven, &b->senders, &b->owners, &b->owner_macs,
-                       &b->exchanges, &b->asked, &b->logins, &b->strangers, &b->told, &b->blocked};
+                       &b->exchanges, &b->asked, &b->logins, &b->strangers, &b->told, &b->blocked, &b->in_vain};
     for (size_t i = 0; i < sizeof tables / sizeof *tables; i++)
         table_end(tables[i]);
-    free(b->due);
+    for (int which = 0; which < 2; which++)
+        free(b->dues[which].due);
     free(b->tail);
     free(b->events);
     free(b);
@@ -30,7 +31,8 @@ static int start_tables(Behaviour *b, const CounterSettings *settings, uint64_t 
            | table_start(&b->senders, 0, seed) | table_start(&b->owners, sizeof(double), seed)
            | table_start(&b->owner_macs, sizeof(int32_t), seed) | table_start(&b->exchanges, sizeof(Exchanges), seed)
            | table_start(&b->asked, sizeof(double), seed) | table_start(&b->logins, sizeof(Login), seed)
-           | table_start(&b->strangers, 0, seed) | table_start(&b->told, sizeof(double), seed) | table_start(&b->blocked, 0, seed);
+           | table_start(&b->strangers, 0, seed) | table_start(&b->told, sizeof(double), seed) | table_start(&b->blocked, 0, seed)
+           | table_start(&b->in_vain, 0, seed);
 }
 
 /* NULL when memory is short or a limit makes no sense. */
@@ -55,7 +57,11 @@ Behaviour *behaviour_new(const BehaviourLimits *limits, const CounterSettings *s
     }
     for (long i = 0; i < n; i++)
         b->login_ports[logins[i] >> 3] |= (uint8_t)(1 << (logins[i] & 7));
-    for (int kind = 0; kind < 3; kind++)
+    b->outside_last = -INFINITY;
+    b->silence = -1;
+    b->learning = 1;
+    b->arp_grace = limits->grace_s;
+    for (int kind = 0; kind < 4; kind++)
         for (int block = 0; block < MOST_BLOCKS; block++)
             b->one_way_most[kind][block] = -INFINITY;
     return b;
@@ -68,16 +74,44 @@ const BehaviourEvent *behaviour_events(const Behaviour *b, long *count)
 }
 
 /* How many of the last packets of training are known. */
+/* Whose events are counted, by each statistic. */
+long behaviour_subjects(const Behaviour *b)
+{
+    long live = 0;
+    for (int what = 0; what < STATISTICS; what++)
+        live += b->counter[what].events.live;
+    return live;
+}
+
 long behaviour_tail(const Behaviour *b)
 {
     return (long)b->tail_count;
 }
 
-/* begun, seconds */
+/* begun, seconds, the longest silence of the outside (-1 where it was not heard), whether somebody reached it, ARP
+ * requests that were answered, the longest wait for a reply */
 void behaviour_training(const Behaviour *b, double *out)
 {
     out[0] = b->begun;
     out[1] = b->seconds;
+    out[3] = b->outside_reached;
+    out[4] = (double)b->arp_replies;
+    out[5] = b->slowest_arp;
+    out[2] = b->outside_heard ? fmax(b->outside_gap, b->begun + b->seconds - b->outside_last) : -1;
+}
+
+/* Training is done: the longest silence of the outside, and whether somebody reached it. */
+void behaviour_outside(Behaviour *b, double silence, int32_t reached)
+{
+    b->silence = silence;
+    b->outside_reached = reached;
+}
+
+/* Seconds to wait for ARP replies from now on. */
+void behaviour_arp_grace(Behaviour *b, double seconds)
+{
+    b->learning = 0;
+    b->arp_grace = seconds;
 }
 
 /* What is known by now is never counted again. */

@@ -77,6 +77,14 @@ static void *payload(const Table *table, int32_t at)
     return table->entries + (size_t)at * table->stride + sizeof(Head);
 }
 
+static int same_subject(const Subject *a, const Subject *b)
+{
+    uint64_t difference = 0;
+    for (int i = 0; i < WORDS; i++)
+        difference |= a->word[i] ^ b->word[i];
+    return !difference;
+}
+
 static int32_t table_find(const Table *table, const Subject *key)
 {
     if (!table->live)
@@ -84,10 +92,26 @@ static int32_t table_find(const Table *table, const Subject *key)
     uint32_t hash = hash_of(table, key);
     for (int32_t at = table->bucket[hash & table->mask]; at != NONE; at = head(table, at)->next) {
         const Head *found = head(table, at);
-        if (found->hash == hash && !memcmp(&found->key, key, sizeof *key))
+        if (found->hash == hash && same_subject(&found->key, key))
             return at;
     }
     return NONE;
+}
+
+/* What `table_find` will read, fetched early: first where a chain begins, then, a while later, its first entry. */
+static void table_fetch_chain(const Table *table, uint32_t hash)
+{
+    __builtin_prefetch(&table->bucket[hash & table->mask]);
+}
+
+static void table_fetch_entry(const Table *table, uint32_t hash)
+{
+    int32_t at = table->bucket[hash & table->mask];
+    if (at == NONE)
+        return;
+    const char *entry = (const char *)head(table, at);
+    __builtin_prefetch(entry);
+    __builtin_prefetch(entry + sizeof(Head) - 1);
 }
 
 /* More buckets; 0 when memory is short: longer chains still work. */

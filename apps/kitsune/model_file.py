@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.kitsune.afterimage import WIDTH
-from apps.kitsune.kernel import LAMBDAS
+from apps.kitsune.kernel import LAMBDAS, Kernel
 from apps.kitsune.kitnet import KitNet, Layer
 
 FORMAT: Final = "sdnator-kitsune-model"
@@ -112,7 +112,7 @@ _DAMAGE = (
 """Errors of numpy's reader on damaged files; it parses array headers as Python literals."""
 
 
-def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:
+def load_model(path: Path, *, clip: float = 0.0, kernel: Kernel | None = None) -> Model:
     """Reads a model; raises `ModelFileError` that names the file and what is wrong with it."""
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -121,7 +121,7 @@ def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:
         raise ModelFileError(f"{path}: no such model; write one with --save-model") from None
     except _DAMAGE as error:
         raise NotAModelError(
-            f"{path}: not a whole Kitsune model ({error}); train again and save it anew"
+            f"{path}: an incomplete Kitsune model ({error}); train again and save the result"
         ) from error
     header = _header(path, arrays)
     try:
@@ -129,7 +129,7 @@ def load_model(path: Path, *, clip: float = 0.0, kernel: Any = None) -> Model:
         return Model(network, dict(header["notes"]))
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise NotAModelError(
-            f"{path}: damaged Kitsune model ({error}); train again and save it anew"
+            f"{path}: damaged Kitsune model ({error}); train again and save the result"
         ) from error
 
 
@@ -150,7 +150,9 @@ def _header(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Any]:
     return dict(header)
 
 
-def _network(header: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], clip: float, kernel: Any) -> KitNet:
+def _network(
+    header: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], clip: float, kernel: Kernel | None
+) -> KitNet:
     if header["lambdas"] != list(LAMBDAS) or header["width"] != WIDTH:
         raise ValueError(f"features: {header['width']} with scales {header['lambdas']}")
     feature_map = header["feature_map"]

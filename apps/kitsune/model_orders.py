@@ -30,4 +30,6 @@ def late(order: ModelOrder, wall_ns: int) -> Answer | None:
     """The answer to an order that is too old; None if it may be carried out."""
     if not 0 < order.expires < wall_ns:
         return None
-    return Answer(id=order.id, done=False, text="the order came too late and was not carried out; ask again")
+    return Answer(
+        id=order.id, done=False, text="the instruction came too late and was not carried out; ask again"
+    )

@@ -41,8 +41,8 @@ class Kitsune:
         ad_grace: packets on which the autoencoders are trained, at least 1.
         max_ae: largest number of features per autoencoder.
         mode: "reference" is exact as published, and its memory grows with the traffic; "bounded" limits it.
-        max_streams: bounded mode: most streams in each of four tables, at least 2.
-        max_links: bounded mode: most links in each of two tables, at least 1.
+        max_streams: bounded mode: maximum number of streams in each of four tables, at least 2.
+        max_links: bounded mode: maximum number of links in each of two tables, at least 1.
         horizon: bounded mode: seconds of capture time after which an idle stream is forgotten.
         clip: limit for scaled features while scoring; 0 means none, as published.
 

@@ -72,14 +72,14 @@ def feature_words(feature: int) -> str:
     return f"{names[statistic]} of {group} over {round(1 / LAMBDAS[scale], 1):g} s"
 
 
-def reason(hot: AnomalousSecond, model: KitNet, line: float) -> str:
+def reason(second: AnomalousSecond, model: KitNet, threshold: float) -> str:
     """What the sender did, and the autoencoders and features with the highest errors."""
-    tally, record = hot.tally, hot.record
+    tally, record = second.tally, second.record
     _, _, mac, address = record.identity
     who = ip_text(*address) or mac_text(mac)
     parts = _comparisons(who, tally.packets, record.training_rate, tally.hosts, record.training_destinations)
     parts.append(
-        f"{tally.over} of {tally.packets} packets scored over {line:.3g}, the highest {tally.peak:.3g}"
+        f"{tally.over} of {tally.packets} packets scored over {threshold:.3g}, the highest {tally.peak:.3g}"
     )
     if isinstance(tally.evidence, Explanation):
         parts.append(_autoencoders(tally.evidence, model))

@@ -15,6 +15,8 @@ _ROUTED: Final = 3
 """A MAC with traffic from or to this many addresses outside the local network is a gateway."""
 _DNS, _DHCP = 53, 67
 _FEW: Final = 4
+_BORROWED: Final = 4
+"""Most addresses of a host that lends itself others' names; a MAC with more may be a new router."""
 
 Address = tuple[int, int, int]
 
@@ -54,7 +56,7 @@ class Roles:
         _remember(self._towards, mac, address)
 
     def spoke(self, address: Address, packets: int, multicast: int, *, dns: bool, dhcp: bool) -> None:
-        """All that an address sent in training: as many packets, so many to groups, some as DNS or DHCP server."""
+        """What an address sent in training: number of packets, of those to groups, and of those as DNS or DHCP server."""
         if dns or dhcp:
             self._serves[address] = "dhcp" if dhcp else "dns"
         self._multicast[address] = [packets, multicast]
@@ -88,6 +90,20 @@ class Roles:
         behind = self._behind.get(mac, set())
         fourth = sum(address[0] == 4 for address in behind)
         return max(fourth, len(behind) - fourth)
+
+    def is_borrowed(self, mac: int, address: Address) -> bool:
+        """Whether a local host uses an outside address beside its own: training has such addresses behind gateways only."""
+        return (
+            bool(self._gateways)
+            and mac not in self._gateways
+            and address[0] != 0
+            and not is_inside(address)
+            and 1 < self.addresses(mac) <= _BORROWED
+        )
+
+    def is_routed(self, mac: int, address: Address) -> bool:
+        """Whether the sender is behind a gateway of training."""
+        return mac in self._gateways and address[0] != 0 and address not in self._gateway_addresses
 
     def to_state(self) -> dict[str, Any]:
         """The learnt roles as plain values."""

@@ -50,8 +50,8 @@ typedef struct {
 
 typedef struct {
     int64_t most_senders;
-    int32_t most_conversations, hot_packets, replies_per_packet;
-    double hot_share;
+    int32_t most_conversations, anomalous_packets, replies_per_packet;
+    double anomalous_share;
 } SenderLimits;
 
 typedef struct {
@@ -192,7 +192,7 @@ static void close_second(Senders *s)
         if (!record)
             continue;
         record->last_second = second;
-        if (tally->over >= s->limits.hot_packets && (double)tally->over >= s->limits.hot_share * (double)tally->packets)
+        if (tally->over >= s->limits.anomalous_packets && (double)tally->over >= s->limits.anomalous_share * (double)tally->packets)
             tell_anomalous(s, tally, record, second);
     }
     s->tally_count = 0;
@@ -378,7 +378,7 @@ static void end_training(Senders *s)
 
 /* ---- the interface */
 
-static void take_row(Senders *s, const Row *row, uint16_t number, int trains, double score, double line, long at)
+static void take_row(Senders *s, const Row *row, uint16_t number, int trains, double score, double threshold, long at)
 {
     if (!s->has_second || row->second != s->second)
         turn(s, row->second);
@@ -403,21 +403,21 @@ static void take_row(Senders *s, const Row *row, uint16_t number, int trains, do
     }
     if (s->training)
         end_training(s);
-    if (!(score < line))
+    if (!(score < threshold))
         mark(tally, score, row->arrival, at);
 }
 
 /* n rows, of which the first `trained` were training.  The rows of peaks that are to be kept go to `peaks` (room for
  * n), their number to kept[0]; the number of this batch and of the oldest in which a peak is kept to kept[1] and [2].
  * -1 when memory is short. */
-int senders_add(Senders *s, const PacketRows *rows, long n, long trained, uint16_t number, const double *scores, double line, int32_t *peaks, long *kept)
+int senders_add(Senders *s, const PacketRows *rows, long n, long trained, uint16_t number, const double *scores, double threshold, int32_t *peaks, long *kept)
 {
     s->event_count = 0;
     s->batch++;
     for (long i = 0; i < n && !s->failed; i++) {
         Row row;
         read_row(rows, i, &row);
-        take_row(s, &row, number, i < trained, scores[i], line, i);
+        take_row(s, &row, number, i < trained, scores[i], threshold, i);
     }
     kept[0] = 0;
     kept[1] = kept[2] = s->batch;

@@ -1,38 +1,53 @@
-"""From scores to anomalous seconds of senders.
+"""From scores to anomalous seconds of senders, counted in C (`senders.c`): no Python object a packet.
 
-`native_senders.py` does the same in C.  A sender is an ingress port, a MAC and an address.  A second of capture time is anomalous for a sender when
-at least three, and at least half, of the packets for which it is responsible score above the threshold.
+A sender is an ingress port, a MAC and an address.  A second of capture time is anomalous for a sender when
+at least three, and at least half, of the packets for which it is responsible score at or above the threshold.  The
+initiator of a conversation is responsible for the replies, so that a flood's victim is not blocked: a reply is a
+TCP SYN-ACK or RST, an ICMP error, or a UDP packet back, soon after the initiator's last packet.
 """
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import repeat, starmap
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.afterimage import seconds
 from apps.kitsune.blocked import Blocked
-from apps.kitsune.conversations import Address, Conversations, is_tcp_reply
-from apps.kitsune.kernel import Columns
-from apps.kitsune.names import ip_text, mac_text
+from apps.kitsune.kernel import Columns, Kernel, load_kernel
+from apps.kitsune.ledger import SwitchNumbers, check, rows_of, seed
 from apps.kitsune.roles import Roles
 
-HOT_PACKETS: Final = 3
-HOT_SHARE: Final = 0.5
+ANOMALOUS_PACKETS: Final = 3
+ANOMALOUS_SHARE: Final = 0.5
 HISTORY_S: Final = 10
 MOST_SENDERS: Final = 131_072
 """Beyond this number, senders unknown to training and silent for `HISTORY_S` are forgotten."""
-_BACKWARDS_S: Final = 10
-_GROUP_BIT: Final = 1 << 40
-
+MOST_CONVERSATIONS: Final = 65_536
+REPLIES_PER_PACKET: Final = 10
+"""An initiator is responsible for at most this many replies per packet of its own; further ones are a flood."""
+Address = tuple[int, int, int]
+"""IP version, upper and lower half of the address."""
 Identity = tuple[str, int, int, Address]
 """Switch, ingress port, MAC, address."""
 Evidence = Callable[[npt.NDArray[np.int32]], Sequence[Any]]
 """Rows of the batch to the data that explain their scores, copied, because the batch is about to be released."""
+
+_SEEN, _TOWARDS, _TRAINED, _CLOCK_SET_BACK, _ANOMALOUS, _FORGOTTEN = range(6)
+_EVENT: Final = np.dtype(
+    [
+        *((name, "i4") for name in ("what", "kept_in", "kept_at", "row")),
+        *((name, "u8") for name in ("ends", "where", "hi", "lo")),
+        *((name, "i8") for name in ("second", "packets", "over", "destinations")),
+        ("first_over", "u8"),
+        *(("training_rate", "i8"), ("training_destinations", "i8"), ("peak", "f8")),
+    ]
+)
+"""A `SenderEvent` of C."""
+_MAC: Final = (1 << 48) - 1
+_WHAT: Final = "senders"
 
 
 @dataclass(slots=True)
@@ -43,7 +58,7 @@ class SenderRecord:
     training_rate: int = 0
     training_destinations: int = 0
     last_second: int = 0
-    hot: deque[int] = field(default_factory=deque)
+    anomalous: deque[int] = field(default_factory=deque)
 
 
 @dataclass(slots=True)
@@ -53,55 +68,15 @@ class Tally:
     packets: int = 0
     over: int = 0
     peak: float = -math.inf
-    peak_row: int = -1
     first_over: int = 0
-    destinations: set[Address] = field(default_factory=set)
-    counted: int = 0
-    """Destinations, where they were counted elsewhere."""
+    hosts: int = 0
+    """Number of different destinations."""
     evidence: Any = None
-
-    @property
-    def hosts(self) -> int:
-        """Number of different destinations."""
-        return self.counted or len(self.destinations)
-
-    def mark(self, score: float, arrival: int, row: int) -> None:
-        """One more packet above the threshold."""
-        if not self.over:
-            self.first_over = arrival
-        self.over += 1
-        if not score <= self.peak:
-            self.peak, self.peak_row = score, row
-
-    def keep(self, evidence: Evidence) -> None:
-        """Copy the peak's evidence, because the batch is about to be released."""
-        if self.peak_row >= 0:
-            self.evidence, self.peak_row = evidence(np.array([self.peak_row], np.int32))[0], -1
-
-
-class Packet(NamedTuple):
-    """The relevant columns of one row of a batch."""
-
-    switch: str
-    time: float
-    arrival: int
-    port: int
-    mac: int
-    to_mac: int
-    source: Address
-    destination: Address
-    to_multicast: bool
-    is_tcp: bool
-    sport: int
-    dport: int
-    udp_sport: int
-    quoted: int
-    flags: int
 
 
 @dataclass(frozen=True, slots=True)
 class AnomalousSecond:
-    """A sender's second in which too many packets scored above the threshold."""
+    """A sender's second in which too many packets scored at or above the threshold."""
 
     second: int
     record: SenderRecord
@@ -111,80 +86,37 @@ class AnomalousSecond:
 
 
 class Senders:
-    """Assigns scored packets to responsible senders and closes seconds as capture time passes them."""
+    """Assigns scored packets to responsible senders and closes seconds as capture time passes them.
 
-    def __init__(self, roles: Roles | None = None) -> None:
+    Args:
+        kernel: None loads the one that was built.
+        roles: as learnt before; then training is over.
+    """
+
+    def __init__(self, kernel: Kernel | None = None, roles: Roles | None = None) -> None:
+        kernel = kernel or load_kernel()
         self.roles = roles or Roles()
-        self.records: list[SenderRecord | None] = []
         self.clock_jumps = 0
-        self._ids: dict[Identity, int] = {}
-        self._free: list[int] = []
         self.blocked = Blocked()
-        self._conversations = Conversations()
-        self._second: int | None = None
-        self._training = True
-        self._tallies: dict[int, Tally] = {}
-        self._evidence: Evidence = lambda rows: rows.tolist()
-
-    def add(
-        self,
-        batch: Columns,
-        switch: str,
-        *,
-        scores: npt.NDArray[np.float64],
-        trained: int,
-        line: float,
-        evidence: Evidence,
-    ) -> list[AnomalousSecond]:
-        """Takes a batch of which the first `trained` packets were training; returns the seconds that became anomalous."""
-        hot: list[AnomalousSecond] = []
-        self._evidence = evidence
-        for row, packet in enumerate(_packets(batch, switch)):
-            second = int(packet.time)
-            if second != self._second:
-                hot += self._turn(second)
-            sender = self._sender(packet)
-            responsible = self._responsible(packet, sender)
-            if self.blocked and self._concerns_blocked(packet, sender, responsible):
-                continue
-            tally = self._tallies.get(responsible)
-            if tally is None:
-                tally = self._tallies[responsible] = Tally()
-            tally.packets += 1
-            if responsible == sender:
-                tally.destinations.add(packet.destination)
-            if row < trained:
-                self.roles.learn(
-                    packet.source, packet.udp_sport, packet.to_mac, packet.destination, packet.to_multicast
-                )
-                continue
-            if self._training:
-                self._end_training()
-            score = scores[row]
-            if not score < line:
-                tally.mark(float(score), packet.arrival, row)
-        for tally in self._tallies.values():
-            tally.keep(evidence)
-        return hot
-
-    def finish(self) -> list[AnomalousSecond]:
-        """The capture has ended: closes the second that is still open."""
-        hot = list(self._close())
-        self._second = None
-        return hot
-
-    def rates(self, identity: Identity) -> tuple[int, int]:
-        """Packets of a sender in the open second, and the highest of any second of training."""
-        number = self._ids.get(identity)
-        record = self.records[number] if number is not None else None
-        if number is None or record is None:
-            return 0, 0
-        tally = self._tallies.get(number)
-        return tally.packets if tally is not None else 0, record.training_rate
-
-    def known(self) -> list[SenderRecord]:
-        """All senders that are remembered."""
-        return [record for record in self.records if record is not None]
+        self._kernel, self._lib = kernel, kernel.lib
+        limits = {
+            "most_senders": MOST_SENDERS,
+            "most_conversations": MOST_CONVERSATIONS,
+            "anomalous_packets": ANOMALOUS_PACKETS,
+            "replies_per_packet": REPLIES_PER_PACKET,
+            "anomalous_share": ANOMALOUS_SHARE,
+        }
+        state = self._lib.senders_new(kernel.ffi.new("SenderLimits *", limits), roles is None, seed())
+        if state == kernel.ffi.NULL:
+            raise MemoryError("senders: no memory for their tables")
+        self._state = kernel.ffi.gc(state, self._lib.senders_free)
+        self._switches = SwitchNumbers()
+        self._history: dict[Identity, deque[int]] = {}
+        """Anomalous seconds of senders that had some."""
+        self._kept: dict[int, Sequence[Any]] = {}
+        """Evidence of the open second, by number of the batch."""
+        self._full: npt.NDArray[np.uint64] = np.zeros(0, np.uint64)
+        """MACs behind which no more addresses are remembered."""
 
     def to_state(self) -> dict[str, Any]:
         """The learnt senders as plain values."""
@@ -195,157 +127,164 @@ class Senders:
         }
 
     @classmethod
-    def from_state(cls, state: dict[str, Any] | None) -> "Senders":
+    def from_state(cls, state: dict[str, Any] | None, kernel: Kernel | None = None) -> "Senders":
         """Senders from a saved model (None: it has none); training is complete.
 
-        Raises `KeyError`, `TypeError` or `ValueError` when the state is not one.
+        Raises:
+            KeyError, TypeError, ValueError: the state is not one.
         """
-        senders = cls(Roles.from_state(state["roles"]) if state else None)
-        senders._training = False
+        self = cls(kernel, Roles.from_state(state["roles"]) if state else Roles())
         for (switch, port, mac, (version, hi, lo)), rate, destinations in state["records"] if state else ():
             identity = (str(switch), int(port), int(mac), (int(version), int(hi), int(lo)))
-            senders.know(
-                SenderRecord(identity, training_rate=int(rate), training_destinations=int(destinations))
+            self._know(identity, int(rate), int(destinations))
+        return self
+
+    def _know(self, identity: Identity, rate: int, destinations: int) -> None:
+        words = np.array(self._words(identity, new=True), dtype=np.uint64)
+        pointer = self._kernel.pointer("uint64_t", words)
+        check(self._lib.senders_know(self._state, pointer, rate, destinations), _WHAT)
+        self.roles.see(identity[2], identity[3])
+
+    def add(
+        self,
+        batch: Columns,
+        switch: str,
+        *,
+        scores: npt.NDArray[np.float64],
+        trained: int,
+        threshold: float,
+        evidence: Evidence,
+    ) -> list[AnomalousSecond]:
+        """Take a batch of which the first `trained` packets were training; returns the seconds that became anomalous."""
+        rows = rows_of(self._kernel, batch)
+        if not rows.count:
+            return []
+        number = self._switches.number(switch)
+        blocks = self._switches.changed_blocks(self.blocked)
+        if blocks is not None:
+            code = self._lib.senders_blocks(
+                self._state, self._kernel.pointer("uint64_t", blocks), len(blocks)
             )
-        return senders
+            check(code, _WHAT)
+        scores = np.ascontiguousarray(scores, dtype=np.float64)
+        peaks, kept = np.empty(rows.count, np.int32), np.zeros(3, np.int64)
+        code = self._lib.senders_add(
+            self._state,
+            rows.pointer,
+            rows.count,
+            trained,
+            number,
+            self._kernel.pointer("double", scores),
+            threshold,
+            self._kernel.pointer("int32_t", peaks),
+            self._kernel.pointer("long", kept),
+        )
+        check(code, _WHAT)
+        seconds = self._take_events(evidence)
+        count, newest, oldest = kept.tolist()
+        if count:
+            self._kept[newest] = evidence(peaks[:count])
+        for number in [number for number in self._kept if number < oldest]:
+            del self._kept[number]
+        return seconds
+
+    def finish(self) -> list[AnomalousSecond]:
+        """The capture has ended: closes the second that is still open."""
+        check(self._lib.senders_finish(self._state), _WHAT)
+        seconds = self._take_events(lambda rows: rows.tolist())
+        self._kept.clear()
+        return seconds
+
+    def rates(self, identity: Identity) -> tuple[int, int]:
+        """Packets of a sender in the open second, and the highest of any second of training."""
+        if identity[0] not in self._switches.names:
+            return 0, 0
+        found = self._kernel.ffi.new("int64_t[2]")
+        self._lib.senders_rates(self._state, self._words(identity), found)
+        return found[0], found[1]
+
+    def known(self) -> list[SenderRecord]:
+        """All senders that are remembered."""
+        null = self._kernel.ffi.NULL
+        count = self._lib.senders_known(self._state, null, null, 0)
+        who, numbers = np.zeros((count, 4), np.uint64), np.zeros((count, 3), np.int64)
+        pointers = self._kernel.pointer("uint64_t", who), self._kernel.pointer("int64_t", numbers)
+        self._lib.senders_known(self._state, *pointers, count)
+        return [
+            SenderRecord(self._identity(words), *row)
+            for words, row in zip(who.tolist(), numbers.tolist(), strict=True)
+        ]
+
+    def _words(self, identity: Identity, *, new: bool = False) -> tuple[int, ...]:
+        switch, port, mac, (version, hi, lo) = identity
+        number = self._switches.number(switch) if new else self._switches.names.index(switch)
+        return mac | port << 48, number | version << 16, hi, lo
+
+    def _identity(self, words: Sequence[int]) -> Identity:
+        ends, where, hi, lo = words
+        return self._switches.names[where & 0xFFFF], ends >> 48, ends & _MAC, (where >> 16 & 0xFF, hi, lo)
+
+    def _take_events(self, evidence: Evidence) -> list[AnomalousSecond]:
+        seconds: list[AnomalousSecond] = []
+        count = self._kernel.ffi.new("long *")
+        pointer = self._lib.senders_events(self._state, count)
+        if not count[0]:
+            return seconds
+        events = np.frombuffer(self._kernel.ffi.buffer(pointer, count[0] * _EVENT.itemsize), _EVENT)
+        for event in self._worth(events).tolist():
+            what, kept_in, kept_at, row, *rest = event
+            identity = self._identity(rest[:4])
+            if what == _SEEN:
+                self._see(identity)
+            elif what == _TOWARDS:
+                self.roles.towards(identity[2], identity[3])
+            elif what == _TRAINED:
+                self._end_training()
+            elif what == _CLOCK_SET_BACK:
+                self.clock_jumps += 1
+                self._history.clear()
+            elif what == _FORGOTTEN:
+                self._history.pop(identity, None)
+            else:
+                proof = evidence(np.array([row], np.int32))[0] if row >= 0 else self._kept[kept_in][kept_at]
+                seconds.append(self._anomalous(identity, rest[4:], proof))
+        return seconds
+
+    def _worth(self, events: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+        """Without new addresses behind MACs that have as many as are remembered: floods are full of them."""
+        if not len(self._full):
+            return events
+        worth: npt.NDArray[np.void] = events[
+            (events["what"] != _SEEN) | ~np.isin(events["ends"] & np.uint64(_MAC), self._full)
+        ]
+        return worth
+
+    def _see(self, identity: Identity) -> None:
+        mac = identity[2]
+        self.roles.see(mac, identity[3])
+        if self.roles.is_full(mac) and mac not in self._full:
+            self._full = np.append(self._full, np.uint64(mac))
 
     def _end_training(self) -> None:
-        self._training = False
-        self._note_rates()
+        null = self._kernel.ffi.NULL
+        count = self._lib.senders_speakers(self._state, null, null, 0)
+        who, numbers = np.zeros((count, 3), np.uint64), np.zeros((count, 4), np.int64)
+        pointers = self._kernel.pointer("uint64_t", who), self._kernel.pointer("int64_t", numbers)
+        self._lib.senders_speakers(self._state, *pointers, count)
+        for (version, hi, lo), (packets, multicast, dns, dhcp) in zip(
+            who.tolist(), numbers.tolist(), strict=True
+        ):
+            self.roles.spoke((version, hi, lo), packets, multicast, dns=bool(dns), dhcp=bool(dhcp))
         self.roles.close_training()
 
-    def _turn(self, second: int) -> list[AnomalousSecond]:
-        if self._second is not None and second < self._second:
-            if self._second - second <= _BACKWARDS_S:
-                return []  # a late packet counts towards the open second
-            self.clock_jumps += 1
-            self._forget_history()
-        hot = list(self._close())
-        self._second = second
-        return hot
-
-    def _close(self) -> Iterator[AnomalousSecond]:
-        if self._training:
-            self._note_rates()
-        second = self._second or 0
-        for responsible, tally in self._tallies.items():
-            record = self.records[responsible]
-            if record is None:
-                continue
-            record.last_second = second
-            if tally.over >= HOT_PACKETS and tally.over >= HOT_SHARE * tally.packets:
-                record.hot.append(second)
-                while record.hot[0] <= second - HISTORY_S:
-                    record.hot.popleft()
-                tally.keep(self._evidence)
-                yield AnomalousSecond(second, record, tally, len(record.hot))
-        self._tallies = {}
-        if len(self._ids) > MOST_SENDERS:
-            self._forget(second)
-
-    def _note_rates(self) -> None:
-        for responsible, tally in self._tallies.items():
-            record = self.records[responsible]
-            if record is not None:
-                record.training_rate = max(record.training_rate, tally.packets)
-                record.training_destinations = max(record.training_destinations, len(tally.destinations))
-
-    def _forget(self, second: int) -> None:
-        for number, record in enumerate(self.records):
-            if record is not None and not record.training_rate and record.last_second < second - HISTORY_S:
-                del self._ids[record.identity]
-                self.records[number] = None
-                self._free.append(number)
-
-    def _forget_history(self) -> None:
-        """The clock was set back: keep rates and roles, forget anomalous seconds."""
-        for record in self.known():
-            record.hot.clear()
-
-    def _sender(self, packet: Packet) -> int:
-        identity = (packet.switch, packet.port, packet.mac, packet.source)
-        number = self._ids.get(identity)
-        if number is None:
-            number = self.know(SenderRecord(identity, last_second=self._second or 0))
-        return number
-
-    def know(self, record: SenderRecord) -> int:
-        """Add a sender, new or from a saved model."""
-        if self._free:
-            number = self._free.pop()
-            self.records[number] = record
-        else:
-            number = len(self.records)
-            self.records.append(record)
-        self._ids[record.identity] = number
-        self.roles.see(record.identity[2], record.identity[3])
-        return number
-
-    def _concerns_blocked(self, packet: Packet, sender: int, responsible: int) -> bool:
-        """Whether a packet answers a sender that is blocked, seen to begin the conversation or not."""
-        if responsible == sender:
-            return self._answers_blocked(packet)
-        record = self.records[responsible]
-        if record is None:
-            return False
-        switch, _, mac, address = record.identity
-        return self.blocked.covers(switch, mac_text(mac), ip_text(*address))
-
-    def _answers_blocked(self, packet: Packet) -> bool:
-        """Whether a packet answers a conversation that was not seen because its initiator is blocked."""
-        answer = packet.quoted or packet.udp_sport >= 0 or is_tcp_reply(packet.flags)
-        return bool(answer) and self.blocked.covers(
-            packet.switch, mac_text(packet.to_mac), ip_text(*packet.destination)
+    def _anomalous(self, identity: Identity, numbers: Sequence[Any], proof: Any) -> AnomalousSecond:
+        second, packets, over, destinations, first_over, rate, hosts, peak = numbers
+        history = self._history.setdefault(identity, deque())
+        history.append(second)
+        while history[0] <= second - HISTORY_S:
+            history.popleft()
+        record = SenderRecord(identity, rate, hosts, second, history)
+        tally = Tally(
+            packets=packets, over=over, peak=peak, first_over=first_over, hosts=destinations, evidence=proof
         )
-
-    def _responsible(self, packet: Packet, sender: int) -> int:
-        charged = self._charged(packet, sender)
-        # who began the conversation may be forgotten
-        return sender if self.records[charged] is None else charged
-
-    def _charged(self, packet: Packet, sender: int) -> int:
-        if packet.sport < 0:
-            return sender
-        if packet.quoted:
-            key = (packet.is_tcp, packet.destination, packet.sport, packet.dport)
-            return self._conversations.payer_of_error(sender, packet.time, key)
-        key = (packet.is_tcp, packet.source, packet.sport, packet.dport)
-        reverse = (packet.is_tcp, packet.destination, packet.dport, packet.sport)
-        return self._conversations.responsible(sender, packet.time, key, reverse, packet.flags)
-
-
-def _packets(batch: Columns, switch: str) -> Iterator[Packet]:
-    is_arp = batch["arp_op"] >= 0
-    is_tcp = batch["tcp_sport"] >= 0
-    multicast = batch["eth_dst"] & _GROUP_BIT != 0
-    return starmap(
-        Packet,
-        zip(
-            repeat(switch, len(is_arp)),
-            seconds(batch).tolist(),
-            batch["arrival"].tolist(),
-            batch["port"].tolist(),
-            batch["eth_src"].tolist(),
-            batch["eth_dst"].tolist(),
-            _addresses(batch, "src", is_arp),
-            _addresses(batch, "dst", is_arp),
-            multicast.tolist(),
-            is_tcp.tolist(),
-            np.where(is_tcp, batch["tcp_sport"], batch["udp_sport"]).tolist(),
-            np.where(is_tcp, batch["tcp_dport"], batch["udp_dport"]).tolist(),
-            np.where(batch["quoted"] != 0, -1, batch["udp_sport"]).tolist(),
-            batch["quoted"].tolist(),
-            batch["tcp_flags"].tolist(),
-            strict=True,
-        ),
-    )
-
-
-def _addresses(batch: Columns, side: str, is_arp: npt.NDArray[np.bool_]) -> Iterator[Address]:
-    """The IP address of each row; for ARP the sender or target address in the message."""
-    version, low = batch["ip_version"], batch[f"ip_{side}_lo"]
-    # received columns may hold anything: see `behaviour/rows.py`
-    version = np.where(is_arp, 4, np.where((version == 4) | (version == 6), version, 0))
-    short = np.where(is_arp, batch[f"arp_{side}_ip"], np.where(version == 4, low & 0xFFFF_FFFF, 0))
-    high = np.where(version == 6, batch[f"ip_{side}_hi"], 0)
-    return zip(version.tolist(), high.tolist(), np.where(version == 6, low, short).tolist(), strict=True)
+        return AnomalousSecond(second, record, tally, len(history))

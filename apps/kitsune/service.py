@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
@@ -103,7 +104,7 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
     """File to which the model is written when training ends and when the app stops; empty: nowhere."""
     keep_model: str = ""
     """File that is loaded if its model was trained for the same switches, ports and settings, and written otherwise;
-    empty: none, or `load_model` and `save_model` say. `sdnator up` sets it."""
+    empty: none; `load_model` and `save_model` apply. `sdnator up` sets it."""
     keep_for: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
     """Switches and their ports, to compare `keep_model` with. `sdnator up` sets it."""
 
@@ -119,7 +120,7 @@ class KitsuneService:
         self._kept = KeptModel(Path(settings.keep_model), self._belongs) if settings.keep_model else None
         self._detector = self._first_detector()
         self._successor: Successor | None = None
-        """The model that trains beside the working one."""
+        """The model that trains beside the one in use."""
         self._told = self._detector.model.is_trained
         self._progress = TrainingProgress(self._detector.model.training_packets)
         self._intake = Intake(_log)
@@ -134,6 +135,8 @@ class KitsuneService:
         self._packets = 0
         self._alerts = 0
         self._found = 0
+        self._numbers = count(1)
+        """Of evidence and states of training, which come under keys of their own."""
         self._training_step = -1
         self._subscriptions: list[Any] = []
 
@@ -150,7 +153,7 @@ class KitsuneService:
             _log.info("%s", self._kept.text)
 
     def ready(self) -> dict[str, str]:
-        """For the ready line: what became of the kept model."""
+        """For the ready line: what happened to the kept model."""
         return {"model": self._kept.text} if self._kept is not None else {}
 
     def _first_detector(self) -> Detector:
@@ -184,7 +187,7 @@ class KitsuneService:
             try:
                 self._kept.keep(self._detector)
             except (ModelFileError, OSError) as error:
-                _log.error("the model is not kept: %s", error)
+                _log.error("the model could not be kept: %s", error)
 
     def health(self) -> dict[str, Any]:
         """Counters and settings for metrics and the dashboard."""
@@ -194,13 +197,14 @@ class KitsuneService:
             "training_packets": self._detector.model.training_packets,
             "alerts": self._alerts,
             "evidence": self._found,
-            "line": self._detector.line,
+            "threshold": self._detector.threshold,
             "training_warnings": self._detector.training_warnings,
             "model": self._model_health(),
             "clock_jumps": self._detector.senders.clock_jumps,
             "times_doubted": self._time.doubted,
             "blocked": len(self._detector.senders.blocked),
             **self._intake.health(),
+            "subjects": self._detector.behaviour.subjects,
             **self._detector.afterimage.counts,
         }
 
@@ -252,17 +256,17 @@ class KitsuneService:
         self._engine.write(ANSWER, answer.to_value(), [NO_WAIT])
 
     def _renew(self) -> str:
-        """Train another model beside the working one; where none works yet, go on."""
+        """Train a second model beside the one in use; if none is in use yet, training continues."""
         if not self._detector.model.is_trained:
             return "a model is being trained already, and none is in use before it"
         self._successor = Successor(self._settings, self._detector, self._kernel)
         wanted = self._successor.detector.model.training_packets
-        text = f"another model trains on the next {wanted:,} packets, beside the one in use; it takes over if it is no worse"
+        text = f"a second model trains on the next {wanted:,} packets, beside the one in use; it takes over if it is no worse"
         _log.warning("an operator asked for it: %s", text)
         return text
 
     def _take_over(self, found: Comparison) -> None:
-        """The successor is trained and compared: it takes over, or is thrown away."""
+        """The successor is trained and compared: it takes over, or is discarded."""
         successor, self._successor = self._successor, None
         if successor is None:
             return
@@ -286,7 +290,7 @@ class KitsuneService:
         self._detector.senders.blocked = before.senders.blocked
         self._progress = TrainingProgress(self._detector.model.training_packets)
         self._told, self._training_step = False, -1
-        text = f"training anew on the next {self._progress.wanted:,} packets; nobody is blocked until then"
+        text = f"training again, on the next {self._progress.wanted:,} packets; nobody is blocked until then"
         text += f"; the old model is kept as {aside}" if aside is not None else ""
         _log.warning("an operator asked for it: %s", text)
         return text
@@ -303,17 +307,19 @@ class KitsuneService:
             batch = self._steady(batch)
             before = self._detector.trained
             scored, alerts = self._detector.process(batch, switch)
-            if self._detector.trained > before:
-                self._progress.see(batch, switch, self._detector.trained - before)
+            trained = self._detector.trained - before
+            if trained:
+                self._progress.see(batch, switch, trained)
             self._packets += len(batch)
             self._is_open = True
             self._note_arrival(switch, int(batch["arrival"][-1]))
             event_time = int(batch["time_us"][-1]) * 1_000
-            self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
+            # evidence rests on training: what ends it comes first, at the time of its last packet
+            self._tell_training(int(batch["time_us"][trained - 1]) * 1_000 if trained else event_time)
             self._write_evidence()
+            self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
             self._write_alerts(alerts)
             self._tell_talkers(batch, switch)
-            self._tell_training(event_time)
             self._tell_drift(event_time)
             if self._detector.model.is_trained and not self._told:
                 self._end_of_training()
@@ -367,6 +373,7 @@ class KitsuneService:
             "count": len(batch),
             "trained": self._detector.trained,
             "over": scored.over,
+            "evidence": self._found,
             "max": float(scored.scores.max()),
             "first_arrival": int(arrival[0]),
             "last_arrival": int(arrival[-1]),
@@ -380,7 +387,8 @@ class KitsuneService:
         for evidence in self._detector.take_evidence():
             self._found += 1
             key = f"{EVIDENCE_KEY}.{evidence.source}"
-            self._engine.write(key, evidence.to_value(), [NO_WAIT], event_time=evidence.event_time)
+            numbered = msgspec.structs.replace(evidence, number=next(self._numbers))
+            self._engine.write(key, numbered.to_value(), [NO_WAIT], event_time=evidence.event_time)
 
     def _tell_training(self, event_time: int) -> None:
         """Every hundredth of training, and its end."""
@@ -402,11 +410,12 @@ class KitsuneService:
                 PortTraining(switch=switch, port=port, packets=count)
                 for (switch, port), count in self._progress.ports.items()
             ),
+            number=next(self._numbers),
         )
         self._engine.write(TRAINING_KEY, state.to_value(), [NO_WAIT], event_time=event_time)
 
     def _tell_talkers(self, batch: RecordBatch, switch: str) -> None:
-        """Who sends most, while somebody looks."""
+        """Top talkers, while somebody looks."""
         if switch not in self._arrived or not self._engine.wanted(key := f"{TALKERS_KEY}.{switch}"):
             return
         if (found := self._talkers.add(batch, switch)) is not None:
@@ -423,7 +432,7 @@ class KitsuneService:
             f"{reading.share:.1%} of benign packets of the last day score over what 1 % of training did, in "
             f"{reading.blocks} half hours; up to {reading.limit:.0%} would be no drift"
         )
-        text = f"benign scores have drifted: {now}; `sdnator model retrain --beside` trains another"
+        text = f"benign scores have drifted: {now}; `sdnator model retrain --beside` trains a second model"
         if not reading.drifted:
             text = f"benign scores are like those of training again: {now}"
         _log.warning("%s", text)

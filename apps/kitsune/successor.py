@@ -1,12 +1,13 @@
-"""A model that trains beside the working one, and takes over when it is no worse.  Pure.
+"""A model that trains beside the one in use, and takes over if it is no worse.  Pure.
 
-    packets ─► working model ─► scores, evidence
-       └─ those of senders that nothing speaks against ─► successor: trains, then scores the same packets as the other
-                                                              ─► no worse: takes over;  worse: thrown away
+    packets ─► model in use ─► scores, evidence
+       └─ those of senders without evidence against them ─► successor: trains, then scores the same packets as the other
+                                                              ─► no worse: takes over;  worse: discarded
 
-No worse means, over a quarter as many packets as training had: hardly more of them over the threshold; a share over
-the score that one packet of its training in a hundred exceeds that is no drift, or no larger than the other model's;
-and nobody accused whom the working model does not accuse.
+Both models are compared over a quarter as many packets as training had.  The successor is no worse if hardly more of
+them are at or above its threshold; if the share above the score that one packet in a hundred of its training exceeds
+would not count as drift, or is no larger than that of the other model; and if it accuses nobody whom the model in use
+does not accuse.
 """
 
 from dataclasses import dataclass
@@ -24,27 +25,27 @@ from due import RecordBatch
 COMPARED_SHARE: Final = 0.25
 """Packets that both score, as a part of those of training."""
 MORE_OVER: Final = 1e-4
-"""Share of the packets that may be over the threshold beside those that the working model has there."""
+"""Share of the packets that may be at or above the threshold in addition to those of the model in use."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What both models made of the same packets."""
+    """How both models scored the same packets."""
 
     no_worse: bool
     text: str
 
 
 class Successor:
-    """Trains on what the working model takes for benign.
+    """Trains on packets that the model in use considers benign.
 
     Args:
         settings: of both.
         working: the model in use; its statistics of packets serve both.
-        kernel: as for the working one.
+        kernel: as for the model in use.
     """
 
-    def __init__(self, settings: DetectorSettings, working: Detector, kernel: Kernel | None) -> None:
+    def __init__(self, settings: DetectorSettings, working: Detector, kernel: Kernel) -> None:
         self.detector = Detector(settings, kernel=kernel)
         self.detector.afterimage = working.afterimage
         self.detector.senders.blocked = working.senders.blocked
@@ -60,13 +61,13 @@ class Successor:
         return max(1, round(COMPARED_SHARE * self.detector.model.training_packets))
 
     def add(self, batch: RecordBatch, switch: str, working: Detector, scored: Scored) -> Comparison | None:
-        """Take a batch that the working model has just scored.
+        """Take a batch that the model in use has just scored.
 
         Args:
             batch: its packets.
             switch: where they were seen.
             working: the model in use.
-            scored: what it made of the batch.
+            scored: its result for the batch.
 
         Returns:
             The outcome, once enough packets were compared.
@@ -87,8 +88,8 @@ class Successor:
         return self._outcome() if self.compared >= self.wanted else None
 
     def _compare(self, which: int, model: Detector, scores: npt.NDArray[np.float64]) -> None:
-        usual = model.drift.line if model.drift is not None else model.line
-        self._over[which] += int(np.count_nonzero(~(scores < model.line)))
+        usual = model.drift.threshold if model.drift is not None else model.threshold
+        self._over[which] += int(np.count_nonzero(~(scores < model.threshold)))
         self._unusual[which] += int(np.count_nonzero(~(scores <= usual)))
 
     def _outcome(self) -> Comparison:
@@ -100,8 +101,8 @@ class Successor:
             and self._unusual[1] <= max(self._unusual[0], limit * self.compared)
         )
         words = (
-            f"of {self.compared:,} packets that both scored {self._over[1]:,} are over the threshold "
-            f"({self._over[0]:,} by the working model), {self._unusual[1] / self.compared:.1%} are unusual "
+            f"of {self.compared:,} packets that both scored {self._over[1]:,} are at or above the threshold "
+            f"({self._over[0]:,} by the model in use), {self._unusual[1] / self.compared:.1%} are unusual "
             f"({self._unusual[0] / self.compared:.1%})"
         )
         if accused:

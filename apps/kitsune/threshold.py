@@ -42,7 +42,7 @@ class Benign:
         rate = len(scores) / max(seconds, 1.0) * 3600
         return cls(len(scores), float(logs.mean()), spread, rate)
 
-    def line(self, false_alarms_per_hour: float) -> float:
+    def threshold(self, false_alarms_per_hour: float) -> float:
         """The score that this many benign packets an hour exceed; raises `ValueError` unless it is above 0."""
         if not false_alarms_per_hour > 0:
             raise ValueError(f"false_alarms_per_hour={false_alarms_per_hour}: must be greater than 0")

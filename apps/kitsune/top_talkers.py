@@ -1,4 +1,4 @@
-"""Who sends most: packets and bytes by sender, over windows of capture time.  Pure.
+"""Top talkers: packets and bytes by sender, over windows of capture time.  Pure.
 
     batches of packets ──add──► sums by port and address ──a window is over──► TopTalkers
 

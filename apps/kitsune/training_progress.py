@@ -47,7 +47,7 @@ class TrainingProgress:
         """Seconds until training is done if packets go on to come as they did lately; None if nobody can say.
 
         Args:
-            now_us: capture time, which goes on while no packet comes.
+            now_us: capture time, which advances while no packets arrive.
         """
         if self.packets >= self.wanted:
             return 0.0

@@ -2,20 +2,20 @@
 
     kind   datagrams from a well-known port, to a port, all of them; TCP segments to a port that are no SYNs; pings
 
-`native_victims.py` does the same in C.  A rate limit towards a victim is set from this.  Pure; bounded in hosts and in sources.
+Counted in C (`victims.c`): no Python object a packet.  A rate limit towards a victim
+is set from this.  Pure; bounded in hosts and in sources.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 
 from apps.evidence import MOST_USUAL
-from apps.kitsune.afterimage import seconds
-from apps.kitsune.behaviour.contacts import ANY_UDP, ECHO, FROM_UDP, STRAY_TCP, UDP
-from apps.kitsune.behaviour.rows import address_of
-from apps.kitsune.kernel import Columns
+from apps.kitsune.behaviour.rows import address_of, parts_of
+from apps.kitsune.kernel import Columns, Kernel, load_kernel
+from apps.kitsune.ledger import check, rows_of, seed
 
 MOST_KINDS: Final = 65_536
 """Pairs of host and kind that are remembered of training, and within a second."""
@@ -23,9 +23,7 @@ MOST_SOURCES: Final = 1_024
 """Sources counted of one pair ..."""
 MOST_SOURCES_OF_ALL: Final = 262_144
 """... and of all."""
-_WELL_KNOWN: Final = 1_024
-_SYN: Final = 0x02
-_ECHO, _ECHO6 = 8, 128
+_WHAT: Final = "victims"
 BACK_S: Final = 60
 """Ports may be this far behind one another; time that goes back farther was set."""
 
@@ -47,38 +45,46 @@ class UsualTraffic(NamedTuple):
 
 
 class VictimRates:
-    """Counts what comes to every host; `add` takes packets in capture order."""
+    """Counts what comes to every host; `add` takes packets in capture order.
 
-    def __init__(self) -> None:
-        self._second = -1
-        self._now: Counter[HostKind] = Counter()
-        self._last: Counter[HostKind] = Counter()
+    Args:
+        kernel: None loads the one that was built.
+    """
+
+    def __init__(self, kernel: Kernel | None = None) -> None:
+        kernel = kernel or load_kernel()
+        self._kernel, self._lib = kernel, kernel.lib
+        limits = {
+            "most_kinds": MOST_KINDS,
+            "most_sources": MOST_SOURCES,
+            "most_sources_of_all": MOST_SOURCES_OF_ALL,
+            "back_s": BACK_S,
+        }
+        state = self._lib.victims_new(kernel.ffi.new("VictimLimits *", limits), seed())
+        if state == kernel.ffi.NULL:
+            raise MemoryError("victims: no memory for their tables")
+        self._state = kernel.ffi.gc(state, self._lib.victims_free)
+        self._has_learnt = False
         self._highest: dict[HostKind, int] = {}
         self._sources: dict[HostKind, Counter[int]] = {}
-        self._named = 0
         self._packets: Counter[HostKind] = Counter()
 
     def add(self, batch: Columns, trained: int) -> None:
         """Take a batch of which the first `trained` packets were training."""
-        for row, (second, source, host, kinds) in enumerate(_packets(batch)):
-            if not kinds:
-                continue
-            if second > self._second or second < self._second - BACK_S:
-                self._second, self._last, self._now = second, self._now, Counter()
-            for kind in kinds:
-                key = host, kind
-                if key in self._now or len(self._now) < MOST_KINDS:
-                    self._now[key] += 1
-                if row < trained:
-                    self._learn(key, source)
+        rows = rows_of(self._kernel, batch)
+        check(self._lib.victims_add(self._state, rows.pointer, rows.count, trained), _WHAT)
+        self._has_learnt |= trained > 0
 
     def usual(self, victim: int, kind: int) -> UsualTraffic:
         """What came of this kind to a host."""
+        self._fetch()
         key = (victim, kind)
+        version, hi, lo = parts_of(victim)
+        rate = self._lib.victims_rate(self._state, kind, version == 6, hi, lo)
         sources, packets = self._sources.get(key, Counter()), self._packets[key]
         named = sources.most_common(MOST_USUAL)
         return UsualTraffic(
-            float(max(self._now[key], self._last[key])),
+            float(rate),
             float(self._highest.get(key, 0)),
             tuple(source for source, _ in named),
             sum(count for _, count in named) / packets if packets else 0.0,
@@ -86,6 +92,7 @@ class VictimRates:
 
     def to_state(self) -> list[list[Any]]:
         """What training has taught, as plain values for the model file."""
+        self._fetch()
         return [
             [
                 *key,
@@ -98,63 +105,39 @@ class VictimRates:
         ]
 
     @classmethod
-    def from_state(cls, state: Iterable[Any]) -> Self:
+    def from_state(cls, state: Iterable[Any], kernel: Kernel | None = None) -> Self:
         """The inverse of `to_state`.
 
         Raises:
             TypeError, ValueError: the state is not one.
         """
-        self = cls()
-        self.restore(state)
-        return self
-
-    def restore(self, state: Iterable[Any]) -> None:
-        """Add what was learnt before; raises `TypeError` or `ValueError`."""
+        self = cls(kernel)
         for host, kind, highest, packets, sources in state:
             key = int(host), int(kind)
             self._highest[key], self._packets[key] = int(highest), int(packets)
             self._sources[key] = Counter({int(source): int(count) for source, count in sources})
+        return self
 
-    def _learn(self, key: HostKind, source: int) -> None:
-        if key not in self._highest and len(self._highest) >= MOST_KINDS:
+    def _fetch(self) -> None:
+        """What C has learnt since the last time."""
+        if not self._has_learnt:
             return
-        self._highest[key] = max(self._highest.get(key, 0), self._now[key])
-        self._packets[key] += 1
-        sources = self._sources.setdefault(key, Counter())
-        if source not in sources:
-            if len(sources) >= MOST_SOURCES or self._named >= MOST_SOURCES_OF_ALL:
-                return
-            self._named += 1
-        sources[source] += 1
+        self._has_learnt = False
+        self._sources = {}
+        for kind, six, *host, highest, packets in self._rows(self._lib.victims_usual, 6):
+            key = _key(kind, six, host)
+            self._highest[key], self._packets[key], self._sources[key] = highest, packets, Counter()
+        for kind, six, *numbers, count in self._rows(self._lib.victims_sources, 7):
+            source = address_of(6 if six else 4, *numbers[2:])
+            self._sources[_key(kind, six, numbers[:2])][source] = count
+
+    def _rows(self, read: Any, width: int) -> list[list[int]]:
+        count = read(self._state, self._kernel.ffi.NULL, 0)
+        rows = np.zeros((count, width), np.uint64)
+        read(self._state, self._kernel.pointer("uint64_t", rows), count)
+        found: list[list[int]] = rows.tolist()
+        return found
 
 
-def _packets(batch: Columns) -> Iterator[tuple[int, int, int, list[int]]]:
-    """Second, source, host, and the kinds that a packet belongs to."""
-    names = ("arp_op", "quoted", "ip_version", *_PORTS, "tcp_flags", "icmp_type", "icmp6_type", *_ADDRESSES)
-    whole = seconds(batch).astype(np.int64).tolist()
-    columns = zip(*(batch[name].tolist() for name in names), strict=True)
-    for second, (arp, quoted, version, *ports, flags, icmp, icmp6, to_hi, to_lo, hi, lo) in zip(
-        whole, columns, strict=True
-    ):
-        if arp >= 0 or quoted or version not in (4, 6):
-            yield second, 0, 0, []
-            continue
-        mask = 0xFFFF_FFFF if version == 4 else (1 << 64) - 1
-        source, host = (address_of(version, *end) for end in ((hi, lo & mask), (to_hi, to_lo & mask)))
-        yield second, source, host, _kinds(ports, flags, icmp == _ECHO or icmp6 == _ECHO6)
-
-
-def _kinds(ports: Sequence[int], flags: int, is_ping: bool) -> list[int]:
-    tcp_sport, tcp_dport, udp_sport, udp_dport = ports
-    kinds = []
-    if udp_sport >= 0:
-        kinds += [FROM_UDP | udp_sport if udp_sport < _WELL_KNOWN else UDP | udp_dport & 0xFFFF, ANY_UDP]
-    if tcp_sport >= 0 and not flags & _SYN:
-        kinds.append(STRAY_TCP | tcp_dport & 0xFFFF)
-    if is_ping and tcp_sport < 0 and udp_sport < 0:
-        kinds.append(ECHO)
-    return kinds
-
-
-_PORTS: Final = ("tcp_sport", "tcp_dport", "udp_sport", "udp_dport")
-_ADDRESSES: Final = ("ip_dst_hi", "ip_dst_lo", "ip_src_hi", "ip_src_lo")
+def _key(kind: int, six: int, host: list[int]) -> HostKind:
+    return address_of(6 if six else 4, *host), kind

@@ -22,6 +22,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Final, NamedTuple
 
 WINDOWS_S: Final = (1.0, 10.0, 60.0, 600.0)
@@ -30,6 +31,8 @@ BLOCKS: Final = 10
 MOST_EVENTS: Final = 1_024
 """Events remembered of one subject; of more within a window the oldest do not count."""
 MOST_SUBJECTS: Final = 65_536
+FORGOTTEN_AT_A_TIME: Final = 2
+"""Quiet subjects forgotten with each event: more than one, so that they become fewer."""
 LEAST_SCALE: Final = 1.0
 """Events: the scale of the tail where training shows no variation at all."""
 LEAST_SHARE: Final = 0.25
@@ -52,6 +55,12 @@ class SlidingSums:
         self.windows = windows
         self._most = most
         self._events: dict[Any, tuple[list[float], list[float]]] = {}
+        self.begun = (0.0,) * len(windows)
+        """By window: the time of the first event of the sums that `add` returned last, seconds."""
+
+    def __len__(self) -> int:
+        """Subjects remembered."""
+        return len(self._events)
 
     def add(self, subject: Any, time: float, weight: float = 1.0) -> tuple[float, ...]:
         """Add an event.
@@ -64,6 +73,7 @@ class SlidingSums:
         Returns:
             The sum of the subject within each window, this event included.
         """
+        self._forget_quiet(time)
         events = self._events.pop(subject, None)
         if events is None:
             events = ([], [0.0])
@@ -80,7 +90,17 @@ class SlidingSums:
             aged = max(aged, MOST_EVENTS // 4)
         if aged > len(times) // 8:
             del times[:aged], sums[:aged]
-        return tuple(sums[-1] - sums[bisect_left(times, time - window)] for window in self.windows)
+        firsts = [bisect_left(times, time - window) for window in self.windows]
+        self.begun = tuple(times[first] for first in firsts)
+        return tuple(sums[-1] - sums[first] for first in firsts)
+
+    def _forget_quiet(self, time: float) -> None:
+        """Forget the subjects that were quiet for longer than the longest window: their sums are 0 anyway."""
+        since = time - self.windows[-1]
+        for subject, (times, _) in list(islice(self._events.items(), FORGOTTEN_AT_A_TIME)):
+            if times[-1] >= since:
+                return
+            del self._events[subject]
 
 
 @dataclass

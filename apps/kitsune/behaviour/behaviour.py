@@ -3,12 +3,12 @@
     contacts that fail     of a sender: in all, by target (port scan), by service (sweep)
     logins                 connections of a sender to one login service
     callbacks              hosts that connect back to whoever has just logged in
-    one-way traffic        packets of a sender to one host that does not take part
+    one-way traffic        packets of a sender to one host that does not take part; SYNs apart from others
     claims                 ARP replies that nobody asked for
     thefts                 ARP packets that claim the address of another, who is present
     strange sources        of a victim: unknown addresses whose contacts fail (forged floods)
     scores                 of a sender: how far Kitsune's scores lie over those of training
-    threshold              a packet over Kitsune's threshold, without weight: for the rule of the paper
+    threshold              a packet at or above Kitsune's threshold, without weight: for the rule of the paper
 
 Pure.  Each statistic has a `Baseline`; what is above it is weighed in nats, and a finding says what has been
 added since the last one about the same subject.
@@ -30,13 +30,17 @@ from apps.kitsune.behaviour.contacts import (
     ARP,
     ECHO,
     FROM_UDP,
-    STRAY_TCP,
+    GRACE_S,
     TCP,
     UDP,
+    UNANSWERED,
     ContactTracker,
     EndedContact,
     PacketRow,
+    flooded_service,
+    protocol_of,
 )
+from apps.kitsune.behaviour.exchanges import OPENING, Exchange
 from apps.kitsune.behaviour.findings import (
     LEAST_NATS,
     Finding,
@@ -44,7 +48,9 @@ from apps.kitsune.behaviour.findings import (
     SeenCount,
     Statistic,
     StatisticCounter,
+    usual_score_of,
 )
+from apps.kitsune.behaviour.outside import NEVER, Outside
 from apps.kitsune.behaviour.rows import SenderId, packet_rows, parts_of
 from apps.kitsune.blocked import Blocked
 from apps.kitsune.kernel import Columns
@@ -85,14 +91,11 @@ LOGINS: Final = frozenset(
 REFUSED_BYTES: Final = 5_000
 """Bytes on the wire that the initiator sends in a login that is refused, at most: the key exchange of SSH and a few
 passwords are 2,000 to 4,000."""
-REPLIES_COUNT: Final = 10
-"""A reply makes up for so many packets: bulk transfers are acknowledged now and then."""
 CALIBRATION_PACKETS: Final = 5_000
 """Packets at the end of training whose scores say how benign ones lie."""
 KEPT: Final = 65_536
 TINY: Final = 1e-300
 _FIN, _SYN, _RST, _ACK = 0x01, 0x02, 0x04, 0x10
-_WELL_KNOWN: Final = 1_024
 CHOSEN: Final = 32_768
 """Clients choose ports from here on by chance (Linux; others from 49,152)."""
 ASKED_S: Final = 3.0
@@ -101,14 +104,6 @@ PRESENT_S: Final = 60.0
 THEFT: Final = 5.0
 """Events that a claim of the address of a present host counts as."""
 AGAIN_S: Final = 10.0
-
-
-@dataclass(slots=True)
-class _Exchange:
-    second: int = -1
-    out: int = 0
-    back: int = 0
-    due: int = 0
 
 
 @dataclass(slots=True)
@@ -167,7 +162,8 @@ class Behaviour:
         }
         self._failures = FoundSoFar()
         """Of senders: the strongest of `CONTACTS`, which are three views of the same packets."""
-        self._exchanges: dict[tuple[int, int], _Exchange] = {}
+        self._outside = Outside()
+        self._exchanges: dict[tuple[int, int], Exchange] = {}
         self._asked: dict[tuple[int, int], float] = {}
         self._logins: dict[tuple[int, int, int, int], _Login] = {}
         self._callbacks = Callbacks()
@@ -176,8 +172,8 @@ class Behaviour:
         self._tail: deque[tuple[SenderId, float]] = deque(maxlen=CALIBRATION_PACKETS)
         """Senders and times of the last packets of training."""
         self._told: dict[SenderId, float] = {}
-        self.line = 1.0
-        """Score over which benign packets hardly ever are."""
+        self.usual_score = 1.0
+        """Score above which benign packets hardly ever are."""
 
     def add(
         self,
@@ -205,7 +201,7 @@ class Behaviour:
             What is worth a message.
         """
         found: list[Finding] = []
-        # where training ends within this batch, the line is known only then
+        # where training ends within this batch, the usual score is known only then
         logs = [] if self._learning else self._logs(scores)
         for number, row in enumerate(packet_rows(batch, switch)):
             block = -1
@@ -242,15 +238,16 @@ class Behaviour:
                 self._ask(row)
         if row.source and row.sender[2] in self._owners.get(row.source, ()):
             self._spoke[row.source] = row.time
+        self._outside.see(row.time, row.source)
         return found
 
     def _logs(self, scores: npt.NDArray[np.float64]) -> list[float]:
-        logs: list[float] = np.log(np.maximum(scores, TINY) / self.line).tolist()
+        logs: list[float] = np.log(np.maximum(scores, TINY) / self.usual_score).tolist()
         return logs
 
     def _calibrate(self, scores: npt.NDArray[np.float64]) -> None:
         """Learn from the last packets of training how their scores lie, now that the model is trained."""
-        self.line = line_of(scores)
+        self.usual_score = usual_score_of(scores)
         tail = list(self._tail)[-len(scores) :]
         per_block = max(1, -(-len(tail) // BLOCKS))
         for number, ((sender, time), log) in enumerate(zip(tail, self._logs(scores), strict=False)):
@@ -276,6 +273,7 @@ class Behaviour:
         self._calibrate(rescored)
         self._callbacks.learn(filter(self.contacts.came_about, self.contacts.seen()))
         self.contacts.close_training()
+        self._close_outside()
         for name, counter in self._counters.items():
             # at the beginning every contact was new
             counter.baseline.close(BLOCKS // 2 if name in (*CONTACTS, "strangers") else 0)
@@ -285,8 +283,11 @@ class Behaviour:
         for baseline in baselines:
             baseline.rarity = max(0.0, math.log(len(self.senders) / max(1, expected)))
 
+    def _close_outside(self) -> None:
+        self._outside.close(self.begun + self.seconds)
+
     def _ended(self, ended: EndedContact, block: int) -> list[Finding]:
-        """A contact that came about makes up for one that failed."""
+        """A successful contact offsets a failed one."""
         found: list[Finding] = []
         if not (ended.failed and ended.half_open) and not _is_reflected(ended):
             found = self._contact(ended, block)
@@ -301,23 +302,33 @@ class Behaviour:
         if call is None:
             return []
         added = self._called.added(call.sender, self._callbacks.nats, ended.time)
-        seen = SeenCount(added, self._callbacks.nats, 1.0, call.seconds, float(self._callbacks.back))
+        begun = ended.time - call.seconds
+        seen = SeenCount(added, self._callbacks.nats, 1.0, call.seconds, float(self._callbacks.back), begun)
         found = Finding("callbacks", call.sender, call.host, call.service, *seen, ended.time, ended.arrival)
         return [found] if added else []
 
     def _contact(self, ended: EndedContact, block: int) -> list[Finding]:
-        sender, target, service, time = ended.sender, ended.target, ended.service, ended.time
-        inside, protocol = is_inside(parts_of(sender[3])), _protocol(service)
-        whose = (sender, protocol)
+        sender, target, time = ended.sender, ended.target, ended.time
+        if self._outside.explains(ended.failed, sender, target, time):
+            return []
         # hosts answer echo requests of everybody: that they do makes up for nothing
-        counts = ended.failed or service == ECHO
+        found = self._views(ended, ended.service, block, counts=ended.failed or ended.service == ECHO)
+        if ended.failed and ended.service == ECHO:
+            found += self._views(ended, UNANSWERED, block, counts=True)
+        return found
+
+    def _views(self, ended: EndedContact, service: int, block: int, *, counts: bool) -> list[Finding]:
+        """What ended, by the service that it counts for; beside another, only how many hosts it is about."""
+        sender, target, time = ended.sender, ended.target, ended.time
+        inside, protocol = is_inside(parts_of(sender[3])), protocol_of(service)
+        whose = (sender, protocol)
         views: list[tuple[Statistic, Any, Any, int, int]] = [
             ("contacts", whose, (protocol, inside), 0, -1),
             ("ports", (sender, target), (protocol, inside), target, -1),
             ("targets", (sender, service), (_named(service), inside), 0, service),
         ]
         best: Finding | None = None
-        for statistic, subject, kind, victim, single in views:
+        for statistic, subject, kind, victim, single in views[-1:] if service == UNANSWERED else views:
             counter = self._counters[statistic]
             sums = counter.sums.add(subject, time, 1.0 if counts else -1.0)
             if block >= 0:
@@ -336,7 +347,7 @@ class Behaviour:
         source, target = ended.sender[3], ended.target
         if block < 0 and source in self._addresses:
             return []
-        key = (target, _flooded(ended))
+        key = (target, flooded_service(ended))
         if not self._fresh_stranger(source, key):
             return []
         found = self._stranger(key, ended, block)
@@ -433,19 +444,21 @@ class Behaviour:
         if mine is None:
             if len(self._exchanges) >= KEPT:
                 self._exchanges.clear()
-            mine = self._exchanges[key] = _Exchange()
-        if mine.second != second:
-            mine.second, mine.out, mine.back, mine.due = second, 0, 0, 0
-        mine.out += 1
-        alone = mine.out - REPLIES_COUNT * mine.back
-        if block < 0:
-            if alone < mine.due:
-                return []
-            mine.due = alone + max(1, alone // 8)
-        kind = _protocol(row.service)
-        counter = self._counters["one_way"]
-        seen = counter.weigh((row.sender, kind), (float(alone),), row.time, block, kind)
-        return [] if seen is None else [self._finding("one_way", row, seen)]
+            mine = self._exchanges[key] = Exchange()
+        opening = row.is_tcp and bool(row.flags & _SYN)
+        alone = mine.sent(second, opening=opening, all_counts=block >= 0)
+        if alone is None:
+            return []
+        kind = OPENING if opening else protocol_of(row.service)
+        counter, whose = self._counters["one_way"], (row.sender, kind)
+        if block >= 0:
+            counter.baseline.learn(whose, block, (float(alone),), kind)
+            return []
+        # what a host sends at a time is one thing: the kind that is most unusual counts, not the sum
+        seen = counter.measure(whose, (float(alone),), kind)
+        added = counter.found.added(row.sender, seen.total, row.time)
+        seen = seen._replace(nats=added, begun=float(int(row.time)))
+        return [self._finding("one_way", row, seen)] if added else []
 
     def _ask(self, row: PacketRow) -> None:
         if len(self._asked) >= KEPT:
@@ -460,6 +473,11 @@ class Behaviour:
         who: SenderId = (*row.sender[:3], 0)  # it may claim several addresses
         seen = self._counters["claims"].see(who, who, row.time, block)
         return [] if seen is None else [self._finding("claims", row._replace(sender=who), seen)]
+
+    @property
+    def subjects(self) -> int:
+        """Hosts, services and pairs of hosts whose events of the last ten minutes are counted, by each statistic."""
+        return sum(len(counter.sums) for counter in self._counters.values())
 
     def proven(self, address: int) -> bool:
         """Whether the address has completed a TCP handshake."""
@@ -501,18 +519,20 @@ class Behaviour:
         if len(self._told) >= KEPT:
             self._told.clear()
         self._told[row.sender] = row.time
-        seen = SeenCount(0.0, 0.0, score, 0.0, self.line)
+        seen = SeenCount(0.0, 0.0, score, 0.0, self.usual_score, row.time)
         return [self._finding("threshold", row, seen, supporting=True)]
 
     def to_state(self) -> dict[str, Any]:
         """What training has taught, as plain values for the model file."""
         return {
             "seconds": self.seconds,
-            "line": self.line,
+            "line": self.usual_score,
             "senders": [list(sender) for sender in self.senders],
             "owners": [[address, sorted(macs)] for address, macs in self._owners.items()],
             "contacts": [list(contact) for contact in self.contacts.trained],
             "callbacks": self._callbacks.to_state(),
+            "outside": [self._outside.longest, self._outside.reachable],
+            "arp_grace": self.contacts.arp_grace,
             "baselines": {name: counter.baseline.to_state() for name, counter in self._counters.items()},
         }
 
@@ -525,9 +545,9 @@ class Behaviour:
         """
         self = cls(1)
         self._learning = False
-        self.seconds, self.line = float(state["seconds"]), float(state["line"])
-        if not (self.seconds > 0 and self.line > 0):
-            raise ValueError(f"training of {self.seconds} s, line {self.line}")
+        self.seconds, self.usual_score = float(state["seconds"]), float(state["line"])
+        if not (self.seconds > 0 and self.usual_score > 0):
+            raise ValueError(f"training of {self.seconds} s, usual score {self.usual_score}")
         self.senders = {
             (str(switch), int(port), int(mac), int(ip)) for switch, port, mac, ip in state["senders"]
         }
@@ -535,7 +555,10 @@ class Behaviour:
         self._addresses = set(self._owners)
         self.contacts.trained = {(int(one), int(other), int(what)) for one, other, what in state["contacts"]}
         self.contacts.close_training()
+        self.contacts.restore_grace(float(state.get("arp_grace", GRACE_S)))
         self._callbacks.restore(state.get("callbacks", (0, 0)))
+        silence, reachable = state.get("outside", (NEVER, False))
+        self._outside.restore(float(silence), bool(reachable))
         for name, counter in self._counters.items():
             counter.baseline.restore(state["baselines"][name])
             counter.trained(self.seconds)
@@ -554,43 +577,21 @@ class Behaviour:
         )
 
 
-def _flooded(failed: EndedContact) -> int:
-    """What a victim is flooded with: a service, datagrams from a well-known port, stray segments."""
-    if failed.service & ~0xFFFF == UDP and failed.reverse - UDP < _WELL_KNOWN:
-        return FROM_UDP | failed.reverse - UDP
-    if failed.service & ~0xFFFF == TCP and not failed.is_syn:
-        return STRAY_TCP | failed.service - TCP
-    return failed.service
-
-
 def _is_cut_off(blocked: Blocked, row: PacketRow) -> bool:
     """Whether a packet goes to a blocked host, whose answers are dropped."""
     return blocked.covers(row.sender[0], mac_text(row.to_mac), ip_text(*parts_of(row.target)))
 
 
-def _protocol(service: int) -> int:
-    """The service without its port."""
-    return service & ~0xFFFF
-
-
 def _named(service: int) -> int:
     """The service; one for all ports that clients choose by chance."""
-    return service if service & 0xFFFF < CHOSEN else _protocol(service) | CHOSEN
+    return service if service & 0xFFFF < CHOSEN else protocol_of(service) | CHOSEN
 
 
 def _is_reflected(failed: EndedContact) -> bool:
     """A datagram from a well-known port outside: who sends it may have been asked in the victim's name."""
-    return _flooded(failed) & ~0xFFFF == FROM_UDP and not is_inside(parts_of(failed.sender[3]))
+    return flooded_service(failed) & ~0xFFFF == FROM_UDP and not is_inside(parts_of(failed.sender[3]))
 
 
 def _refuses(flags: int) -> bool:
     """A RST, or a SYN-ACK, which a flooded host sends as well."""
     return bool(flags & _RST) or flags & (_SYN | _ACK) == _SYN | _ACK
-
-
-def line_of(scores: npt.NDArray[np.float64]) -> float:
-    """The score that one benign packet in a hundred reaches, and never less than a tenth of the paper's threshold."""
-    finite = scores[np.isfinite(scores) & (scores > 0)]
-    if not len(finite):
-        return 1.0
-    return max(math.exp(float(np.quantile(np.log(finite), 0.99))), 0.1)

@@ -44,7 +44,7 @@ class Callback:
 
 
 class Callbacks:
-    """Remembers logins, and tells which hosts connect back."""
+    """Remembers logins, and detects hosts that connect back."""
 
     def __init__(self) -> None:
         self.pairs = 0
@@ -59,7 +59,7 @@ class Callbacks:
         return math.log((self.pairs + 2) / (self.back + 1))
 
     def learn(self, contacts: Iterable[Contact]) -> None:
-        """Take the contacts of training that came about; hosts reach each other by ARP, too."""
+        """Take the successful contacts of training; hosts also reach each other by ARP."""
         inside = [contact for contact in contacts if is_inside(parts_of(contact[1])) and contact[2] < OTHER]
         reached = {(source, target) for source, target, _ in inside}
         opened = {(source, target) for source, target, service in inside if service >> 16 == TCP >> 16}
@@ -88,7 +88,7 @@ class Callbacks:
             self._visits.popitem(last=False)
 
     def heard(self, ended: EndedContact) -> Callback | None:
-        """A new contact came about; the callback that it is, if it is one."""
+        """A new contact succeeded; returns the callback, if it is one."""
         if ended.service >> 16 != TCP >> 16 or {ended.service, ended.reverse} & _BY_DESIGN:
             return None
         host = ended.sender[3]

@@ -1,10 +1,11 @@
-"""Who tries to reach whom, and whether that comes about.
+"""Contacts: which host tries to reach which, and whether it succeeds.
 
     first packet towards a service ──► pending ──► completed (an answer; for TCP the handshake's end)
                                           └──► failed: RST, or nothing within the grace period
 
 A contact is an address, another address and a service: a TCP or UDP port, ICMP echo, or ARP.  Only its first
-attempt counts; contacts that training knows never do.  A scanner is known by its contacts that fail, and that few
+attempt counts; contacts that training knows never do.  Hosts of one LAN answer ARP requests within milliseconds: how
+long to wait for that is learnt.  A scanner is known by its contacts that fail, and that few
 come about (Jung et al., Fast Portscan Detection Using Sequential Hypothesis Testing, 2004).
 """
 
@@ -13,7 +14,14 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 GRACE_S: Final = 0.4
-"""Seconds of capture time within which a contact must come about."""
+"""Seconds of capture time within which a contact must succeed."""
+ARP_MARGIN: Final = 4.0
+"""For an ARP reply this many times the longest wait of training is enough ..."""
+LEAST_ARP_GRACE_S: Final = 0.1
+"""... and never less than this: a wireless host that saves power hears of it with the next beacon ..."""
+LEAST_ARP_REPLIES: Final = 100
+"""... if as many pairs of hosts asked and answered in training, of whom only the first time counts: so the next one is
+the slowest of all with a chance of one in a hundred."""
 MOST_CONTACTS: Final = 131_072
 ECHO: Final = 1 << 24
 ARP: Final = 2 << 24
@@ -24,9 +32,12 @@ STRAY_TCP: Final = 5 << 24
 """Segments of connections that were never opened."""
 ANY_UDP: Final = 6 << 24
 """Datagrams to many ports."""
+UNANSWERED: Final = 8 << 24
+"""Echo requests without a reply, which are counted beside all of them."""
 TCP: Final = 6 << 16
 UDP: Final = 17 << 16
 _SYN, _RST, _ACK = 0x02, 0x04, 0x10
+_WELL_KNOWN: Final = 1_024
 
 Contact = tuple[int, int, int]
 """Initiator's address, the other's, service."""
@@ -34,6 +45,8 @@ Contact = tuple[int, int, int]
 
 def service_text(service: int) -> str:
     """`tcp/22`, `udp/53`, `icmp`, `arp`; `from-udp/53`, `tcp-ack/80` and `udp` of floods."""
+    if service >= UNANSWERED:
+        return "icmp"
     if service >= ANY_UDP:
         return "udp"
     if service >= STRAY_TCP:
@@ -60,7 +73,7 @@ class _Pending:
 
 
 class EndedContact(NamedTuple):
-    """A contact that came about, or failed."""
+    """A contact that succeeded, or failed."""
 
     failed: bool
 
@@ -103,6 +116,20 @@ class PacketRow(NamedTuple):
     """Bytes on the wire."""
 
 
+def protocol_of(service: int) -> int:
+    """The service without its port."""
+    return service & ~0xFFFF
+
+
+def flooded_service(failed: EndedContact) -> int:
+    """What a victim is flooded with: a service, datagrams from a well-known port, stray segments."""
+    if protocol_of(failed.service) == UDP and failed.reverse - UDP < _WELL_KNOWN:
+        return FROM_UDP | failed.reverse - UDP
+    if protocol_of(failed.service) == TCP and not failed.is_syn:
+        return STRAY_TCP | failed.service - TCP
+    return failed.service
+
+
 class ContactTracker:
     """Follows contacts; bounded by two generations of `MOST_CONTACTS`."""
 
@@ -113,15 +140,28 @@ class ContactTracker:
         self._young: set[Contact] = set()
         self._old: set[Contact] = set()
         self._pending: dict[Contact, _Pending] = {}
-        self._order: deque[tuple[float, Contact]] = deque()
+        self._order: tuple[deque[tuple[float, Contact]], deque[tuple[float, Contact]]] = (deque(), deque())
+        """Ends of grace periods, each in order: of ARP requests, of all others."""
+        self.arp_grace = GRACE_S
+        """Seconds within which an ARP request must be answered."""
+        self.arp_seen = 0, 0.0
+        """ARP requests of training that were answered, and the longest wait for a reply."""
         self._proven: dict[int, None] = {}
         self._vain: dict[Contact, None] = {}
 
     def close_training(self) -> None:
         """What is known by now is never counted again."""
+        if self._learning:
+            self.arp_grace = arp_grace_of(*self.arp_seen)
         self.trained = self.seen()
         self._young, self._old = set(), set()
         self._learning = False
+
+    def restore_grace(self, arp_grace: float) -> None:
+        """A saved training has taught this; raises `ValueError`."""
+        if not 0 < arp_grace <= GRACE_S:
+            raise ValueError(f"{arp_grace} s for an ARP reply")
+        self.arp_grace = arp_grace
 
     def seen(self) -> set[Contact]:
         """All contacts of training and the recent past, failed ones included."""
@@ -158,18 +198,26 @@ class ContactTracker:
             self._pending[there] = _Pending(
                 row.time, row.sender, row.arrival, row.reverse, bool(row.flags & _SYN)
             )
-            self._order.append((row.time + GRACE_S, there))
+            order = self._order[row.service != ARP]
+            order.append((row.time + self._grace(row.service), there))
         return None
 
     def due(self, now: float) -> list[EndedContact]:
         """Contacts whose grace period is over at `now` (seconds of capture time)."""
         failed = []
-        while self._order and self._order[0][0] <= now:
-            _, contact = self._order.popleft()
+        while first := min(
+            (order for order in self._order if order), key=lambda order: order[0][0], default=None
+        ):
+            if first[0][0] > now:
+                break
+            _, contact = first.popleft()
             pending = self._pending.get(contact)
             if pending is not None:
-                failed.append(self._fail(contact, pending, pending.time + GRACE_S))
+                failed.append(self._fail(contact, pending, pending.time + self._grace(contact[2])))
         return failed
+
+    def _grace(self, service: int) -> float:
+        return self.arp_grace if service == ARP else GRACE_S
 
     def _fail(self, contact: Contact, pending: _Pending, time: float) -> EndedContact:
         del self._pending[contact]
@@ -180,6 +228,9 @@ class ContactTracker:
 
     def _answered(self, row: PacketRow, contact: Contact, pending: _Pending) -> EndedContact | None:
         if not row.is_tcp:
+            if self._learning and row.service == ARP:
+                replies, slowest = self.arp_seen
+                self.arp_seen = replies + 1, max(slowest, row.time - pending.time)
             return self._complete(contact, row.time)
         if row.flags & _RST:
             return self._fail(contact, pending, row.time)
@@ -204,6 +255,13 @@ class ContactTracker:
         self._young.add(contact)
         if len(self._young) >= MOST_CONTACTS:
             self._old, self._young = self._young, set()
+
+
+def arp_grace_of(replies: int, slowest: float) -> float:
+    """Seconds to wait for an ARP reply, after a training with so many, the slowest of which took `slowest` seconds."""
+    if replies < LEAST_ARP_REPLIES:
+        return GRACE_S
+    return min(max(LEAST_ARP_GRACE_S, ARP_MARGIN * slowest), GRACE_S)
 
 
 def _ended(contact: Contact, pending: _Pending, time: float, *, failed: bool) -> EndedContact:

@@ -1,10 +1,14 @@
-"""Findings: what a statistic counted beyond its baseline, weighed, and told as far as it is new.  Pure.
+"""Findings: what a statistic counted beyond its baseline, weighed, and reported as far as it is new.  Pure.
 
 sliding sums ──► Baseline ──nats──► FoundSoFar ──what is new──► Finding
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from apps.kitsune.behaviour.baseline import LEAST_SCALE, WINDOWS_S, Baseline, SlidingSums
 from apps.kitsune.behaviour.rows import SenderId
@@ -23,7 +27,7 @@ Statistic = Literal[
     "threshold",
 ]
 HALF_LIFE_S: Final = 600.0
-"""After so many seconds without more, half of what was found is forgotten."""
+"""Seconds after which half of a finding is forgotten if nothing is added."""
 LEAST_NATS: Final = 1.0
 """Less is not worth a message ..."""
 LEAST_STEP: Final = 0.5
@@ -57,6 +61,8 @@ class Finding:
     window_s: float
     usual: float
     """The highest of training."""
+    begun: float
+    """Capture time of the first packet that it rests on, seconds."""
     time: float
     arrival: int
     supporting: bool = False
@@ -99,6 +105,7 @@ class SeenCount(NamedTuple):
     events: float
     window_s: float
     usual: float
+    begun: float
 
 
 class StatisticCounter:
@@ -141,4 +148,12 @@ class StatisticCounter:
     def measure(self, whose: Any, sums: tuple[float, ...], kind: Any) -> SeenCount:
         """Weigh sums, whatever was found before."""
         nats, which, usual = self.baseline.nats(whose, sums[: self.usable], kind)
-        return SeenCount(0.0, nats, sums[which], self.sums.windows[which], usual)
+        return SeenCount(0.0, nats, sums[which], self.sums.windows[which], usual, self.sums.begun[which])
+
+
+def usual_score_of(scores: npt.NDArray[np.float64]) -> float:
+    """The score that one benign packet in a hundred reaches, and never less than a tenth of the paper's threshold."""
+    finite = scores[np.isfinite(scores) & (scores > 0)]
+    if not len(finite):
+        return 1.0
+    return max(math.exp(float(np.quantile(np.log(finite), 0.99))), 0.1)

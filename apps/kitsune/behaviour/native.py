@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from apps.kitsune.behaviour import behaviour as twin
-from apps.kitsune.behaviour import callbacks, contacts, findings
+from apps.kitsune.behaviour import callbacks, contacts, exchanges, findings, outside
 from apps.kitsune.behaviour.baseline import (
     BLOCKS,
     LEAST_SHARE,
@@ -20,6 +20,7 @@ from apps.kitsune.behaviour.baseline import (
 )
 from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS, CONTACTS, Behaviour
 from apps.kitsune.behaviour.findings import Finding, Statistic
+from apps.kitsune.behaviour.outside import NEVER
 from apps.kitsune.behaviour.rows import SenderId, address_of, parts_of
 from apps.kitsune.blocked import Blocked
 from apps.kitsune.kernel import Columns, Kernel
@@ -49,7 +50,7 @@ _EVENT: Final = np.dtype(
     [
         *(("what", "i4"), ("block", "i4"), *((f"who{word}", "u8") for word in range(4))),
         *(("victim_hi", "u8"), ("victim_lo", "u8"), ("service", "i8"), ("kind", "u8")),
-        *((name, "f8") for name in ("nats", "total", "count", "window", "usual", "time")),
+        *((name, "f8") for name in ("nats", "total", "count", "window", "usual", "begun", "time")),
         *(("arrival", "u8"), ("has_sender", "i4"), ("supporting", "i4")),
         *((f"sum{number}", "f8") for number in range(_MOST_WINDOWS)),
     ]
@@ -69,6 +70,7 @@ class NativeBehaviour(Behaviour):
     def __init__(self, training_packets: int, kernel: Kernel) -> None:
         super().__init__(training_packets)
         self._kernel, self._lib = kernel, kernel.lib
+        self._silence, self._reached = NEVER, 0.0
         self._switches = SwitchNumbers()
         logins = np.array(sorted(twin.LOGINS), dtype=np.uint16)
         pointer = kernel.pointer("uint16_t", logins)
@@ -90,7 +92,7 @@ class NativeBehaviour(Behaviour):
         self = cls(1, kernel)
         for name in (
             "seconds",
-            "line",
+            "usual_score",
             "senders",
             "_owners",
             "_addresses",
@@ -98,6 +100,7 @@ class NativeBehaviour(Behaviour):
             "contacts",
             "_learning",
             "_callbacks",
+            "_outside",
         ):
             setattr(self, name, getattr(former, name))
         try:
@@ -150,6 +153,11 @@ class NativeBehaviour(Behaviour):
         check(code, _WHAT)
         return [self._finding_of(event) for event in self._events()]
 
+    @property
+    def subjects(self) -> int:
+        """As `Behaviour.subjects`."""
+        return int(self._lib.behaviour_subjects(self._state))
+
     def proven(self, address: int) -> bool:
         """Whether the address has completed a TCP handshake."""
         version, hi, lo = parts_of(address)
@@ -185,9 +193,11 @@ class NativeBehaviour(Behaviour):
                 "soon_s": callbacks.SOON_S,
                 "most_logins": callbacks.MOST_LOGINS,
                 "refused_bytes": twin.REFUSED_BYTES,
-                "replies_count": twin.REPLIES_COUNT,
+                "replies_count": exchanges.REPLIES_COUNT,
                 "chosen": twin.CHOSEN,
                 "blocks": BLOCKS,
+                "in_vain_s": outside.IN_VAIN_S,
+                "others": outside.OTHERS,
             },
         )
 
@@ -208,7 +218,7 @@ class NativeBehaviour(Behaviour):
         )
 
     def _log_scores(self, scores: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.log(np.maximum(scores, twin.TINY) / self.line)
+        return np.log(np.maximum(scores, twin.TINY) / self.usual_score)
 
     def _apply_blocks(self, blocked: Blocked | None) -> None:
         rows = self._switches.changed_blocks(blocked or Blocked())
@@ -227,7 +237,7 @@ class NativeBehaviour(Behaviour):
 
     def _finding_of(self, event: tuple[Any, ...]) -> Finding:
         who, victim, statistic = event[_WHO], event[_VICTIM], STATISTICS[event[0]]
-        service, _, nats, total, count, window, usual, time, arrival, named, supporting = event[
+        service, _, nats, total, count, window, usual, begun, time, arrival, named, supporting = event[
             8:-_MOST_WINDOWS
         ]
         return Finding(
@@ -239,7 +249,8 @@ class NativeBehaviour(Behaviour):
             total,
             count,
             window,
-            self.line if statistic == "threshold" else usual,
+            self.usual_score if statistic == "threshold" else usual,
+            begun,
             time,
             arrival,
             bool(supporting),
@@ -260,9 +271,10 @@ class NativeBehaviour(Behaviour):
                 whose = (whose, service)
             sums = event[_SUMS][: len(counter.sums.windows)]
             counter.baseline.learn(whose, block, sums, _kind_in(statistic, kind))
-        times = np.empty(2)
+        times = np.empty(6)
         self._lib.behaviour_training(self._state, self._kernel.pointer("double", times))
-        self.begun, self.seconds = times.tolist()
+        self.begun, self.seconds, self._silence, self._reached, replies, slowest = times.tolist()
+        self.contacts.arp_seen = int(replies), slowest
 
     def _know(self, sender: SenderId, *, owner: bool) -> None:
         if owner:
@@ -272,7 +284,7 @@ class NativeBehaviour(Behaviour):
             self.senders.add(sender)
 
     def _calibrate(self, scores: npt.NDArray[np.float64]) -> None:
-        self.line = twin.line_of(scores)
+        self.usual_score = findings.usual_score_of(scores)
         logs = self._log_scores(np.ascontiguousarray(scores))
         count = min(len(logs), self._trained_tail())
         pointer = self._kernel.pointer("double", logs)
@@ -290,8 +302,13 @@ class NativeBehaviour(Behaviour):
         self._lib.behaviour_close_training(self._state)
         self._hand_over()
 
+    def _close_outside(self) -> None:
+        self._outside.restore(self._silence, bool(self._reached))
+
     def _hand_over(self) -> None:
-        """The baselines, and what callbacks weigh, to C."""
+        """The baselines, what callbacks weigh and what is known of the outside, to C."""
+        self._lib.behaviour_outside(self._state, self._outside.longest, self._outside.reachable)
+        self._lib.behaviour_arp_grace(self._state, self.contacts.arp_grace)
         self._lib.behaviour_callbacks(self._state, self._callbacks.nats, self._callbacks.back)
         for what, statistic in enumerate(_COUNTED):
             counter, baseline = self._counters[statistic], self._counters[statistic].baseline
@@ -374,13 +391,3 @@ def _keys(rows: Iterable[tuple[int, ...]]) -> npt.NDArray[np.uint64]:
 
 def _padded(counts: list[float]) -> list[float]:
     return counts + [0.0] * (_MOST_WINDOWS - len(counts))
-
-
-def behaviour_of(training_packets: int, kernel: Kernel | None) -> Behaviour:
-    """On the C kernel, or its Python twin without one."""
-    return Behaviour(training_packets) if kernel is None else NativeBehaviour(training_packets, kernel)
-
-
-def restored_behaviour(state: Mapping[str, Any], kernel: Kernel | None) -> Behaviour:
-    """From a model file; raises KeyError, TypeError or ValueError."""
-    return Behaviour.from_state(state) if kernel is None else NativeBehaviour.restored(state, kernel)

@@ -13,8 +13,8 @@ from apps.kitsune.afterimage import WIDTH, AfterImage, Mode
 from apps.kitsune.behaviour.native import NativeBehaviour
 from apps.kitsune.kernel import PACKET_FIELDS, ROW_FIELDS, ColumnError, Kernel, load_kernel
 from apps.kitsune.kitnet import KitNet, Layer
-from apps.kitsune.native_senders import NativeSenders
-from apps.kitsune.native_victims import NativeVictimRates
+from apps.kitsune.senders import Senders
+from apps.kitsune.victims import VictimRates
 
 EDGES = (0, 1, -1, 4, 6, 255, 65_535, 65_536, 2**31 - 1, -(2**31), 2**32 - 1, 2**48, 2**63 - 1, -(2**63))
 TIMES = (0.0, -1.0, 1e-300, 1e9, -1e18, float(2**63), 1.8e308, math.inf, -math.inf, math.nan)
@@ -85,7 +85,7 @@ def entry(kernel: Kernel, columns: dict[str, np.ndarray]) -> None:
 def ledgers(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
     """Senders, behaviour and victims: training, blocks, a batch of anything, findings, what a model keeps."""
     for _ in range(rounds):
-        senders, rates = NativeSenders(kernel), NativeVictimRates(kernel)
+        senders, rates = Senders(kernel), VictimRates(kernel)
         behaviour = NativeBehaviour(200, kernel)
         left = 200
         for step in range(6):
@@ -96,7 +96,7 @@ def ledgers(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
             scores = random.choice([0.1, 2.0, math.nan, math.inf], rows)
             trained = min(left, rows)
             left -= trained
-            how = {"scores": scores, "trained": trained, "line": 1.0, "evidence": lambda chosen: chosen}
+            how = {"scores": scores, "trained": trained, "threshold": 1.0, "evidence": lambda chosen: chosen}
             senders.add(found, f"s{step % 2}", **how)
             rates.add(found, trained)
             behaviour.add(found, f"s{step % 2}", scores, trained, lambda: np.full(50, 0.5))
@@ -128,7 +128,6 @@ def network(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
 def main() -> None:
     library, seed, rounds = sys.argv[1:]
     kernel = load_kernel(Path(library))
-    assert kernel is not None
     random = np.random.default_rng(int(seed))
     with np.errstate(all="ignore"):
         features(kernel, random, int(rounds))

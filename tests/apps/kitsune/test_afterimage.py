@@ -9,22 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apps.kitsune.afterimage import WIDTH, AfterImage, seconds
-from apps.kitsune.kernel import load_kernel
 from due import RecordBatch
 from sdnator.testing.oracles.afterimage import NaiveAfterImage as Naive
 from sdnator.testing.packet_rows import batch_of, blank, part, tshark_fields
 from tests.apps.kitsune.real_packets import real, tsv_rows
-from tests.requirements import missing, shared_data
+from tests.naive.kitsune.afterimage import PythonAfterImage
+from tests.requirements import shared_data
 
-ENGINES = ["kernel", "twin"]
+ENGINES = {"kernel": AfterImage, "twin": PythonAfterImage}
 GATEWAY, HOST = 0xC0A80201, 0xC0A8026E
-
-
-def engine(name):
-    kernel = load_kernel() if name == "kernel" else None
-    if name == "kernel" and kernel is None:
-        missing("the C kernel was not built: install gcc and run pip install -e .")
-    return kernel
 
 
 def require_reference_arithmetic():
@@ -36,7 +29,7 @@ def require_reference_arithmetic():
 
 
 def features(batch, name="kernel", mode="reference", step=1000, **limits):
-    afterimage = AfterImage(mode, kernel=engine(name), **limits)
+    afterimage = ENGINES[name](mode, **limits)
     return np.concatenate(
         [afterimage.update(part(batch, start, start + step)) for start in range(0, len(batch), step)]
     )
@@ -207,7 +200,7 @@ def test_bounded_mode_holds_its_ceiling():
         ip_src_lo=np.arange(count),
         ip_dst_lo=np.full(count, 7),
     )
-    afterimage = AfterImage("bounded", max_streams=64, max_links=32, kernel=engine("kernel"))
+    afterimage = AfterImage("bounded", max_streams=64, max_links=32)
     assert np.isfinite(afterimage.update(batch)).all()
     assert afterimage.counts["streams"] <= 4 * 64
     assert afterimage.counts["links"] <= 2 * 32
@@ -215,7 +208,7 @@ def test_bounded_mode_holds_its_ceiling():
 
 
 def test_bounded_mode_forgets_what_is_idle():
-    afterimage = AfterImage("bounded", horizon=60.0, kernel=engine("kernel"))
+    afterimage = AfterImage("bounded", horizon=60.0)
     afterimage.update(
         blank(100, ip_version=np.full(100, 4), ip_src_lo=np.arange(100), time_us=np.arange(100))
     )

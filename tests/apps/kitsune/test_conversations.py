@@ -2,7 +2,8 @@
 
 import pytest
 
-from apps.kitsune.conversations import REPLIES_PER_PACKET, Conversations
+from apps.kitsune.senders import REPLIES_PER_PACKET
+from tests.naive.kitsune.conversations import Conversations
 
 CLIENT, SERVER = (4, 0, 0x0A000001), (4, 0, 0x0A000002)
 SYN, SYN_ACK, RST, ACK = 0x02, 0x12, 0x04, 0x10
@@ -54,15 +55,15 @@ def test_answers_to_a_search_by_multicast_are_charged_to_the_searcher():
 def test_icmp_errors_are_charged_to_who_sent_the_quoted_packet():
     talk = Conversations()
     say(talk, 0.0, CLIENT, SERVER, (1000, 7), tcp=False)
-    assert talk.payer_of_error(2, 0.1, (False, CLIENT, 1000, 7)) == 1
-    assert talk.payer_of_error(2, 0.1, (False, CLIENT, 1001, 7)) == 2
+    assert talk.responsible_for_error(2, 0.1, (False, CLIENT, 1000, 7)) == 1
+    assert talk.responsible_for_error(2, 0.1, (False, CLIENT, 1001, 7)) == 2
 
 
 def test_a_flood_of_answers_is_not_charged_to_its_victim():
     talk = Conversations()
     say(talk, 0.0, CLIENT, SERVER, (1000, 123), tcp=False)
-    payers = [say(talk, 0.1, SERVER, CLIENT, (123, 1000), tcp=False) for _ in range(100)]
-    assert payers == [1] * REPLIES_PER_PACKET + [2] * (100 - REPLIES_PER_PACKET)
+    responsible = [say(talk, 0.1, SERVER, CLIENT, (123, 1000), tcp=False) for _ in range(100)]
+    assert responsible == [1] * REPLIES_PER_PACKET + [2] * (100 - REPLIES_PER_PACKET)
 
 
 def test_memory_is_bounded():

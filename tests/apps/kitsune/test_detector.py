@@ -88,7 +88,9 @@ def test_batch_size_changes_nothing(packets, outcome):
 def test_a_calibrated_line_holds_after_calibration(packets):
     settings = msgspec.structs.replace(SETTINGS, false_alarms_per_hour=1.0)
     detector = Detector(settings, kernel=load_kernel())
-    lines = [detector.process(part(packets, start, start + 1000))[0].line for start in range(0, 38_000, 1000)]
+    lines = [
+        detector.process(part(packets, start, start + 1000))[0].threshold for start in range(0, 38_000, 1000)
+    ]
     assert lines[0] == 1.0
     assert 0.2 < lines[-1] < 1.0
 

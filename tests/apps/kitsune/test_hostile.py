@@ -6,12 +6,13 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as examples
 
 from apps.kitsune.afterimage import AfterImage
-from apps.kitsune.kernel import ColumnError, load_kernel
+from apps.kitsune.kernel import ColumnError
 from apps.kitsune.model_orders import ORDERS
 from apps.kitsune.service import BLOCKS, INTERESTS, PACKETS, SCORE, SWITCHES, KitsuneService, Settings
 from sdnator.testing.packet_rows import blank, part
 from tests.apps.firewall.enforcement.test_eve import decision
 from tests.apps.hostile import NOW, Hands, mutations, values
+from tests.naive.kitsune.afterimage import PythonAfterImage
 
 KEY = "network.packets.p4runtime_ctrl.s1.all"
 SWITCH = "network.switch.p4runtime_ctrl.s1"
@@ -107,10 +108,10 @@ def test_one_time_far_ahead_changes_no_other_score():
     assert np.allclose(found[0][351:], found[1][351:], rtol=1e-6)
 
 
-@pytest.mark.parametrize("kernel", [None, load_kernel()], ids=["twin", "kernel"])
-def test_columns_of_other_lengths_are_refused(kernel):
+@pytest.mark.parametrize("kind", [PythonAfterImage, AfterImage])
+def test_columns_of_other_lengths_are_refused(kind):
     """A longer time column must not be read beyond the end of the others."""
-    image = AfterImage(kernel=kernel)
+    image = kind()
     columns = dict(blank(5))
     for name, wrong in (
         ("time_us", np.zeros(5000, "i8")),

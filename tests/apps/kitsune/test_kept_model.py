@@ -40,7 +40,7 @@ def test_it_is_taken_up_where_switches_ports_and_settings_are_the_same(tmp_path,
     assert found.model.is_trained
     assert found.behaviour.senders == trained.behaviour.senders
     assert found.drift is not None
-    assert place.text.startswith("took up the model of")
+    assert place.text.startswith("using the kept model of")
     assert stat.S_IMODE(place.path.stat().st_mode) == 0o600
     assert [each.name for each in place.path.parent.iterdir()] == ["kitsune.npz"]
 
@@ -61,7 +61,7 @@ def test_it_is_taken_up_where_switches_ports_and_settings_are_the_same(tmp_path,
 def test_elsewhere_it_stays_beside_and_the_reason_is_one_line(tmp_path, trained, settings, switches, why):
     place = kept(tmp_path, settings, switches)
     assert place.detector(settings, None) is None
-    assert place.text.startswith("training anew: ")
+    assert place.text.startswith("training again: ")
     assert why in place.text
     assert "\n" not in place.text
     (aside,) = models_aside(place.path)
@@ -76,7 +76,7 @@ def test_one_of_another_schema_or_a_damaged_one_is_not_used(tmp_path, trained, m
     assert "its schema is 1, this program's is 2" in place.text
     place.path.write_bytes(b"no model")
     assert place.detector(SMALL, None) is None
-    assert "not a whole Kitsune model" in place.text
+    assert "an incomplete Kitsune model" in place.text
     assert len(models_aside(place.path)) == 2
 
 
@@ -114,7 +114,7 @@ def test_a_service_that_starts_again_scores_at_once(tmp_path):
     fed(engine, mixed(400))
     first.stop()
     again = service(tmp_path)
-    assert again.ready()["model"].startswith("took up")
+    assert again.ready()["model"].startswith("using the kept model")
     assert again.health()["model"]["done"]
     (told,) = [each for each in (engine.values(TRAINING_KEY)) if each["done"]]
     assert list(told["ports"]) == [{"switch": "s1", "port": int(mixed(1)["port"][0]), "packets": 221}]

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apps.kitsune.kernel import load_kernel
 from apps.kitsune.kitnet import KitNet
 from sdnator.testing.oracles.kitnet import NaiveKitNet as Naive
-from tests.apps.kitsune.test_afterimage import ENGINES, engine
+from tests.naive.kitsune.kitnet import PythonKitNet
 from tests.requirements import shared_data
 
+NETWORKS = {"kernel": KitNet, "twin": PythonKitNet}
 FM, AD = 500, 1500
 
 
@@ -20,11 +20,11 @@ def published():
     return features, np.load(shared_data("kitsune/scores.npz"))["first3000_fm500_ad1500_m10"]
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("step", [1, 17, 3000])
 def test_equals_the_published_scores(published, name, step):
     features, wanted = published
-    network = KitNet(fm_grace=FM, ad_grace=AD, kernel=engine(name))
+    network = NETWORKS[name](fm_grace=FM, ad_grace=AD)
     found = np.concatenate([network.process(features[at : at + step])[0] for at in range(0, 3000, step)])
     assert not found[: FM + AD + 1].any()
     assert np.abs(found[FM + AD + 1 :] / wanted[FM + AD + 1 :] - 1).max() < 1e-12
@@ -37,10 +37,10 @@ def test_the_naive_version_equals_the_published_scores(published):
     assert np.allclose(found, wanted, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_first_score_follows_fm_plus_ad_plus_one_packets(name):
     rows = np.random.default_rng(3).random((30, 6))
-    network = KitNet(6, fm_grace=5, ad_grace=10, max_ae=3, kernel=engine(name))
+    network = NETWORKS[name](6, fm_grace=5, ad_grace=10, max_ae=3)
     scores, errors = network.process(rows)
     assert np.count_nonzero(scores == 0) == network.training_packets == 16
     assert errors.shape == (14, len(network.feature_map))
@@ -51,25 +51,25 @@ def test_first_score_follows_fm_plus_ad_plus_one_packets(name):
 def test_kernel_equals_twin_and_naive_on_random_features(width, most, seed):
     rows = np.random.default_rng(seed).normal(size=(90, max(width, 2)))
     width = rows.shape[1]
-    kernel = KitNet(width, fm_grace=20, ad_grace=30, max_ae=most, kernel=load_kernel())
-    twin = KitNet(width, fm_grace=20, ad_grace=30, max_ae=most)
+    kernel = KitNet(width, fm_grace=20, ad_grace=30, max_ae=most)
+    twin = PythonKitNet(width, fm_grace=20, ad_grace=30, max_ae=most)
     naive = Naive(width, most, 20, 30)
     wanted = np.array([naive.process(row) for row in rows])
     assert np.allclose(twin.process(rows)[0], wanted, rtol=1e-10, atol=0)
     assert np.allclose(kernel.process(rows)[0], wanted, rtol=1e-10, atol=0)
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_a_given_map_trains_on_all_training_packets(name):
     rows = np.random.default_rng(5).random((40, 4))
-    network = KitNet(4, fm_grace=9, ad_grace=20, feature_map=[[0, 1], [2, 3]], kernel=engine(name))
+    network = NETWORKS[name](4, fm_grace=9, ad_grace=20, feature_map=[[0, 1], [2, 3]])
     network.process(rows[:29])
     assert network.ensemble is not None
     assert np.array_equal(network.ensemble.high[0], rows[:29, :2].max(axis=0))
     assert not network.is_trained
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_a_constant_feature_that_moves_is_limited_by_clip_only(name):
     rows = np.random.default_rng(7).random((80, 4))
     rows[:, 1] = 5.0
@@ -77,18 +77,18 @@ def test_a_constant_feature_that_moves_is_limited_by_clip_only(name):
     moved[:, 1] = 6.0
     scores = {}
     for clip in (0.0, 1e6):
-        network = KitNet(4, fm_grace=20, ad_grace=50, clip=clip, kernel=engine(name))
+        network = NETWORKS[name](4, fm_grace=20, ad_grace=50, clip=clip)
         network.learn(rows[:71])
         scores[clip] = network.score(moved)[0]
     assert (scores[0.0] > 1e12).all()
     assert ((scores[1e6] > 1) & (scores[1e6] < 1e12)).all()
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_nan_gives_nan_and_enters_no_range(name):
     rows = np.random.default_rng(9).random((60, 4))
     rows[40, 2] = np.nan
-    network = KitNet(4, fm_grace=20, ad_grace=50, max_ae=4, kernel=engine(name))
+    network = NETWORKS[name](4, fm_grace=20, ad_grace=50, max_ae=4)
     network.learn(rows)
     assert network.ensemble is not None
     assert np.isfinite(network.ensemble.high[0, : len(network.feature_map[0])]).all()

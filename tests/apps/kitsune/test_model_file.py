@@ -45,7 +45,7 @@ def test_a_truncated_file_is_refused_wherever_it_ends(path):
     whole = path.read_bytes()
     for size in (0, 1, 30, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        with pytest.raises(NotAModelError, match=r"model\.npz: not a whole Kitsune model"):
+        with pytest.raises(NotAModelError, match=r"model\.npz: an incomplete Kitsune model"):
             load_model(path)
 
 
@@ -133,5 +133,5 @@ def test_a_zip_file_of_another_version_or_encrypted_is_refused(path, place, byte
     directory = whole.index(b"PK\x01\x02")
     whole[directory + place + 2] = whole[whole.index(b"PK\x03\x04") + place] = byte
     path.write_bytes(bytes(whole))
-    with pytest.raises(NotAModelError, match="not a whole Kitsune model"):
+    with pytest.raises(NotAModelError, match="an incomplete Kitsune model"):
         load_model(path)

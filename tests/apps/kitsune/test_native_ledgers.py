@@ -7,18 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apps.kitsune import conversations
-from apps.kitsune import senders as twin
-from apps.kitsune import victims as victims_twin
-from apps.kitsune.kernel import ColumnError, load_kernel
-from apps.kitsune.native_senders import NativeSenders
-from apps.kitsune.native_victims import NativeVictimRates
+from apps.kitsune import senders as senders_module
+from apps.kitsune import victims as victims_module
+from apps.kitsune.kernel import ColumnError
 from apps.kitsune.senders import Senders
 from apps.kitsune.victims import VictimRates
 from apps.messages import Target
 from tests.apps.firewall.enforcement.test_eve import decision
 from tests.apps.kitsune.behaviour.test_native import plain
 from tests.apps.kitsune.random_traffic import scores_of, traffic
+from tests.naive.kitsune.senders import PythonSenders
+from tests.naive.kitsune.victims import PythonVictimRates
 
 TRAINING = 700
 
@@ -48,7 +47,12 @@ def feed(sides, random, start_s, left, step):
     count = int(random.integers(1, 400))
     batch, scores = traffic(random, count, start_s), scores_of(random, count) * 3
     trained, switch = min(left, count), f"s{count % 2}"
-    how = {"scores": scores, "trained": trained, "line": 1.0, "evidence": lambda rows: rows * 1_000 + step}
+    how = {
+        "scores": scores,
+        "trained": trained,
+        "threshold": 1.0,
+        "evidence": lambda rows: rows * 1_000 + step,
+    }
     found = [side.add(batch, switch, **how) for side in sides]
     assert seconds_of(found[0]) == seconds_of(found[1])
     assert records_of(sides[0]) == records_of(sides[1])
@@ -65,9 +69,9 @@ def test_anomalous_seconds_roles_and_rates_are_equal(small, seed):
     random = np.random.default_rng(seed)
     with pytest.MonkeyPatch.context() as patch:
         if small:
-            patch.setattr(twin, "MOST_SENDERS", 30)
-            patch.setattr(conversations, "MOST", 20)
-        sides, left, at = [Senders(), NativeSenders(load_kernel())], TRAINING, 100.0
+            patch.setattr(senders_module, "MOST_SENDERS", 30)
+            patch.setattr(senders_module, "MOST_CONVERSATIONS", 20)
+        sides, left, at = [PythonSenders(), Senders()], TRAINING, 100.0
         for step in range(14):
             left = feed(sides, random, at, left, step)
             at += float(random.choice([-30, 1, 20, 80]))
@@ -80,7 +84,7 @@ def test_anomalous_seconds_roles_and_rates_are_equal(small, seed):
         assert sides[0].clock_jumps == sides[1].clock_jumps
         states = [json.loads(json.dumps(side.to_state())) for side in sides]
         assert plain(states[0]) == plain(states[1])
-        again = [Senders.from_state(states[0]), NativeSenders.restored(states[0], load_kernel())]
+        again = [PythonSenders.from_state(states[0]), Senders.from_state(states[0])]
         feed(again, random, at, 0, 99)
 
 
@@ -90,8 +94,8 @@ def test_usual_traffic_is_equal(seed, most):
     random = np.random.default_rng(seed)
     with pytest.MonkeyPatch.context() as patch:
         for name in ("MOST_KINDS", "MOST_SOURCES", "MOST_SOURCES_OF_ALL"):
-            patch.setattr(victims_twin, name, most)
-        sides, left, at = [VictimRates(), NativeVictimRates(load_kernel())], TRAINING, 0.0
+            patch.setattr(victims_module, name, most)
+        sides, left, at = [PythonVictimRates(), VictimRates()], TRAINING, 0.0
         for _ in range(8):
             count = int(random.integers(1, 300))
             batch, trained = traffic(random, count, at), min(left, count)
@@ -106,7 +110,7 @@ def test_usual_traffic_is_equal(seed, most):
 def test_columns_that_do_not_fit_are_refused():
     """Neither missing ones nor others of another length reach C."""
     batch = dict(traffic(np.random.default_rng(1), 10, 0.0))
-    rates = NativeVictimRates(load_kernel())
+    rates = VictimRates()
     with pytest.raises(ColumnError, match="tcp_flags"):
         rates.add({name: column for name, column in batch.items() if name != "tcp_flags"}, 0)
     with pytest.raises(ColumnError, match="equally long"):

@@ -15,13 +15,19 @@ def learn(roles, source, *, sport=-1, to_mac=0xFFFFFFFFFFFF, to=NOTHING, multica
     roles.learn(source, sport, to_mac, to, multicast)
 
 
-def test_a_mac_towards_many_outside_addresses_is_a_gateway():
+def behind_a_router():
+    """Roles of a training in which a host spoke to three outside addresses."""
     roles = Roles()
     roles.see(ROUTER_MAC, ROUTER)
     roles.see(HOST_MAC, HOST)
     for number in range(3):
         learn(roles, HOST, to_mac=ROUTER_MAC, to=outside(number))
     roles.close_training()
+    return roles
+
+
+def test_a_mac_towards_many_outside_addresses_is_a_gateway():
+    roles = behind_a_router()
     assert roles.role(ROUTER_MAC, ROUTER) == "gateway"
     assert roles.role(ROUTER_MAC, NOTHING) == "gateway"
     assert roles.role(HOST_MAC, HOST) == "host"
@@ -36,6 +42,17 @@ def test_an_outside_address_behind_the_gateway_is_a_host_and_its_mac_has_many_ad
     assert roles.role(ROUTER_MAC, outside(1)) == "host"
     assert roles.role(ROUTER_MAC, ROUTER) == "gateway"
     assert roles.addresses(ROUTER_MAC) == 6
+
+
+def test_who_is_behind_a_gateway_shares_its_way_in():
+    """Anybody there can send under such an address; the gateway itself, and a host of the LAN, sit on their own ports."""
+    roles = behind_a_router()
+    restored = Roles.from_state(roles.to_state())
+    for each in (roles, restored):
+        assert each.is_routed(ROUTER_MAC, outside(77))
+        assert not each.is_routed(ROUTER_MAC, ROUTER)
+        assert not each.is_routed(ROUTER_MAC, NOTHING)
+        assert not each.is_routed(HOST_MAC, HOST)
 
 
 def test_servers_and_multicast_speakers():

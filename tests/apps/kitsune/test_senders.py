@@ -1,4 +1,4 @@
-"""A second is hot when at least three and at least half of a sender's packets are above the threshold; anomalous seconds add up."""
+"""A second is anomalous when at least three and at least half of a sender's packets are above the threshold; anomalous seconds add up."""
 
 import numpy as np
 
@@ -27,9 +27,11 @@ def packets(rows):
     ), scores.astype(float)
 
 
-def feed(senders, rows, trained=0, line=1.0):
+def feed(senders, rows, trained=0, threshold=1.0):
     batch, scores = packets(rows)
-    return senders.add(batch, "s1", scores=scores, trained=trained, line=line, evidence=lambda row: row)
+    return senders.add(
+        batch, "s1", scores=scores, trained=trained, threshold=threshold, evidence=lambda row: row
+    )
 
 
 def trained_senders():
@@ -38,17 +40,17 @@ def trained_senders():
     return senders
 
 
-def test_a_second_becomes_hot_when_it_is_over():
+def test_a_second_becomes_anomalous_when_it_is_over():
     senders = trained_senders()
     assert feed(senders, [(5, HOST, 2)] * 3) == []
-    (hot,) = feed(senders, [(6, HOST, 0)])
-    assert hot.second == BASE_S + 5
-    assert (hot.tally.packets, hot.tally.over, hot.tally.peak, hot.tally.first_over) == (3, 3, 2.0, 0)
-    assert hot.record.identity == ("s1", 3, HOST & 0xFF, (4, 0, HOST))
-    assert (hot.anomalous_seconds, hot.record.training_rate) == (1, 4)
+    (found,) = feed(senders, [(6, HOST, 0)])
+    assert found.second == BASE_S + 5
+    assert (found.tally.packets, found.tally.over, found.tally.peak, found.tally.first_over) == (3, 3, 2.0, 0)
+    assert found.record.identity == ("s1", 3, HOST & 0xFF, (4, 0, HOST))
+    assert (found.anomalous_seconds, found.record.training_rate) == (1, 4)
 
 
-def test_two_packets_or_less_than_half_are_not_hot():
+def test_two_packets_or_less_than_half_are_not_anomalous():
     senders = trained_senders()
     assert (
         feed(senders, [(5, HOST, 2)] * 2 + [(6, HOST, 2)] * 3 + [(6, HOST, 0.1)] * 4 + [(7, HOST, 0)]) == []
@@ -56,10 +58,10 @@ def test_two_packets_or_less_than_half_are_not_hot():
     assert len(feed(senders, [(8, HOST, 2)] * 3 + [(8, HOST, 0.1)] * 3 + [(9, HOST, 0)])) == 1
 
 
-def test_hot_seconds_of_the_last_ten_add_up():
+def test_anomalous_seconds_of_the_last_ten_add_up():
     senders = trained_senders()
     rows = [(second, HOST, 5) for second in (10, 11, 15, 20, 21) for _ in range(3)]
-    counts = [hot.anomalous_seconds for hot in feed(senders, rows) + senders.finish()]
+    counts = [found.anomalous_seconds for found in feed(senders, rows) + senders.finish()]
     assert counts == [1, 2, 3, 3, 3]
 
 
@@ -79,9 +81,9 @@ def test_evidence_is_that_of_the_highest_score_also_across_batches():
     senders = trained_senders()
     feed(senders, [(5, HOST, 2), (5, HOST, 9), (5, HOST, 3)])
     feed(senders, [(5, HOST, 4)])
-    (hot,) = senders.finish()
-    assert hot.tally.evidence == 1
-    assert hot.tally.peak == 9
+    (found,) = senders.finish()
+    assert found.tally.evidence == 1
+    assert found.tally.peak == 9
 
 
 def test_nan_and_infinite_scores_are_over_the_line():
@@ -93,8 +95,8 @@ def test_nan_and_infinite_scores_are_over_the_line():
 def test_late_packets_count_in_the_open_second_and_a_clock_set_back_starts_anew():
     senders = trained_senders()
     assert feed(senders, [(9, HOST, 2), (8, HOST, 2), (9, HOST, 2)]) == []
-    (hot,) = feed(senders, [(-10_000, HOST, 0)])
-    assert (hot.second, senders.clock_jumps) == (BASE_S + 9, 1)
+    (found,) = feed(senders, [(-10_000, HOST, 0)])
+    assert (found.second, senders.clock_jumps) == (BASE_S + 9, 1)
 
 
 def test_replies_of_a_flooded_host_heat_the_flooder():
@@ -120,16 +122,16 @@ def test_replies_of_a_flooded_host_heat_the_flooder():
     )
     senders = trained_senders()
     for batch in (syn, answer):
-        senders.add(batch, "s1", scores=np.full(3, 9.0), trained=0, line=1.0, evidence=lambda row: row)
-    (hot,) = senders.finish()
-    assert hot.record.identity[3] == (4, 0, HOST)
-    assert hot.tally.packets == 6
+        senders.add(batch, "s1", scores=np.full(3, 9.0), trained=0, threshold=1.0, evidence=lambda row: row)
+    (found,) = senders.finish()
+    assert found.record.identity[3] == (4, 0, HOST)
+    assert found.tally.packets == 6
 
 
 def test_arp_speaks_for_its_sender_address():
     arp = blank(3, time_us=np.full(3, BASE_S * 1_000_000), arp_op=np.ones(3), arp_src_ip=np.full(3, HOST))
     senders = trained_senders()
-    senders.add(arp, "s1", scores=np.full(3, 9.0), trained=0, line=1.0, evidence=lambda row: row)
+    senders.add(arp, "s1", scores=np.full(3, 9.0), trained=0, threshold=1.0, evidence=lambda row: row)
     assert senders.finish()[0].record.identity[3] == (4, 0, HOST)
 
 
@@ -138,8 +140,8 @@ def test_state_goes_through_plain_values():
     feed(senders, [(5, HOST, 0)])
     again = Senders.from_state(senders.to_state())
     assert feed(again, [(50, HOST, 3)] * 3) == []
-    (hot,) = again.finish()
-    assert (hot.record.training_rate, hot.record.training_destinations) == (4, 3)
+    (found,) = again.finish()
+    assert (found.record.training_rate, found.record.training_destinations) == (4, 3)
 
 
 def test_spoofed_senders_are_forgotten(monkeypatch):
@@ -166,11 +168,11 @@ def test_answers_to_a_blocked_sender_are_nobodys():
 
     def second(at, scores):
         batch = blank(4, time_us=np.full(4, (BASE_S + at) * 1_000_000), **sides)
-        how = {"trained": 0, "line": 1.0, "evidence": lambda row: row}
+        how = {"trained": 0, "threshold": 1.0, "evidence": lambda row: row}
         return senders.add(batch, "s1", scores=np.array(scores, float), **how) + senders.finish()
 
-    (hot,) = second(5, [0, 2, 2, 2])
-    assert hot.record.identity[3] == (4, 0, HOST)
+    (found,) = second(5, [0, 2, 2, 2])
+    assert found.record.identity[3] == (4, 0, HOST)
     address = ".".join(str(byte) for byte in HOST.to_bytes(4, "big"))
     for number, switch in enumerate(("s1", "*")):
         target = Target(kind="ip", address=address)
@@ -178,6 +180,6 @@ def test_answers_to_a_blocked_sender_are_nobodys():
         batch = blank(4, time_us=np.full(4, (BASE_S + 6 + number) * 1_000_000), **sides).take(
             np.array([1, 2, 3])
         )
-        how = {"trained": 0, "line": 1.0, "evidence": lambda row: row}
+        how = {"trained": 0, "threshold": 1.0, "evidence": lambda row: row}
         assert senders.add(batch, "s1", scores=np.full(3, 2.0), **how) + senders.finish() == []
         senders.blocked.decide(decision(id=f"d{number}", action="unblock", switch=switch, target=target))

@@ -1,4 +1,4 @@
-"""The calibrated line lets through as many benign packets as asked for, if their scores are log-normal."""
+"""The calibrated threshold lets through as many benign packets as asked for, if their scores are log-normal."""
 
 import numpy as np
 import pytest
@@ -10,17 +10,17 @@ def scores(count, seed=1, middle=-4.6, spread=0.8):
     return np.exp(np.random.default_rng(seed).normal(middle, spread, count))
 
 
-def test_line_lets_the_wanted_share_through():
+def test_the_threshold_lets_the_wanted_share_through():
     benign = Benign.of(scores(100_000), seconds=3600.0)
     assert benign.packets_per_hour == 100_000
-    line = benign.line(100.0)
-    assert 60 <= np.count_nonzero(scores(100_000, seed=2) > line) <= 160
+    threshold = benign.threshold(100.0)
+    assert 60 <= np.count_nonzero(scores(100_000, seed=2) > threshold) <= 160
 
 
-def test_a_heavier_upper_tail_raises_the_line():
+def test_a_heavier_upper_tail_raises_the_threshold():
     light = scores(10_000)
     heavy = np.where(light > np.quantile(light, 0.98), light * 5, light)
-    assert Benign.of(heavy, 3600.0).line(1.0) > Benign.of(light, 3600.0).line(1.0)
+    assert Benign.of(heavy, 3600.0).threshold(1.0) > Benign.of(light, 3600.0).threshold(1.0)
 
 
 def test_drift_counts_in_spreads():
@@ -55,13 +55,13 @@ def test_a_short_run_is_fitted_at_its_end():
 
 def test_zero_nan_and_infinite_scores_do_not_break_the_fit():
     benign = Benign.of(np.array([0.0, np.nan, np.inf, 0.1, 0.2, 0.3]), 1.0)
-    assert np.isfinite(benign.line(1.0))
+    assert np.isfinite(benign.threshold(1.0))
 
 
 @pytest.mark.parametrize("alarms", [0.0, -1.0, float("nan")])
 def test_no_alarms_at_all_cannot_be_promised(alarms):
     with pytest.raises(ValueError, match="must be greater than 0"):
-        Benign.of(scores(100), 1.0).line(alarms)
+        Benign.of(scores(100), 1.0).threshold(alarms)
 
 
 def test_too_few_scores_are_refused():

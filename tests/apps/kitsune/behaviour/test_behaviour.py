@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from apps.kitsune.behaviour.behaviour import CONTACTS, Behaviour
+from apps.kitsune.behaviour.contacts import ARP, UNANSWERED
+from apps.kitsune.behaviour.native import NativeBehaviour
 from apps.kitsune.blocked import Blocked
+from apps.kitsune.kernel import load_kernel
 from apps.messages import Target
 from due import RecordBatch
 from sdnator.testing.packet_rows import blank
@@ -80,6 +83,33 @@ def test_a_scan_is_found_by_its_failed_contacts_within_a_second():
     assert total(found, *CONTACTS) > 12
     assert {each.sender[3] for each in found if each.sender} == {STRANGER}
     assert found[0].time < BASE_US / 1e6 + 701
+
+
+def test_a_finding_begins_with_its_first_packet_and_not_with_its_window():
+    """How long an attack went on unstopped is counted from there."""
+    rows = [packet(700 + n / 50, STRANGER, SERVER, 50_000, 1_000 + n, SYN) for n in range(50)]
+    found = feed(quiet_network(), rows)
+    assert min(each.begun for each in found) == BASE_US / 1e6 + 700
+    assert len({each.begun for each in found if each.statistic == "ports"}) == 1
+    assert {each.window_s for each in found if each.statistic == "ports"} == {10.0}
+
+
+@pytest.mark.parametrize("kind", [Behaviour, lambda packets: NativeBehaviour(packets, load_kernel())])
+def test_who_was_quiet_for_longer_than_any_window_takes_no_memory(kind):
+    """A network that sees new hosts all day would fill every table up to its limit otherwise."""
+    behaviour = kind(1)
+    feed(behaviour, [packet(0, HOST, SERVER, 30_000, 80, SYN)], trained=1)
+    scans = (
+        [packet(at + n / 50, STRANGER, 0x0A000100 + at + n, 1, 80, SYN) for n in range(50)]
+        for at in (10, 2_000)
+    )
+    feed(behaviour, next(scans))
+    feed(behaviour, [packet(20, HOST, SERVER, 30_001, 80, SYN)])
+    first = behaviour.subjects
+    feed(behaviour, next(scans))
+    feed(behaviour, [packet(2_010, HOST, SERVER, 30_002, 80, SYN)])
+    assert first > 50
+    assert behaviour.subjects <= first
 
 
 def test_connections_that_come_about_are_no_scan():
@@ -205,6 +235,55 @@ def test_a_sweep_by_pings_is_found_though_hosts_answer():
     assert {each.statistic for each in found if each.sender} == {"targets"}
 
 
+def test_what_a_monitor_reaches_says_nothing_about_pings_without_a_reply():
+    """A monitoring host's round over all hosts, in training, does not hide a sweep over addresses where nobody is."""
+
+    def ping(at, source, target, *, answered):
+        there = packet(at, source, target, icmp_type=8, icmp_code=0)
+        return [there, packet(at + 0.001, target, source, icmp_type=0, icmp_code=0)] if answered else [there]
+
+    monitored = [row for n in range(40) for row in ping(n / 20, HOST, 0x0A000100 + n, answered=True)]
+    usual = [row for at in range(10, 600, 10) for row in handshake(at, HOST, SERVER, 30_000 + at, 80)]
+    behaviour = Behaviour(len(monitored) + len(usual))
+    feed(behaviour, [*monitored, *usual], trained=len(monitored) + len(usual))
+    sweep = [ping(700 + n / 10, STRANGER, 0x0A000200 + n, answered=n % 2 == 0) for n in range(32)]
+    found = feed(behaviour, [*(row for rows in sweep for row in rows), packet(705, HOST, SERVER, 1, 80, ACK)])
+    assert total(found, *CONTACTS) > BOUND
+    assert {(each.statistic, each.service) for each in found if each.sender} == {("targets", UNANSWERED)}
+    assert max(each.count for each in found) == 16
+
+
+def asked_network():
+    """Ten minutes in which a host asks for a server's MAC, and gets it within 4 ms."""
+    rows = [packet(0.5 * n, HOST + n % 120, SERVER, arp_op=1) for n in range(240)]
+    rows += [packet(0.5 * n + 0.004, SERVER, HOST + n % 120, arp_op=2) for n in range(240)]
+    rows.sort(key=lambda row: row["time_us"])
+    behaviour = Behaviour(len(rows))
+    feed(behaviour, rows, trained=len(rows))
+    return behaviour
+
+
+def test_how_long_to_wait_for_an_arp_reply_is_learnt():
+    """Where every host answers within 4 ms, nobody waits 400: a slow sweep is found so much sooner."""
+    rows = [packet(700 + n / 2, STRANGER, 0x0A000300 + n, arp_op=1) for n in range(20)]
+    rows += [packet(700.03 + n / 2, HOST, SERVER, 1, 80, ACK) for n in range(20)]
+    rows.sort(key=lambda row: row["time_us"])
+    sooner, found = (feed(kind(), rows) for kind in (asked_network, quiet_network))
+    waits = [
+        [each.time - BASE_US / 1e6 - 700 for each in some if each.service == ARP] for some in (sooner, found)
+    ]
+    assert waits[0][0] < 0.11
+    assert waits[1][0] > 0.39
+
+
+def test_a_late_arp_reply_is_waited_for_where_training_saw_few():
+    """Of the few in a quiet network nothing can be learnt."""
+    rows = [packet(700, STRANGER, SERVER + 7, arp_op=1), packet(700.3, SERVER + 7, STRANGER, arp_op=2)]
+    behaviour = quiet_network()
+    assert feed(behaviour, [*rows, packet(702, HOST, SERVER, 1, 80, ACK)]) == []
+    assert behaviour.contacts.arp_grace == 0.4
+
+
 def test_a_host_that_connects_back_after_a_login_speaks_against_who_logged_in():
     """Data connections of FTP come back by design, and without a login it is nothing."""
 
@@ -236,6 +315,83 @@ def test_a_flood_is_found_and_a_transfer_is_not():
         if n % 4 == 0:
             transfer.append(packet(700.01 + n / 1000, STRANGER, HOST, 9_000, 50_000, ACK))
     assert feed(quiet_network(), transfer) == []
+
+
+def test_syns_of_a_known_host_are_a_flood_where_bulk_transfers_are_usual():
+    """They are compared with SYNs of training, not with segments that a busy host takes its time to acknowledge."""
+    rows = [row for at in range(0, 600, 10) for row in handshake(at, HOST, SERVER, 30_000 + at, 80)]
+    rows += [
+        packet(at + 0.1 + n / 1000, HOST, SERVER, 30_000, 80, ACK)
+        for at in (100, 300, 500)
+        for n in range(60)
+    ]
+    rows.sort(key=lambda row: row["time_us"])
+    behaviour = Behaviour(len(rows))
+    feed(behaviour, rows, trained=len(rows))
+    more = [packet(690 + n / 1000, HOST, SERVER, 30_000, 80, ACK) for n in range(70)]
+    assert total(feed(behaviour, more), "one_way") < 6
+    flood = [packet(700 + n / 300, HOST, SERVER, 40_000 + n, 80, SYN) for n in range(290)]
+    assert total(feed(behaviour, flood), "one_way") > BOUND
+    opened = [row for n in range(20) for row in handshake(710 + n / 300, HOST, SERVER, 41_000 + n, 80)]
+    assert not total(feed(behaviour, sorted(opened, key=lambda row: row["time_us"])), "one_way")
+
+
+def test_who_ends_a_call_a_moment_later_floods_nobody():
+    """Replies of the second before make up for packets, too; not those of a second that is longer ago."""
+
+    def after(end_s, begin_s):
+        call = [packet(700 + n / 200, HOST, SERVER, udp_sport=5, udp_dport=9) for n in range(400)]
+        call += [
+            packet(700 + n / 200, SERVER, HOST, udp_sport=9, udp_dport=5) for n in range(round(200 * end_s))
+        ]
+        call += [packet(begin_s + n / 200, HOST, SERVER, udp_sport=5, udp_dport=9) for n in range(150)]
+        return total(feed(quiet_network(), sorted(call, key=lambda row: row["time_us"])), "one_way")
+
+    assert after(2, 702) < 1
+    assert after(2, 704) > 5
+
+
+def test_contacts_that_fail_while_the_uplink_is_down_say_nothing():
+    """Once nothing has come from outside for longer than ever in training; within the network they count as before."""
+    far = 0x08000000
+
+    def after(silence_s, target):
+        rows = [row for at in range(0, 600, 5) for row in handshake(at, HOST, far, 30_000 + at, 443)]
+        behaviour = Behaviour(len(rows))
+        feed(behaviour, rows, trained=len(rows))
+        scan = [packet(600 + silence_s + n / 10, HOST, target + n, 50_000, 443, SYN) for n in range(40)]
+        return total(feed(behaviour, [*scan, packet(700, HOST, SERVER, 1, 80, ACK)]), *CONTACTS)
+
+    assert after(-4, far + 1) > 12
+    assert after(6, far + 1) == 0
+    assert after(6, 0x0A000100) > 12
+
+
+def test_contacts_fail_for_everybody_where_a_provider_is_down():
+    """Something still comes from outside, but four hosts in turn reach nobody new there; until somebody does."""
+    far = 0x08000000
+    rows = [row for at in range(0, 600, 5) for row in handshake(at, HOST, far, 30_000 + at, 443)]
+
+    def scan(host, start_s):
+        return [packet(start_s + n / 10, host, far + 100 + n, 50_000 + host % 7, 443, SYN) for n in range(40)]
+
+    def last_of(*more):
+        behaviour = Behaviour(len(rows))
+        feed(behaviour, rows, trained=len(rows))
+        alive = [packet(600 + n, far, HOST, 443, 30_000, ACK) for n in range(60)]
+        others = [row for n in range(3) for row in scan(HOST + 1 + n, 601 + 10 * n)[:1]]
+        packets = sorted([*alive, *others, *more, *scan(HOST, 650)], key=lambda row: row["time_us"])
+        found = feed(behaviour, [*packets, packet(700, HOST, SERVER, 1, 80, ACK)])
+        return total([each for each in found if each.sender and each.sender[3] == HOST], *CONTACTS)
+
+    assert last_of() == 0
+    assert last_of(*handshake(645, HOST + 1, far + 50, 50_000, 443)) > 12
+
+
+def test_where_the_outside_was_never_heard_its_silence_says_nothing():
+    behaviour = quiet_network()
+    scan = [packet(700 + n / 10, HOST, 0x08000000 + n, 50_000, 443, SYN) for n in range(40)]
+    assert total(feed(behaviour, [*scan, packet(720, HOST, SERVER, 1, 80, ACK)]), *CONTACTS) > 12
 
 
 def test_forged_sources_are_counted_for_their_victim():
@@ -298,3 +454,7 @@ def test_what_was_learnt_survives_the_model_file():
         Behaviour.from_state({"seconds": -1, "line": 1})
     with pytest.raises(ValueError, match="connected back"):
         Behaviour.from_state(behaviour.to_state() | {"callbacks": [1, 5]})
+    with pytest.raises(ValueError, match="silence"):
+        Behaviour.from_state(behaviour.to_state() | {"outside": [-3.0, True]})
+    with pytest.raises(ValueError, match="ARP reply"):
+        Behaviour.from_state(behaviour.to_state() | {"arp_grace": 0.0})

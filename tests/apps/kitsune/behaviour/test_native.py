@@ -39,6 +39,7 @@ def feed(sides, random, start_s, *, left, blocked=None, count=None):
         side.add(batch, f"s{count % 2}", scores, trained, lambda: rescored, 1.5, blocked) for side in sides
     ]
     assert repr(found[0]) == repr(found[1])
+    assert sides[0].subjects == sides[1].subjects
     return trained, found[0]
 
 
@@ -53,11 +54,16 @@ def test_findings_and_what_is_learnt_are_equal(small, seed):
             patch.setattr(twin, "KEPT", 20)
             patch.setattr("apps.kitsune.behaviour.findings.KEPT", 20)
             patch.setattr(contacts, "MOST_CONTACTS", 30)
+            patch.setattr(contacts, "LEAST_ARP_REPLIES", 1)
         sides = [Behaviour(TRAINING), NativeBehaviour(TRAINING, load_kernel())]
         blocked, left, at, findings = Blocked(), TRAINING, 0.0, 0
         for step in range(12):
             trained, found = feed(sides, random, at, left=left, blocked=blocked)
-            left, at, findings = left - trained, at + float(random.exponential(30)), findings + len(found)
+            left, at, findings = (
+                left - trained,
+                at + float(random.exponential(400 if step % 4 == 3 else 30)),
+                findings + len(found),
+            )
             if step == 8:
                 target = Target(kind="ip", address="192.168.2.2")
                 blocked.decide(decision(id="d1", action="block", switch="*", target=target))

@@ -1,6 +1,6 @@
-"""AfterImage in plain Python: the kernel's twin for machines without a C compiler.
+"""AfterImage in plain Python: the tables.
 
-Reference mode does at once, packet by packet, what the kernel defers; bounded mode (`afterimage_bounded`)
+Reference mode does at once, packet by packet, what the kernel defers; bounded mode (`afterimage`)
 takes the kernel's steps in the kernel's order.  Both give bit-identical results, which tests check with
 random traffic.
 """

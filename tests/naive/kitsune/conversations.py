@@ -7,15 +7,14 @@ own; further replies are a flood by the host that sends them.
 
 from typing import Final
 
+from apps.kitsune import senders as product
+from apps.kitsune.senders import REPLIES_PER_PACKET, Address
+
 UDP_REPLY_S: Final = 5.0
 TCP_REPLY_S: Final = 65.0
 """A half-open connection repeats its SYN-ACK for up to 63 s."""
-REPLIES_PER_PACKET: Final = 10
-MOST: Final = 65_536
 _SYN, _RST, _ACK = 0x02, 0x04, 0x10
 
-Address = tuple[int, int, int]
-"""IP version, upper and lower half of the address."""
 Key = tuple[bool, Address, int, int]
 """TCP or UDP, initiator's address, initiator's port, the other port."""
 
@@ -53,7 +52,7 @@ class Conversations:
             return sender
         return _charge(begun, sender) if reply else sender
 
-    def payer_of_error(self, sender: int, time: float, key: Key) -> int:
+    def responsible_for_error(self, sender: int, time: float, key: Key) -> int:
         """The sender held responsible for an ICMP error that quotes a packet sent under `key`."""
         begun = self._find(key, time)
         return sender if begun is None else _charge(begun, sender)
@@ -64,7 +63,7 @@ class Conversations:
         return entry if entry is not None and abs(time - entry.time) <= within else None
 
     def _begin(self, key: Key, sender: int, time: float) -> None:
-        if not 0 <= time - self._turned <= TCP_REPLY_S or len(self._young) >= MOST:
+        if not 0 <= time - self._turned <= TCP_REPLY_S or len(self._young) >= product.MOST_CONVERSATIONS:
             self._old, self._young, self._turned = self._young, {}, time
         entry = self._young.get(key)
         if entry is None or entry.sender != sender:

@@ -1,4 +1,4 @@
-"""Bounded mode of AfterImage's Python twin: size limits, expiry, and catching up in one step.
+"""AfterImage in plain Python, with bounded mode: size limits, expiry, and catching up in one step.
 
 A stream with many links (a hub) logs its packets instead of updating all its peers.  A peer applies
 what it has missed when it is next needed: packet by packet while the log still has it, else in closed
@@ -11,7 +11,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.afterimage_python import (
+from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode
+from apps.kitsune.kernel import Columns
+from tests.naive.kitsune.afterimage_tables import (
     LOG_KEPT,
     SCALES,
     DampedStream,
@@ -21,8 +23,7 @@ from apps.kitsune.afterimage_python import (
     factors_of,
     pair_of,
 )
-from apps.kitsune.kernel import Columns
-from apps.kitsune.text_keys import TextKeys, text_keys
+from tests.naive.kitsune.text_keys import TextKeys, text_keys
 
 HUB_DEGREE: Final = 8
 HUBS_ASKED: Final = 32
@@ -160,6 +161,15 @@ def _account(link: Link, side: int) -> None:
         link.w3[k] += (hub.count[k] - link.count_then[side][k] * since[k]) * until[k]
     link.residual[side] = hub.log[-1][2]
     _note(link, side)
+
+
+class PythonAfterImage(AfterImage):
+    """`AfterImage` without its kernel."""
+
+    def __init__(
+        self, mode: Mode = "reference", *, max_streams=MAX_STREAMS, max_links=MAX_LINKS, horizon=HORIZON_S
+    ):
+        self._engine = PythonEngine(mode == "bounded", max_streams, max_links, horizon)
 
 
 class PythonEngine:

@@ -1,0 +1,51 @@
+"""What evidence says reads as English: one of a thing in the singular, and ARP by what it lacks."""
+
+import pytest
+
+from apps.kitsune.behaviour.contacts import ARP, UDP, UNANSWERED
+from apps.kitsune.behaviour.findings import Finding
+from apps.kitsune.behaviour.rows import address_of
+from apps.kitsune.evidence import evidence_of
+from apps.kitsune.roles import Roles
+from apps.kitsune.victims import UsualTraffic
+
+HOST, VICTIM = address_of(4, 0, 0xC0A80205), address_of(4, 0, 0xC0A80209)
+
+
+def words(statistic, count, service=-1, usual=0.0):
+    return told(statistic, count, service, usual).text
+
+
+def told(statistic, count, service=-1, usual=0.0, came=None):
+    finding = Finding(
+        statistic=statistic, sender=("s1", 1, 5, HOST), victim=VICTIM, service=service, nats=3.0, total=3.0,
+        count=count, window_s=10.0, usual=usual, begun=98.5, time=100.0, arrival=7,
+    )  # fmt: skip
+    return evidence_of(finding, Roles(), proven=False, forged=False, rate=1.0, training_rate=1.0, usual=came)
+
+
+@pytest.mark.parametrize(
+    ("count", "said"), [(1, "sent 1 packet a second to 192.168.2.9"), (2, "sent 2 packets a second to")]
+)
+def test_one_packet_is_not_packets(count, said):
+    assert said in words("one_way", count)
+
+
+def test_an_arp_sweep_is_told_by_the_replies_that_are_missing():
+    assert "192.168.2.5 got no ARP reply from 4 new hosts within 10 s" in words("targets", 4, ARP)
+
+
+def test_a_sweep_by_pings_is_told_by_what_does_not_answer():
+    assert "192.168.2.5 got no echo reply from 4 new hosts within 10 s" in words("targets", 4, UNANSWERED)
+
+
+def test_one_host_did_so():
+    assert "1 host did so in training" in words("callbacks", 1, 0, usual=1.0)
+
+
+def test_a_flood_says_what_came_to_its_victim_in_training():
+    """Where its sender cannot be blocked, a rate limit towards the victim rests on it."""
+    came = UsualTraffic(9.0, 40.0, (VICTIM,), 0.5)
+    found = told("one_way", 500, UDP | 5060, came=came)
+    assert (found.usual_rate, found.usual_sources, found.usual_share) == (40.0, ("192.168.2.9",), 0.5)
+    assert (found.rate, found.training_rate) == (1.0, 1.0), "of the sender"
