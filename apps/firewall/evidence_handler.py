@@ -1,6 +1,5 @@
 """Alerts and evidence → decisions: asks the decider, looks up history, carries out what is due, reports the rest."""
 
-from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -11,6 +10,7 @@ from apps.firewall.arrivals import evidence_of
 from apps.firewall.enforcement.announcer import Announcer
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import OFFENCES_READ, Archive
+from apps.firewall.evidence.exhibits import Exhibits
 from apps.firewall.incidents.incident_reports import IncidentReports
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider, Proposal
@@ -18,11 +18,9 @@ from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.prefix_aggregation import gather_blocks
 from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.syn.syn_defence import UNKNOWN_HISTORY, SynDefence
-from apps.messages import Alert, Decision, Exhibit, FalseAlarm, Sender, Target
+from apps.messages import Alert, Decision, FalseAlarm, Ground, Target
 from due import Item
 
-EVIDENCE_KEPT: Final = 10
-SENDERS_KEPT: Final = 10_000
 TARGETS_KEPT: Final = 1_000
 OFFENCES_HOLD_S: Final = 10.0
 """Seconds for which the archived blocks of a target are not asked for again."""
@@ -69,12 +67,12 @@ class EvidenceHandler:
         self._clock = clock
         self._earlier: dict[Target, tuple[float, list[Item]]] = {}
         """Archived blocks by target, and when they were read."""
-        self._exhibits: defaultdict[Sender, deque[Exhibit]] = defaultdict(lambda: deque(maxlen=EVIDENCE_KEPT))
+        self._exhibits = Exhibits()
 
     def alert(self, item: Item, alert: Alert) -> None:
         """A sender had an anomalous second."""
         self._incidents.alert(alert)
-        self._remember(alert.sender, evidence_of(item, alert.reason))
+        self._exhibits.add(alert.sender, evidence_of(item, alert.reason), alert.event_time)
         if self._ledger.covering(alert.sender) is not None:
             return
         verdict = self.decider.alert(alert)
@@ -85,9 +83,9 @@ class EvidenceHandler:
         self._block(alert, verdict.target, reason, earlier or 0)
 
     def evidence(self, item: Item, evidence: Evidence) -> None:
-        """Something speaks against a sender, or for the protection of a victim."""
+        """There is evidence against a sender, or for protecting a victim."""
         if evidence.sender is not None:
-            self._remember(evidence.sender, evidence_of(item, evidence.text))
+            self._exhibits.add(evidence.sender, evidence_of(item, evidence.text), evidence.event_time)
         at = evidence.event_time
         placed = self._lessons.weighed(self.decider.test.placed(evidence), item.app_id)
         self._lessons.note(placed, item.app_id)
@@ -111,14 +109,12 @@ class EvidenceHandler:
         evidence = proposal.evidence
         if proposal.service is not None:
             exhibits = (evidence_of(item, evidence.text),)
-            subject = (proposal.service.address, evidence.service)
             for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
-                grounds = self._lessons.book.take(subject, evidence.event_time)
-                self._publish(structs.replace(decision, grounds=grounds))
+                self._publish(structs.replace(decision, grounds=self._grounds_of(proposal)))
             self.decider.settled(proposal)
         elif proposal.limit is not None:
             exhibits, victim = (evidence_of(item, evidence.text),), evidence.victims[0]
-            grounds = self._lessons.book.take((victim, evidence.service), evidence.event_time)
+            grounds = self._grounds_of(proposal)
             for decision in self._limits.open(victim, proposal.limit, proposal.reason, exhibits, evidence):
                 self._publish(structs.replace(decision, grounds=grounds))
             self.decider.settled(proposal)
@@ -129,6 +125,11 @@ class EvidenceHandler:
             unknown = "" if proposal.offences is not None else f" ({UNKNOWN_HISTORY})"
             self._block(evidence, proposal.target, proposal.reason + unknown, proposal.offences or 0)
             self.decider.settled(proposal)
+
+    def _grounds_of(self, proposal: Proposal) -> tuple[Ground, ...]:
+        if proposal.tally is None:
+            return ()
+        return self._lessons.book.take(proposal.tally.subject, proposal.evidence.event_time)
 
     def _block(self, cause: Alert | Evidence, target: Target, reason: str, offences: int) -> None:
         """Block a sender, unless a cap forbids it."""
@@ -142,7 +143,7 @@ class EvidenceHandler:
             sender.switch,
             target,
             reason,
-            self._exhibits[sender],
+            self._exhibits.of(sender),
             cause.event_time,
             offences=offences,
             first_packet=cause.first_packet,
@@ -189,8 +190,3 @@ class EvidenceHandler:
             address: history.count_offences(items, target, now, self._lessons)
             for address, target in targets.items()
         }
-
-    def _remember(self, sender: Sender, exhibit: Exhibit) -> None:
-        if len(self._exhibits) >= SENDERS_KEPT and sender not in self._exhibits:
-            self._exhibits.pop(next(iter(self._exhibits)))
-        self._exhibits[sender].append(exhibit)

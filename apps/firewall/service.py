@@ -7,7 +7,7 @@ import logging
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
@@ -17,7 +17,7 @@ from msgspec import structs
 
 import due.service
 from apps.enforcement import ALLOWED, CONFIRMED, ENFORCED, SWITCHES, EnforcementReport
-from apps.evidence import EVIDENCE, TRAINING, Evidence, TrainingState
+from apps.evidence import EVIDENCE, JUDGED, TRAINING, Evidence, Judged, TrainingState
 from apps.firewall import arrivals
 from apps.firewall.arp.arp_bindings import ArpBindings
 from apps.firewall.arp.theft_handler import TheftHandler
@@ -30,9 +30,10 @@ from apps.firewall.enforcement.storing import StoredAnswers
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
+from apps.firewall.evidence.archived_state import ArchivedState
 from apps.firewall.evidence.history import FAMILIES
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
-from apps.firewall.evidence.past import ArchivedPast
+from apps.firewall.evidence.writing_order import WritingOrder
 from apps.firewall.evidence_handler import EvidenceHandler
 from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
 from apps.firewall.policy.auto_allowlist import surroundings
@@ -98,6 +99,7 @@ CAPABILITIES = (
     Capability("network.packet_out.firewall.*", delivery="reliable"),
     Capability(f"{history.ANSWERS}.*", delivery="reliable", archive="always"),
     Capability(history.LESSONS, delivery="reliable", archive="always"),
+    Capability(f"{JUDGED}.firewall", delivery="reliable"),
 )
 
 COMMAND = "network.p4_command.firewall"
@@ -122,9 +124,13 @@ class FirewallService:
         self._intake = Intake(log)
         self._settings = settings
         self._rules = settings.rules
-        self._known = KnownSources(settings.known_limit)
+        self._known = KnownSources(settings.known_limit, settings.known_days)
         self._ledger = BlockLifecycle(settings.rules, known=self._known)
         self._counts = dict.fromkeys(("alerts", "evidence"), 0)
+        self._order: WritingOrder[Callable[[], None]] = WritingOrder()
+        self._judged: Counter[str] = Counter()
+        """Pieces of evidence by the app that wrote them."""
+        self._decisions = 0
         allowed = (*settings.rules.allow, *(surroundings() if settings.allow_surroundings else ()))
         self._limits = RateLimits(settings.rules)
         self._allow_entries = AllowEntries()
@@ -151,7 +157,7 @@ class FirewallService:
             contest_s=settings.arp_contest_s,
         )
         self._archive = Archive(engine, settings.archive_patience_s)
-        self._past = ArchivedPast(self._archive, self._intake, settings)
+        self._past = ArchivedState(self._archive, self._intake, settings)
         self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
         self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
         self._lessons = FalseAlarms(settings.rules.false_alarm_days)
@@ -267,6 +273,7 @@ class FirewallService:
     def tick(self) -> None:
         """Examine suspected floods that are due, and write known sources in batches."""
         with self._lock:
+            self._carry_on(self._order.overdue(time.monotonic()))
             self._floods.tick()
             for notice in self._floods.notices(self._now):
                 self._announcer.say(notice, logging.INFO)
@@ -303,6 +310,7 @@ class FirewallService:
             "blocking_stopped": int(bool(self._ledger.stopped)),
             "stopped_by": self._ledger.stopped,
             "bindings": len(self._bindings),
+            "evidence_missed": self._order.missed,
             "archive_away": self._archive.unanswered,
             "answers_unstored": self._stored.unstored,
             "archive_items_read": self._archive.items_read,
@@ -428,19 +436,35 @@ class FirewallService:
             self._handler.alert(item, alert)
             self._say_notices()
 
-    def _on_training(self, _: Item, state: TrainingState) -> None:
-        with self._lock:
-            self._handler.decider.trained(state)
-            self._ledger.trained_hosts = state.hosts
+    def _on_training(self, item: Item, state: TrainingState) -> None:
+        self._in_order(item, state.number, lambda: self._trained(state))
 
     def _on_evidence(self, item: Item, evidence: Evidence) -> None:
+        self._in_order(item, evidence.number, lambda: self._judge(item, evidence))
+
+    def _in_order(self, item: Item, number: int, act: Callable[[], None]) -> None:
         with self._lock:
-            self._counts["evidence"] += 1
-            at = self._time.fit(evidence.event_time)
-            self._lapse(at)
-            since = min(evidence.since, at)
-            self._handler.evidence(item, structs.replace(evidence, event_time=at, since=since))
-            self._say_notices()
+            writer = f"{item.app_id}.{item.instance_id}"
+            self._carry_on(self._order.take(writer, number, act, time.monotonic()))
+
+    def _carry_on(self, acts: Iterable[Callable[[], None]]) -> None:
+        for act in acts:
+            act()
+
+    def _trained(self, state: TrainingState) -> None:
+        self._handler.decider.trained(state)
+        self._ledger.trained_hosts = state.hosts
+
+    def _judge(self, item: Item, evidence: Evidence) -> None:
+        self._counts["evidence"] += 1
+        at = self._time.fit(evidence.event_time)
+        self._lapse(at)
+        since = min(evidence.since, at)
+        self._handler.evidence(item, structs.replace(evidence, event_time=at, since=since))
+        self._say_notices()
+        self._judged[item.app_id] += 1
+        judged = Judged(app=item.app_id, evidence=self._judged[item.app_id], decisions=self._decisions)
+        self._engine.write(f"{JUDGED}.firewall", judged.to_value(), [due.NO_WAIT], event_time=at)
 
     # -- switches -----------------------------------------------------------------------------
 
@@ -544,6 +568,7 @@ class FirewallService:
             [due.NO_WAIT],
             event_time=decision.event_time,
         )
+        self._decisions += 1
         return decision
 
     def _carry_out_prefix(self, decision: Decision, switches: Iterable[str]) -> None:

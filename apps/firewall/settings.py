@@ -70,7 +70,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         for name in (*self.evidence_queries, *self.evidence_apps, *self.enforcers):
             if not _SEGMENT.fullmatch(name):
-                raise ValueError(f"{name!r} is no name of a query or an app: letters, digits and _ only")
+                raise ValueError(f"{name!r} is not the name of a query or an app: letters, digits and _ only")
         if self.syslog:
             syslog_place(self.syslog)
         if not self.enforcers or len(set(self.enforcers)) < len(self.enforcers):

@@ -13,7 +13,7 @@ from due import Item, RecordBatch
 
 
 class TheftHandler:
-    """Blocks those who take over addresses, or tells of them.
+    """Blocks hosts that take over addresses, or reports them.
 
     Args:
         mode: `tell`: nobody is blocked.

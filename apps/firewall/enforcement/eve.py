@@ -65,7 +65,7 @@ def incident_event(incident: Incident) -> Event:
         incident: as published.
 
     Returns:
-        An `alert`; its action is `blocked` only where a switch has confirmed a block or guard.
+        An `alert`; its action is `blocked` only where an enforcer has confirmed a block or guard.
     """
     number, signature, category, severity = SIGNATURES[incident.kind]
     stopped = any(action.enforced and action.remedy in _STOPPING for action in incident.actions)
@@ -105,7 +105,7 @@ def incident_event(incident: Incident) -> Event:
 
 
 def decision_event(decision: Decision, places: Sequence[str] = ()) -> Event:
-    """A decision that belongs to no incident: a block is an alert with the action `blocked`.
+    """A decision that belongs to no incident: an alert, whose action is `blocked` once an enforcer has confirmed a block.
 
     Args:
         decision: the decision.
@@ -125,7 +125,7 @@ def decision_event(decision: Decision, places: Sequence[str] = ()) -> Event:
             event["in_iface"] = f"{decision.switch}:{target.port}"
     elif "/" not in target.address:  # programs that expect an address there take no prefix
         event["src_ip"] = target.address
-    blocks = decision.action == "block" and not decision.dry_run
+    blocks = decision.action == "block" and not decision.dry_run and bool(places)
     said = {
         "decision": [decision.id],
         "target": [target.address],

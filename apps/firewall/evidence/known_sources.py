@@ -17,10 +17,16 @@ DAY: Final = 86_400_000_000_000
 
 
 class KnownSources:
-    """The `limit` sources with the most recent handshakes; times are capture time in ns."""
+    """The `limit` sources with the most recent handshakes; times are capture time in ns.
 
-    def __init__(self, limit: int) -> None:
+    Args:
+        limit: most sources.
+        days: capture time after which a source whose last handshake it was is no longer known.
+    """
+
+    def __init__(self, limit: int, days: int = 30) -> None:
         self._limit = limit
+        self._held = days * DAY
         self._seen: OrderedDict[str, int] = OrderedDict()
         self._added: OrderedDict[str, None] = OrderedDict()
         self._dropped: OrderedDict[str, None] = OrderedDict()
@@ -42,13 +48,8 @@ class KnownSources:
                 del self._dropped[source], self._added[source]
         self._seen[source] = max(at, self._seen.get(source, 0))
         self._seen.move_to_end(source)
-        while len(self._seen) > self._limit:
+        while len(self._seen) > self._limit or next(iter(self._seen.values())) < at - self._held:
             self._drop(next(iter(self._seen)))
-
-    def forget_before(self, time: int) -> None:
-        """Remove sources whose last handshake is older than `time`."""
-        for source in [source for source, at in self._seen.items() if at < time]:
-            self._drop(source)
 
     def _drop(self, source: str) -> None:
         del self._seen[source]
@@ -73,15 +74,6 @@ class KnownSources:
 def _update(kind: Any, source: str) -> TableUpdate:
     match = {"is_ipv4": int(ipaddress.ip_address(source).version == 4), "src": source}
     return TableUpdate(kind=kind, table=TABLE, match=match, action="" if kind == "delete" else "known")
-
-
-def learn_archived(known: KnownSources, shakes: Iterable[tuple[str, int]], days: int) -> None:
-    """Restore archived handshakes (source, capture time), oldest first; age counts back from the newest."""
-    handshakes = list(shakes)
-    newest = max((at for _, at in handshakes), default=0)
-    for source, at in handshakes:
-        if at >= newest - days * DAY:
-            known.learn(source, at)
 
 
 def in_batches(updates: Iterable[TableUpdate], size: int = 200) -> Iterable[tuple[TableUpdate, ...]]:

@@ -9,7 +9,7 @@ One attacker is one incident: a MAC with few addresses, otherwise a MAC and an a
 are one incident too, where the evidence says flood or guessing: other kinds name victims that have nothing else in
 common.
 
-All times are capture time in ns, and believed: whoever calls has refused those that cannot be (`SteadyTime`).
+All times are capture time in ns, and believed: the caller has refused impossible ones (`SteadyTime`).
 """
 
 from collections import OrderedDict
@@ -19,7 +19,7 @@ from typing import Final
 
 from msgspec import structs
 
-from apps.evidence import Evidence, Kind
+from apps.evidence import ONE_HOST, Evidence, Kind
 from apps.firewall.incidents.open_incident import (
     MOST_KEYS,
     AttackerKey,
@@ -43,9 +43,7 @@ UPDATES: Final = 200
 SUSPECT_SHARE: Final = 0.5
 """Share of its bound at which a sum makes an incident of a suspicion."""
 FADED_SHARE: Final = 0.1
-"""A suspicion whose older evidence has faded to this share of the sum begins anew."""
-ONE_HOST: Final = 4
-"""Addresses of a MAC up to which they are one host: IPv4, link-local and two global ones of IPv6."""
+"""A suspicion whose older evidence has faded to this share of the sum starts over."""
 SHARED_VICTIM: Final = ("flood", "guessing")
 _REMEDIES: Final[dict[str, Remedy]] = {"block": "block", "protect": "guard", "meter": "meter"}
 _KINDS: Final[tuple[tuple[str, Kind], ...]] = (
@@ -74,7 +72,7 @@ class IncidentBook:
         self._by_key: dict[AttackerKey, OpenIncident] = {}
         self._by_decision: dict[str, OpenIncident] = {}
         self._changed: OrderedDict[str, OpenIncident] = OrderedDict()
-        """Open incidents with news that nobody was told, the oldest news first."""
+        """Open incidents with unpublished changes, the oldest change first."""
         self._closed: list[Incident] = []
         self._now = 0
         self._second = self._looked = 0

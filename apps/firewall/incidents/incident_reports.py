@@ -41,7 +41,7 @@ class IncidentReports:
         self._book = book or IncidentBook()
         self._written = 0
         self._alone: OrderedDict[str, tuple[Decision, tuple[str, ...]]] = OrderedDict()
-        """Standing decisions that belong to no incident, and the places that were told."""
+        """Standing decisions that belong to no incident, and the places that were reported for them."""
 
     def restore(self, incidents: Iterable[Incident]) -> None:
         """Go on with what was open before a restart.
@@ -65,7 +65,7 @@ class IncidentReports:
         """The sum has reached its bound, and an alert is all that may be done.
 
         Args:
-            evidence: the piece that tipped the scales, told to `evidence()` before.
+            evidence: the piece that led to the decision, passed to `evidence()` before.
             total_nats: the sum with it.
             bound: the bound.
             why: why nothing stronger is done, in words.

@@ -84,7 +84,7 @@ class OpenIncident:
     names: set[AttackerKey] = field(default_factory=set)
     """Attackers, counted once each: a MAC has several keys where it speaks ARP and IP."""
     attackers_before: int = 0
-    """Attackers before a restart, whose names nobody has."""
+    """Number of attackers from before a restart, whose names are lost."""
     nameless: bool = False
     """Whether evidence came that accuses nobody: forged addresses, or too many."""
     kinds: dict[Kind, float] = field(default_factory=dict)

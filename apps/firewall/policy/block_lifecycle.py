@@ -2,7 +2,8 @@
 
 Pure: every call carries its capture time.  A block that ends while its drop counter still grows at more
 than three times the sender's training rate is extended.  Otherwise it is lifted and the sender is on
-probation: one anomalous second blocks it again, for the next longer time.
+probation: one anomalous second blocks it again, for the next longer time.  A block that an instruction asked for
+ends when it says, and without probation: it rests on no evidence.
 """
 
 import hashlib
@@ -12,6 +13,7 @@ from collections import deque
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
+from apps.firewall.evidence.history import INSTRUCTIONS
 from apps.firewall.policy.rules import Rules
 from apps.messages import Confirmation, Decision, Exhibit, Sender, Target
 
@@ -27,6 +29,7 @@ STILL_GOING_FLOOR = 1.0
 """... and at least this many packets per second, for senders with a very low training rate."""
 
 
+_INSTRUCTED = INSTRUCTIONS.partition("*")[0]
 _GOING_ON = "still going on ({:.0f} dropped packets a second): "
 _FIRST_REASON = re.compile(r"^still going on \([0-9]+ dropped packets a second\): ")
 _MOST_PROBATION = 16_384
@@ -46,6 +49,11 @@ class Block:
     state: str = "decided"
     host: str = ""
     """The address behind a blocked MAC, or the blocked address."""
+
+    @property
+    def is_asked_for(self) -> bool:
+        """Whether an instruction asked for it, and said how long it lasts."""
+        return any(each.key.startswith(_INSTRUCTED) for each in self.decision.evidence)
 
     @property
     def drop_rate(self) -> float:
@@ -171,12 +179,6 @@ class BlockLifecycle:
         self._ids.append(name)
         return name
 
-    def blocks_address(self, address: str) -> bool:
-        """Whether a block of this address, or of its prefix, is in force."""
-        targets = (block.decision.target for block in self.blocks.values())
-        exact = any(target.kind == "ip" and target.address == address for target in targets)
-        return exact or self.in_blocked_prefix(address)
-
     def in_blocked_prefix(self, address: str) -> bool:
         """Whether a prefix that contains this address is blocked."""
         targets = (block.decision.target.address for block in self.blocks.values())
@@ -228,6 +230,9 @@ class BlockLifecycle:
 
     def _end(self, block: Block, now: int) -> Decision:
         old = block.decision
+        if block.is_asked_for:
+            del self.blocks[old.id]
+            return _changed(old, now, action="unblock", reason="the time that was asked for is over")
         floor = max(block.training_rate * STILL_GOING_RATIO, STILL_GOING_FLOOR)
         if block.drop_rate > floor and not old.dry_run:
             extended = _changed(

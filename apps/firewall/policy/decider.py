@@ -2,19 +2,20 @@
 
 sequential   evidence of every source adds up until it crosses the bound of the budget (the default)
 seconds      five anomalous seconds of ten (`rules.judge`)
-paper        the first packet over Kitsune's threshold
+paper        the first packet at or above Kitsune's threshold
 """
 
-from collections.abc import Callable, Collection
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from msgspec import structs
 
-from apps.evidence import Evidence, TrainingState
+from apps.evidence import ONE_HOST, Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
-from apps.firewall.policy.rate_limits import limit_of, limit_words
+from apps.firewall.policy.rate_limits import limit_of, limit_words, usual_rate_of
 from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
 from apps.firewall.policy.sequential_test import LEAST_BOUND, EvidenceSum, SequentialTest
 from apps.firewall.syn.services import TcpService
@@ -78,11 +79,12 @@ class Decider:
         self._bindings = bindings
         self._known = known
         self._allow = allow
-        self._told: dict[object, int] = {}
+        self._told: OrderedDict[object, int] = OrderedDict()
+        """When a refusal about a subject was last reported; the newest is the last."""
         self.test = SequentialTest(rules.false_blocks_per_day)
 
     def trained(self, state: TrainingState | None) -> None:
-        """Training goes on, or is done; None: nobody has trained."""
+        """The state of training, in progress or done; None: there was no training."""
         self.test.training = state
 
     def alert(self, alert: Alert) -> PolicyVerdict:
@@ -99,7 +101,7 @@ class Decider:
         return PolicyVerdict(target, f"{verdict.reason}; {refusal}" if target else refusal)
 
     def evidence(self, evidence: Evidence, app: str, offences: Offences) -> Proposal | None:
-        """Hear evidence; a proposal if something is due, or would be.
+        """Add evidence; returns a proposal if a decision is due, or would be.
 
         Args:
             evidence: decoded, its time checked.
@@ -133,7 +135,7 @@ class Decider:
         target = narrowest_target(sender, evidence.mac_addresses)
         if target is None or self._allow().covers(sender) or evidence.role in self._rules.protected_roles:
             return None
-        return Proposal(evidence, f"first packet over the threshold: {evidence.text}", target)
+        return Proposal(evidence, f"first packet at or above the threshold: {evidence.text}", target)
 
     def _against(
         self, evidence: Evidence, sender: Sender, tally: EvidenceSum, bound: float, offences: Offences
@@ -157,6 +159,11 @@ class Decider:
             return None
         reason = _reason(tally, now, bound, total, needed, earlier)
         target, refusal = self._chosen(evidence, sender, target)
+        spared = self._allow().covers(sender)
+        if target is None and not spared and self._may_be_planted(evidence, sender):
+            remedy = self._for_the_victim(tally, f"{reason}; {refusal}", total, needed)
+            if remedy is not None:
+                return remedy
         if refusal and not self._news(sender, now):
             return None
         return Proposal(
@@ -180,9 +187,12 @@ class Decider:
             return None, "training is too short for the budget of false blocks: nobody is blocked"
         if target is None:
             behind = f"{evidence.mac_addresses} addresses are behind {sender.mac}"
-            return None, f"{behind}, and the frames carry none"
+            return None, f"{behind}, and the frames carry no address"
         if target.kind == "ip" and evidence.training_rate > 0 and evidence.forgeable:
             return None, f"{target.address} is known from training, and anybody could have forged it"
+        if self._may_be_planted(evidence, sender) and not self._rules.block_unproven_addresses:
+            why = f"{target.address} is behind a router and has completed no handshake"
+            return None, f"{why}, so anybody could have forged it"
         return self._unforged(target, sender, forgeable=evidence.forgeable)
 
     def _unforged(self, target: Target, sender: Sender, *, forgeable: bool) -> tuple[Target | None, str]:
@@ -199,6 +209,22 @@ class Decider:
             return None, f"{target.address} is known from handshakes and may be forged"
         return target, ""
 
+    @staticmethod
+    def _may_be_planted(evidence: Evidence, sender: Sender) -> bool:
+        """Whether a third party could have sent all this under the address of a sender behind a router."""
+        if not sender.ip or not evidence.forgeable or evidence.forged or evidence.kind == "spoofing":
+            return False
+        return evidence.routed or evidence.mac_addresses > ONE_HOST
+
+    def _for_the_victim(
+        self, tally: EvidenceSum, reason: str, total: float, needed: float
+    ) -> Proposal | None:
+        """A guard or rate limit against what a sender that cannot be blocked floods its victim with."""
+        strongest = max(tally.contributions.values(), key=lambda each: each.nats).latest
+        if strongest.kind != "flood" or not strongest.victims or not strongest.service:
+            return None
+        return self._remedy(strongest, [strongest], reason, tally, total, needed)
+
     def _towards(self, evidence: Evidence, tally: EvidenceSum, total: float, bound: float) -> Proposal | None:
         """A victim of senders that cannot be told apart, or whose addresses are forged."""
         now = evidence.event_time
@@ -208,35 +234,51 @@ class Decider:
                 f"on which port {evidence.address} is, and whether the address is its own, nobody has told"
             )
             return self._refused(evidence, reason, refusal, tally, total, bound)
+        pieces = [each.latest for each in tally.contributions.values()]
+        remedy = self._remedy(evidence, pieces, reason, tally, total, bound)
+        if remedy is not None:
+            return remedy
+        refusal = f"there is no remedy for floods of {evidence.service or 'this kind'} from forged addresses"
+        return self._refused(evidence, reason, refusal, tally, total, bound)
+
+    @staticmethod
+    def _remedy(
+        evidence: Evidence,
+        pieces: Sequence[Evidence],
+        reason: str,
+        tally: EvidenceSum,
+        total: float,
+        bound: float,
+    ) -> Proposal | None:
+        """A guard of the service that evidence names, or a rate limit of its packets; None if neither fits."""
         protocol, _, port = evidence.service.partition("/")
         if protocol == "tcp" and port.isdecimal():
             service = TcpService(evidence.victims[0], int(port))
             return Proposal(evidence, reason, service=service, nats=total, bound=bound, tally=tally)
-        limit = limit_of([each.latest for each in tally.contributions.values()])
-        if limit is not None:
-            seen = max(each.latest.training_rate for each in tally.contributions.values())
-            reason = f"{reason}; {limit_words(limit, seen)}"
-            return Proposal(evidence, reason, limit=limit, nats=total, bound=bound, tally=tally)
-        refusal = f"there is no remedy for floods of {evidence.service or 'this kind'} from forged addresses"
-        return self._refused(evidence, reason, refusal, tally, total, bound)
+        limit = limit_of(pieces)
+        if limit is None:
+            return None
+        reason = f"{reason}; {limit_words(limit, max(map(usual_rate_of, pieces)))}"
+        return Proposal(evidence, reason, limit=limit, nats=total, bound=bound, tally=tally)
 
     def _refused(
         self, evidence: Evidence, reason: str, refusal: str, tally: EvidenceSum, total: float, bound: float
     ) -> Proposal | None:
-        """A proposal to do nothing; None if that was told lately."""
+        """A proposal to do nothing; None if the same was reported recently."""
         if not self._news(tally.subject, evidence.event_time):
             return None
         text = f"{reason}; {refusal}"
         return Proposal(evidence, text, refusal=refusal, nats=total, bound=bound, tally=tally)
 
     def _news(self, subject: object, now: int) -> bool:
-        """Whether a refusal about this subject was not told lately."""
+        """Whether no refusal about this subject was reported recently."""
         last = self._told.get(subject)
         if last is not None and now - last < TELL_AGAIN_S * SECOND:
             return False
-        if len(self._told) >= MOST_TOLD:
-            self._told.clear()
         self._told[subject] = now
+        self._told.move_to_end(subject)
+        while len(self._told) > MOST_TOLD or next(iter(self._told.values())) < now - TELL_AGAIN_S * SECOND:
+            self._told.popitem(last=False)
         return True
 
 

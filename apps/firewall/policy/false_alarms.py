@@ -28,6 +28,8 @@ EPHEMERAL: Final = 32_768
 SUFFIX: Final = ".false_alarm"
 """Behind the source of evidence that counts less, so that its sum stays apart."""
 _HALF_LIFE_NS: Final = 600_000_000_000
+_HELD_NS: Final = 6 * _HALF_LIFE_NS
+"""Capture time after its last evidence for which a subject's grounds are kept."""
 _LEAST_SHARE: Final = 0.05
 """Grounds with a smaller share of the strongest one's nats are left out."""
 _SAID: Final = " (called a false alarm before, so it counts less)"
@@ -78,13 +80,16 @@ class GroundBook:
         """Note what a piece of evidence about a subject has added at a capture time, ns."""
         grounds = self._subjects.setdefault(subject, {})
         self._subjects.move_to_end(subject)
-        if len(self._subjects) > MOST_SUBJECTS:
-            self._subjects.popitem(last=False)
         name = _identity(ground)
         nats, then = grounds.pop(name, (0.0, now))
         grounds[name] = ground.nats + _faded(nats, then, now), max(then, now)
+        while len(self._subjects) > MOST_SUBJECTS or self._newest_of_the_oldest() < now - _HELD_NS:
+            self._subjects.popitem(last=False)
         if len(grounds) > 2 * MOST_GROUNDS:
             del grounds[min(grounds, key=lambda each: _faded(*grounds[each], now))]
+
+    def _newest_of_the_oldest(self) -> int:
+        return max(then for _, then in next(iter(self._subjects.values())).values())
 
     def take(self, subject: _Subject, now: int) -> tuple[Ground, ...]:
         """What a decision about a subject rests on, the strongest first; it is then forgotten."""
@@ -177,10 +182,10 @@ class FalseAlarms:
         """
         self._end(now)
         if decision in self._lessons:
-            raise ValueError(f"{decision} was called a false alarm already")
+            raise ValueError(f"{decision} has already been called a false alarm")
         if len(self._lessons) >= MOST_LESSONS:
             raise ValueError(
-                f"{MOST_LESSONS} false alarms are remembered; take some back with `sdnator blocks false-alarm ID "
+                f"{MOST_LESSONS} false alarms are remembered; revoke some with `sdnator blocks false-alarm ID "
                 "--revoke`, or put the senders on the allow-list"
             )
         expires = now + self._days * _DAY_NS

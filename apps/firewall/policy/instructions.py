@@ -79,7 +79,7 @@ class Desk:
         if len(self._ledger.blocks) >= self._ledger.rules.max_blocks:
             raise ValueError(f"{len(self._ledger.blocks)} blocks are in force (max_blocks); lift some first")
         if self._ledger.matching(target.address):
-            raise ValueError(f"{target.address} is blocked already")
+            raise ValueError(f"{target.address} is already blocked")
         reason = f"by hand: {instruction.reason or 'no reason given'}"
         decision = self._ledger.open(
             EVERY_SWITCH, target, reason, (evidence,), now, seconds=instruction.seconds
@@ -125,7 +125,7 @@ class Desk:
     def _revoke(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
         lesson = self._lessons.revoke(instruction.subject, now)
         kinds = sorted({ground.source for ground in lesson.grounds})
-        return [], f"{', '.join(kinds)} counts in full again; the decision itself is not made again"
+        return [], f"{', '.join(kinds)} counts in full again; the decision itself is not restored"
 
     def _panic(self, _: Instruction, __: Exhibit, now: int) -> tuple[list[Decision], str]:
         blocks = [block.decision for block in self._ledger.blocks.values()]
@@ -174,7 +174,7 @@ def refused_as_foreign(instruction: Instruction, app: str) -> Answer | None:
     """The answer to an app that wants to teach; None if it may say what it says."""
     if instruction.verb not in _TEACHING or app in OPERATORS:
         return None
-    text = f"{app} may not say so: only operators call something a false alarm, by `sdnator` or on the page"
+    text = f"{app} may not say so: only operators can call something a false alarm, with `sdnator` or on the dashboard"
     return Answer(id=instruction.id, done=False, text=text)
 
 
@@ -196,6 +196,6 @@ def target_in(text: str) -> Target:
             return Target(kind="ip", address=str(ipaddress.ip_address(text)))
         network = ipaddress.ip_network(text, strict=False)
     except ValueError:
-        raise ValueError(f"{text!r} is no IP address, no prefix and no MAC address") from None
+        raise ValueError(f"{text!r} is not an IP address, prefix or MAC address") from None
     alone = network.num_addresses == 1
     return Target(kind="ip", address=str(network.network_address if alone else network))

@@ -47,11 +47,13 @@ def any_within(network: Network, addresses: Collection[str]) -> bool:
 def gather_blocks(
     ledger: BlockLifecycle, gather: Callable[[Iterable[str]], Mapping[str, Collection[str]]], now: int
 ) -> Iterator[Decision]:
-    """Replace blocks of many addresses of a prefix by one block of the prefix."""
+    """Replace blocks of many addresses of a prefix by one block of the prefix; those asked for stay as they are."""
     single = {
         block.decision.target.address: block.decision
         for block in ledger.blocks.values()
-        if block.decision.target.kind == "ip" and "/" not in block.decision.target.address
+        if block.decision.target.kind == "ip"
+        and "/" not in block.decision.target.address
+        and not block.is_asked_for
     }
     for prefix, members in gather(single).items():
         made = [single[each] for each in members]

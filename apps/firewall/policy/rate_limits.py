@@ -43,17 +43,22 @@ def limit_of(pieces: Sequence[Evidence]) -> RateLimit | None:
     if flood is None:
         return None
     # of several sources the one that knows most about training
-    best = max(pieces, key=lambda each: (bool(each.usual_sources), each.training_rate))
+    best = max(pieces, key=lambda each: (bool(each.usual_sources), usual_rate_of(each)))
     version = ":" in best.victims[0] if best.victims else False
     spared = tuple(each for each in best.usual_sources if (":" in each) == version)
     kind, port = flood
     return RateLimit(
         kind=kind,
         port=port,
-        rate=_rate(best.training_rate * (1.0 - best.usual_share)),
+        rate=_rate(usual_rate_of(best) * (1.0 - best.usual_share)),
         spared=spared,
-        spared_rate=_rate(best.training_rate),
+        spared_rate=_rate(usual_rate_of(best)),
     )
+
+
+def usual_rate_of(evidence: Evidence) -> float:
+    """The highest rate of such packets towards the victim in training."""
+    return evidence.training_rate if evidence.sender is None else evidence.usual_rate
 
 
 def _rate(packets: float) -> int:
@@ -146,7 +151,7 @@ class RateLimits:
         self.refused += 1
         if self._said is None or now - self._said >= MINUTE:
             self._said = now
-            text = f"{MOST_LIMITS} rate limits are in force: none is set towards {victim}, nor towards others after it"
+            text = f"{MOST_LIMITS} rate limits are in force: none is set towards {victim} or any later victim"
             self.notices.append(OperatorNotice("cap", text, now))
 
     def count_drops(self, decision: str, packets: int, now: int) -> None:

@@ -18,12 +18,12 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Options of blocking."""
 
     rule: Literal["sequential", "seconds", "paper"] = "sequential"
-    """What decides: the sum of all evidence, anomalous seconds, or the first packet over the threshold."""
+    """What decides: the sum of all evidence, anomalous seconds, or the first packet at or above the threshold."""
     false_blocks_per_day: float = 0.1
     """Sequential rule: how many false blocks a day are acceptable; the bound follows from it and from training."""
     anomalous_seconds: int = 5
     """Rule of seconds: anomalous seconds among the last ten that lead to a block."""
-    hot_seconds_fast: int = 2
+    anomalous_seconds_fast: int = 2
     """The same for senders far beyond their training rate."""
     fast_rate_ratio: float = 20.0
     """\"Far beyond\": this many times the highest rate of any second of training."""
@@ -36,14 +36,16 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     limit_s: int = 60
     """Seconds for which a rate limit lasts; then it is lifted, unless it still drops a flood."""
     max_blocks: int = 4096
-    """Most blocks in force at a time; beyond it the firewall stops blocking and reports that."""
+    """Maximum number of blocks in force; beyond it the firewall stops blocking and reports that."""
     max_decisions_per_minute: int = 120
-    """Most blocks decided in a minute of capture time; beyond it the firewall stops blocking and reports that."""
+    """Maximum number of blocks decided per minute of capture time; beyond it the firewall stops blocking and reports that."""
     max_known_share: float = 0.25
     """Largest share of the hosts known from handshakes, or from training if that saw more, that may be blocked at a time
     (one always may)."""
     block_known_addresses: bool = False
     """Also block addresses known from handshakes that are behind a router; others can forge them."""
+    block_unproven_addresses: bool = False
+    """Also block addresses behind a router that have completed no handshake; others can forge them."""
     prefix_neighbours: int = 128
     """Number of misbehaving addresses of one prefix from which the whole prefix is blocked; 0: never."""
     prefix_v4: int = 24
@@ -85,7 +87,7 @@ class AllowList:
                 networks.append(ipaddress.ip_network(entry, strict=False))
             except ValueError as error:
                 raise ValueError(
-                    f"allow-list entry {entry!r} is no IP address, prefix or MAC address: {error}"
+                    f"allow-list entry {entry!r} is not an IP address, prefix or MAC address: {error}"
                 ) from error
         return cls(tuple(networks), frozenset(macs))
 
@@ -143,7 +145,7 @@ def judge(alert: Alert, rules: Rules, allow_list: AllowList, *, on_probation: bo
     if target is None:
         return PolicyVerdict(
             None,
-            f"{alert.mac_addresses} addresses are behind {alert.sender.mac}, and the frames carry none",
+            f"{alert.mac_addresses} addresses are behind {alert.sender.mac}, and the frames carry no address",
         )
     return PolicyVerdict(target, f"{why}: {alert.reason}")
 
@@ -153,7 +155,7 @@ def _seconds_needed(alert: Alert, rules: Rules, *, on_probation: bool) -> tuple[
         return 1, "anomalous again during probation"
     ratio = alert.rate / alert.training_rate if alert.training_rate > 0 else 0.0
     if ratio >= rules.fast_rate_ratio:
-        return rules.hot_seconds_fast, (
+        return rules.anomalous_seconds_fast, (
             f"anomalous in {alert.anomalous_seconds} seconds of the last ten at {ratio:.0f} times its training rate"
         )
     return rules.anomalous_seconds, f"anomalous in {alert.anomalous_seconds} seconds of the last ten"

@@ -37,10 +37,15 @@ LEAST_BOUND: Final = 5.0
 MOST_SUBJECTS: Final = 16_384
 MOST_SOURCES: Final = 32
 """Sources remembered for one subject."""
+FADED_NATS: Final = 0.1
+"""A sum that has faded to less decides nothing any more, and is forgotten."""
+PLACE_HELD_S: Final = 3_600
+"""Seconds of capture time for which it is known where an address was last seen."""
+_SWEEP_S: Final = 60
 _SECOND: Final = 1_000_000_000
 
 UNPLACED: Final = "unplaced"
-"""In place of a service: the address of a sender whose port and MAC nobody has told."""
+"""In place of a service: the address of a sender whose port and MAC are unknown."""
 
 Subject = Sender | tuple[str, str]
 """A sender; or a victim's address and service."""
@@ -72,6 +77,10 @@ class EvidenceSum:
         """The sum in nats at a capture time, ns."""
         return sum(nats for nats, _ in self.shares(now, bound))
 
+    def faded(self, now: int, bound: float) -> bool:
+        """Whether nothing is left that could count in a decision."""
+        return self.total(now, bound) < FADED_NATS
+
     def shares(self, now: int, bound: float) -> list[tuple[float, SourceNats]]:
         """What each source adds to the sum, the largest first."""
         weights = [(each.at(now), each) for each in self.contributions.values()]
@@ -97,8 +106,9 @@ class SequentialTest:
     def __init__(self, false_blocks_per_day: float) -> None:
         self._budget = false_blocks_per_day
         self._tallies: OrderedDict[Subject, EvidenceSum] = OrderedDict()
-        self._placed: dict[str, Sender] = {}
-        """By address: the sender last seen with it."""
+        self._placed: OrderedDict[str, tuple[Sender, int]] = OrderedDict()
+        """By address: the sender last seen with it, and when; the one seen last is the last."""
+        self._swept = 0
         self.training: TrainingState | None = None
         """The training that evidence rests on; None: none is done."""
 
@@ -125,8 +135,9 @@ class SequentialTest:
 
     def hear(self, evidence: Evidence, app: str) -> EvidenceSum:
         """Add evidence that an app wrote; returns all that there is about its subject."""
+        self._sweep(evidence.event_time)
         if evidence.sender is not None and evidence.sender.ip:
-            self._place(evidence.sender)
+            self._place(evidence.sender, evidence.event_time)
         subject, source = self._subject_of(evidence), f"{app}.{evidence.source}"
         now = evidence.event_time
         tally = self._tallies.get(subject)
@@ -155,22 +166,37 @@ class SequentialTest:
 
     def placed(self, evidence: Evidence) -> Evidence:
         """Evidence about a plain address with the sender that was last seen with it, if there is one."""
-        sender = self._placed.get(evidence.address) if evidence.sender is None else None
+        sender = self._last_with(evidence.address) if evidence.sender is None else None
         return evidence if sender is None else structs.replace(evidence, sender=sender, address="")
 
-    def _place(self, sender: Sender) -> None:
-        self._placed[sender.ip] = sender
+    def _last_with(self, address: str) -> Sender | None:
+        return self._placed.get(address, (None, 0))[0]
+
+    def _place(self, sender: Sender, now: int) -> None:
+        self._placed[sender.ip] = sender, now
+        self._placed.move_to_end(sender.ip)
         if len(self._placed) > MOST_SUBJECTS:
-            del self._placed[next(iter(self._placed))]
+            self._placed.popitem(last=False)
+
+    def _sweep(self, now: int) -> None:
+        """Once a minute, forget what can have no part in a decision: a network meets ever new addresses."""
+        if now < self._swept + _SWEEP_S * _SECOND:
+            return
+        self._swept = now
+        bound = self.bound
+        for subject in [each for each, tally in self._tallies.items() if tally.faded(now, bound)]:
+            del self._tallies[subject]
+        while self._placed and next(iter(self._placed.values()))[1] < now - PLACE_HELD_S * _SECOND:
+            self._placed.popitem(last=False)
 
     def _subject_of(self, evidence: Evidence) -> Subject:
         """Whom evidence is about; a plain address is that of a sender who has been seen, if there is one."""
         if evidence.sender is not None:
             return evidence.sender
         if evidence.address:
-            return self._placed.get(evidence.address) or (evidence.address, UNPLACED)
+            return self._last_with(evidence.address) or (evidence.address, UNPLACED)
         return evidence.victims[0], evidence.service
 
     def forget(self, subject: Subject) -> None:
-        """Start anew for a subject: after a decision, or a false alarm."""
+        """Reset the sum of a subject: after a decision, or a false alarm."""
         self._tallies.pop(subject, None)

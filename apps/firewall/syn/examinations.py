@@ -2,7 +2,7 @@
 
     suspicion ─► waits for its capture time ─► first examination: guard ─► waits again ─► second: block
 
-The newest SYN tells how far capture time is.  Where no SYN comes any more, silence decides: as long as the wait
+Capture time is taken from the newest SYN.  If no more SYNs come, silence decides: as long as the wait
 itself on a live switch, and after a tick of the switch's clock where it stands between packets, as in a replay.
 Pure; times are capture time in ns and the caller's monotonic clock in seconds.
 """
@@ -13,6 +13,8 @@ from typing import Final
 from apps.firewall.syn.syn_defence import Suspicion
 
 HOSTS_WATCHED: Final = 64
+AGAIN_MS: Final = 10
+"""From a look that came too early to the next: a flood of 5,000 SYNs a second fills the sample within that."""
 _SECOND: Final = 1_000_000_000
 _SET_BACK: Final = 3600 * _SECOND
 """A SYN that is this far behind the newest one means that a clock was set back."""
@@ -39,7 +41,7 @@ class Examinations:
 
     def __init__(self, grace_ms: int, patience_ms: int, most: int = HOSTS_WATCHED) -> None:
         self.live = True
-        """Whether capture time goes on when no packet comes."""
+        """Whether capture time advances while no packets arrive."""
         self._grace_s = grace_ms / 1000
         self._patience_s = patience_ms / 1000
         self._most = most
@@ -62,6 +64,25 @@ class Examinations:
             return None
         self._first[key] = _Waiting(Examination(suspicion, at, sure=False), self._grace_s, now)
         return self._grace_s
+
+    def again(self, examined: Examination, now: float, *, soon: bool) -> float | None:
+        """Examine once more after a look that came before there was enough to look at.
+
+        Args:
+            examined: that look.
+            now: monotonic time, s.
+            soon: SYNs to the host are being copied; else it may take a grace period until they are.
+
+        Returns:
+            How soon, s; None where it waits already or too many do.
+        """
+        wait_s = min(AGAIN_MS / 1000, self._grace_s) if soon else self._grace_s
+        at = max(examined.at + round(wait_s * _SECOND), self._reached if soon else 0)
+        key = examined.suspicion.host, at
+        if key in self._first or len(self._first) >= self._most:
+            return None
+        self._first[key] = _Waiting(Examination(examined.suspicion, at, sure=False), wait_s, now)
+        return wait_s
 
     def doubt(self, examined: Examination, now: float) -> None:
         """Examine again when handshakes have had time to complete."""

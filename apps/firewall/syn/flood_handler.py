@@ -5,7 +5,6 @@ I/O: writes requests for samples and packet-outs; a timer of its own wakes it, u
 
 import threading
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import due
@@ -130,7 +129,7 @@ class FloodHandler:
                 self._engine.write(f"network.packet_out.firewall.{switch}", value, [due.NO_WAIT])
 
     def hear_switch(self, state: SwitchReport, *, believed: bool) -> None:
-        """A switch has told its clock; whether its time is plausible."""
+        """A switch has reported its clock; returns whether its time is plausible."""
         self._examinations.live = state.clock != "packets"
         if believed:
             self._examinations.tick(state.event_time)
@@ -215,7 +214,8 @@ class FloodHandler:
         """Examine the SYNs of a suspected flood, and decide."""
         watch = self.defence.suspect(due.suspicion, due.at)
         if self._is_too_early(watch, due):
-            wait = self._examinations.suspect(replace(due.suspicion, now=due.at), self._clock())
+            soon = self._samples.runs(due.suspicion.host)
+            wait = self._examinations.again(due, self._clock(), soon=soon)
             if wait is not None:
                 self._look_later(wait)
             return

@@ -52,11 +52,14 @@ class SuspectSamples:
     def __len__(self) -> int:
         return len(self._running)
 
+    def runs(self, host: str) -> bool:
+        """Whether SYNs to a host are being copied, or will be."""
+        return any(each.host == host for each in self._running.values())
+
     def begin(self, host: str, now: float) -> Iterator[dict[str, Any]]:
         """The packet request for a host; none while it is sampled, soon after that, or where no bit is free."""
         free = [name for name in self.names() if name not in self._running]
-        held = any(each.host == host for each in self._running.values())
-        if not free or held or self._resting.get(host, now) > now:
+        if not free or self.runs(host) or self._resting.get(host, now) > now:
             return
         self._running[free[0]] = _Sample(host, now + _UNDER_WAY_S)
         yield _request(free[0], active=True, conditions=_towards(host))

@@ -196,7 +196,7 @@ class SynAckBuffer:
     def _end(self, job: _Job) -> None:
         if job.found:
             del self._jobs[job.decision]
-            text = f"half-open connections {job.wanted}: {job.found:,} were looked at, and reset or spared"
+            text = f"half-open connections {job.wanted}: {job.found:,} were examined, and reset or spared"
             self.notes.append(Note(job.decision, text))
         elif job.seen:
             del self._jobs[job.decision]

@@ -225,7 +225,7 @@ class SynDefence:
     def due(self, now: int) -> list[Decision]:
         """Lift guards that have expired."""
         over = [service for service, decision in self._guarded.items() if 0 < decision.expires <= now]
-        reason = "no flood was seen for the time of a guard"
+        reason = "no flood was seen for the length of a guard"
         return [
             _changed(self._guarded.pop(service), action="unprotect", reason=reason, event_time=now)
             for service in over

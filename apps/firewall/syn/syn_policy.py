@@ -23,10 +23,10 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     copies: Literal["suspects", "all"] = "suspects"
     """Which SYNs the switch copies: samples of those towards hosts that it reports, or all of them, as replays need,
-    where a flood may be over before a sample is asked for."""
+    where a flood may be over before a sample can be requested."""
     threshold: int = 100
     """SYNs towards one host within a window from which a flood is suspected; with all copies new half-open
-    connections count, too."""
+    connections also count."""
     window_ms: int = 200
     """Length of that window."""
     grace_ms: int = 60
@@ -36,7 +36,7 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     reset_after_ms: int = 1000
     """Age at which half-open connections that a flood left at a server are reset, once a rule stops the flood."""
     resets: int = 4096
-    """Most resets for one decision; 0: none, the connections stay until the server's own time-out."""
+    """Maximum number of resets for one decision; 0: none, the connections stay until the server's own time-out."""
     sample: int = 20_000
     """SYNs kept in memory for the case that a flood is suspected."""
     sample_most: int = 500
@@ -44,7 +44,7 @@ class SynRules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     sample_ms: int = 1500
     """Longest time for which they are copied."""
     least: int = 50
-    """Least number of SYNs without a handshake in a sample that counts as a flood."""
+    """Minimum number of SYNs without a handshake in a sample that counts as a flood."""
     repeats: int = 4
     """A source is repeating if it sent this many SYNs of the sample ..."""
     share: float = 0.9
@@ -95,7 +95,7 @@ def judge_syns(
     """Which defence follows from the number and repetition of sources."""
     total = sample.total
     if total < rules.least:
-        return SynVerdict("nothing", (), f"{total} unfinished SYNs towards {sample.service} are no flood")
+        return SynVerdict("nothing", (), f"{total} unfinished SYNs towards {sample.service} are not a flood")
     floor = max(rules.repeats, rules.lightest * _typical(sample.syns.values()))
     repeating = {source: count for source, count in sample.syns.items() if count >= floor}
     theirs = sum(repeating.values())

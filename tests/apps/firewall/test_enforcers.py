@@ -175,5 +175,5 @@ def test_hostile_reports_raise_one_error():
 
 @pytest.mark.parametrize("enforcers", [(), ("nftables", "nftables"), ("a.b",), ("Up",)])
 def test_wrong_enforcers_are_named(enforcers):
-    with pytest.raises(ValueError, match=r"enforcers|no name"):
+    with pytest.raises(ValueError, match=r"enforcers|not the name"):
         Settings(enforcers=enforcers)

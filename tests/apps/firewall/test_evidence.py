@@ -50,6 +50,18 @@ def test_weak_evidence_blocks_when_it_persists():
     assert on.blocked == [CAMERA.mac]
 
 
+def test_evidence_that_overtakes_the_end_of_training_is_judged_after_it():
+    """The two come under keys of their own; without training nothing is decided."""
+    on = Desk(rule="sequential")
+    hear(on, structs.replace(evidence(20.0, AT), number=2))
+    assert not on.blocked
+    state = TrainingState(
+        packets=9, wanted=9, done=True, seconds=3_600.0, senders=20, event_time=NOW, number=1
+    )
+    on.hand("network.training.kitsune", state.to_value(), pattern="network.training.*")
+    assert on.blocked == [CAMERA.mac]
+
+
 class CountingEngine(FakeEngine):
     """Counts the questions about earlier blocks of a MAC."""
 
@@ -120,6 +132,57 @@ def test_the_forger_of_an_address_is_blocked_and_its_owner_is_not():
 def test_a_handshake_proves_an_address_behind_a_router():
     on = desk()
     hear(on, evidence(20.0, AT, mac_addresses=9, training_rate=5.0, forgeable=False))
+    assert on.blocked == [CAMERA.ip]
+
+
+def routed(**changes):
+    """A stranger behind the router, of whom anybody could have sent this."""
+    stranger = structs.replace(CAMERA, ip="198.51.100.9")
+    return evidence(20.0, AT, sender=stranger, mac_addresses=200, routed=True, **changes)
+
+
+def test_nobody_gets_an_innocent_address_blocked_by_a_scan_in_its_name():
+    """Nobody knows a stranger yet, but whoever is blocked cannot become a client; a handshake proves it."""
+    on = desk()
+    hear(on, routed())
+    assert on.decisions == []
+    assert any("198.51.100.9 is behind a router and has completed no handshake" in text for text in on.events)
+    hear(on, structs.replace(routed(forgeable=False), event_time=NOW + SECOND))
+    assert on.blocked == ["198.51.100.9"]
+
+
+def test_an_operator_may_have_strangers_blocked_nevertheless():
+    on = desk(rules=Rules(block_unproven_addresses=True))
+    hear(on, routed())
+    assert on.blocked == ["198.51.100.9"]
+
+
+@pytest.mark.parametrize("training_rate", [0.0, 5.0])
+def test_a_flood_in_the_name_of_a_stranger_has_its_victim_protected(training_rate):
+    """Whoever sent it: the guard and the limit are towards the victim, at what training saw come to it."""
+    flood = {"kind": "flood", "victims": ("10.0.0.1",), "training_rate": training_rate}
+    on = desk()
+    hear(on, routed(service="tcp/80", **flood))
+    assert [(each.action, each.target.address) for each in on.decisions] == [("protect", "10.0.0.1")]
+    on = desk()
+    hear(on, routed(service="udp/5060", usual_rate=100.0, usual_sources=("192.0.2.7",), **flood))
+    (made,) = on.decisions
+    assert (made.action, made.target.address) == ("meter", "10.0.0.1")
+    assert made.limit == RateLimit(kind="udp_to", port=5060, rate=200, spared=("192.0.2.7",), spared_rate=200)
+    assert [each.sender for each in made.grounds] == [structs.replace(CAMERA, ip="198.51.100.9")]
+
+
+def test_what_is_allowed_may_flood_its_victim():
+    """The allow-list always wins; a rate limit would hit others, too."""
+    on = desk(rules=Rules(allow=("198.51.100.0/24",)))
+    hear(on, routed(kind="flood", victims=("10.0.0.1",), service="icmp"))
+    assert on.decisions == []
+
+
+def test_a_host_with_a_few_addresses_is_not_a_router():
+    """Whoever sends under its MAC sits on its port; of its addresses the one that attacks is blocked."""
+    on = desk()
+    hear(on, evidence(20.0, AT, mac_addresses=3))
     assert on.blocked == [CAMERA.ip]
 
 
@@ -202,7 +265,7 @@ def test_the_rule_of_the_paper_blocks_at_the_first_packet_over_the_threshold():
     on = desk("paper")
     hear(on, evidence(20.0, AT), evidence(0.0, AT, "threshold", supporting=True))
     assert on.blocked == [CAMERA.mac]
-    assert on.decisions[0].reason.startswith("first packet over the threshold")
+    assert on.decisions[0].reason.startswith("first packet at or above the threshold")
 
 
 def test_a_budget_has_to_be_possible():

@@ -160,7 +160,7 @@ class Counted(FakeEngine):
 
 def test_of_many_archived_decisions_only_recent_ones_are_read(monkeypatch):
     """100,000 decisions of two years: what is older than the longest block is not read."""
-    monkeypatch.setattr("apps.firewall.evidence.past.time.time_ns", lambda: NOW)
+    monkeypatch.setattr("apps.firewall.evidence.archived_state.time.time_ns", lambda: NOW)
     engine, step = Counted(), 2 * 365 * 86_400 * SECOND // 100_000
     value = decision(event_time=1, expires=2).to_value()
     engine.archived = [
@@ -179,7 +179,7 @@ def test_of_many_archived_decisions_only_recent_ones_are_read(monkeypatch):
 @pytest.mark.parametrize("value", [None, np.ones(3), {"id": []}, {"source": "x"}, b"\xff"])
 def test_archived_items_are_checked_as_well(value, monkeypatch):
     """What was archived by somebody else, or damaged, does not keep the firewall from starting."""
-    monkeypatch.setattr("apps.firewall.evidence.past.time.time_ns", lambda: NOW)
+    monkeypatch.setattr("apps.firewall.evidence.archived_state.time.time_ns", lambda: NOW)
     engine = FakeEngine()
     keys = (
         "network.block.firewall.ipv4", "network.protect.firewall.ipv4", "network.block_prefix.firewall.ipv4",

@@ -136,11 +136,13 @@ def test_what_only_would_be_blocked_is_allowed():
 
 
 def test_decisions_by_hand():
-    """A block names its source, a guard the service; a prefix is no address."""
-    assert (EVENTS["block by hand"]["src_ip"], EVENTS["block by hand"]["alert"]["action"]) == (
-        "192.0.2.1",
-        "blocked",
-    )
+    """A block names its source, a guard the service; a prefix is no address; nothing is blocked before it is confirmed."""
+    assert EVENTS["block by hand"]["src_ip"] == "192.0.2.1"
+    places = ["nftables gateway"]
+    in_force = decision_event(decision(), places)["alert"]
+    assert [EVENTS["block by hand"]["alert"]["action"], in_force["action"]] == ["allowed", "blocked"]
+    assert in_force["metadata"]["enforcers"] == places
+    assert decision_event(decision(dry_run=True), places)["alert"]["action"] == "allowed"
     assert EVENTS["block by hand"]["timestamp"] == "2023-11-14T22:13:20.123456+0000"
     assert EVENTS["MAC by hand"]["ether"] == {"src_mac": "02:00:00:00:00:01"}
     assert (EVENTS["guard"]["dest_ip"], EVENTS["guard"]["dest_port"]) == ("2001:db8::1", 443)

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.firewall.evidence.known_sources import DAY, HANDSHAKES, KnownSources, in_batches, learn_archived
+from apps.firewall.evidence.known_sources import DAY, HANDSHAKES, KnownSources, in_batches
 from due import Item
 
 
@@ -20,17 +20,21 @@ def test_most_recent_sources_are_kept():
     assert sorted(known) == ["10.0.0.1", "10.0.0.3"]
 
 
-def test_old_handshakes_in_the_archive_do_not_count():
-    """Age is measured in capture time, from the newest handshake back."""
-    known = KnownSources(10)
-    learn_archived(known, [("10.0.0.1", 0), ("10.0.0.2", DAY), ("10.0.0.3", 3 * DAY)], 2)
+def test_old_handshakes_do_not_count():
+    """Age is measured in capture time, from the newest handshake back, and the switch hears of it."""
+    known = KnownSources(10, days=2)
+    for source, at in (("10.0.0.1", 0), ("10.0.0.2", DAY)):
+        known.learn(source, at)
+    known.changes()
+    known.learn("10.0.0.3", 3 * DAY)
     assert sorted(known) == ["10.0.0.2", "10.0.0.3"]
+    assert [(each.kind, each.match["src"]) for each in known.changes()] == [
+        ("delete", "10.0.0.1"), ("insert", "10.0.0.3"),
+    ]  # fmt: skip
 
 
-def test_cold_archive_is_no_error():
-    """Nobody is known then."""
+def test_at_first_nobody_is_known():
     known = KnownSources(10)
-    learn_archived(known, [], 30)
     assert (len(known), known.everything()) == (0, [])
 
 

@@ -58,7 +58,7 @@ def test_a_decision_carries_the_sum_and_whose_shares_it_is():
 
 
 def test_weak_evidence_is_no_incident():
-    """Below half of the bound nothing is told, and a suspicion that has faded begins anew."""
+    """Below half of the bound nothing is told, and a suspicion that has faded starts over."""
     book = IncidentBook()
     for at_s in range(100, 400, 10):
         assert book.hear_evidence(evidence(at_s, nats=2.0, first_packet=at_s), 2.0, BOUND) == []

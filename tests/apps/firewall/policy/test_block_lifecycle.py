@@ -2,7 +2,7 @@
 
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.rules import Rules
-from apps.messages import Alert, Confirmation, Decision, Sender, Target
+from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
 from tests.apps.firewall.alerts import CAMERA, alert
 
 
@@ -104,6 +104,22 @@ def test_drops_at_the_training_rate_do_not_extend():
     decision = opened(ledger)
     ledger.count_drops(decision.id, 20 * 600, decision.expires)
     assert ledger.due(decision.expires)[0].action == "unblock"
+
+
+def test_a_block_that_was_asked_for_ends_when_it_says():
+    """However much it drops, also after a restart, and it puts nobody on probation: it rests on no evidence."""
+    said = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary="block")
+    first, restarted = BlockLifecycle(Rules()), BlockLifecycle(Rules())
+    target = Target(kind="mac", address=CAMERA.mac, port=CAMERA.port)
+    decision = first.open("*", target, "by hand: ticket 4711", [said], 100 * SECOND, seconds=30)
+    restarted.restore([decision])
+    for ledger in (first, restarted):
+        ledger.count_drops(decision.id, 1_000_000, decision.expires)
+        assert ledger.due(decision.expires - 1) == []
+        (lifted,) = ledger.due(decision.expires)
+        assert (lifted.action, lifted.id) == ("unblock", decision.id)
+        assert ledger.blocks == {}
+        assert not ledger.on_probation(CAMERA, decision.expires)
 
 
 def test_block_refused_by_the_switch_is_not_in_force():

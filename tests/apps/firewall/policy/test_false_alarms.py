@@ -107,7 +107,18 @@ def test_their_number_is_bounded():
     lessons = FalseAlarms(90)
     for number in range(MOST_LESSONS):
         lessons.teach(f"d{number}", (ground_of(BACKUP, "kitsune"),), NOW, "")
-    with pytest.raises(ValueError, match="take some back"):
+    with pytest.raises(ValueError, match="revoke some"):
         lessons.teach("one more", (), NOW, "")
     with pytest.raises(ValueError, match="already"):
         FalseAlarms.teach(taught(BACKUP), "d1", (), NOW, "")
+
+
+def test_grounds_are_kept_for_an_hour():
+    lessons = FalseAlarms(90)
+    for at_s in (100, 3_000, 4_000):
+        other = structs.replace(
+            evidence(1.0, at_s, "ports"), sender=structs.replace(BACKUP.sender, ip="10.9.9.9")
+        )
+        lessons.note(other if at_s > 100 else BACKUP, "kitsune")
+    assert lessons.book.take(BACKUP.sender, 4_000 * SECOND) == ()
+    assert len(lessons.book.take(other.sender, 4_000 * SECOND)) == 1

@@ -49,7 +49,7 @@ def test_block_by_hand_says_who_wanted_it():
     [
         ("192.0.2.0/24", "192.0.2.66", "allow-list"),
         ("02:00:00:00:00:01", "02:00:00:00:00:01", "allow-list"),
-        ("10.0.0.1", "web", "no IP address"),
+        ("10.0.0.1", "web", "not an IP address"),
     ],
 )
 def test_refused_with_a_reason(allowed, subject, why):
@@ -130,5 +130,5 @@ def test_targets():
     assert target_in("192.0.2.7/24") == Target(kind="ip", address="192.0.2.0/24")
     assert target_in("192.0.2.7/32") == Target(kind="ip", address="192.0.2.7")
     for wrong in ("02:00:00:00:00:AA@x", "192.0.2.7@3", "192.0.2.0/33"):
-        with pytest.raises(ValueError, match="no IP address"):
+        with pytest.raises(ValueError, match="not an IP address"):
             target_in(wrong)

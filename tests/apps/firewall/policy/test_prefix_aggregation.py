@@ -48,8 +48,20 @@ def test_prefix_comes_first_then_its_addresses_are_lifted():
     assert "130 addresses" in made[0].reason
     assert made[0].evidence
     assert [each.decision for each in ledger.blocks.values()] == [made[0]]
-    assert ledger.blocks_address("192.0.2.99")
-    assert not ledger.blocks_address("192.0.3.99")
+    assert ledger.in_blocked_prefix("192.0.2.99")
+    assert not ledger.in_blocked_prefix("192.0.3.99")
+
+
+def test_a_block_that_was_asked_for_outlives_that_of_its_prefix():
+    """Whoever lifts the prefix lifts what the firewall decided, not what an operator has."""
+    ledger = BlockLifecycle(Rules())
+    said = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary="block")
+    by_hand = ledger.open("*", Target(kind="ip", address="192.0.2.1"), "by hand", [said], NOW, seconds=36_000)
+    for address in hosts("192.0.2.", 130)[2:]:
+        ledger.open("*", Target(kind="ip", address=address), "why", (), NOW)
+    made = list(gather_blocks(ledger, lambda each: {"192.0.2.0/24": list(each)}, NOW))
+    assert (len(made), made[0].expires) == (129, NOW + 600 * SECOND)
+    assert by_hand.id in ledger.blocks
 
 
 def test_nothing_to_gather():

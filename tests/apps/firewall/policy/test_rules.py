@@ -25,12 +25,12 @@ NOBODY = AllowList()
         ({"anomalous_seconds": 10, "role": "multicast"}, False),
     ],
 )
-def test_block_needs_enough_hot_seconds_of_an_ordinary_host(changes, blocked):
+def test_block_needs_enough_anomalous_seconds_of_an_ordinary_host(changes, blocked):
     """Five of ten, or two at twenty times the training rate; never a router or server."""
     assert (judge(alert(**changes), RULES, NOBODY).target is not None) == blocked
 
 
-def test_one_hot_second_is_enough_on_probation():
+def test_one_anomalous_second_is_enough_on_probation():
     """A sender whose block was lifted does not get five more seconds."""
     assert judge(alert(anomalous_seconds=1), RULES, NOBODY, on_probation=True).target is not None
 

@@ -6,7 +6,7 @@ import pytest
 from msgspec import structs
 
 from apps.evidence import Evidence, TrainingState
-from apps.firewall.policy.sequential_test import HALF_LIFE_S, SequentialTest
+from apps.firewall.policy.sequential_test import HALF_LIFE_S, PLACE_HELD_S, SequentialTest
 from tests.apps.firewall.alerts import CAMERA, SECOND
 
 
@@ -59,6 +59,24 @@ def test_evidence_of_one_source_adds_up_and_fades():
     assert total(test, evidence(2.0, 100), evidence(3.0, 100)) == pytest.approx(5.0)
     later = 100 + int(HALF_LIFE_S)
     assert total(test, evidence(0.0, later)) == pytest.approx(2.5)
+
+
+def test_sums_that_have_faded_and_places_of_long_ago_are_forgotten():
+    """A network that meets ever new addresses keeps those of the last hour, and no sum that could still count."""
+    test = trained()
+    for number in range(50):
+        sender = structs.replace(CAMERA, ip=f"198.51.100.{number}")
+        test.hear(evidence(1.0, 100 + number, sender=sender), "kitsune")
+    strong = evidence(40.0, 200, sender=structs.replace(CAMERA, ip="198.51.100.99"))
+    test.hear(strong, "kitsune")
+    assert len(test) == 51
+    assert total(test, evidence(1.0, 100 + PLACE_HELD_S)) == pytest.approx(1.0)
+    assert len(test) == 2
+    assert test.sum_of(structs.replace(strong, event_time=(100 + PLACE_HELD_S) * SECOND)) > 0.5
+    named = evidence(1.0, 300, sender=None, address="198.51.100.99")
+    assert test.placed(named).sender == strong.sender
+    test.hear(evidence(1.0, 400 + PLACE_HELD_S), "kitsune")
+    assert test.placed(named) == named
 
 
 def test_sources_that_saw_the_same_packets_are_not_added_in_full():

@@ -43,6 +43,19 @@ def test_silence_decides_on_a_live_switch():
     assert [each.sure for each in made.due(51.15)] == [True]
 
 
+def test_a_look_that_came_too_early_is_repeated_with_the_next_syns():
+    """Not a grace period later: the sample that it waits for may be full by then."""
+    made = waiting(live=True)
+    made.hear(NOW + 130 * MS, 50.0)
+    (early,) = made.due(50.0)
+    assert made.again(early, 50.0, soon=True) == 0.01
+    assert made.due(50.0)[0].at == NOW + 130 * MS
+    made.again(early, 50.0, soon=False)
+    assert made.due(50.0) == []
+    made.hear(NOW + 200 * MS, 50.0)
+    assert made.due(50.0)[0].at == NOW + 200 * MS
+
+
 def test_silence_of_a_stalled_replay_decides_nothing():
     """Nor does a tick that has overtaken SYNs; a tick and silence together are the end of the capture."""
     made = waiting(live=False)

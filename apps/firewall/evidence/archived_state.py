@@ -20,7 +20,7 @@ from apps.firewall.arrivals import (
 from apps.firewall.enforcement.switch_entries import KEPT, leftovers
 from apps.firewall.evidence.archive import MOST, Archive
 from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, LESSONS
-from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, learn_archived
+from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources
 from apps.firewall.settings import Settings
 from apps.incidents import INCIDENTS, Incident
 from apps.messages import (
@@ -55,7 +55,7 @@ _T = TypeVar("_T")
 log = logging.getLogger(__name__)
 
 
-class ArchivedPast:
+class ArchivedState:
     """Reads each kind of message with limits; `intake` counts malformed ones."""
 
     def __init__(self, archive: Archive, intake: Intake, settings: Settings) -> None:
@@ -120,7 +120,8 @@ class ArchivedPast:
         days, most = self._settings.known_days, _SOURCE_SHARE * self._settings.known_limit
         since = time.time_ns() - (days + 1) * _DAY_NS
         shakes = self._read(HANDSHAKES, "handshake", _archived_handshake, since=since, most=most)
-        learn_archived(known, shakes, days)
+        for source, at in shakes:  # oldest first
+            known.learn(source, at)
         log.info("%d known sources in the archive", len(known))
 
     def leftovers(self, wanted: Iterable[TableUpdate]) -> dict[str, list[TableUpdate]]:
