@@ -31,7 +31,7 @@ ActionState = Literal["decided", "in_force", "over", "failed"]
 
 
 class Contribution(Message, frozen=True, kw_only=True):
-    """What one source of evidence says."""
+    """What one source of evidence contributes."""
 
     source: Name
     """A statistic, a query, or `alert`: the last segment of the evidence's key."""
@@ -45,7 +45,7 @@ class Contribution(Message, frozen=True, kw_only=True):
 
 
 class IncidentAction(Message, frozen=True, kw_only=True):
-    """What was decided in an incident, and what became of it."""
+    """A decision in an incident, and its outcome."""
 
     decision: Name = ""
     """Id of the decision; empty for `alert`, where nothing was sent to a switch."""
@@ -69,7 +69,7 @@ class IncidentAction(Message, frozen=True, kw_only=True):
     nats: Nats = 0.0
     """Sum of the evidence against the target when it was decided."""
     bound: Nats = 0.0
-    """What that sum had to reach; 0 = another rule decided."""
+    """The sum that was needed; 0 = another rule decided."""
     contributions: Annotated[tuple[Contribution, ...], Meta(max_length=MOST_CONTRIBUTIONS)] = ()
     """Shares of that sum, the largest first."""
     packets: Number = 0
@@ -112,7 +112,7 @@ class Incident(Message, frozen=True, kw_only=True):
     service: Annotated[str, Meta(max_length=32)] = ""
     """`tcp/22`, `udp/53`, `arp`; empty if there is no single one."""
     begun: Time
-    """Capture time of the first packet that its evidence rests on, ns."""
+    """Capture time of the first packet that its evidence is based on, ns."""
     last: Time
     """Capture time of the last sign of it, ns: evidence, an alert, or a growing drop counter."""
     event_time: Time

@@ -81,7 +81,7 @@ def check_plain(value: object, what: str) -> None:
                 text += sum(len(name) for name in part if isinstance(name, str))
             waiting.extend((each, depth + 1) for each in (part.values() if isinstance(part, dict) else part))
         elif kind not in _ATOMS:
-            raise MessageError("shape", f"{what}: {kind.__name__} is no plain value")
+            raise MessageError("shape", f"{what}: {kind.__name__} is not a plain value")
         if text > MOST_TEXT:
             raise MessageError("size", f"{what}: over {MOST_TEXT:,} characters")
 
@@ -97,7 +97,7 @@ def as_map(value: object, what: str) -> dict[str, Any]:
         The same map.
 
     Raises:
-        MessageError: it is no map, or `check_plain` refuses it.
+        MessageError: it is not a map, or `check_plain` refuses it.
     """
     if type(value) is not dict:
         raise MessageError("shape", f"{what}: a map is expected, not {type(value).__name__}")

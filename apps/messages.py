@@ -63,7 +63,7 @@ def address_in(text: object, what: str) -> str:
     try:
         return str(ipaddress.ip_address(text if isinstance(text, str) else ""))
     except ValueError:
-        raise MessageError("range", f"{what}: {str(text)[:80]!r} is no IP address") from None
+        raise MessageError("range", f"{what}: {str(text)[:80]!r} is not an IP address") from None
 
 
 Role = Literal["host", "gateway", "dns", "dhcp", "multicast"]
@@ -196,7 +196,7 @@ class Sender(Message, frozen=True, kw_only=True):
             MessageError: one of them is not an address.
         """
         if not _MAC.fullmatch(self.mac):
-            raise MessageError("range", f"sender: {self.mac[:80]!r} is no MAC address")
+            raise MessageError("range", f"sender: {self.mac[:80]!r} is not a MAC address")
         if self.ip:
             address_in(self.ip, "sender")
 
@@ -209,16 +209,16 @@ class Alert(Message, frozen=True, kw_only=True):
     event_time: Time
     """End of the anomalous second."""
     first_packet: Number
-    """Arrival number at the switch of the first packet above the threshold in this second."""
+    """Arrival number at the switch of the first packet at or above the threshold in this second."""
     packets: Number
-    """Packets charged to the sender in this second."""
+    """Packets in this second for which the sender is responsible."""
     over: Number
-    """How many of them scored above the threshold."""
+    """How many of them scored at or above the threshold."""
     peak_score: float
     anomalous_seconds: Number
     """Anomalous seconds among the last ten, this one included."""
     rate: Rate
-    """Packets a second charged to the sender in this second."""
+    """Packets per second for which the sender is responsible, in this second."""
     training_rate: Rate
     """The highest rate of any second of training; 0 for a sender never seen in training."""
     mac_addresses: Number
@@ -251,12 +251,14 @@ class Target(Message, frozen=True, kw_only=True):
         """
         if self.kind == "mac":
             if not _MAC.fullmatch(self.address):
-                raise MessageError("range", f"target: {self.address[:80]!r} is no MAC address")
+                raise MessageError("range", f"target: {self.address[:80]!r} is not a MAC address")
             return
         try:
             ipaddress.ip_network(self.address)
         except ValueError:
-            raise MessageError("range", f"target: {self.address[:80]!r} is no IP address or prefix") from None
+            raise MessageError(
+                "range", f"target: {self.address[:80]!r} is not an IP address or prefix"
+            ) from None
 
 
 class Exhibit(Message, frozen=True, kw_only=True):
@@ -269,7 +271,7 @@ class Exhibit(Message, frozen=True, kw_only=True):
 
 
 class Ground(Message, frozen=True, kw_only=True):
-    """A kind of evidence that a decision rests on, as narrow as it can be called a false alarm."""
+    """A kind of evidence that a decision is based on: the unit in which false alarms are taught."""
 
     source: Name
     """`<app>.<source>` of the evidence."""
@@ -277,7 +279,7 @@ class Ground(Message, frozen=True, kw_only=True):
     victim: Name = ""
     """Where the evidence names no service, or accuses nobody by name."""
     service: Annotated[str, Meta(max_length=32)] = ""
-    """`tcp/445`, `udp/ephemeral`; empty where the evidence is about no single one."""
+    """`tcp/445`, `udp/ephemeral`; empty if the evidence is about no single service."""
     nats: Annotated[float, Meta(ge=0, le=1e12)] = 0.0
     """What it had added when the decision was made."""
 
@@ -301,7 +303,7 @@ MOST_SPARED: Final = 64
 
 
 class RateLimit(Message, frozen=True, kw_only=True):
-    """What of the traffic towards a victim may come at which rate: packets over it are dropped.
+    """The rate at which packets of one kind may reach a victim; packets above it are dropped.
 
     Source: RFC 8955 (FlowSpec), `traffic-rate-packets`.
     """
@@ -355,7 +357,7 @@ class Decision(Message, frozen=True, kw_only=True):
     """Escalation step: 0 for a first offence."""
     dry_run: bool = False
     first_packet: Number = 0
-    """Arrival number of the packet that tipped the scales."""
+    """Arrival number of the packet that led to the decision."""
     grounds: Annotated[tuple[Ground, ...], Meta(max_length=MOST_GROUNDS)] = ()
     """The evidence that added up to it, the strongest first; empty where something else decided."""
     limit: RateLimit | None = None
@@ -391,14 +393,14 @@ class Decision(Message, frozen=True, kw_only=True):
 
 
 class FalseAlarm(Message, frozen=True, kw_only=True):
-    """`network.false_alarm.firewall.<change>`: what an operator has taught about a decision, or taken back."""
+    """`network.false_alarm.firewall.<change>`: what an operator has taught about a decision, or revoked."""
 
     id: Name
     """The decision's."""
     grounds: Annotated[tuple[Ground, ...], Meta(max_length=MOST_GROUNDS)]
     """Evidence that counts less from now on."""
     event_time: Time
-    """Capture time at which it was said, ns."""
+    """Capture time at which the operator said so, ns."""
     expires: Time
     """Capture time from which the evidence counts in full again, ns."""
     reason: Words = ""
@@ -432,11 +434,11 @@ class Confirmation(Message, frozen=True, kw_only=True):
 
 
 class Instruction(Message, frozen=True, kw_only=True):
-    """`network.instruction.<app>.firewall`: what an operator asks of the firewall."""
+    """`network.instruction.<app>.firewall`: what an operator asks the firewall to do."""
 
     id: Name
     verb: Literal["block", "unblock", "allow", "disallow", "panic", "false_alarm", "revoke"]
-    """`false_alarm` and `revoke` are heard from operators only: the command line and the page."""
+    """`false_alarm` and `revoke` are accepted from operators only: the command line and the dashboard."""
     subject: Name = ""
     """An address or MAC to block; a decision's id or an address to unblock; an allow-list entry; the id of a decision
     that was a false alarm."""

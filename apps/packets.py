@@ -17,7 +17,7 @@ from due import RecordBatch
 
 PACKET_COLUMNS: Final[dict[str, str]] = {
     # where and when
-    "sequence": "u8",  # of this packet-in among all that the switch sent; gaps are losses
+    "sequence": "u8",  # number of this packet-in among all that the switch sent; gaps are losses
     "arrival": "u8",  # number of the frame among all that reached the switch, from 0
     "time_us": "i8",  # capture time, absolute us since the epoch, UTC
     "port": "u2",  # ingress port of the switch

@@ -1,4 +1,4 @@
-"""Who sends most: the message from whoever sees all packets to the page.
+"""Top talkers: the message to the dashboard from the app that sees all packets.
 
 kitsune ──TopTalkers──► page      network.traffic.<app>.<switch>
 """

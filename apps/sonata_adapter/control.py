@@ -60,7 +60,7 @@ class Written(msgspec.Struct, frozen=True):
     keys: tuple[str, ...]
     output: Output
     switch: str
-    """Whose packets it is made of."""
+    """The switch whose packets it is made from."""
 
 
 MOST_KEYS: Final = 1_024
@@ -163,7 +163,7 @@ class Control:
 
     @property
     def now_us(self) -> int | None:
-        """Capture time: how far the switches' clocks and packets have come."""
+        """Capture time reached by the switches' clocks and packets."""
         heard = [station.clock.heard_us for station in self._stations.values()]
         heard += [lane.host.watermark_us for station in self._stations.values() for lane in station.lanes]
         return max((each for each in heard if each is not None), default=None)
@@ -231,7 +231,7 @@ class Control:
         return written
 
     def counts(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
-        """Process keys whose differences are over the threshold at the end of a window.
+        """Process keys whose differences are at or above the threshold at the end of a window.
 
         Their times move no clock: a report that was asked for carries the time that was asked about.
         """

@@ -4,7 +4,7 @@
     network.traffic_capture.sonata.<protocol>:flag=syn,dst=…,dport=80               packets
     network.handshake.sonata.tcp                                                     completed handshakes
 
-A missing parameter has its default.  Items carry all parameters, spelled as in the interest
+`threshold=auto` learns a threshold (`evidence.auto_thresholds`).  A missing parameter has its default.  Items carry all parameters, spelled as in the interest
 (`window=3000ms` stays so), so that the observer receives them.
 """
 
@@ -18,12 +18,15 @@ from apps.sonata_adapter.errors import InvalidRequest
 from apps.sonata_adapter.query.catalogue import Template
 from apps.sonata_adapter.query.expressions import ACK, FIN, RST, SYN_ACK, Flags, Term
 from apps.sonata_adapter.query.language import ETHERTYPE_ARP, Query, arp, eth, ip, tcp, udp
-from apps.sonata_adapter.query.parameters import ANY_PREFIX, Parameter, Value, prefix
+from apps.sonata_adapter.query.parameters import ANY_PREFIX, UNREFINED, Parameter, Value, prefix
 from due import Key
 
 QUERY_PREFIX: Final = "network.traffic_query.sonata"
 CAPTURE_PREFIX: Final = "network.traffic_capture.sonata"
 HANDSHAKE: Final = "network.handshake.sonata.tcp"
+
+AUTO: Final = "auto"
+_THRESHOLD: Final = "threshold"
 
 Kind = Literal["query", "capture", "handshake"]
 
@@ -109,12 +112,38 @@ def canonical_key(template: Template, values: Mapping[str, Value] | None = None)
     return Key(f"{QUERY_PREFIX}.{template.name}").with_specs(**specs).text
 
 
+def is_auto(key: Key) -> bool:
+    """Whether a query's key leaves its threshold to what the network's training saw."""
+    is_query = ".".join(key.segments[:-1]) == QUERY_PREFIX
+    return is_query and key.concrete and _THRESHOLD in key.specs and key.spec(_THRESHOLD) == AUTO
+
+
+def values_beside_auto(key: Key, template: Template) -> tuple[dict[str, Value], str]:
+    """The values of a key with `threshold=auto` but for the threshold, and the key of its results.
+
+    Raises `InvalidRequest` for an unknown parameter, for a value out of bounds, and with `refine`.
+    """
+    parameters = {each.name: each for each in template.parameters}
+    given = {name: key.spec(name) for name in key.specs}
+    if _THRESHOLD not in parameters:
+        raise InvalidRequest(f"{key}: no parameter {_THRESHOLD}; there are {', '.join(parameters)}")
+    values = _values(key, parameters, {name: text for name, text in given.items() if name != _THRESHOLD})
+    if values.get("refine", UNREFINED) != UNREFINED:
+        raise InvalidRequest(f"{key}: refine needs a threshold that is a number, since prefixes count more")
+    texts = {name: given.get(name, each.text(values[name])) for name, each in parameters.items()}
+    return values, Key(f"{QUERY_PREFIX}.{template.name}").with_specs(**texts).text
+
+
 def _query_request(
     key: Key, name: str, given: Mapping[str, str], templates: Mapping[str, Template]
 ) -> QueryRequest:
     template = templates.get(name)
     if template is None:
         raise InvalidRequest(f"{key}: there is no query {name}; there are {', '.join(templates)}")
+    if is_auto(key):
+        raise InvalidRequest(
+            f"{key}: only a running adapter learns thresholds (`sdnator explain` shows them); give a number here"
+        )
     values = _values(key, {each.name: each for each in template.parameters}, given)
     identity = canonical_key(template, values)
     texts = {each.name: given.get(each.name, each.text(values[each.name])) for each in template.parameters}

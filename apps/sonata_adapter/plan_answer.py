@@ -10,6 +10,7 @@ import msgspec
 
 from apps.sonata_adapter.control import Control
 from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.evidence.auto_thresholds import AutoThresholds, auto_keys, auto_told
 from apps.sonata_adapter.keys import QueryRequest, request_of
 from apps.sonata_adapter.planner.explain import explain, match_text
 from apps.sonata_adapter.planner.operators import placed_operators
@@ -24,7 +25,7 @@ OF: Final = "of"
 
 
 def plan_key(key: str) -> str:
-    """The key under which the adapter tells what it does for a key."""
+    """The key under which the adapter answers what it does for a key."""
     return Key(PLAN).with_specs(**{OF: key}).text
 
 
@@ -34,18 +35,23 @@ def asked_of(key: str) -> str:
     return parsed.spec(OF) if parsed.concrete and OF in parsed.specs else ""
 
 
-def plan_answer(key: str, control: Control, templates: Mapping[str, Template]) -> dict[str, Any]:
+def plan_answer(
+    key: str, control: Control, templates: Mapping[str, Template], auto: AutoThresholds | None = None
+) -> dict[str, Any]:
     """What the adapter does for a key.
 
     Args:
         key: of a query, of a raw stream or of handshakes; any text.
         control: what is in force.
         templates: the queries that are known.
+        auto: what runs at thresholds of its own.
 
     Returns:
         A DUE value: `state` is running, possible (nobody wants it), refused or follows (a wildcard).
     """
     try:
+        if auto_keys([key]):
+            return _auto_planned(key, control, templates, auto)
         request = request_of(key, templates)
     except (SonataError, DueError) as error:
         return {"key": key, "state": "refused", "reason": str(error)}
@@ -82,6 +88,21 @@ def _planned(
         "text": explain(request, plans, meaning=meaning),
     }
     return answer | ({"came": control.came(one)} if running else {})
+
+
+def _auto_planned(
+    key: str, control: Control, templates: Mapping[str, Template], auto: AutoThresholds | None
+) -> dict[str, Any]:
+    """The plan of what runs for a key with `threshold=auto`, and the threshold; `SonataError` if it is refused."""
+    query = auto.of(Key.parse(key).text) if auto is not None else None
+    if query is None:
+        beside = AutoThresholds()
+        refused = beside.want([key], templates)
+        query = beside.of(Key.parse(key).text)
+        if query is None:
+            raise SonataError(refused.get(key, f"{key} is a wildcard"))
+    told = _planned(key, query.requests[-1], control, templates)
+    return told | {"output": query.output, "auto": auto_told(query)}
 
 
 def _entries(one: QueryPlan) -> list[dict[str, Any]]:

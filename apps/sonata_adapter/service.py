@@ -36,6 +36,7 @@ from apps.sonata_adapter.arrivals import (
 )
 from apps.sonata_adapter.control import Control, ControllerUpdates, Source, Written, leftovers
 from apps.sonata_adapter.errors import SonataError
+from apps.sonata_adapter.evidence.auto_thresholds import AutoThresholds, auto_keys
 from apps.sonata_adapter.evidence.count_baseline import CountBaseline
 from apps.sonata_adapter.evidence.evidence_queries import EVIDENCE_PREFIX, EvidenceQueries
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
@@ -103,12 +104,13 @@ _STATES_READ: Final = 2_000
 _COMMANDS_READ: Final = 20_000
 """Most archived items that are read at start, the youngest."""
 _TRAININGS_READ: Final = 100
+_BASELINES_READ: Final = 50
 _STEP_US: Final = 3_600_000_000
 """A longer step of a switch's clock is accepted only after several items agree."""
 _LAST_ANSWERS_S: Final = 3.0
 _LOOK_S: Final = 0.01
 _MOST_PLANS: Final = 64
-"""Plans that are told at a time; more interests in plans get no answer."""
+"""Maximum number of plans answered at a time; further interests in plans get no answer."""
 _PLAN_S: Final = 1.0
 _MY_KEYS: Final = (QUERY_PREFIX, CAPTURE_PREFIX, HANDSHAKE)
 
@@ -155,9 +157,11 @@ class SonataAdapterService:
         self._switches: dict[str, Any] = {}
         self._wanted: frozenset[str] = frozenset()
         self._evidence = EvidenceQueries(self._stored)
+        self._auto = AutoThresholds(self._stored)
         self._evidence_wanted: frozenset[str] = frozenset()
+        self._auto_wanted: frozenset[str] = frozenset()
         self._running: tuple[QueryRequest, ...] = ()
-        """What runs for evidence."""
+        """What runs for evidence, and at thresholds of its own."""
         self._swept: set[str] = set()
         self._active = False
         self._ending = False
@@ -217,6 +221,7 @@ class SonataAdapterService:
                 "times_doubted": sum(each.doubted for each in self._times.values()),
                 "evidence": self._evidence.written,
                 "evidence_queries": self._evidence.health(),
+                "auto_thresholds": self._auto.health(),
                 **self._intake.health(),
             }
 
@@ -249,16 +254,21 @@ class SonataAdapterService:
         with self._lock:
             self._active = bool(assignments)
             self._sweep()
-            if (wanted, evidence) != (self._wanted, self._evidence_wanted):
-                self._wanted = wanted
+            auto = auto_keys(wanted)
+            if (wanted, evidence) != (self._auto_wanted | self._wanted, self._evidence_wanted):
+                self._wanted, wanted_before = wanted - auto, self._auto_wanted
                 templates = self._templates()
                 self._control.know(templates)
                 if evidence != self._evidence_wanted:
                     self._evidence_wanted = evidence
                     for key, reason in self._evidence.want(evidence, templates).items():
                         self._refuse(key, reason)
-                self._running = self._evidence.requests
-                self._apply(self._control.want(wanted, self._running))
+                if auto != wanted_before:
+                    self._auto_wanted = auto
+                    for key, reason in self._auto.want(auto, templates).items():
+                        self._refuse(key, reason)
+                self._running = self._learning_requests()
+                self._apply(self._control.want(self._wanted, self._running))
             if heard - self._heard:
                 # a new controller does not know earlier requests
                 self._apply(self._control.everything())
@@ -266,6 +276,7 @@ class SonataAdapterService:
             asked = {key: asked_of(key) for key in plans}
             self._plans = dict([(key, of) for key, of in asked.items() if of][:_MOST_PLANS])
             served = self._wanted.union(request.output for request in self._control.requests)
+            served |= self._auto.outputs(self._auto_wanted)
             self._results = {key: found for key, found in self._results.items() if key in served}
             self._plans_at = 0.0
 
@@ -277,7 +288,7 @@ class SonataAdapterService:
         self._plans_at = now + _PLAN_S
         templates = self._templates()
         for key, of in self._plans.items():
-            told = plan_answer(of, self._control, templates)
+            told = plan_answer(of, self._control, templates, self._auto)
             written, last = self._results.get(told.get("output", ""), (0, 0))
             told |= {"results": written, "last_result": last, "monotonic_s": now}
             told |= {"switches": sorted(self._switches), "adapter_cpu_s": time.process_time()}
@@ -335,30 +346,48 @@ class SonataAdapterService:
         name = key.split(":", maxsplit=1)[0].rpartition(".")[2]
         self._engine.write(f"{INCOMPATIBLE}.{name}", {"key": key, "reason": reason}, [NO_WAIT])
 
-    def _stored(self, query: str) -> CountBaseline | None:
-        """The newest baseline of a query in the archive."""
-        items = youngest(self._find, {"dataKey": f"{BASELINE}.{query}"}, 0, 1)
-        return self._intake.read("baseline", baseline_in, items[-1]) if items else None
+    def _stored(self, query: str, text: str) -> CountBaseline | None:
+        """The newest baseline in the archive of a query of this name that counts just this."""
+        for item in reversed(youngest(self._find, {"dataKey": f"{BASELINE}.{query}"}, 0, _BASELINES_READ)):
+            found = self._intake.read("baseline", baseline_in, item)
+            if found is not None and found.text == text:
+                return found
+        return None
 
     def _on_training(self, item: Item, state: TrainingState) -> None:
         with self._lock:
+            self._report(self._auto.train(item.app_id, state))
             self._say(self._evidence.train(item.app_id, state))
 
     def _hear(self) -> None:
         now_us = self._control.now_us
         if now_us is not None:
+            self._report(self._auto.hear(now_us))
             self._say(self._evidence.hear(now_us))
+
+    def _learning_requests(self) -> tuple[QueryRequest, ...]:
+        """What runs for evidence and at thresholds of its own; what both learn alike runs once."""
+        found = {each.identity: each for each in (*self._evidence.requests, *self._auto.requests)}
+        return tuple(found.values())
+
+    def _report(self, found: Iterable[tuple[str, QueryResult]]) -> None:
+        """Write results that have reached a threshold of their query's own."""
+        for key, result in found:
+            query = self._auto.of(key)
+            if query is not None:
+                self._put(query.output, result.to_value(), result.at_us)
 
     def _say(self, found: Iterable[tuple[str, Evidence]]) -> None:
         """Write evidence and baselines; follow the thresholds, which change when training ends."""
         for key, evidence in found:
             self._engine.write(key, evidence.to_value(), [NO_WAIT], event_time=evidence.event_time)
-        for query, baseline in self._evidence.learnt():
+        for query, baseline in (*self._evidence.learnt(), *self._auto.learnt()):
             self._engine.write(
                 f"{BASELINE}.{query}", baseline.to_value(), [NO_WAIT], event_time=baseline.event_time
             )
-        if self._evidence.requests != self._running:
-            self._running = self._evidence.requests
+        running = self._learning_requests()
+        if running != self._running:
+            self._running = running
             self._apply(self._control.want(self._wanted, self._running))
 
     def _observe(self, sources: set[Source]) -> None:
@@ -428,15 +457,20 @@ class SonataAdapterService:
             value: Any = output.batch if isinstance(output, Captured) else output.to_value()
             at_us = output.last_us if isinstance(output, Captured) else output.at_us
             for key in one.keys:
-                if self._evidence.owns(key):
+                if self._evidence.owns(key) or self._auto.owns(key):
                     if isinstance(output, QueryResult):
                         weighed.append((key, one.switch, output))
                     continue
-                self._written += 1
-                self._results[key] = (self._results.get(key, (0, 0))[0] + 1, at_us * 1000)
-                self._engine.write(key, value, [NO_WAIT], event_time=at_us * 1000)
+                self._put(key, value, at_us)
         if weighed:
+            self._report(self._auto.take(weighed))
             self._say(self._evidence.take(weighed))
+
+    def _put(self, key: str, value: Any, at_us: int) -> None:
+        """Write one result."""
+        self._written += 1
+        self._results[key] = (self._results.get(key, (0, 0))[0] + 1, at_us * 1000)
+        self._engine.write(key, value, [NO_WAIT], event_time=at_us * 1000)
 
 
 def _engine(settings: Settings) -> Callable[..., WindowEngine]:
@@ -470,7 +504,7 @@ def cell_request(reads: Sequence[CellRead]) -> RecordBatch:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the adapter until it is told to stop."""
+    """Run the adapter until it is stopped."""
     return int(
         due.service.run("sonata_adapter", SonataAdapterService, Settings, INTERESTS, CAPABILITIES, argv)
     )

@@ -8,6 +8,7 @@ Source: block maxima and the jackknife (Coles, An Introduction to Statistical Mo
 chapter 3; Efron, 1982).
 """
 
+import math
 from statistics import median
 from typing import Annotated, Final
 
@@ -17,7 +18,7 @@ from apps.evidence import MOST_NATS
 from apps.messages import Message, Name, Number, Rate, Time
 
 BLOCKS: Final = 10
-"""Training is divided into so many blocks at least, twice as many at most."""
+"""Training is divided into at least this many blocks, and at most twice as many."""
 MOST_HOSTS: Final = 16_384
 """Hosts of which the highest count is kept; the counts of others make the newcomers' highest."""
 _LEAST_SCALE: Final = 1.0
@@ -25,6 +26,10 @@ _LEAST_SCALE: Final = 1.0
 _LEAST_SHARE: Final = 0.25
 """The scale is at least this share of the highest count of training."""
 _EVERYBODY: Final = ""
+_EULER: Final = 0.5772156649
+"""Euler's constant: the mean of a Gumbel distribution is this many scales beyond its location."""
+_LEAST_BLOCKS: Final = 8
+"""With fewer block maxima their distribution is not estimated."""
 
 Count = Annotated[float, Meta(ge=0, le=1e18)]
 
@@ -37,13 +42,15 @@ class CountBaseline(Message, frozen=True, kw_only=True):
     low: Annotated[int, Meta(ge=1, le=1 << 62)]
     """That threshold: a host without a count may have come as far as one below it."""
     newcomer: Count
-    """The highest count of any host: what somebody unknown may do."""
+    """The highest count of any host: what is normal for an unknown host."""
     middle: Count
     """The median of the hosts' highest counts: what is usual here is not suspicious of a quiet host either."""
     highest: Annotated[dict[Name, Count], Meta(max_length=MOST_HOSTS)]
     """The highest count by host, where it reached the threshold."""
     relative: Count = 0.0
     """Mean excess of a new maximum, as a share of the former one (plus one)."""
+    maxima: Annotated[tuple[Count, ...], Meta(max_length=2 * BLOCKS)] = ()
+    """The highest count of anybody in each block of training; what did not reach the threshold is one below it."""
     windows: Number = 0
     """Results of training."""
     seconds: Rate = 0.0
@@ -64,8 +71,31 @@ class CountBaseline(Message, frozen=True, kw_only=True):
         usual = self.usual(host)
         return min(max(0.0, (count - usual) / self.scale(usual)), MOST_NATS)
 
+    def rare(self, rate: float) -> int:
+        """The count that anybody reaches this often, times an hour; at least one more than was ever seen.
+
+        Block maxima have Gumbel's distribution where single counts have an exponential tail or a lighter one, as
+        sums of many have.  Its location and scale are estimated by L-moments; the scale is taken larger by its
+        standard error.
+
+        Source: Coles (2001), chapter 3; Hosking, L-moments, Journal of the Royal Statistical Society B 52, 1990.
+        """
+        beyond = max(self.low, int(max(self.newcomer, self.low - 1.0)) + 1)
+        number = len(self.maxima)
+        if number < _LEAST_BLOCKS or not self.seconds:
+            nats = -math.log(rate * max(self.seconds, 1.0) / 3600)
+            return max(beyond, self.count_of(nats, max(self.newcomer, self.low - 1.0)))
+        ordered = sorted(self.maxima)
+        mean = sum(ordered) / number
+        spread = sum((2 * place - number + 1) * each for place, each in enumerate(ordered))
+        scale = spread / (number * (number - 1)) / math.log(2)
+        location = mean - _EULER * scale
+        scale = max(_LEAST_SCALE, scale * (1 + 1 / math.sqrt(number)))
+        blocks_an_hour = 3600 * number / self.seconds
+        return max(beyond, math.ceil(location + scale * math.log(blocks_an_hour / rate)))
+
     def count_of(self, nats: float, usual: float) -> int:
-        """The count that weighs so many nats for a host with this usual count."""
+        """The count that weighs this many nats for a host with this usual count."""
         return max(self.low, int(usual + nats * self.scale(usual)) + 1)
 
 
@@ -107,11 +137,20 @@ class CountTraining:
             newcomer=newcomer,
             middle=median(highest.values()) if highest else 0.0,
             highest=highest,
+            maxima=self._maxima(low, end_us),
             relative=sum(ratios) / len(ratios) if ratios else 0.0,
             windows=self._results,
             seconds=max(0, end_us - begin_us) / 1e6,
             event_time=end_us * 1000,
         )
+
+    def _maxima(self, low: int, end_us: int) -> tuple[float, ...]:
+        """Of anybody in each whole block, also in those before the first count."""
+        seen = self._blocks.get(_EVERYBODY, {})
+        if self._origin_us is None or not self._block_us:
+            return ()
+        number = min(2 * BLOCKS, max(max(seen, default=0) + 1, (end_us - self._origin_us) // self._block_us))
+        return tuple(seen.get(block, low - 1.0) for block in range(number))
 
     def _merge(self) -> None:
         """Make blocks twice as long."""

@@ -4,6 +4,7 @@ template ─► measure (the count in `filter count >= N`), who (src, dst, mac),
          ─► the query with any other threshold, reported at the crossing or with its count at the window's end
 """
 
+import hashlib
 from collections.abc import Mapping
 from typing import Final
 
@@ -23,11 +24,12 @@ from apps.sonata_adapter.query.dataflow import (
 )
 from apps.sonata_adapter.query.expressions import BinaryOperation, Expression, Field, Kind, Number
 from apps.sonata_adapter.query.language import SYN, Filter, Map, Query, arp, output_kinds, tcp
+from apps.sonata_adapter.query.parameters import Value
 
 _LOWER: Final = 4
-"""While a query learns, its threshold is one in so many of the catalogue's, ..."""
+"""While a query learns, its threshold is the catalogue's divided by this, ..."""
 _LOWEST: Final = 5
-"""... but no lower than this, where it is not lower itself: such thresholds count single events already."""
+"""... but no lower than this, unless the catalogue's is lower itself: such thresholds already count single events."""
 _WINDOW_MS: Final = 3_000
 _SHORT_WINDOW_MS: Final = 1_000
 """For results that are known at the window's end only: the shortest whose counts the switch is asked for."""
@@ -63,6 +65,8 @@ class EvidenceRecipe(msgspec.Struct, frozen=True, kw_only=True):
     unit: str
     low: int
     """Threshold while the query learns: what is below it, training does not see."""
+    declared: int
+    """The threshold of the query as it is declared."""
     crosses: bool
     """Whether a result is reported at the threshold, in the middle of a window."""
     supporting: bool
@@ -75,15 +79,18 @@ class EvidenceRecipe(msgspec.Struct, frozen=True, kw_only=True):
         return self._with(self.low).text()
 
     def learning(self, key: str) -> QueryRequest:
-        """The query that reports each count from `low` on, when its window is over."""
-        return self._request(key, "counts", self._with(self.low, whole=True))
+        """The query that reports each count from `low` on, when its window is over.
+
+        It has the same identity for all that learn the same, so that it is counted once.
+        """
+        told = hashlib.blake2s(self.text.encode(), digest_size=8).hexdigest()
+        return self._request(key, f"{self.name} {told} at counts", self._with(self.low, whole=True))
 
     def at(self, key: str, threshold: int) -> QueryRequest:
         """The query with a threshold."""
-        return self._request(key, str(threshold), self._with(threshold))
+        return self._request(key, f"{key} at {threshold}", self._with(threshold))
 
-    def _request(self, key: str, what: str, query: Query) -> QueryRequest:
-        identity = f"{key} at {what}"
+    def _request(self, key: str, identity: str, query: Query) -> QueryRequest:
         query = msgspec.structs.replace(query, name=identity)
         return QueryRequest(key, "query", self.name, identity, identity, query)
 
@@ -101,7 +108,20 @@ class EvidenceRecipe(msgspec.Struct, frozen=True, kw_only=True):
 
 def recipe_of(template: Template) -> EvidenceRecipe:
     """How results of a query become evidence; raises `InvalidRequest` if they name nobody or count nothing."""
+    recipe = plain_recipe_of(template)
     query = template.query()
+    if template.name in CATALOGUE and not recipe.crosses and query.window_ms == _WINDOW_MS:
+        query = template.query({"window": _SHORT_WINDOW_MS})
+    if template.name == "port_scan":
+        # a flooded server answers to as many ports as a scanner asks
+        query = msgspec.structs.replace(query, steps=(Filter(_BEGINNING.node), *query.steps))
+    supporting = recipe.supporting and not _begins(query)
+    return msgspec.structs.replace(recipe, query=query, supporting=supporting)
+
+
+def plain_recipe_of(template: Template, values: Mapping[str, Value] | None = None) -> EvidenceRecipe:
+    """What a query with these values counts, just as it is declared; raises `InvalidRequest` as `recipe_of` does."""
+    query = template.query(values)
     kinds = query.fields
     if kinds.get("src") != "address" and kinds.get("dst") != "address" and not _is_frame_sender(kinds):
         raise InvalidRequest(
@@ -118,11 +138,6 @@ def recipe_of(template: Template) -> EvidenceRecipe:
             f"query {template.name} leaves {measure} out of its results, which evidence needs"
         )
     crosses = isinstance(compile_query(query), Crossing)
-    if template.name in CATALOGUE and not crosses and query.window_ms == _WINDOW_MS:
-        query = template.query({"window": _SHORT_WINDOW_MS})
-    if template.name == "port_scan":
-        # a flooded server answers to as many ports as a scanner asks
-        query = msgspec.structs.replace(query, steps=(Filter(_BEGINNING.node), *query.steps))
     kind, service = _MEANT.get(template.name, ("other", ""))
     return EvidenceRecipe(
         name=template.name,
@@ -132,6 +147,7 @@ def recipe_of(template: Template) -> EvidenceRecipe:
         measure=measure,
         unit=_unit(template, measure),
         low=max(1, threshold // _LOWER, min(threshold, _LOWEST)),
+        declared=threshold,
         crosses=crosses,
         supporting=bool({"src", "mac"} & kinds.keys()) and not _begins(query),
         query=query,

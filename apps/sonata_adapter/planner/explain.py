@@ -34,7 +34,7 @@ def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "") -> s
     if any(entry.role == "clock" for entry in one.entries):
         lines.append("    keys that may become results; their other counts are read when the window is over")
     elif any(entry.role == "difference" for entry in one.entries):
-        lines.append("    keys that are over the threshold when the window is over; keys without a cell")
+        lines.append("    keys at or above the threshold when the window is over; keys without a cell")
     elif one.in_switch:
         lines.append("    keys that reached the threshold, reported once in a window; keys without a cell")
     if one.in_switch:
@@ -60,8 +60,8 @@ def _level_lines(request: QueryRequest) -> list[str]:
             f"    {place}. below each /{levels[place - 2]} that crosses, and a window longer: {name}"
             for place, name in enumerate(names[1:], 2)
         ),
-        f"    at most {MOST} prefixes at a time; where more cross, addresses of all packets",
-        f"    an attack is reported from its window {len(levels)} on, at the latest {delay} after its begin",
+        f"    at most {MOST} prefixes at a time; if more cross, addresses of all packets",
+        f"    an attack is reported from its window {len(levels)} on, at the latest {delay} after it began",
     ]
 
 
@@ -70,7 +70,7 @@ def _entry_lines(entry: StageEntry) -> list[str]:
         period = duration_text(entry.window_us // 1000)
         return [
             f"    bit {entry.bit:<3} {match_text(entry.match)}",
-            f"      stage {entry.stage}: says every {period} how far time has come, by which windows end",
+            f"      stage {entry.stage}: reports its clock every {period}, so that windows end",
         ]
     key = ", ".join(name.removesuffix("_mask") + _prefix_text(name, mask) for name, mask in entry.masks)
     unit = "bytes" if entry.by_bytes else "frames"

@@ -122,7 +122,10 @@ class _InSwitch(_Walk):
         entry = self._entries[-1]
         if entry.role == "difference":
             what = "both sides count in one cell" if isinstance(step, Join) else "on the cell's difference"
-            return "switch", f"{what}; keys over {entry.threshold} are reported when the window is over"
+            return (
+                "switch",
+                f"{what}; keys of at least {entry.threshold} are reported when the window is over",
+            )
         if self._crossing and isinstance(step, Filter):
             return "switch", f"a key is reported once a window, when it reaches {entry.threshold}"
         if self._crossing:

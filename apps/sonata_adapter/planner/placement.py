@@ -39,6 +39,7 @@ class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Classifier bits from 0 on; the firewall uses four for samples, the controller the others for ports and the
     whole stream."""
     stages: int = 8
+    """Counting stages that the adapter may use."""
     entries: int = 32
     """Entries of a stage."""
     cells: int = 32_768
@@ -48,7 +49,7 @@ class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     reduce_cells: int = 8_192
     """Cells that an entry of a reduce takes, if available, otherwise a quarter."""
     reads: bool = True
-    """Whether the controller answers requests for cells: then differences are counted in the switch, too."""
+    """Whether the controller answers requests for cells; if so, differences are counted in the switch too."""
     read_window_ms: int = 1_000
     """Shortest window of queries that need cells read; the switch reports its time no more often."""
 

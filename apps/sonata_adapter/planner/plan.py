@@ -3,10 +3,10 @@
     query ─► graph ─► can the switch count it?  ─ yes, and there is room ─► counting entries, reports
                                                 └ no ─► copies of the packets that its filters name
 
-The switch counts a reduce over packets, or over a distinct over packets, whose keys are addresses,
-the destination port and the length, and differences of counts over packets in one cell.  Each distinct and each reduce takes a bit of the classifier for
-each alternative of its filter and a place in a counting stage; in one stage, no frame may match two
-entries.  If there is no room for all, the queries that save most tuples come first.
+The switch can count a reduce over packets, or over a distinct over packets, whose keys are addresses, the destination
+port and the length; and, in one cell, differences of such counts.  Each distinct and each reduce takes a bit of the
+classifier for each alternative of its filter, and a place in a counting stage; within one stage, no frame may match
+two entries.  If there is not room for all queries, those that save most tuples come first.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -42,7 +42,7 @@ from apps.sonata_adapter.query.language import duration_text
 _LONGEST_PERIOD_MS: Final = 10_000
 """Longest period between two time reports of the switch, ms."""
 _SHARE_WITHIN: Final = 2
-"""What a narrowed query takes is one in so many of the cells that it would take of all packets."""
+"""A narrowed query takes the number of cells that it would take for all packets, divided by this."""
 _OTHER_SIDE: Final = {
     "ip.src": "ip.dst", "ip.dst": "ip.src", "tcp.sport": "tcp.dport", "tcp.dport": "tcp.sport",
     "udp.sport": "udp.dport", "udp.dport": "udp.sport", "length": "length",
@@ -166,7 +166,7 @@ def _marked(plans: Mapping[str, QueryPlan], generation: int) -> dict[str, QueryP
 def _timed(plans: Mapping[str, QueryPlan], limits: SwitchLimits) -> dict[str, QueryPlan]:
     """The plans, with the switch's clock as slow as the windows of all that it serves allow.
 
-    It tells the end of each window, and something in between.
+    It reports the end of each window, and the time in between.
     """
     windows = [
         entry.window_us // 1000
@@ -289,7 +289,7 @@ def _entries(request: QueryRequest, space: Space, limits: SwitchLimits) -> list[
     if request.query.window_ms < limits.read_window_ms:
         raise NotPlaced(
             f"its result is known at the window's end only, and cells of windows shorter than "
-            f"{duration_text(limits.read_window_ms)} are not read: they would come late"
+            f"{duration_text(limits.read_window_ms)} are not read: they would come too late"
         )
     found: list[StageEntry] = [space.clock()]
     for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):

@@ -103,7 +103,7 @@ class _Walk:
                     names, more = self._join(names, step)
                     conditions += more
                 case _:
-                    raise NotPlaced("the switch counts before a join, not behind it")
+                    raise NotPlaced("the switch counts before a join, not after it")
         return names, conditions
 
     def _join(

@@ -33,7 +33,7 @@ _MARK: Final = " | "
 _KEPT: Final = 4
 """Windows whose results are remembered, against one that comes of two counts."""
 _REST_WINDOWS: Final = 2
-"""For so long a bit that was given up is not given to another count: cells of its last window have it, too."""
+"""For this long a bit that was given up is not given to another count: cells of its last window still carry it."""
 
 
 class Crossings:
@@ -114,7 +114,7 @@ class Refinement:
         *,
         generation: int = 1,
     ) -> RefinementCounts:
-        """Counts for these requests and their plan; `clocks`: how far each switch's time (us) has come."""
+        """Counts for these requests and their plan; `clocks`: the time (us) that each switch has reached."""
         self._resting = [each for each in self._resting if _rests(each, clocks)]
         resting = [each.bit for each in self._resting]
         while True:

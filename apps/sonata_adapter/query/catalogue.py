@@ -250,14 +250,14 @@ CATALOGUE: Final[dict[str, Template]] = {
         ),
         Template(
             name="syn_flood",
-            meaning="hosts with half-open connections: SYNs to it + SYN-ACKs of it - ACKs to it",
+            meaning="hosts with half-open connections: SYNs to + SYN-ACKs from - ACKs to them",
             result="dst: the host; count: the difference at the window's end",
             parameters=(_W, number("threshold", 3, "report at this difference", unit="segments"), _DST),
             build=_syn_flood,
         ),
         Template(
             name="incomplete_flows",
-            meaning="hosts with connections that do not end: SYNs to it - FINs of it",
+            meaning="hosts with connections that do not end: SYNs to - FINs from them",
             result="dst: the host; count: the difference at the window's end",
             parameters=(
                 window(30_000),
@@ -269,10 +269,10 @@ CATALOGUE: Final[dict[str, Template]] = {
         Template(
             name="slowloris",
             meaning="hosts with many TCP connections that carry few bytes each",
-            result="dst: the host; connections; bytes; count: bytes a connection",
+            result="dst: the host; connections; bytes; count: bytes per connection",
             parameters=(
                 _W,
-                number("threshold", 90, "report up to this many bytes a connection", unit="bytes"),
+                number("threshold", 90, "report up to this many bytes per connection", unit="bytes"),
                 number("connections", 5, "only hosts with this many connections", unit="connections"),
                 number("bytes", 500, "only hosts with this many bytes", unit="bytes"),
                 _DST,

@@ -109,7 +109,7 @@ class Crossing(msgspec.Struct, frozen=True, tag=True):
 
 
 class TupleStream(msgspec.Struct, frozen=True, tag=True):
-    """Report packets (no names) or tuples of packets as they come."""
+    """Report packets (no names) or tuples of packets one by one, without a window."""
 
     node: PacketSource
     names: Names | None

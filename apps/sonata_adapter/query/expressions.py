@@ -24,7 +24,7 @@ class Node(msgspec.Struct, frozen=True, tag=True):
 
 
 class Field(Node, frozen=True):
-    """A field of the packet, or of the tuple that the operator before made."""
+    """A field of the packet, or of the tuple that the previous operator made."""
 
     name: str
 
@@ -68,7 +68,7 @@ Expression: TypeAlias = Field | Number | BinaryOperation | Not | Within | Contai
 PACKET_FIELDS: Final[dict[str, tuple[Kind, str]]] = {
     "ip.src": ("address", "source address, IPv4 or IPv6"),
     "ip.dst": ("address", "destination address, IPv4 or IPv6"),
-    "ip.proto": ("number", "protocol behind IPv6 extension headers, -1 = no IP"),
+    "ip.proto": ("number", "protocol after IPv6 extension headers, -1 = no IP"),
     "ip.version": ("number", "4, 6, or 0 = no IP"),
     "tcp.sport": ("number", "TCP source port, -1 = not TCP"),
     "tcp.dport": ("number", "TCP destination port, -1 = not TCP"),
@@ -86,9 +86,9 @@ PACKET_FIELDS: Final[dict[str, tuple[Kind, str]]] = {
     "arp.dst": ("address", "address that an ARP message asks for or answers to, 0.0.0.0 = not ARP"),
     "eth.src": ("mac", "source MAC address"),
     "eth.dst": ("mac", "destination MAC address"),
-    "eth.type": ("number", "EtherType behind VLAN tags"),
+    "eth.type": ("number", "EtherType after VLAN tags"),
     "vlan": ("number", "outer VLAN, -1 = untagged"),
-    "port": ("number", "port of the switch that the frame came in by"),
+    "port": ("number", "ingress port at the switch"),
     "length": ("number", "bytes on the wire"),
     "dns.response": ("number", "1 = DNS answer over UDP, 0 = question, -1 = no DNS"),
     "dns.qtype": ("number", "record type of the first question, -1 = none; dns.type is the same"),
@@ -97,14 +97,14 @@ PACKET_FIELDS: Final[dict[str, tuple[Kind, str]]] = {
     "entropy(dns.name)": ("number", "Shannon entropy of that name's bytes, 0 to 8,000, -1 = none"),
     "tcp.payload_len": (
         "number",
-        "TCP payload by the headers; -1 = no TCP, or behind IPv6 extension headers",
+        "TCP payload by the headers; -1 = no TCP, or after IPv6 extension headers",
     ),
     "len(payload)": ("number", "the same for TCP and UDP"),
     "entropy(payload)": ("number", "Shannon entropy of the payload, as far as it was copied, -1 = none"),
 }
 """Fields of a packet.  `dns.*` and those of payloads need copies of the frame's bytes.
 
-What a function makes of a packet's text is a field, too: its name is the call."""
+The result of a function of a packet's text is a field too: its name is the call."""
 FUNCTIONS: Final = ("len", "entropy")
 OTHER_NAMES: Final = {"dns.type": "dns.qtype"}
 """Second names of fields."""
@@ -189,7 +189,7 @@ def substitute(expression: Expression, names: Mapping[str, Expression]) -> Expre
         case Within(field, prefix):
             found = names.get(field.name, field)
             if not isinstance(found, Field):
-                raise QueryError(f"{field.name} is no address; 'in {prefix}' needs one")
+                raise QueryError(f"{field.name} is not an address; 'in {prefix}' needs one")
             return Within(found, prefix)
         case _:
             return expression
@@ -254,7 +254,7 @@ def _unknown(name: str, kinds: Mapping[str, Kind]) -> str:
     from difflib import get_close_matches
 
     if name in PACKET_FIELDS and "(" in name:
-        return f"{name} is of packets only: use it before a map, or name it in the map"
+        return f"{name} is a field of packets only: use it before a map, or name it in the map"
     near = get_close_matches(name, kinds, 1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(kinds))}"
     return f"unknown field {name}; {hint}"
@@ -438,7 +438,7 @@ def as_node(value: object) -> Expression:
     if isinstance(value, Node):
         node: Any = value
         return node  # type: ignore[no-any-return]
-    raise QueryError(f"{value!r} is no field, number or condition")
+    raise QueryError(f"{value!r} is not a field, number or condition")
 
 
 def canonical_prefix(text: str) -> str:
@@ -457,7 +457,7 @@ def canonical_prefix(text: str) -> str:
         return str(ip_network(text, strict=False))
     except ValueError:
         raise QueryError(
-            f"{text!r} is no address or prefix; write it as 10.0.0.1, 10.0.0.0/8 or 2001:db8::/32"
+            f"{text!r} is not an address or prefix; write it as 10.0.0.1, 10.0.0.0/8 or 2001:db8::/32"
         ) from None
 
 

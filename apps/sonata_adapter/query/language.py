@@ -68,9 +68,8 @@ class Reduce(msgspec.Struct, frozen=True, tag=True):
 class Join(msgspec.Struct, frozen=True, tag=True):
     """Join the tuples of two queries that have equal keys, at the end of a window.
 
-    inner: keys that both sides have.  left: all keys of this side.  outer: all keys of either side.  anti:
-        keys of
-    this side that the other side does not have.  Missing fields are 0.
+    inner: keys that both sides have.  left: all keys of this side.  outer: all keys of either side.
+    anti: keys of this side that the other side does not have.  Missing fields are 0.
     """
 
     other: "Pipeline"
@@ -285,7 +284,7 @@ def _after(step: Step, kinds: dict[str, Kind], stateful: bool) -> dict[str, Kind
             return {name: kind_of(value, kinds) for name, value in fields}
         case Distinct():
             if kinds.keys() >= PACKET_KINDS.keys():
-                raise QueryError("distinct needs a map before it that says of which fields")
+                raise QueryError("distinct needs a map before it that names its fields")
             return kinds
         case Reduce():
             return _after_reduce(step, kinds)
@@ -393,7 +392,7 @@ def payload_contains(pattern: bytes) -> Term:
 
 
 def entropy(text: Term) -> Term:
-    """Shannon entropy of a packet's text, in thousandths of a bit a byte.
+    """Shannon entropy of a packet's text, in thousandths of a bit per byte.
 
     Args:
         text: `dns.name` or `payload`.

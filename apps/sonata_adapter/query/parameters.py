@@ -58,7 +58,8 @@ class Parameter(msgspec.Struct, frozen=True, kw_only=True):
         if self.kind == "levels":
             return "none, or up to three rising lengths of IPv4 prefixes below 32, such as 16 or 8/16"
         low, high = self.text(self.low), self.text(self.high)
-        return f"{low} to {high}" + (f" {self.unit}" if self.unit else "")
+        or_auto = ", or auto" if self.name == "threshold" and self.kind == "number" else ""
+        return f"{low} to {high}" + (f" {self.unit}" if self.unit else "") + or_auto
 
     def _number(self, text: str) -> int:
         if not re.fullmatch(r"[0-9]{1,18}", text):
@@ -124,5 +125,5 @@ def levels() -> Parameter:
         name="refine",
         kind="levels",
         default=UNREFINED,
-        meaning="count prefixes of these lengths first (IPv6: four times as long), addresses below what crossed",
+        meaning="count prefixes of these lengths first (IPv6: four times as long), addresses only below those that crossed",
     )

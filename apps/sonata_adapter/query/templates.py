@@ -51,7 +51,7 @@ def read_text(file: Path) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise QueryTextError(file.name, line, 1, "no text in UTF-8") from None
+        raise QueryTextError(file.name, line, 1, "not UTF-8 text") from None
 
 
 def _refuse_known(names: Iterable[str]) -> None:

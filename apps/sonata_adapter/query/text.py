@@ -139,7 +139,7 @@ def parse_queries(text: str, where: str = "query") -> list[Template]:
             end += 1
         template = _query(where, lines[at], lines[at + 1 : end])
         if any(template.name == other.name for other in templates):
-            raise QueryTextError(where, lines[at].number, 1, f"query {template.name} is there twice")
+            raise QueryTextError(where, lines[at].number, 1, f"query {template.name} is defined twice")
         templates.append(template)
         at = end
     if not templates:
@@ -153,14 +153,12 @@ def _line(where: str, number_: int, raw: str) -> _Line:
     while at < len(raw):
         found = _TOKEN.match(raw, at)
         if found is None:
-            raise QueryTextError(where, number_, at + 1, f"{raw[at]!r} means nothing here")
+            raise QueryTextError(where, number_, at + 1, f"{raw[at]!r} is not allowed here")
         if found.lastgroup != "space":
             tokens.append(_Token(str(found.lastgroup), found[0], at + 1))
         at = found.end()
         if len(tokens) > _MOST_TOKENS:
-            raise QueryTextError(
-                where, number_, at, f"too long; {_MOST_TOKENS} words and signs a line at most"
-            )
+            raise QueryTextError(where, number_, at, f"too long; {_MOST_TOKENS} tokens per line at most")
     return _Line(number_, len(raw) - len(raw.lstrip()), tuple(tokens))
 
 
@@ -293,7 +291,7 @@ class _Reader:
         return int(digits, base)
 
     def _call(self, function: str) -> Expression:
-        """The field that a function makes of a packet's text."""
+        """The field that holds a function of a packet's text."""
         made = f"{function}({self.token.text})"
         if made not in PACKET_FIELDS:
             known = ", ".join(name for name in PACKET_FIELDS if name.startswith(f"{function}("))
@@ -331,7 +329,7 @@ def _query(where: str, head: _Line, body: list[_Line]) -> Template:
         reader.fail("a query begins with 'query NAME(window=3s):'")
     name = reader.name("the name of the query")
     if "." in name:
-        raise QueryTextError(where, head.number, head.tokens[1].column, "the name of a query has no dot")
+        raise QueryTextError(where, head.number, head.tokens[1].column, "the name of a query may have no dot")
     if len(name) > _MOST_NAME:
         what = f"the name of a query has {_MOST_NAME} letters at most"
         raise QueryTextError(where, head.number, head.tokens[1].column, what)
@@ -363,7 +361,7 @@ def _parameters(reader: _Reader) -> tuple[Parameter, ...]:
         while not reader.accept(")"):
             name = reader.name("the name of a parameter")
             if "." in name or len(name) > _MOST_NAME:
-                reader.fail(f"the name of a parameter has no dot, and {_MOST_NAME} letters at most")
+                reader.fail(f"the name of a parameter may have no dot, and {_MOST_NAME} letters at most")
             reader.expect("=")
             if name in found and name != "window":
                 reader.fail(f"parameter {name} is given twice")
@@ -398,7 +396,7 @@ def _block(where: str, lines: list[_Line], parameters: Mapping[str, int], joins:
         while end < len(lines) and lines[end].indent > indent:
             end += 1
         if line.indent != indent:
-            raise QueryTextError(where, line.number, line.indent + 1, "not in line with the steps before")
+            raise QueryTextError(where, line.number, line.indent + 1, "not aligned with the steps before")
         reader = _Reader(where, line, parameters)
         steps.append(_step(where, reader, lines[at + 1 : end], parameters, joins))
         sizes = _sizes(reader, steps[-1], sizes)
@@ -436,7 +434,7 @@ def _step(
         return _join(where, reader, beneath, parameters, joins)
     if beneath:
         raise QueryTextError(
-            where, beneath[0].number, beneath[0].indent + 1, f"nothing stands beneath {word}"
+            where, beneath[0].number, beneath[0].indent + 1, f"there is nothing beneath {word}"
         )
     step = _simple_step(reader, word)
     reader.end()
@@ -492,5 +490,5 @@ def _join(
     reader.expect(":")
     reader.end()
     if not beneath:
-        reader.fail("the other side of a join stands beneath it, further to the right")
+        reader.fail("the other side of a join is written beneath it, indented further")
     return Join(_block(where, beneath, parameters, joins + 1), keys, kind)

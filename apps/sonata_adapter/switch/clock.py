@@ -15,7 +15,7 @@ class Clock:
 
     def __init__(self) -> None:
         self.heard_us: int | None = None
-        """The latest time that the switch has told."""
+        """The latest time that the switch has reported."""
         self._since: float | None = None
         self._anchor: tuple[int, float] | None = None
         self.rate = 1.0

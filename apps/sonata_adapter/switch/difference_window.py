@@ -51,7 +51,7 @@ class DifferenceWindow:
 
     @property
     def is_open(self) -> bool:
-        """Whether a result may come of it without anything new."""
+        """Whether it may yield a result without further input."""
         undecided = any(key not in self.done for key in self.told)
         return bool(self.waiting or undecided or (self.over is None and (self.apart or self.unheard)))
 

@@ -1,6 +1,6 @@
 """Differences that the switch counts in one cell: SYNs - FINs of a host.  Pure.
 
-report: a window is over and a key is still over the threshold ─► its result
+report: a window is over and a key is still at the threshold or above ─► its result
 report: a key has no cell                                      ─► counted here; its cell, should it have got
                                                                   one later, is read when the window is over
 sweep: no frame of the query for a while                       ─► the switch is asked to look at what waits
@@ -88,7 +88,7 @@ class Differences:
         return []
 
     def counted(self, batch: RecordBatch, now: float) -> list[QueryResult]:
-        """Keys that are over the threshold at the end of their windows, seconds of the caller's clock."""
+        """Keys at or above the threshold at the end of their windows, seconds of the caller's clock."""
         self.tuples += len(batch)
         self._ending = now if self._ending is not None else None
         keys = self._tables.told(self._first.source, batch)
@@ -151,7 +151,7 @@ class Differences:
 
     @property
     def open(self) -> int:
-        """Windows that results may still come of."""
+        """Windows that may still yield results."""
         return sum(1 for window in self._windows.values() if window.is_open)
 
     def answer(self, question: int, counted: int, clock: Clock) -> list[QueryResult]:

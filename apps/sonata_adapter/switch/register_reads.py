@@ -161,7 +161,7 @@ class RegisterReads:
 
     @property
     def open(self) -> int:
-        """Windows that results may still come of."""
+        """Windows that may still yield results."""
         return sum(1 for window in self._windows.values() if window.over is None or window.pending)
 
     def answer(self, question: int, counted: int, clock: Clock) -> list[QueryResult]:

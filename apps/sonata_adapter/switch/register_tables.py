@@ -1,4 +1,4 @@
-"""Counts of single keys → the rows that a query makes of them."""
+"""Counts of single keys → the rows that a query computes from them."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
@@ -38,13 +38,13 @@ PART: Final = {
     "udp.dport": "port",
     "length": "length",
 }
-"""Where a key's value stands in the question about its cell."""
+"""Where a key's value is in the request to read its cell."""
 
 _TOLD_ADDRESSES: Final = {"source": "src", "destination": "dst"}
 
 
 class RegisterTables:
-    """What one query makes of the counts of keys: `sources` in the order of `dataflow.sources`."""
+    """What one query computes from the counts of keys: `sources` in the order of `dataflow.sources`."""
 
     def __init__(self, query: Query) -> None:
         table = compile_query(query)
@@ -79,7 +79,7 @@ class RegisterTables:
         return _rows([Field(name) for name in self.fields(source)], packets)
 
     def told(self, source: int, batch: RecordBatch) -> list[Key]:
-        """The key of each count that the switch told by itself."""
+        """The key of each count that the switch reported by itself."""
         parts = {
             name: list(zip(*(column.tolist() for column in _told(name, batch)), strict=True))
             for name in self.fields(source)

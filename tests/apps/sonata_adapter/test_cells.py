@@ -6,6 +6,7 @@ import pytest
 from apps.sonata_adapter.control import Control
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from apps.sonata_adapter.results import QueryResult
+from dataplane.compiler.c_machine import CMachine
 from dataplane.v1model.tables import TableEntry, Ternary
 from due import RecordBatch
 from sdnator.testing.query_traffic import BASE_US, TimedFrame, batch_of, tcp
@@ -23,7 +24,7 @@ class Network:
     """A switch with the adapter's counting entries; the classifier's verdict is set frame by frame."""
 
     def __init__(self, key):
-        self.switch = made(sdnator(), "auto")
+        self.switch = made(sdnator(), CMachine)
         self.control = Control({**CATALOGUE, **OWN})
         self.control.switch("s1", BASE_US)
         changes = self.control.want([key])

@@ -45,7 +45,7 @@ class Network:
 
     def __init__(self, name, stored=None):
         self.key = f"{EVIDENCE_PREFIX}.{name}"
-        self.queries = EvidenceQueries(lambda _: stored)
+        self.queries = EvidenceQueries(lambda _name, _text: stored)
         assert not self.queries.want([self.key], {**CATALOGUE, **OWN})
         self.now = BEGIN
         self.queries.hear(self.now)

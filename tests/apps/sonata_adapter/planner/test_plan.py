@@ -194,4 +194,4 @@ def test_explain_shows_levels_and_their_delay():
     text = explain(request, plan([coarsest(request)]))
     assert "by (destination /8), reports 45" in text
     assert "by (destination /32), reports 45" in text
-    assert "at the latest 9s after its begin" in text
+    assert "at the latest 9s after it began" in text
