@@ -6,11 +6,13 @@
 
 The feeder keeps a bounded number of packets in flight, counted by scored + dropped, so that no queue
 of the loop can overflow and the loop's delay, in packets, is small and known.  A replay may be a hundred times as fast
-as its capture, so it does not run further than a second of capture time ahead of a decision that is on its way.
+as its capture.  So that time to block says nothing about that, and neither the window nor the machine decides, it does
+not run further than half a second of capture time ahead of the oldest packet in flight, of evidence that is being
+judged, or of a decision that is on its way.  On a quiet network that takes long, so it does so only where a dry run of
+the capture has shown that something may be decided, if there was one.
 """
 
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -23,22 +25,29 @@ from apps.incidents import INCIDENTS, Incident
 from apps.messages import Alert, Confirmation, Decision
 from apps.sonata_adapter.keys import HANDSHAKE
 from dataplane.ports.capture_port import CapturePortError
-from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
+from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest
 from sdnator.capture.capture_blocks import CaptureBlocks
 from sdnator.capture.interfaces import Feed
 from sdnator.errors import PipelineError
 from sdnator.incidents.incident_rows import newest_of_each, with_counters
 from sdnator.replay.drop_counters import DropCounters
+from sdnator.replay.loop_observer import (
+    CONFIRM_SECONDS,
+    JUDGING,
+    REACTION_NS,
+    REPORTS,
+    SUSPICIONS,
+    LoopObserver,
+)
 from sdnator.replay.packet_accounting import PacketAccounting, PacketState
 from sdnator.replay.pipeline import SWITCH_NAME, PipelinePlan, ReplayPipeline
+from sdnator.replay.quiet_stretches import QuietStretches
 from sdnator.replay.readiness import QueriesReady
 from sdnator.replay.survey import Survey
 
 if TYPE_CHECKING:
     from p4rt import ChannelSecurity
 
-CONFIRM_SECONDS = 5.0
-"""Seconds for the confirmation of the last decisions."""
 CHUNK = 16_384
 """Most packets sent at a time."""
 SHARE = 4
@@ -61,12 +70,6 @@ DEATH_SECONDS = 5.0
 """Seconds from a part's closed sockets to the end of its process."""
 COORDINATED = "coordinated"
 """Phase of an engine whose declarations the Coordinator knows."""
-_DECIDED = ("block", "unblock", "protect", "unprotect", "meter", "unmeter")
-"""Actions of confirmed decisions; prefixes are blocked by commands that carry the decision's id."""
-STOPPING = ("block", "meter")
-"""Actions of decisions that drop packets."""
-AHEAD_NS = 1_000_000_000
-"""Capture time that may pass between a decision and the switch's answer: more than it takes on a wire."""
 PACKETS = "packets"
 """The controller's name for the request of every packet."""
 INTERESTS = (
@@ -79,8 +82,10 @@ INTERESTS = (
     Interest("network.confirmation.p4runtime_ctrl.*"),
     Interest("network.switch.p4runtime_ctrl.*"),
     Interest(INCIDENTS),
+    Interest(JUDGING),
+    Interest(SUSPICIONS),
 )
-QUERY_INTERESTS = (Interest(HANDSHAKE),)
+QUERY_INTERESTS = (Interest(HANDSHAKE), Interest(REPORTS))
 CAPABILITIES = (Capability("network.clock.replay.*", delivery="reliable"),)
 AFTER_END_NS = 2_000_000_000
 """Capture time that passes in silence after the last packet: seconds and windows end, and what waits is decided."""
@@ -117,13 +122,17 @@ class ReplayOptions:
     keep: Path | None = None
     """Folder in which logs, settings and the archive of the passes stay; None = they are deleted."""
 
-    def in_flight_limit(self, sent: int, *, mitigate: bool) -> int:
-        """Most packets in flight on the chosen switch after `sent` packets: training blocks nobody."""
-        free = not mitigate or sent < self.training_packets
+    def in_flight_limit(self, *, free: bool) -> int:
+        """Most packets in flight on the chosen switch; `free`: while nothing can be blocked."""
         window = (
             (FREE_WINDOW[self.headers] if free else BLOCKING_WINDOW) if self.window is None else self.window
         )
         return window if self.switch == "embedded" else min(window, WIRE_WINDOW)
+
+    @property
+    def unhindered(self) -> bool:
+        """Whether nothing but the loop itself limits the speed of a replay."""
+        return self.switch == "embedded" and self.pace is None and self.window is None
 
     @property
     def headers(self) -> Telemetry:
@@ -158,6 +167,8 @@ class PassResult:
     alerts: list[Alert] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     """Blocks and guards, and their ends, in the order of deciding."""
+    signs: list[int] = field(default_factory=list)
+    """Capture times (ns) of what may lead to a decision: alerts, evidence, results of queries, decisions."""
     handshakes: list[tuple[int, str]] = field(default_factory=list)
     """Capture time (ns) and source of each completed handshake that a query has found."""
     confirmations: list[Confirmation] = field(default_factory=list)
@@ -177,87 +188,6 @@ Progress = Callable[[PacketAccounting, int], None]
 """Called at intervals with the packet accounting and the number of blocks so far."""
 
 
-class _Observer:
-    """Items that the replay receives over DUE; callbacks run in the engine's thread."""
-
-    def __init__(self, result: PassResult) -> None:
-        self._result = result
-        self.moved = threading.Condition()
-        self.switch: dict[str, Any] = {}
-        self.blocks = 0
-        self.last = time.monotonic()
-        """When the last alert, decision or confirmation came."""
-        self._decided: set[str] = set()
-        self._unanswered: dict[str, tuple[int, float]] = {}
-        """Decisions on their way to the switch: capture time, and until when an answer is waited for."""
-
-    def is_ahead(self, time_ns: int) -> bool:
-        """Whether a packet of this capture time is too far ahead of a decision that is on its way."""
-        now = time.monotonic()
-        return any(time_ns > at + AHEAD_NS and now < until for at, until in self._unanswered.values())
-
-    def subscribe(self, engine: Engine) -> None:
-        engine.observe("network.anomaly.kitsune.score").subscribe(self._on_score)
-        engine.observe("network.anomaly.kitsune.alert").subscribe(self._on_alert)
-        for kind in ("block", "block_prefix", "protect", "meter"):
-            engine.observe(f"network.{kind}.firewall.*").subscribe(self._on_decision)
-        engine.observe("network.confirmation.p4runtime_ctrl.*").subscribe(self._on_confirmation)
-        engine.observe("network.switch.p4runtime_ctrl.*").subscribe(self._on_switch)
-        engine.observe(INCIDENTS).subscribe(self._on_incident)
-
-    def subscribe_queries(self, engine: Engine) -> None:
-        engine.observe(HANDSHAKE).subscribe(self._on_handshake)
-
-    def _on_score(self, item: Item) -> None:
-        value = item.value
-        with self.moved:
-            self._result.flight.scored(value["arrival"], value["score"], value["state"] == 0)
-            self.moved.notify_all()
-
-    def _on_alert(self, item: Item) -> None:
-        with self.moved:
-            self._result.alerts.append(Alert.from_value(item.value))
-            self.last = time.monotonic()
-
-    def _on_decision(self, item: Item) -> None:
-        with self.moved:
-            decision = Decision.from_value(item.value)
-            self._result.decisions.append(decision)
-            self._decided.add(decision.id)
-            if not decision.dry_run and decision.action in STOPPING:
-                self._unanswered[decision.id] = decision.event_time, time.monotonic() + CONFIRM_SECONDS
-            self.last = time.monotonic()
-
-    def _on_handshake(self, item: Item) -> None:
-        with self.moved:
-            self._result.handshakes.append((int(item.value["at"]), str(item.value["source"])))
-
-    def _on_incident(self, item: Item) -> None:
-        with self.moved:
-            self._result.incidents.append(Incident.from_value(item.value))
-
-    def _on_confirmation(self, item: Item) -> None:
-        confirmation = Confirmation.from_value(item.value)
-        with self.moved:
-            self._unanswered.pop(confirmation.id, None)
-            if confirmation.action not in _DECIDED and confirmation.id not in self._decided:
-                return  # of a command: an entry of a query, or a known source
-            self.last = time.monotonic()
-            self._result.confirmations.append(confirmation)
-            self._result.confirmed_at.append(time.monotonic())
-            self.moved.notify_all()
-            if confirmation.state == "installed":
-                self.blocks += 1
-
-    def _on_switch(self, item: Item) -> None:
-        with self.moved:
-            self.switch = item.value
-            self._result.lost_on_the_way = int(item.value["lost"])
-            for block in item.value["blocks"]:
-                self._result.drops_counted[str(block["id"])] = int(block["packets"])
-            self.moved.notify_all()
-
-
 class ReplayPass:
     """One pass of a capture through a fresh pipeline.
 
@@ -266,10 +196,17 @@ class ReplayPass:
         options: how to replay.
         mitigate: False = the firewall decides but nothing is installed.
         watch: indices of packets whose time of sending matters.
+        dry_run: an earlier pass of the same capture without mitigation, if there was one.
     """
 
     def __init__(
-        self, survey: Survey, options: ReplayOptions, *, mitigate: bool, watch: frozenset[int]
+        self,
+        survey: Survey,
+        options: ReplayOptions,
+        *,
+        mitigate: bool,
+        watch: frozenset[int],
+        dry_run: PassResult | None = None,
     ) -> None:
         self._survey = survey
         self._options = options
@@ -280,14 +217,15 @@ class ReplayPass:
             by_digest=options.headers == "digest",
         )
         self._result = PassResult(flight, mitigate)
-        self._observer = _Observer(self._result)
+        self._quiet = None if dry_run is None else _quiet_stretches(survey, dry_run)
+        self._observer = LoopObserver(self._result, self._quiet)
         self._drops: DropCounters | None = None
         self._looked = 0.0
 
     def run(self, progress: Progress | None = None) -> PassResult:
         """Run it to the last packet; raises PipelineError if a part fails or the loop stalls."""
         options = self._options
-        name = "with-blocking" if self._result.mitigate else "kitsune-alone"
+        name = "with-blocking" if self._result.mitigate else "dry-run"
         with tempfile.TemporaryDirectory(prefix="sdnator-", ignore_cleanup_errors=True) as temporary:
             folder = Path(temporary) if options.keep is None else options.keep.absolute() / name
             folder.mkdir(parents=True, exist_ok=True)
@@ -323,7 +261,7 @@ class ReplayPass:
         while engine.health()["phase"] != COORDINATED:
             pipeline.check()
             if time.monotonic() > deadline:
-                raise PipelineError(f"the coordinator did not answer within {STALL_SECONDS:.0f} s")
+                raise PipelineError(f"the Coordinator did not answer within {STALL_SECONDS:.0f} s")
             time.sleep(0.01)
 
     def _run(self, pipeline: ReplayPipeline, engine: Engine, progress: Progress | None) -> None:
@@ -345,7 +283,7 @@ class ReplayPass:
                 raise PipelineError(str(error)) from error
 
     def _wait_for_packets(self, pipeline: ReplayPipeline, engine: Engine) -> None:
-        """Wait until the controller has told the switch to send packets, because Kitsune and queries want them.
+        """Wait until the switch sends packets, because Kitsune and queries want them.
 
         Its state item may be older than our subscription, so the archive is read as well.
         """
@@ -361,7 +299,7 @@ class ReplayPass:
                 return
             pipeline.check()
             if sends and queries is not None and time.monotonic() > deadline:
-                raise PipelineError(f"queries do not run after {STALL_SECONDS:.0f} s: {queries.missing}")
+                raise PipelineError(f"queries are not served after {STALL_SECONDS:.0f} s: {queries.missing}")
             if time.monotonic() > deadline:
                 raise PipelineError(
                     f"switch {SWITCH_NAME} did not begin to send packets within {STALL_SECONDS:.0f} s; "
@@ -458,21 +396,44 @@ class ReplayPass:
                 progress(self._result.flight, self._observer.blocks)
 
     def _wait_for_room(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> int:
-        sent, mitigate = self._result.flight.sent, self._result.mitigate
-        limit = self._options.in_flight_limit(sent, mitigate=mitigate)
+        sent = self._result.flight.sent
+        free = self._free_until(sent) - sent
+        limit = self._options.in_flight_limit(free=free > 0)
+        share = max(1, limit // SHARE)
+        if free > 0:
+            self._await(pipeline, feed, progress, lambda flight: flight.in_flight <= limit - share)
+            # behind the last free packet another window holds
+            return min(limit - self._result.flight.in_flight, free)
         next_ns = int(self._survey.time_ns[sent])
+        # fewer packets than that wait until none is in flight: a lap costs the same for one packet as for a hundred
+        enough_ns = int(self._survey.time_ns[sent : sent + share].max())
         self._await(
             pipeline,
             feed,
             progress,
             lambda flight: (
-                flight.in_flight <= limit - max(1, limit // SHARE) and not self._observer.is_ahead(next_ns)
+                flight.in_flight <= limit - share
+                and (not flight.in_flight or enough_ns <= self._horizon(next_ns))
+                and not self._observer.is_judging()
+                and not self._observer.is_ahead(next_ns)
             ),
         )
         room = limit - self._result.flight.in_flight
-        left = self._options.training_packets - sent
-        # behind the last packet of training another window may hold
-        return min(room, left) if mitigate and left > 0 else room
+        late = self._survey.time_ns[sent : sent + room] > self._horizon(next_ns)
+        return max(1, int(late.argmax())) if late.any() else room
+
+    def _free_until(self, sent: int) -> int:
+        """Index of the first packet, from that of `sent` on, that may meet a decision."""
+        if not self._result.mitigate:
+            return self._survey.packets
+        if sent < self._options.training_packets:
+            return self._options.training_packets
+        return sent if self._quiet is None else self._quiet.end(sent)
+
+    def _horizon(self, next_ns: int) -> int:
+        """Capture time up to which packets may be sent, ns: a remedy for the oldest in flight could be in force by then."""
+        oldest = self._result.flight.oldest_in_flight
+        return REACTION_NS + (next_ns if oldest is None else int(self._survey.time_ns[oldest]))
 
     def _drain(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
         self._await(pipeline, feed, progress, lambda flight: flight.in_flight == 0)
@@ -492,7 +453,8 @@ class ReplayPass:
                 flight.judge(feed.verdicts())
                 if done(flight):
                     return
-                self._observer.moved.wait(POLL_SECONDS)
+                # scores wake us, verdicts do not
+                self._observer.moved.wait(POLL_SECONDS if flight.judged < flight.sent else LOOK_SECONDS)
             now = time.monotonic()
             if flight.decided != last:
                 last, since = flight.decided, now
@@ -501,7 +463,7 @@ class ReplayPass:
             self._look(pipeline, progress)
             if now - since > STALL_SECONDS:
                 raise PipelineError(
-                    f"the loop stands still: {flight.in_flight} of {flight.sent} packets sent are neither scored "
+                    f"the loop is stuck: {flight.in_flight} of {flight.sent} packets sent are neither scored "
                     f"nor dropped after {STALL_SECONDS:.0f} s"
                     + (
                         ""
@@ -520,6 +482,12 @@ class ReplayPass:
         if silence > SETTLE_SECONDS:
             with self._observer.moved:
                 flight.settle()
+
+
+def _quiet_stretches(survey: Survey, dry_run: PassResult) -> QuietStretches:
+    """What the dry run tells about the pass after it."""
+    decided = min((decision.event_time for decision in dry_run.decisions), default=None)
+    return QuietStretches(survey.time_ns, dry_run.signs, decided)
 
 
 def _firewall(*, mitigate: bool, queries: bool) -> dict[str, Any]:

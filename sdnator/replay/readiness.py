@@ -18,8 +18,10 @@ _PREFIXES: Final = (QUERY_PREFIX, CAPTURE_PREFIX, HANDSHAKE)
 
 def wanted_keys(interests: Iterable[Mapping[str, Any]]) -> frozenset[str]:
     """Canonical keys of queries that apps have an interest in, from the Coordinator's `/interests`."""
-    keys = (str(one["key"]) for one in interests)
-    return frozenset(Key.parse(key).text for key in keys if key.startswith(_PREFIXES))
+    texts = (str(one["key"]) for one in interests)
+    keys = (Key.parse(text) for text in texts if text.startswith(_PREFIXES))
+    # a wildcard asks for nothing: it receives what others ask for
+    return frozenset(key.text for key in keys if key.concrete)
 
 
 def assigned_keys(assignments: Iterable[Mapping[str, Any]]) -> frozenset[str]:
@@ -61,7 +63,7 @@ class QueriesReady:
 
     def _missing(self, wanted: frozenset[str], requests: int) -> str:
         if unassigned := wanted - assigned_keys(ask(self._url, "/assignments")):
-            return f"nobody makes {', '.join(sorted(unassigned))}"
+            return f"no app produces {', '.join(sorted(unassigned))}"
         health = (ask(self._url, "/health")["apps"].get(ADAPTER) or {"health": {"app": {}}})["health"]["app"]
         served = len(health.get("queries", ())) + int(health.get("refused", 0))
         if served < len(wanted):

@@ -38,7 +38,7 @@ class CaptureReplay:
     scores_without_blocking: NDArray[np.float64] | None
     """The same for the pass without blocking; None where there was no such pass."""
     states: NDArray[np.uint8]
-    """What became of each packet, as a number of `sdnator.replay.packet_accounting.PacketState`; (packets,)."""
+    """The state of each packet, as a number of `sdnator.replay.packet_accounting.PacketState`; (packets,)."""
     attack: NDArray[np.bool_] | None
     """True for packets that the labels count to an attack, shape (packets,); None without labels."""
     alerts: tuple[Alert, ...]
@@ -70,8 +70,8 @@ def replay_capture(
     """Replay a capture through the embedded switch, the controller, Kitsune, the Sonata adapter and the firewall.
 
     The pipeline runs in processes of its own, which end before this returns. With labels or a report there are
-    two passes, first without blocking and then with it, as with `sdnator replay`. Call it from the main thread:
-    the processes end with the thread that started them.
+    two passes, first a dry run and then with blocking, as with `sdnator replay`; without, too, if the dry run saves
+    more time than it takes. Call it from the main thread: the processes end with the thread that started them.
 
     Args:
         capture: a pcap or pcapng file, plain or gzipped; or the name of a fetched data set, such as "mirai".
@@ -84,10 +84,10 @@ def replay_capture(
         queries: False runs Kitsune alone, without the Sonata adapter and the defence against SYN floods.
         report: folder for the HTML report; None writes none.
         keep: folder for the logs of all parts and the archive; None deletes them.
-        progress: called now and then with the title of the pass, the packets done and the packets in the capture.
+        progress: called from time to time with the title of the pass, the packets done and the packets in the capture.
 
     Returns:
-        Scores, blocks, figures and what became of each packet.
+        Scores, blocks, figures and the state of each packet.
 
     Raises:
         BadInput: an argument, the capture or the labels cannot be used; the text says which and what to do.
@@ -147,12 +147,12 @@ def _result(outcome: run.ReplayOutcome, report: Path | None) -> CaptureReplay:
         from sdnator.report.replay_report import write_replay_report
 
         page = write_replay_report(report, outcome, figures)
-    last, alone = outcome.reported, outcome.alone
+    last, dry_run = outcome.reported, outcome.dry_run
     return CaptureReplay(
         capture=outcome.survey.path,
         time_ns=outcome.survey.time_ns,
         scores=last.flight.score,
-        scores_without_blocking=alone.flight.score if alone is not None else None,
+        scores_without_blocking=dry_run.flight.score if dry_run is not None else None,
         states=last.flight.state,
         attack=outcome.labels.attack if outcome.labels is not None else None,
         alerts=tuple(last.alerts),

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,9 +15,14 @@ from sdnator.incidents.incident_rows import as_json
 from sdnator.replay.guards import WouldChallenge, would_challenge
 from sdnator.replay.limits import LimitedPackets, limited_packets
 from sdnator.replay.loop import PassResult, Progress, ReplayOptions, ReplayPass, wall_seconds_to_block
+from sdnator.replay.loop_observer import REACTION_NS
 from sdnator.replay.packet_accounting import PacketState
+from sdnator.replay.quiet_stretches import laps
 from sdnator.replay.summary import attack_figures, auc, block_rows
 from sdnator.replay.survey import Survey, survey
+
+MANY_LAPS: Final = 400
+"""Rounds through the loop that take longer than the start and end of a dry run, at 25 ms each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +31,7 @@ class ReplayOutcome:
 
     survey: Survey
     labels: Labels | None
-    alone: PassResult | None
+    dry_run: PassResult | None
     """The pass without mitigation, if there was one."""
     blocking: PassResult | None
     """The pass with mitigation, if there was one."""
@@ -40,7 +45,7 @@ class ReplayOutcome:
     @property
     def reported(self) -> PassResult:
         """The pass that the figures describe: with mitigation unless it was switched off."""
-        chosen = self.blocking or self.alone
+        chosen = self.blocking or self.dry_run
         assert chosen is not None  # noqa: S101 - there is at least one pass
         return chosen
 
@@ -77,7 +82,10 @@ def run(
     both: bool,
     progress: Callable[[str], Progress] | None = None,
 ) -> ReplayOutcome:
-    """Run one pass, or two (`both`): Kitsune alone first, then with blocking.
+    """Run one pass, or two: first a dry run, then with blocking.
+
+    Two if `both` are wanted, or if the dry run saves more time than it takes, because it shows where the pass with
+    blocking has to keep up.
 
     Raises:
         PipelineError: a part failed.
@@ -87,23 +95,22 @@ def run(
     if labels is not None and bool(labels.attack.any()):
         watch = frozenset({int(np.argmax(labels.attack))})
 
-    def one_pass(title: str, mitigating: bool) -> PassResult:
-        # scores alone are wanted of the first of two passes
-        chosen = replace(options, queries=options.queries and (mitigating or not both))
-        replay = ReplayPass(surveyed, chosen, mitigate=mitigating, watch=watch)
+    def one_pass(title: str, *, mitigating: bool, seen: PassResult | None = None) -> PassResult:
+        replay = ReplayPass(surveyed, options, mitigate=mitigating, watch=watch, dry_run=seen)
         return replay.run(progress(title) if progress is not None else None)
 
-    alone = one_pass("Kitsune alone", False) if both or not mitigate else None
-    blocking = one_pass("with blocking", True) if mitigate else None
+    first = both or not mitigate or _looks_ahead(surveyed, options)
+    dry_run = one_pass("dry run", mitigating=False) if first else None
+    blocking = one_pass("with blocking", mitigating=True, seen=dry_run) if mitigate else None
     notes = surveyed.notes()
     if options.model is not None:
-        notes.append(f"nothing was trained here: the model is {options.model}")
+        notes.append(f"no training in this replay: the model is {options.model}")
     if options.switch != "embedded":
         notes.append(
-            f"packets have the capture's times, but what switch {options.switch} measures itself runs on its own "
-            "clock: meters and idle time-outs of entries"
+            f"packets have the capture's times, but the meters and idle time-outs of switch {options.switch} run on its "
+            "own clock"
         )
-    reported = blocking or alone
+    reported = blocking or dry_run
     assert reported is not None  # noqa: S101 - there is at least one pass
     challenged = would_challenge(surveyed.path, surveyed.packets, reported.decisions, reported.handshakes)
     if challenged.by_guard:
@@ -112,8 +119,14 @@ def run(
         )
     limited = limited_packets(surveyed.path, surveyed.packets, reported.decisions)
     return ReplayOutcome(
-        surveyed, labels, alone, blocking, notes, time.monotonic() - begun, challenged, limited
+        surveyed, labels, dry_run, blocking, notes, time.monotonic() - begun, challenged, limited
     )
+
+
+def _looks_ahead(surveyed: Survey, options: ReplayOptions) -> bool:
+    """Whether a dry run before the pass with blocking pays."""
+    tested = surveyed.time_ns[options.training_packets :]
+    return options.unhindered and laps(tested, REACTION_NS) >= MANY_LAPS
 
 
 def figures(outcome: ReplayOutcome) -> dict[str, Any]:
@@ -162,7 +175,7 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "first_block_packet": blocks[0]["packet"] if blocks else None,
         "time_to_block_s": time_to_block,
         **attack,
-        "auc": auc(outcome.alone.flight, outcome.labels) if outcome.alone and outcome.labels else None,
+        "auc": auc(outcome.dry_run.flight, outcome.labels) if outcome.dry_run and outcome.labels else None,
         "seconds": round(outcome.seconds, 3),
         "packets_per_second": round(flight.sent / result.seconds, 1) if result.seconds else None,
         "notes": outcome.notes,

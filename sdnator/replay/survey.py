@@ -52,7 +52,7 @@ class Survey:
         found = [] if self.cut is None else [str(self.cut)]
         if bool((self.time_ns % 1_000 != 0).any()):
             found.append(
-                "the capture has nanosecond times; the switch's clock counts microseconds, the rest is cut off"
+                "the capture has nanosecond times; the switch's clock counts microseconds, so they are truncated"
             )
         backwards = int(np.count_nonzero(np.diff(self.time_ns) < 0))
         if backwards:

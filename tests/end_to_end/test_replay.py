@@ -4,7 +4,7 @@ import csv
 import json
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, chdir
 from itertools import islice
 
 import numpy as np
@@ -82,12 +82,21 @@ def test_nobody_is_blocked_in_the_real_harmless_traffic(real_capture):
     assert found["alerts"] == 3
 
 
-def test_attackers_are_blocked_and_nobody_else(attacked_capture, tmp_path):
-    """The infected camera is stopped, with the report to prove it, and no harmless device loses a packet."""
+@pytest.fixture(scope="module")
+def attacked_replay(attacked_capture):
+    """Figures, report and kept folder of one replay with labels; folders are given relative to the current one."""
     capture, labels = attacked_capture
-    report = tmp_path / "report"
     training = ("--fm-grace", "2000", "--ad-grace", "10000")
-    found = figures("replay", capture, "--labels", labels, *training, "--report", report)
+    with chdir(capture.parent):
+        found = figures(
+            "replay", capture, "--labels", labels, *training, "--report", "report", "--keep", "keep"
+        )
+    return found, capture.with_name("report"), capture.with_name("keep")
+
+
+def test_attackers_are_blocked_and_nobody_else(attacked_replay):
+    """The infected camera is stopped, with the report to prove it, and no harmless device loses a packet."""
+    found, report, _ = attacked_replay
     assert found["packets_lost"] == 0
     assert found["packets_in"] == (
         found["packets_scored"] + found["packets_dropped"] + found["packets_not_copied"]
@@ -152,14 +161,9 @@ def test_flood_answered_by_its_victim_blocks_the_flooder_only(tmp_path):
     assert found["packets_lost"] == 0
 
 
-def test_everything_decided_is_in_the_archive(tmp_path, monkeypatch):
-    """Alerts, scores, decisions and confirmations are found again, in a folder given relative to the current one."""
-    monkeypatch.chdir(tmp_path)
-    capture = tmp_path / "short.pcap"
-    make(MiraiLikeOptions(seed=4, benign_seconds=600, attack_seconds=120), capture)
-    keep = tmp_path / "keep"
-    labels = tmp_path / "short.labels.csv"
-    found = figures("replay", capture, "--labels", labels, "--train", "9000", "--keep", "keep")
+def test_everything_decided_is_in_the_archive(attacked_replay):
+    """Alerts, scores, decisions and confirmations are found again."""
+    found, _, keep = attacked_replay
     archive = SqliteArchive(f"sqlite:///{keep / 'with-blocking' / 'archive.db'}")
     try:
         assert len(archive.find({"dataKey": "network.anomaly.kitsune.alert"})) == found["alerts"]

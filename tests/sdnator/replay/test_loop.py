@@ -1,9 +1,12 @@
-"""Who dies in a replay is named; tests/end_to_end has the replay itself."""
+"""Who dies in a replay is named, and nothing is sent ahead of what is still judged; tests/end_to_end has the replay itself."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
-from msgspec import structs
 
-from apps.messages import Confirmation, Decision, Message, Target
+from apps.evidence import Judged
+from apps.messages import Alert, Confirmation, Decision, Message, Sender, Target
 from due import Item
 from sdnator.errors import PipelineError
 from sdnator.replay.loop import (
@@ -12,10 +15,13 @@ from sdnator.replay.loop import (
     WIRE_WINDOW,
     PassResult,
     ReplayOptions,
+    ReplayPass,
     _name_the_dead,
-    _Observer,
 )
+from sdnator.replay.loop_observer import REACTION_NS, LoopObserver
 from sdnator.replay.packet_accounting import PacketAccounting
+from sdnator.replay.quiet_stretches import QuietStretches
+from sdnator.replay.survey import Survey
 
 SECOND = 1_000_000_000
 
@@ -37,21 +43,47 @@ def test_a_part_that_is_still_dying_is_waited_for():
 
 
 @pytest.mark.parametrize(
-    ("options", "mitigate", "sent", "most"),
+    ("options", "free", "most"),
     [
-        ({}, False, 100_000, FREE_WINDOW["digest"]),
-        ({}, True, 10, FREE_WINDOW["digest"]),
-        ({}, True, 55_001, BLOCKING_WINDOW),
-        ({"telemetry": "packet-in"}, True, 10, FREE_WINDOW["packet-in"]),
-        ({"window": 300}, False, 10, 300),
-        ({"window": 300}, True, 55_001, 300),
-        ({"switch": "bmv2"}, False, 10, WIRE_WINDOW),
-        ({"switch": "bmv2", "window": 4}, True, 10, 4),
+        ({}, True, FREE_WINDOW["digest"]),
+        ({}, False, BLOCKING_WINDOW),
+        ({"telemetry": "packet-in"}, True, FREE_WINDOW["packet-in"]),
+        ({"window": 300}, True, 300),
+        ({"window": 300}, False, 300),
+        ({"switch": "bmv2"}, True, WIRE_WINDOW),
+        ({"switch": "bmv2", "window": 4}, False, 4),
     ],
 )
-def test_many_packets_are_in_flight_only_while_nothing_can_be_blocked(options, mitigate, sent, most):
-    """Training blocks nobody; an interface takes few, whatever is asked for."""
-    assert ReplayOptions(**options).in_flight_limit(sent, mitigate=mitigate) == most
+def test_many_packets_are_in_flight_only_while_nothing_can_be_blocked(options, free, most):
+    """An interface takes few, whatever is asked for."""
+    assert ReplayOptions(**options).in_flight_limit(free=free) == most
+
+
+def test_only_training_and_what_a_dry_run_saw_quiet_is_sent_freely():
+    """Without a dry run every packet behind training may meet a decision; in a dry run none does."""
+    seen = PassResult(PacketAccounting(60), False, signs=[40 * SECOND])
+    assert _free_until(mitigate=False) == [60, 60, 60, 60]
+    assert _free_until(mitigate=True) == [11, 11, 30, 50]
+    assert _free_until(mitigate=True, dry_run=seen) == [11, 30, 30, 60]
+    seen.decisions.append(_decision("d1", 40 * SECOND, dry_run=True))
+    assert _free_until(mitigate=True, dry_run=seen) == [11, 30, 30, 50]
+
+
+def test_alerts_evidence_reports_and_decisions_are_signs():
+    """All that may lead to a decision; the replay goes back to caution at one that the dry run did not have."""
+    quiet = QuietStretches(np.arange(60) * SECOND, [40 * SECOND])
+    result = PassResult(PacketAccounting(60), True)
+    observer = LoopObserver(result, quiet)
+    observer._on_sign(Item("network.evidence.kitsune.scan", {}, 1, 40 * SECOND, "kitsune", "i1", 1))
+    assert quiet.end(0) == 30
+    observer._on_alert(_item(Alert(
+        id="a1", sender=Sender(switch="s1", port=1, mac="02:00:00:00:00:01"), event_time=50 * SECOND, first_packet=50,
+        packets=9, over=9, peak_score=2.0, anomalous_seconds=1, rate=9.0, training_rate=1.0, mac_addresses=1,
+        reason="r",
+    )))  # fmt: skip
+    assert quiet.end(0) == 0
+    observer._on_decision(_item(_decision("d1", 51 * SECOND)))
+    assert result.signs == [40 * SECOND, 50 * SECOND, 51 * SECOND]
 
 
 def test_headers_come_by_digest_where_the_switch_sends_lists():
@@ -64,22 +96,82 @@ def test_headers_come_by_digest_where_the_switch_sends_lists():
 
 
 def test_replay_does_not_run_away_from_a_decision_on_its_way():
-    """A second of capture time behind the decision packets wait for the switch's answer; a dry run holds nothing up."""
-    observer = _Observer(PassResult(PacketAccounting(1), True))
+    """Half a second of capture time behind the decision packets wait for the switch's answer; a dry run holds nothing up."""
+    observer = LoopObserver(PassResult(PacketAccounting(1), True))
     at = 1_000 * SECOND
-    made = Decision(
-        id="d1", action="block", switch="s1", target=Target(kind="ip", address="10.0.0.1"), reason="r",
-        event_time=at, expires=0,
-    )  # fmt: skip
-    observer._on_decision(_item(structs.replace(made, id="d0", dry_run=True)))
+    observer._on_decision(_item(_decision("d0", at, dry_run=True)))
     assert not observer.is_ahead(at + 60 * SECOND)
-    observer._on_decision(_item(made))
-    assert not observer.is_ahead(at + SECOND)
-    assert observer.is_ahead(at + SECOND + 1)
+    observer._on_decision(_item(_decision("d1", at)))
+    assert not observer.is_ahead(at + REACTION_NS)
+    assert observer.is_ahead(at + REACTION_NS + 1)
     observer._on_confirmation(
         _item(Confirmation(id="d1", switch="s1", state="installed", action="block", event_time=at))
     )
     assert not observer.is_ahead(at + 60 * SECOND)
+
+
+def test_replay_waits_until_evidence_is_judged_and_its_decisions_have_come():
+    """Scores say how much evidence there is, the firewall how much of it is judged, and how many decisions it wrote."""
+    observer = LoopObserver(PassResult(PacketAccounting(4), True))
+    observer._on_score(_scores(0, evidence=0))
+    assert not observer.is_judging()
+    observer._on_score(_scores(1, evidence=2))
+    assert observer.is_judging()
+    observer._on_judged(_item(Judged(app="kitsune", evidence=1, decisions=0)))
+    observer._on_judged(_item(Judged(app="other", evidence=9, decisions=0)))
+    assert observer.is_judging()
+    observer._on_judged(_item(Judged(app="kitsune", evidence=2, decisions=1)))
+    assert observer.is_judging(), "its decision is still on its way"
+    observer._on_decision(_item(_decision("d1", SECOND)))
+    assert not observer.is_judging()
+
+
+def test_the_oldest_packet_in_flight_holds_up_later_ones():
+    """Dropped and scored ones do not; packets that were not sent are not in flight."""
+    flight = PacketAccounting(5)
+    assert flight.oldest_in_flight is None
+    flight.send(4)
+    assert flight.oldest_in_flight == 0
+    flight.judge(bytes([3, 0, 3, 3]))
+    _score(flight, 2)
+    assert flight.oldest_in_flight == 0
+    _score(flight, 0)
+    assert flight.oldest_in_flight == 3
+    _score(flight, 3)
+    assert flight.oldest_in_flight is None
+
+
+def _free_until(*, mitigate: bool, dry_run: PassResult | None = None) -> list[int]:
+    """Of a packet a second, 11 for training, from packets 0, 11, 30 and 50 on."""
+    nothing = np.zeros(60, np.uint32)
+    survey = Survey(
+        Path("some.pcap"), np.arange(60) * SECOND, nothing.astype(np.uint64), nothing, 0, None, nothing, nothing,
+        plain=True,
+    )  # fmt: skip
+    options = ReplayOptions(fm_grace=1, ad_grace=9)
+    made = ReplayPass(survey, options, mitigate=mitigate, watch=frozenset(), dry_run=dry_run)
+    return [made._free_until(sent) for sent in (0, 11, 30, 50)]
+
+
+def _decision(name: str, at: int, *, dry_run: bool = False) -> Decision:
+    return Decision(
+        id=name, action="block", switch="s1", target=Target(kind="ip", address="10.0.0.1"), reason="r",
+        event_time=at, expires=0, dry_run=dry_run,
+    )  # fmt: skip
+
+
+def _score(flight: PacketAccounting, index: int) -> None:
+    flight.scored(np.array([index], np.uint64), np.ones(1), np.zeros(1, bool))
+
+
+def _scores(index: int, *, evidence: int) -> Item:
+    value = {
+        "arrival": np.array([index], np.uint64),
+        "score": np.ones(1),
+        "state": np.ones(1, np.uint8),
+        "evidence": evidence,
+    }
+    return Item("network.any.app.key", value, 1, 1, "app", "i1", 1)
 
 
 def _item(message: Message) -> Item:

@@ -34,7 +34,7 @@ def coordinator(monkeypatch):
 def test_each_step_is_waited_for(coordinator):
     ready = QueriesReady("http://127.0.0.1:1")
     assert not ready.look(["packets"])
-    assert "nobody makes" in ready.missing
+    assert "no app produces" in ready.missing
     coordinator.assigned = [SYN, FLOOD]
     assert not ready.look(["packets"])
     assert "0 of 2 queries" in ready.missing
@@ -58,6 +58,16 @@ def test_app_that_goes_on_asking_is_waited_for(coordinator):
 def test_query_that_the_adapter_refuses_holds_nothing_up(coordinator):
     coordinator.assigned = [SYN, FLOOD]
     coordinator.health = {"queries": {"a": ""}, "bits": 1, "refused": 1}
+    ready = QueriesReady("http://127.0.0.1:1")
+    ready.look(["q0"])
+    assert ready.look(["q0"])
+
+
+def test_a_wildcard_asks_for_nothing(coordinator):
+    """It receives what others have asked for, so there is no query of its own to wait for."""
+    coordinator.interests = [SYN, "network.traffic_query.sonata.*"]
+    coordinator.assigned = [SYN]
+    coordinator.health = {"queries": {"a": ""}, "bits": 1, "refused": 0}
     ready = QueriesReady("http://127.0.0.1:1")
     ready.look(["q0"])
     assert ready.look(["q0"])
