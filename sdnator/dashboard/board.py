@@ -137,7 +137,7 @@ class Board:
         """What an enforcer said; `enforcer` is its app id."""
         place = confirmation.switch
         with self.lock:
-            where = place if enforcer == SWITCHES else place_text(enforcer, place)
+            where = f"switch {place}" if enforcer == SWITCHES else place_text(enforcer, place)
             name = f"{confirmation.id} {where}"
             text = confirmation.state + (f": {confirmation.cause}" if confirmation.cause else "")
             self.answers.pop(name, None)
@@ -253,7 +253,7 @@ class Board:
 
     def threshold(self) -> float | None:
         """The score from which Kitsune calls a packet anomalous."""
-        value = self.health.get("kitsune", {}).get("app", {}).get("line")
+        value = self.health.get("kitsune", {}).get("app", {}).get("threshold")
         return float(value) if isinstance(value, int | float) else None
 
     def _rate(self, now: float) -> None:

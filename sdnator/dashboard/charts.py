@@ -36,7 +36,7 @@ def score_chart() -> dict[str, Any]:
     line = {"type": "line", "showSymbol": True, "symbolSize": 2, "connectNulls": False, "data": []}
     return {
         "animation": False,
-        "grid": {"left": 48, "right": 16, "top": 34, "bottom": 26},
+        "grid": {"left": 48, "right": 64, "top": 34, "bottom": 26},
         "legend": {"top": 0, "left": 40, "textStyle": {"color": GREY}, "itemHeight": 8},
         "tooltip": {"trigger": "axis"},
         "xAxis": {"type": "time", **axis},
@@ -66,7 +66,7 @@ def threshold(value: float | None) -> dict[str, Any]:
         "silent": True,
         "symbol": "none",
         "lineStyle": {"color": AMBER, "type": "dashed", "width": 1.5},
-        "label": {"formatter": "threshold {c}", "position": "insideEndTop", "color": AMBER},
+        "label": {"formatter": "threshold\n{c}", "position": "end", "color": AMBER},
         "data": [] if value is None else [{"yAxis": value}],
     }
 

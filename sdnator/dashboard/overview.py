@@ -4,11 +4,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from apps.enforcement import place_text
 from apps.incidents import REMEDY_WORDS, Incident
-from sdnator.counted import counted
+from apps.messages import one_line
 from sdnator.dashboard.board import Board
 from sdnator.dashboard.texts import clock, number
 from sdnator.model_words import headline
+from sdnator.plurals import counted
 
 Level = Literal["well", "notice", "trouble"]
 _LOST: Final = ("lost", "dropped_slow", "set_aside")
@@ -16,6 +18,7 @@ _ACTION_STATES: Final = {"decided": "decided", "in_force": "in force", "over": "
 _TALKED_S: Final = 10.0
 """A list that is older says nothing of now: the switch is silent, or nobody counts."""
 _TALKERS: Final = 10
+_CAUSE: Final = 120
 _COSTS: Final = {
     "packet_in": "packet-in",
     "digests": "digest",
@@ -39,18 +42,21 @@ def health(board: Board) -> Health:
     switches = board.switches.values()
     away = [name for name, one in board.switches.items() if not (one.get("connected") and one.get("primary"))]
     if not board.switches:
-        return Health("notice", "Waiting for a switch: none has been heard of yet.")
+        return Health("notice", "Waiting for a switch: none has reported yet.")
     if away:
         verb = "is" if len(away) == 1 else "are"
         return Health("trouble", f"Switch {', '.join(away)} {verb} not under control.")
+    if idle := _idle_enforcers(board):
+        return Health("trouble", f"Blocks are not carried out everywhere: {idle}.")
     missing = [app["app_id"] for app in board.present() if "active" not in app["states"]]
     if missing:
         return Health("trouble", f"No instance of {', '.join(missing)} is active.")
-    parts = [_guarding(switches), _incidents(board), _lost(board)]
+    parts = [_guarding(switches), _incidents(board), _lost(board), *_undelivered(board)]
     model = board.model()
     if model is not None and not model.get("done"):
         parts.insert(1, f"{headline(model)}, and nobody is blocked before")
-    grave = board.open_incidents() or lost(board) or (model is not None and not model.get("done"))
+    untrained = model is not None and not model.get("done")
+    grave = board.open_incidents() or lost(board) or list(_undelivered(board)) or untrained
     text = "; ".join(parts)
     return Health("notice" if grave else "well", f"{text[:1].upper()}{text[1:]}.")
 
@@ -82,6 +88,23 @@ def _lost(board: Board) -> str:
     return f"{count:,} lost, see Machinery" if count else "nothing lost"
 
 
+def _idle_enforcers(board: Board) -> str:
+    """Enforcers besides the switches that say of themselves that they do not work, and why."""
+    said = ((app, one.get("app", {})) for app, one in board.health.items())
+    return "; ".join(
+        f"{place_text(app, str(one['place']))}: {one_line(str(one.get('problem', '')))[:_CAUSE]}"
+        for app, one in said
+        if "place" in one and one.get("enforcing") and one.get("working") is False
+    )
+
+
+def _undelivered(board: Board) -> Iterator[str]:
+    """Events that no collector will get, by the way on which they were lost."""
+    for one in board.health.get("firewall", {}).get("app", {}).get("outlets", ()):
+        if count := int(one.get("lost") or 0):
+            yield f"{counted(count, 'event')} not delivered by {one.get('name')}"
+
+
 def timeline(incident: Incident) -> list[str]:
     """What happened, in order of time: its first packet, decisions, when they were in force, the end."""
     found = [(incident.begun, "first packet")]
@@ -109,7 +132,7 @@ def asked_rows(board: Board) -> Iterator[dict[str, Any]]:
             "id": name,
             "target": f"{name}: {counted(len(asked), 'request')} in force",
             "where": ", ".join(sent) or "nothing is sent at the moment",
-            "reason": ", ".join(asked) or "nothing is asked of it: it copies no packet",
+            "reason": ", ".join(asked) or "nothing is requested from it: it copies no packets",
             "action": "",
         }
 
@@ -126,7 +149,7 @@ def talker_rows(board: Board, now: float) -> list[dict[str, Any]]:
             row = {
                 "id": f"{one.switch} {each.sender.port} {who}",
                 "sender": who,
-                "from": f"{one.switch} {each.sender.port}",
+                "from": f"{one.switch} port {each.sender.port}",
                 "bits": number(8 * each.bytes / seconds),
                 "packets": number(each.packets / seconds),
                 "share": f"{each.bytes / max(1, one.bytes):.0%}",

@@ -17,10 +17,12 @@ from sdnator.model_words import headline, model_lines
 if TYPE_CHECKING:
     from nicegui.events import GenericEventArguments
 
-    from sdnator.dashboard.acting import Acting
+    from sdnator.dashboard.operator_actions import OperatorActions
     from sdnator.dashboard.page_backend import PageBackend
 
 _SHOWN = 50
+_PAGE = 8
+"""Rows of a list that are on show at once."""
 _LISTS_SECONDS = 1.0
 """Lists change no more often: people read them, and press buttons in them."""
 _ENTRY = """
@@ -74,15 +76,26 @@ def _table(name: str, *labels: str) -> ui.table:
         }
         for label in labels
     ]
-    table = ui.table(rows=[], columns=columns, row_key="id", pagination=8)
-    table.classes(f"plain {name}").props("flat dense rows-per-page-label=rows")
+    table = ui.table(rows=[], columns=columns, row_key="id", pagination=_PAGE)
+    table.classes(f"plain {name}").props("flat dense hide-pagination rows-per-page-label=rows")
     return table
+
+
+def _fill(table: ui.table, rows: list[dict[str, Any]]) -> None:
+    """Show these rows, and a way to turn pages only where there are some."""
+    if table.rows == rows:
+        return
+    table.rows = rows
+    if len(rows) > _PAGE:
+        table.props(remove="hide-pagination")
+    else:
+        table.props("hide-pagination")
 
 
 class OverviewPanel:
     """One browser's view of what happens now."""
 
-    def __init__(self, service: "PageBackend", acting: "Acting") -> None:
+    def __init__(self, service: "PageBackend", acting: "OperatorActions") -> None:
         self._board = service.board
         self._acting = acting
         self._history_s = service.settings.history_s
@@ -96,14 +109,14 @@ class OverviewPanel:
         with ui.element("div").classes("figures q-mb-sm"):
             for name in (
                 "packets scored/s",
-                "above the threshold",
+                "at or above the threshold",
                 "open incidents",
                 "alerts",
                 "blocks and guards",
             ):
                 with ui.element("div").classes("figure"):
                     self._numbers[name] = ui.label("-").classes("number")
-                    ui.label(name).classes("name")
+                    ui.label(self._spoken(name)).classes("name")
         with ui.element("div").classes("board"):
             with _panel("Incidents", wide=True):
                 self._incidents = self._feed("incidents", "", "no incidents")
@@ -121,8 +134,8 @@ class OverviewPanel:
                 self._talkers.add_slot(
                     "no-data", '<div class="nothing">no packet has been counted for ten seconds</div>'
                 )
-            with _panel("What is asked of the switches"):
-                self._asked = self._feed("asked", "", "no switch has been heard of yet")
+            with _panel("Requests to the switches"):
+                self._asked = self._feed("asked", "", "no switch has reported yet")
             with _panel("Training"):
                 self._progress = ui.linear_progress(0.0, show_value=False).props('aria-label="training"')
                 self._model = ui.label("").classes("quiet model").style("white-space: pre-line")
@@ -140,10 +153,14 @@ class OverviewPanel:
         with _panel("Alerts"):
             self._alerts = self._feed("alerts", "", "no alerts")
 
+    def _spoken(self, figure: str) -> str:
+        """The name of a figure, with the time that it is about where it is no state of now."""
+        return f"{figure}, {self._history_s:.0f} s" if figure == "above the threshold" else figure
+
     def _feed(self, name: str, buttons: str, nothing: str) -> ui.table:
         columns = [{"name": "target", "label": "", "field": "target", "align": "left"}]
-        table = ui.table(rows=[], columns=columns, row_key="id", pagination=8)
-        table.classes(f"feed {name}").props("flat dense hide-header rows-per-page-label=rows")
+        table = ui.table(rows=[], columns=columns, row_key="id", pagination=_PAGE)
+        table.classes(f"feed {name}").props("flat dense hide-header hide-pagination rows-per-page-label=rows")
         table.add_slot("no-data", f'<div class="nothing">{nothing}</div>')
         table.add_slot("body", _ENTRY.replace("BUTTONS", buttons if self._acting.allowed else ""))
         return table
@@ -178,8 +195,7 @@ class OverviewPanel:
             self._drawn = now
             self._draw(points, limit, now)
         for name, found in rows.items():
-            if (table := self._tables()[name]).rows != found:
-                table.rows = found
+            _fill(self._tables()[name], found)
         for name, text in figures.items():
             if self._numbers[name].text != text:
                 self._numbers[name].set_text(text)
@@ -196,7 +212,7 @@ class OverviewPanel:
         }
 
     def _show_model(self, model: Mapping[str, Any] | None) -> None:
-        text = "\n".join(model_lines(model)) if model is not None else "no app has said anything of a model"
+        text = "\n".join(model_lines(model)) if model is not None else "no app has reported a model"
         if self._model.text == text:
             return
         self._model.set_text(text)
@@ -219,8 +235,7 @@ class OverviewPanel:
                 continue
             self._readings[place.name] = now, found
             rows += port_rows(place.name, before, found, now - then)
-        if self._ports.rows != rows:
-            self._ports.rows = rows
+        _fill(self._ports, rows)
 
     def _draw(self, points: tuple[list[Point], list[Point]], limit: float | None, now: float) -> None:
         highest, mean = self._chart.options["series"]
@@ -259,7 +274,7 @@ class OverviewPanel:
         over = sum(each.over for each in board.scores.bins)
         return {
             "packets scored/s": number(board.scores.rate(now)),
-            "above the threshold": number(over),
+            "at or above the threshold": number(over),
             "open incidents": number(board.open_incidents()),
             "alerts": number(board.counts["alerts"]),
             "blocks and guards": number(sum(not each.dry_run for each in board.standing())),

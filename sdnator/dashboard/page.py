@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING
 
 from nicegui import app, ui
 
-from sdnator.dashboard.acting import Acting
+from sdnator.dashboard.access_control import KEY, SIGN_IN
 from sdnator.dashboard.apps_panel import AppsPanel
 from sdnator.dashboard.archive_panel import ArchivePanel
-from sdnator.dashboard.gate import KEY, SIGN_IN
+from sdnator.dashboard.operator_actions import OperatorActions
 from sdnator.dashboard.overview_panel import OverviewPanel
 from sdnator.dashboard.queries_panel import QueriesPanel
 from sdnator.dashboard.style import STYLE
@@ -22,7 +22,7 @@ def build(service: "PageBackend") -> None:
     ui.add_css(STYLE)
     ui.colors(primary="#2f6fb3")
     session = str(app.storage.browser.get(KEY, ""))
-    acting = Acting(service, session)
+    acting = OperatorActions(service, session)
     degraded = _header(acting)
     tabs, places = _tabs()
     with ui.tab_panels(tabs, value="Overview", animated=False).classes("w-full").props("keep-alive"):
@@ -35,7 +35,7 @@ def build(service: "PageBackend") -> None:
         with ui.tab_panel(places["Switches"]).classes("q-pa-none"):
             switches = SwitchesPanel(service)
         with ui.tab_panel(places["Archive"]).classes("q-pa-none"):
-            archive = ArchivePanel(service)
+            archive = ArchivePanel(service, acting)
 
     quick = {"Overview": overview.refresh, "Machinery": apps.refresh, "Queries": queries.refresh}
 
@@ -60,12 +60,13 @@ def build(service: "PageBackend") -> None:
         elif tabs.value == "Archive":
             await archive.open()
 
+    overview.refresh()  # who opens the page is not told for a moment that nothing is blocked
     ui.timer(1 / service.settings.frames, refresh)
     ui.timer(3.0, refresh_slowly)
     tabs.on_value_change(refresh_slowly)
 
 
-def _header(acting: Acting) -> ui.label:
+def _header(acting: OperatorActions) -> ui.label:
     """The header; returns its place for what is degraded."""
     with ui.header(elevated=False).classes("items-center bar"):
         ui.label("SDNator").classes("text-weight-medium text-subtitle1")

@@ -51,6 +51,7 @@ class QueriesPanel:
                     rows=[], columns=_columns("operator", "runs", "why"), row_key="id"
                 ).props("flat dense hide-pagination :rows-per-page-options=[0]")
                 self._operators.classes("plain operators")
+                self._operators.add_slot("no-data", '<div class="nothing">no plan has been asked for</div>')
         ui.context.client.on_disconnect(self._stop)
 
     def refresh(self) -> None:
@@ -90,7 +91,7 @@ class QueriesPanel:
         except (BadInput, DueError) as error:
             self._said.set_text(str(error))
             return
-        self._said.set_text("the adapter is asked …")
+        self._said.set_text("asking the adapter …")
 
     def _stop(self) -> None:
         self._end()

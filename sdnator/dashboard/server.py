@@ -88,11 +88,11 @@ def serve(
     from nicegui import ui
     from starlette.middleware.sessions import SessionMiddleware
 
-    from sdnator.dashboard.gate import Gate
+    from sdnator.dashboard.access_control import AccessControl
     from sdnator.dashboard.page import build
 
     app = FastAPI(openapi_url=None)
-    app.add_middleware(Gate, sessions=service.sessions, noted=service.note)
+    app.add_middleware(AccessControl, sessions=service.sessions, noted=service.note)
     # added last, so that it reads the cookie before the gate asks for it; forgotten with the process: who was signed in
     # signs in again
     app.add_middleware(

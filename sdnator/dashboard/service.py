@@ -173,7 +173,7 @@ class DashboardService:
         return handle
 
     def _take_up_history(self) -> None:
-        """Decisions in force and the last alerts, from the archive."""
+        """Decisions in force, what enforcers said of them, and the last alerts and incidents, from the archive."""
         try:
             items = [item for key in DECISIONS for item in self._engine.get(key)]
         except DueError as error:
@@ -182,6 +182,12 @@ class DashboardService:
         ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
         for item in ordered:
             self._tolerant(lambda one: self.board.decide([Decision.from_value(one.value)]))(item)
+        standing = [decision.id for decision in self.board.standing()]
+        said = self._engine.get({"dataKey": CONFIRMATIONS, "value.id": {"$in": standing}}) if standing else []
+        for item in sorted(said, key=lambda item: (item.timestamp, item.sequence)):
+            self._tolerant(
+                lambda one: self.board.confirm(Confirmation.from_value(one.value), sender_of(one))
+            )(item)
         since = time.time_ns() - _DAY_NS
         query = {"dataKey": "network.anomaly.kitsune.alert", "timestamp": {"$gte": since}}
         for item in self._engine.get(query)[-200:]:
@@ -208,7 +214,7 @@ class DashboardService:
         if deed == REFUSED and not self._refusals.pass_on(time.monotonic()):
             self._unnoted += 1
             return
-        # whoever is refused chose the name
+        # the name was chosen by a client that was refused
         name = "".join(one if one.isprintable() else "?" for one in who[:_NAME_CHARACTERS])
         log.info("%s: %s, from %s", name, deed, source or "the page")
         deed_done = AuditedDeed(who=name, deed=deed, source=source, unnoted=self._unnoted)
@@ -248,7 +254,7 @@ class DashboardService:
     def explain(self, key: str, told: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
         """Hear what the Sonata adapter does for a key, in the engine's thread, until what is returned is called."""
         if self._explained >= _EXPLAINED:
-            raise BadInput(f"{_EXPLAINED} pages ask already; close one")
+            raise BadInput(f"{_EXPLAINED} pages are already asking; close one")
         handler = self._tolerant(lambda item: told(item.value))
         subscriptions = [self._engine.observe(plan_key(key)).subscribe(handler)]
         self._explained += 1
@@ -309,7 +315,7 @@ def listening(host: str, port: int) -> socket.socket:
     except OSError as error:
         if not port:
             raise
-        log.warning("port %d: %s; a free one is taken", port, error.strerror)
+        log.warning("port %d: %s; using a free one", port, error.strerror)
         return socket.create_server((host, 0), family=family)
 
 

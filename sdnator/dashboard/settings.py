@@ -18,7 +18,7 @@ class DashboardOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """File with the owner's sign-in token; empty: `dashboard.token` in the state folder, made at the first start.
     $SDNATOR_DASHBOARD_TOKEN overrides both."""
     frames: float = 4.0
-    """Most updates of the page per second."""
+    """Maximum number of updates of the dashboard per second."""
     history_s: float = 120.0
     """Length of the score plot in seconds."""
 

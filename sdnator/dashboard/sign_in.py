@@ -15,7 +15,7 @@ from sdnator.rights.users import OWNER, PageUser, Users
 VARIABLE = "SDNATOR_DASHBOARD_TOKEN"
 LEAST = 16
 IDLE_SECONDS = 12 * 3600.0
-"""A browser that asks for nothing for so long signs in again."""
+"""After this long without a request a browser has to sign in again."""
 _SESSIONS = 64
 _REMEMBERED_SECONDS = 60.0
 _FREE_TRIES = 2
@@ -158,7 +158,7 @@ class Sessions:
 
     def _begun(self, name: str, user: PageUser | None, source: str, now: float) -> str:
         self._throttle.forget(source)
-        # never the browser's own number: whoever planted that would be signed in, too
+        # never the browser's own number: an attacker who planted that would be signed in, too
         key = secrets.token_urlsafe(24)
         self._signed_in[key] = _Session(name, user, now)
         while len(self._signed_in) > _SESSIONS:

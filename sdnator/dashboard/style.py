@@ -39,7 +39,7 @@ summary { cursor: pointer; list-style: none; text-decoration: underline; }
 .plain { width: 100%; }
 .plain td { white-space: normal !important; overflow-wrap: break-word; }
 .found td:last-child { overflow-wrap: anywhere; }
-.plain td:first-child { white-space: nowrap !important; }
+.plain td:first-child, .plain td.text-right { white-space: nowrap !important; }
 .q-table__card { background: transparent !important; }
 .choice { min-width: 150px; }
 .nothing { padding: 8px 4px; opacity: .7; }
@@ -49,6 +49,9 @@ summary { cursor: pointer; list-style: none; text-decoration: underline; }
   .figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
   .nicegui-content { padding: 8px; gap: 8px; }
   .q-tab__icon { display: none; } .q-tab { padding: 0 7px; min-width: 0; } .q-tab__label { font-size: .8rem; }
+  .bar .q-btn__content .block { display: none; } .bar { gap: 4px; padding: 2px 8px; flex-wrap: nowrap; }
+  .bar .who { overflow: hidden; text-overflow: ellipsis; white-space: nowrap; min-width: 0; }
+  .plain td, .plain th { padding: 4px 5px !important; } .plain th { white-space: normal !important; }
   .entry { flex-wrap: wrap; } .entry .text { flex-basis: 70%; }
   .entry .side { margin-left: 14px; }
 }

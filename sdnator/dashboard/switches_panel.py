@@ -37,7 +37,7 @@ class SwitchesPanel:
                     self._state = ui.label("").classes("quiet")
                 self._fault = ui.label("").classes("fault")
             with ui.element("div").classes("panel"):
-                ui.label("What entries have counted").classes("panel-title")
+                ui.label("Counters of entries").classes("panel-title")
                 columns = _columns(
                     ("packets", "right"), ("bytes", "right"), ("entry", "left"), ("action", "left")
                 )
@@ -74,7 +74,7 @@ class SwitchesPanel:
         with self._board.lock:
             state = self._board.switches.get(name, {})
         if not state:
-            return "its controller has said nothing yet"
+            return "its controller has not reported yet"
         rank = "primary" if state.get("primary") else "backup"
         joined = f"connected, {rank}" if state.get("connected") else "not connected"
         sent, lost = number(int(state.get("packet_in", 0))), number(int(state.get("lost", 0)))

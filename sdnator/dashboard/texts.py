@@ -30,7 +30,7 @@ def number(value: float) -> str:
 def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     """A decision for the list."""
     until = f"until {clock(one.expires)}" if one.expires else "without end"
-    said = ", ".join(f"{switch}: {text}" for switch, text in answers.items())
+    said = _places_said(answers)
     where = "all switches" if one.switch in ("", "*") else one.switch
     # without any answer nobody knows: the page may be younger than the block
     nowhere = bool(answers) and not any(text.startswith(_STANDING) for text in answers.values())
@@ -52,6 +52,19 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
     }
 
 
+def _places_said(answers: dict[str, str]) -> str:
+    """Where a decision is in force; who has refused it and why, or has ended it."""
+    stands = sorted(place for place, text in answers.items() if text.startswith(_STANDING))
+    found = [f"in force: {', '.join(stands)}"] if stands else []
+    for place, text in sorted(answers.items()):
+        state, _, cause = text.partition(": ")
+        if state == "failed":
+            found.append(f"{place} refused it: {cause}" if cause else f"{place} refused it")
+        elif place not in stands:
+            found.append(f"{place}: {state}")
+    return "; ".join(found)
+
+
 def alert_row(one: Alert, number: int) -> dict[str, Any]:
     """An alert for the list."""
     sender = one.sender
@@ -61,7 +74,7 @@ def alert_row(one: Alert, number: int) -> dict[str, Any]:
         "target": who,
         "address": sender.ip or sender.mac,
         "where": f"{clock(one.event_time)} · {sender.switch} port {sender.port} · score {one.peak_score:.1f} "
-        f"· {one.over} of {one.packets} packets above the threshold",
+        f"· {one.over} of {one.packets} packets at or above the threshold",
         "reason": one.reason,
     }
 

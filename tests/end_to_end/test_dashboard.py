@@ -162,7 +162,7 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
 
     def told():
         done = operator.run("blocks", "add", ADDRESS, "--reason", "a test")
-        return done.returncode == 0 or "blocked already" in done.stderr
+        return done.returncode == 0 or "already blocked" in done.stderr
 
     until(told)
     until(lambda: in_switch(operator, "block_src", ADDRESS))
@@ -330,7 +330,7 @@ def by_a_link(operator, page):
     page.find(".who", "owner, operator")
     page.driver.delete_all_cookies()
     page.driver.get(link)
-    page.find(".fault", "was used")
+    page.find(".fault", "has been used")
 
 
 def look_around(page):

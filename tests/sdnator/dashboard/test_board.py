@@ -148,7 +148,7 @@ def test_apps_that_came_and_went_are_no_news_but_missing_parts_are():
 def test_the_line_is_kitsunes_own():
     board = Board()
     assert board.threshold() is None
-    board.healthy("kitsune", {"app": {"line": 1.25}}, 1.0)
+    board.healthy("kitsune", {"app": {"threshold": 1.25}}, 1.0)
     assert board.threshold() == 1.25
 
 

@@ -55,6 +55,22 @@ def test_a_missing_part_and_training_are_said():
     assert "training 43 %, about 3 min left, and nobody is blocked before" in health(found).text
 
 
+def test_an_enforcer_that_cannot_work_and_lost_events_are_said():
+    """Nobody should believe that a host drops what it does not, or that the SIEM has been told."""
+    found = board()
+    idle = {"place": "gateway", "enforcing": True, "working": False, "problem": "no CAP_NET_ADMIN"}
+    found.healthy("nftables", {"app": idle}, 2.0)
+    told = health(found)
+    assert told.level == "trouble"
+    assert told.text == "Blocks are not carried out everywhere: nftables gateway: no CAP_NET_ADMIN."
+    found.healthy("nftables", {"app": idle | {"working": True}}, 3.0)
+    outlets = [{"name": "syslog", "delivered": 5, "lost": 2}, {"name": "eve_file", "delivered": 7, "lost": 0}]
+    found.healthy("firewall", {"app": {"outlets": outlets}}, 3.0)
+    told = health(found)
+    assert (told.level, "2 events not delivered by syslog" in told.text) == ("notice", True)
+    assert "eve_file" not in told.text
+
+
 def test_commands_that_look_on_are_no_apps():
     """`observe` and the commands of an operator come and go; nothing is missing when they have gone."""
     found = board()
@@ -116,7 +132,7 @@ def test_top_talkers_are_rates_of_the_last_window_and_go_when_nothing_comes():
         found.talks(window, 5.0)
     rows = talker_rows(found, 6.0)
     assert [(one["from"], one["sender"], one["bits"], one["share"]) for one in rows] == [
-        ("s2 2", "10.0.0.1", "36.0 k", "50%"),
-        ("s1 2", "10.0.0.1", "4,000", "50%"),
+        ("s2 port 2", "10.0.0.1", "36.0 k", "50%"),
+        ("s1 port 2", "10.0.0.1", "4,000", "50%"),
     ]
     assert talker_rows(found, 60.0) == []

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+from apps.messages import Confirmation, Decision, Target
 from due import Item
 from sdnator.dashboard import service
 from sdnator.dashboard.service import CAPABILITIES, INTERESTS, DashboardService, listening
@@ -42,6 +43,30 @@ def test_an_archived_item_that_nobody_understands_does_not_keep_the_pages_from_s
     dashboard = DashboardService(cast("Any", Archive()), Settings())
     dashboard._take_up_history()
     assert dashboard.health()["misunderstood"] == len(service.DECISIONS) + 2
+
+
+def test_a_page_that_starts_later_knows_where_a_block_is_in_force():
+    """From the archive: enforcers say it once."""
+    target = Target(kind="ip", address="192.0.2.1")
+    block = Decision(
+        id="d1", action="block", switch="*", target=target, reason="r", event_time=1, expires=0
+    )  # fmt: skip
+    said = Confirmation(
+        id="d1", switch="gateway", state="installed", action="block", target=target, event_time=1
+    )  # fmt: skip
+    key = "network.confirmation.nftables.gateway"
+    archived = {
+        service.DECISIONS[0]: [Item(service.DECISIONS[0], block.to_value(), 1, 1, "firewall", "i", 1)],
+        service.CONFIRMATIONS: [Item(key, said.to_value(), 2, 1, "nftables", "i", 1)],
+    }
+
+    class Kept:
+        def get(self, query):
+            return archived.get(query if isinstance(query, str) else query["dataKey"], [])
+
+    dashboard = DashboardService(cast("Any", Kept()), Settings())
+    dashboard._take_up_history()
+    assert dict(dashboard.board.answers) == {"d1 nftables gateway": "installed"}
 
 
 @pytest.mark.parametrize(

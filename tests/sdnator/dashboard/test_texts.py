@@ -16,9 +16,34 @@ def test_blocks_are_undone_and_guards_released_but_those_of_the_settings_stay(ac
     one = Decision(
         id="d", action=action, switch="*", target=target, reason="r", event_time=1, expires=expires
     )
-    row = decision_row(one, {"s1": "installed"})
-    assert (row["undo"], row["said"]) == (button, "s1: installed")
+    row = decision_row(one, {"switch s1": "installed"})
+    assert (row["undo"], row["said"]) == (button, "in force: switch s1")
     assert row["where"].startswith("all switches")
+
+
+def test_a_row_says_where_it_is_in_force_and_who_has_refused_it():
+    """In words of operators: what a switch calls its own entry is no news."""
+    one = Decision(
+        id="d",
+        action="block",
+        switch="*",
+        target=Target(kind="ip", address="192.0.2.1"),
+        reason="r",
+        event_time=1,
+        expires=2,
+    )
+    answers = {
+        "switch s1": "exists: table ingress.block_src already has an entry for (src=Exact(value=1))",
+        "nftables gateway": "installed",
+        "webhook_enforcer edge": "failed: it is our printer",
+    }
+    row = decision_row(one, answers)
+    assert (
+        row["said"]
+        == "in force: nftables gateway, switch s1; webhook_enforcer edge refused it: it is our printer"
+    )
+    assert row["word"] == "block"
+    assert decision_row(one, {"switch s1": "removed"})["said"] == "switch s1: removed"
 
 
 def test_only_what_evidence_led_to_can_be_called_a_false_alarm():

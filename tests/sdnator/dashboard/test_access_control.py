@@ -15,7 +15,7 @@ from starlette.routing import Route, WebSocketRoute
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from sdnator.dashboard.gate import Gate
+from sdnator.dashboard.access_control import AccessControl
 from sdnator.dashboard.server import Guard
 from sdnator.dashboard.sign_in import Sessions
 from sdnator.rights.sign_in_link import FILE, new_link
@@ -47,7 +47,9 @@ class Door:
                 Middleware(
                     SessionMiddleware, secret_key="x" * 32, session_cookie="sdnator", same_site="strict"
                 ),
-                Middleware(Gate, sessions=self.sessions, noted=lambda *words: self.noted.append(words)),
+                Middleware(
+                    AccessControl, sessions=self.sessions, noted=lambda *words: self.noted.append(words)
+                ),
             ],
         )
         self.server = uvicorn.Server(uvicorn.Config(Guard(app, ()), log_level="warning"))

@@ -1,6 +1,6 @@
 """The door of the pages: who has not signed in gets the sign-in form and nothing else.
 
-browser ──► Guard (names, other sites) ──► cookie ──► Gate ─┬─ /sign-in, /sign-out, /link/…  answered here
+browser ──► Guard (names, other sites) ──► cookie ──► AccessControl ─┬─ /sign-in, /sign-out, /link/…  answered here
                                                            ├─ signed in                     the pages
                                                            └─ else                          to /sign-in, or 401
 """
@@ -58,7 +58,7 @@ Noted = Callable[[str, str, str], None]
 """Who, what they did at the door, and from where."""
 
 
-class Gate:
+class AccessControl:
     """ASGI, within the middleware that reads the cookie into `scope["session"]`.
 
     Args:
@@ -115,7 +115,7 @@ class Gate:
         source = request.client.host if request.client is not None else ""
         await asyncio.sleep(self._sessions.delay_s(source, name, time.monotonic()))
         if name and self._waiting >= _MOST_WAITING:
-            return _form("too many sign in just now: try again, or use the token", 503)
+            return _form("too many people are signing in just now: try again, or use the token", 503)
         self._waiting += 1
         try:
             if name:
@@ -137,7 +137,7 @@ class Gate:
         source = request.client.host if request.client is not None else ""
         key = self._sessions.by_link(request.url.path.removeprefix(LINK), source, time.monotonic())
         if not key:
-            return _form("this link was used, or a newer one was made: `sdnator user link`", 401)
+            return _form("this link has been used, or a newer one was created: run `sdnator user link`", 401)
         return self._begin(request, key, "signed in by a link", source)
 
     def _begin(self, request: Request, key: str, what: str, source: str) -> Response:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from nicegui import ui
 
-from sdnator.dashboard.gate import SIGN_IN
+from sdnator.dashboard.access_control import SIGN_IN
 
 if TYPE_CHECKING:
     from apps.messages import Answer
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _ANSWER_SECONDS = 10.0
 
 
-class Acting:
+class OperatorActions:
     """One browser's right to act."""
 
     def __init__(self, service: "PageBackend", session: str) -> None:
