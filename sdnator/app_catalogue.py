@@ -70,7 +70,7 @@ class CataloguedApp:
 
         found: type = self._held("Settings", type)
         if not issubclass(found, msgspec.Struct):
-            raise BadInput(f"{self._place()}: Settings is no msgspec.Struct")
+            raise BadInput(f"{self._place()}: Settings is not a msgspec.Struct")
         return found
 
     @property

@@ -29,7 +29,7 @@ def _lines() -> Iterator[str]:
     )
     yield from (".SH SYNOPSIS", ".B sdnator", ".I COMMAND", "[ARGUMENTS] [OPTIONS]")
     yield ".SH DESCRIPTION"
-    yield _text("Each command tells its arguments and options with `--help`.")
+    yield _text("Each command shows its arguments and options with `--help`.")
     texts = {name: text for name, (_, text) in COMMANDS.items()}
     texts["replay"] = "Replay a capture through switch, controller, Kitsune, Sonata adapter and firewall."
     shown = {name for names in GROUPS.values() for name in names}

@@ -34,25 +34,25 @@ def model_lines(model: Mapping[str, Any]) -> Iterator[str]:
         yield f"  {port['name']}: {int(port['packets']):,} packets of training"
     if beside := model.get("beside"):
         yield (
-            f"  beside it another one trains: {int(beside['packets']):,} of {int(beside['wanted']):,} packets, then "
+            f"  beside it a second model trains: {int(beside['packets']):,} of {int(beside['wanted']):,} packets, then "
             f"{int(beside['compared']):,} of {int(beside['to_compare']):,} are compared"
         )
     share, limit = model.get("drift_share"), model.get("drift_limit")
     if share is not None and limit is not None:
         yield (
-            f"  last day: {share:.1%} of benign packets over what 1 % of training exceeded, in "
+            f"  last day: {share:.1%} of benign packets scored above what 1 % of training exceeded, in "
             f"{int(model.get('drift_blocks', 0))} half hours; drift from {limit:.0%} on"
         )
     if model.get("drifted"):
         yield (
-            "  the network is not what it was in training: `sdnator model retrain --beside` trains another model, "
+            "  the network is not what it was in training: `sdnator model retrain --beside` trains a second model, "
             "which takes over if it is no worse"
         )
 
 
 def _left(seconds: float | None, packets: int) -> str:
     if seconds is None:
-        return "waiting for packets" if not packets else "no telling how long it will take"
+        return "waiting for packets" if not packets else "time left unknown"
     if seconds < 90:
         return f"about {max(1, round(seconds))} s left"
     if seconds < 5_400:

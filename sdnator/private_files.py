@@ -38,7 +38,7 @@ def _holds(path: Path, text: str) -> bool:
 
 
 def kept_secret(path: Path) -> str:
-    """The secret in a file of mode 0600; made at the first call, and anew where others can read the file.
+    """The secret in a file of mode 0600; made at the first call, and again if others can read the file.
 
     Raises OSError.
     """

@@ -243,7 +243,7 @@ def keys() -> str:
     lines: list[str] = []
     for name, module in {"coordinator": "coordinator.service", **SERVICES, **ENFORCER_SERVICES}.items():
         service = import_module(module)
-        lines += [f"## {name}", "", "Can make:", ""]
+        lines += [f"## {name}", "", "Can produce:", ""]
         made = ((_code(one.key), one.delivery, one.archive) for one in service.CAPABILITIES)
         lines += [table(("key", "delivery", "archived"), made), "", "Wants:", ""]
         lines += [f"- {_code(one.key)}{when}" for one, when in _interests(service)]
@@ -278,7 +278,7 @@ def _interests(service: Any) -> Iterator[tuple[Any, str]]:
 def _packets() -> Iterator[str]:
     packets = import_module("apps.packets")
     texts = dict(re.findall(r'^    "(\w+)": "\w+",(?:  # (.*))?$', inspect.getsource(packets), re.MULTILINE))
-    yield "A record batch: one numpy array for each column, all equally long. -1 means absent, unless stated otherwise."
+    yield "A record batch: one numpy array per column, all of the same length. -1 means absent, unless stated otherwise."
     yield ""
     rows = (
         (_code(name), _code(dtype), texts.get(name, "")) for name, dtype in packets.PACKET_COLUMNS.items()

@@ -11,12 +11,12 @@ from apps.messages import Decision, Exhibit, Ground, writer_of
 from due import Item
 from sdnator.blocks.blocks_archive import find
 from sdnator.blocks.blocks_places import PlaceAnswer, action_word, last_answers, places_words
-from sdnator.blocks.five_lines import five_lines
+from sdnator.blocks.decision_summary import five_lines
 from sdnator.blocks.lessons import ground_words, lesson_lines, lessons_in_force
-from sdnator.counted import counted
 from sdnator.errors import BadInput
 from sdnator.incidents.incidents_archive import incident_of
 from sdnator.notation import local_time
+from sdnator.plurals import counted
 
 _SHOWN = 200
 

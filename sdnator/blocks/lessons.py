@@ -30,7 +30,7 @@ def lesson_lines(lesson: FalseAlarm) -> Iterator[str]:
     yield f"{lesson.id} was called a false alarm on {_day(lesson.event_time)}{why}; until {_day(lesson.expires)}:"
     for ground in lesson.grounds:
         yield f"  {ground_words(ground)} counts {WEIGHT:g} of its weight, and only beside other evidence"
-    yield f"  take it back: sdnator blocks false-alarm {lesson.id} --revoke"
+    yield f"  revoke: sdnator blocks false-alarm {lesson.id} --revoke"
 
 
 def ground_words(ground: Ground) -> str:

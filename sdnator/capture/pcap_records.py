@@ -100,7 +100,9 @@ class GunzipStream(io.RawIOBase):
                 self._packed += len(packed)
             self._rest = b""
             if self.delivered > max(BOMB_BYTES, self._packed * MAX_RATIO):
-                self.fault = f"the gzip stream unpacks to over {MAX_RATIO} times its size, as no capture does"
+                self.fault = (
+                    f"the gzip stream unpacks to more than {MAX_RATIO} times its size, as no capture does"
+                )
                 return b""
             if not packed:
                 self.fault = "" if self._fresh else "the gzip stream ends too early"
@@ -128,7 +130,7 @@ def read_pcap(stream: BinaryIO, magic: bytes) -> Iterator[CapturedFrame]:
     order, tick = PCAP_MAGICS[magic]
     header = stream.read(20)
     if len(header) < 20:
-        raise Damage(0, "the file header is not whole")
+        raise Damage(0, "the file header is incomplete")
     link = struct.unpack(f"{order}16xI", header)[0] & 0xFFFF
     if link != LINK_ETHERNET:
         raise WrongLink(link)
@@ -137,11 +139,11 @@ def read_pcap(stream: BinaryIO, magic: bytes) -> Iterator[CapturedFrame]:
     offset = 24
     while head := read(16):
         if len(head) < 16:
-            raise Damage(offset, "the header of a packet is not whole")
+            raise Damage(offset, "the header of a packet is incomplete")
         seconds, fraction, captured, length = unpack(head)
         if captured > MAX_FRAME or length > MAX_FRAME:
             raise Damage(
-                offset, f"a packet of {max(captured, length)} bytes is announced, which no capture holds"
+                offset, f"a packet of {max(captured, length)} bytes is announced, more than any capture holds"
             )
         data = read(captured)
         if len(data) < captured:
@@ -179,7 +181,7 @@ def read_pcapng(stream: BinaryIO) -> Iterator[CapturedFrame]:
         if not start:
             return
         if len(start) < 12:
-            raise Damage(offset, "the header of a block is not whole")
+            raise Damage(offset, "the header of a block is incomplete")
         if start[:4] == PCAPNG_MAGIC:
             section = _Section(_section_order(start[4:], offset))
             kind, head = _SECTION, section.head
@@ -190,7 +192,7 @@ def read_pcapng(stream: BinaryIO) -> Iterator[CapturedFrame]:
 def _section_order(head: bytes, offset: int) -> tuple[str, bytes]:
     orders = {b"\x1a\x2b\x3c\x4d": ">", b"\x4d\x3c\x2b\x1a": "<"}
     if len(head) < 8 or head[4:] not in orders:
-        raise Damage(offset, "a section header is not whole")
+        raise Damage(offset, "a section header is incomplete")
     return orders[head[4:]], head
 
 
@@ -198,7 +200,7 @@ def _block(stream: BinaryIO, head: bytes, order: str, offset: int) -> tuple[int,
     """Length of the block and its body; `head` is its length field and the four bytes behind it."""
     (size,) = struct.unpack(f"{order}I", head[:4])
     if size < 12 or size % 4 or size > MAX_BLOCK:
-        raise Damage(offset, f"a block of {size} bytes is announced, which cannot be")
+        raise Damage(offset, f"a block of {size} bytes is announced, which is impossible")
     if size == 12:
         body, tail = b"", head[4:]
     else:
@@ -222,7 +224,7 @@ class _Section:
         if len(self.interfaces) >= MAX_INTERFACES:
             raise Damage(offset, f"more than {MAX_INTERFACES:,} interfaces are described")
         if len(body) < 8:
-            raise Damage(offset, "the description of an interface is not whole")
+            raise Damage(offset, "the description of an interface is incomplete")
         link, snap_length = struct.unpack(f"{self.order}H2xI", body[:8])
         ticks, seconds = 1_000_000, 0
         for code, value in self._options(body[8:]):
@@ -245,7 +247,7 @@ class _Section:
         layout = {_PACKET: "5I", _OLD_PACKET: "H2x4I", _SIMPLE_PACKET: "I"}[kind]
         start = struct.calcsize(f"{self.order}{layout}")
         if len(body) < start:
-            raise Damage(offset, "the header of a packet is not whole")
+            raise Damage(offset, "the header of a packet is incomplete")
         fields = struct.unpack_from(f"{self.order}{layout}", body)
         interface = self._interface(0 if kind == _SIMPLE_PACKET else fields[0], offset)
         if kind == _SIMPLE_PACKET:  # carries no time: that of the packet before it
@@ -257,7 +259,7 @@ class _Section:
                 raise Damage(offset, "the time of a packet is out of range")
         if captured > MAX_FRAME or length > MAX_FRAME:
             raise Damage(
-                offset, f"a packet of {max(captured, length)} bytes is announced, which no capture holds"
+                offset, f"a packet of {max(captured, length)} bytes is announced, more than any capture holds"
             )
         if captured > len(body) - start:
             raise Damage(offset, f"a packet has {len(body) - start} of its {captured} bytes")

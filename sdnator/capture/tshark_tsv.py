@@ -130,7 +130,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[TsharkRow]:
             for number, line in numbered:
                 yield _row(path, number, line.rstrip("\r\n").split("\t"))
         except (UnicodeDecodeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
-            raise MalformedTsv(f"{path}: not a whole table ({error}); copy or write it again") from None
+            raise MalformedTsv(f"{path}: an incomplete table ({error}); copy or write it again") from None
         except OSError as error:
             raise MissingTsv(f"{path}: cannot be read ({error.strerror}); copy it again") from None
 
@@ -192,7 +192,7 @@ def _open(path: Path) -> TextIO:
     except FileNotFoundError:
         raise MissingTsv(f"{path}: no such file; check the path of the table") from None
     except OSError as error:
-        raise MissingTsv(f"{path}: cannot be read ({error.strerror}); give a table of tshark") from None
+        raise MissingTsv(f"{path}: cannot be read ({error.strerror}); give a tshark table") from None
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:
@@ -201,7 +201,7 @@ def _lines(path: Path, file: TextIO) -> Iterator[str]:
         number += 1
         if len(line) > MAX_LINE:
             raise MalformedTsv(
-                f"{path}: line {number:,} is longer than {MAX_LINE:,} characters; this is not a table of tshark"
+                f"{path}: line {number:,} is longer than {MAX_LINE:,} characters; this is not a tshark table"
             )
         yield line
 

@@ -12,8 +12,10 @@ from due.keys import Key
 from sdnator.config import config_file
 from sdnator.errors import BadInput
 from sdnator.private_files import write_private_json
+from sdnator.rights.audit_trail import note
 from sdnator.rights.granting import OPERATOR, is_dangerous
 from sdnator.rights.identities import Identities, credential_file
+from sdnator.rights.keeping import keeps_archives
 from sdnator.up import running
 
 app = typer.Typer(help="Apps that the pipeline does not start: their credentials.", no_args_is_help=True)
@@ -24,8 +26,12 @@ def enrol(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Its app id.")],
     publish: Annotated[list[str], typer.Option(metavar="KEY", help="Key pattern that it may publish.")] = [],  # noqa: B006
     observe: Annotated[list[str], typer.Option(metavar="KEY", help="Key pattern that it may observe.")] = [],  # noqa: B006
+    read: Annotated[
+        list[str], typer.Option(metavar="KEY", help="Key pattern that it may read from the archive.")
+    ] = [],  # noqa: B006
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The credential file; default: NAME.credential.json.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Credential file to write; default: NAME.credential.json."),
     ] = None,
     *,
     command: Annotated[
@@ -35,16 +41,19 @@ def enrol(
     """Give an app of yours a credential, with rights for these keys; enrol it again to change them.
 
     The app reads the file that $DUE_CREDENTIAL names, or takes it as `--engine FILE`. A running pipeline knows the
-    credential within a second or two.
+    credential within a second or two. From the archive it reads what it wrote itself, and the keys of --read: from
+    MongoDB itself, otherwise by GET /get of the Coordinator, with its password as token.
 
     Exit codes: 0 written, 2 a key is malformed, commands something, or the file cannot be written.
 
     Example: sdnator app enrol my_detector --publish 'network.anomaly.my_detector.**' --observe 'network.packets.**'
     """
-    rights = Rights(app=name, publish=_checked(publish), observe=_checked(observe))
+    rights = Rights(app=name, publish=_checked(publish), observe=_checked(observe), read=_checked(read))
     for key in () if command else rights.publish:
         if is_dangerous(key, name):
-            raise BadInput(f"--publish {key}: that commands something, or is another part's; add --command")
+            raise BadInput(
+                f"--publish {key}: this key commands something or belongs to another part; add --command to grant it"
+            )
     identities = Identities(running.state_folder())
     with identities.changing():
         known = identities.all.get(name)
@@ -53,10 +62,16 @@ def enrol(
         made = identities.put(name, rights, enrolled=True)
     path = (out or Path(f"{name}.credential.json")).absolute()
     try:
-        write_private_json(path, credential_file(identities.url(_server(), name), "", made))
+        write_private_json(
+            path, credential_file(identities.url(_server(), name), _archive(identities, name), made)
+        )
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror}") from None
-    typer.echo(f"{name} may publish {_shown(rights.publish)} and observe {_shown(rights.observe)}")
+    granted = (
+        f"publish {_shown(rights.publish)}; observe {_shown(rights.observe)}; read {_shown(rights.read)}"
+    )
+    note(f"enrolled app {name}: {granted}")
+    typer.echo(f"{name} may {granted}")
     typer.echo(f"its credential: {path}; start it with DUE_CREDENTIAL={path}")
 
 
@@ -73,7 +88,12 @@ def list_apps(
     }
     if as_json:
         shown = {
-            name: {"enrolled": one.enrolled, "publish": one.rights.publish, "observe": one.rights.observe}
+            name: {
+                "enrolled": one.enrolled,
+                "publish": one.rights.publish,
+                "observe": one.rights.observe,
+                "read": one.rights.read,
+            }
             for name, one in rows.items()
         }
         typer.echo(json.dumps(shown))
@@ -83,13 +103,14 @@ def list_apps(
         typer.echo(f"{name} ({kind})")
         typer.echo(f"  publishes {_shown(one.rights.publish)}")
         typer.echo(f"  observes  {_shown(one.rights.observe)}")
+        typer.echo(f"  reads     {_shown(one.rights.read)}")
     if not rows:
-        typer.echo("no app has a credential: `sdnator up` makes those of its apps")
+        typer.echo("no app has a credential; `sdnator up` creates those of its own apps")
 
 
 @app.command("remove")
 def remove(name: Annotated[str, typer.Argument(metavar="NAME", help="Its app id.")]) -> None:
-    """Take an enrolled app's credential away; its connections end within a second or two.
+    """Revoke an enrolled app's credential; its connections end within a second or two.
 
     Exit codes: 0 removed, 2 no such app is enrolled.
 
@@ -101,7 +122,8 @@ def remove(name: Annotated[str, typer.Argument(metavar="NAME", help="Its app id.
         if known is None or not known.enrolled:
             raise BadInput(f"no app {name} is enrolled: see `sdnator app list`")
         identities.remove(name)
-    typer.echo(f"{name} has no credential any more")
+    note(f"revoked the credential of app {name}")
+    typer.echo(f"{name}: its credential is revoked")
 
 
 def _checked(patterns: list[str]) -> tuple[str, ...]:
@@ -123,3 +145,14 @@ def _server() -> str:
         return given or f"unix://{link}"
     embedded = link.is_symlink() and found.updates.endswith(f"@{link.readlink()}")
     return f"unix://{link}" if embedded else found.updates
+
+
+def _archive(identities: Identities, name: str) -> str:
+    """The archive of the running pipeline, where it knows apps; empty: the app has one of its own."""
+    found = running.find()
+    if found is None or not keeps_archives(found.archive):
+        return ""
+    from due.drivers.mongodb_apps import has_app  # pymongo is an extra
+    from sdnator.rights.mongo_keeper import apps_url
+
+    return apps_url(found.archive, identities, name) if has_app(found.archive) else ""

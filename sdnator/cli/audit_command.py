@@ -14,9 +14,9 @@ from sdnator.cli.plain_table import plain_table
 from sdnator.notation import instant_ns
 from sdnator.rights.audited_deed import AUDITED, AuditedDeed
 
-_INSTRUCTIONS = "network.instruction.*.firewall"
+_INSTRUCTIONS = "network.instruction.*.*"
 _PAGE = "dashboard"
-"""Its instructions stand among the deeds, with the name of whoever gave them."""
+"""Its instructions stand among the deeds, with the name of the user who gave them."""
 
 ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
 
@@ -26,13 +26,14 @@ def audit(
     since: Annotated[
         str, typer.Option(help="Since: 1h or 7d ago, or a local time such as 2024-05-01T12:00.")
     ] = "7d",
-    who: Annotated[str, typer.Option(help="Of this user or app only.", metavar="NAME")] = "",
+    who: Annotated[str, typer.Option(help="Only what this user or app did.", metavar="NAME")] = "",
     archive: ArchiveOption = "",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Show who signed in, was refused, and told the firewall what.
+    """Show the audit trail: sign-ins, refusals, changes of users and apps, instructions to firewall and detector.
 
-    Oldest first. Users of the page stand by name; `operator` is whoever uses the command line, other names are apps.
+    Oldest first. Users of the dashboard appear by name, those of the command line by the name of their Unix user; other
+    names are apps.
 
     Example: sdnator audit --since 24h
     """
@@ -41,7 +42,7 @@ def audit(
     if as_json:
         print(json.dumps({"deeds": deeds}))
     elif not deeds:
-        print("nothing was done")
+        print("nothing was done in that time")
     else:
         rows = ((_clock(one["time"]), one["who"], one["source"] or "-", one["deed"]) for one in deeds)
         print(plain_table(("time", "who", "from", "what"), rows))
@@ -50,13 +51,20 @@ def audit(
 def _deeds(archive: str, start: int) -> Iterator[dict[str, Any]]:
     query = {"timestamp": {"$gte": start}}
     items = [item for key in (AUDITED, _INSTRUCTIONS) for item in find(archive, {"dataKey": key, **query})]
+    named = {str(item.value.get("instruction") or "") for item in items if _is_deed(item)} - {""}
     for item in sorted(items, key=lambda one: one.timestamp):
+        if not _is_deed(item) and isinstance(item.value, dict) and str(item.value.get("id")) in named:
+            continue  # it stands there with the name of whoever gave it
         try:
             found = _deed(item)
         except MessageError:  # an app of somebody else wrote it
             continue
         if found is not None:
             yield found
+
+
+def _is_deed(item: Item) -> bool:
+    return ".audit." in item.key and isinstance(item.value, dict)
 
 
 def _deed(item: Item) -> dict[str, Any] | None:

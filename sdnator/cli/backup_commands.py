@@ -47,7 +47,7 @@ def backup(
 ) -> None:
     """Write archive, configuration and trained models into one file.
 
-    The pipeline may run meanwhile. Back up a MongoDB archive with its own tools (mongodump).
+    The pipeline may be running. Back up a MongoDB archive with its own tools (mongodump).
     Exit codes: 0 written, 1 it could not be written, 2 misuse.
 
     Example: sdnator backup sdnator-backup.tar.gz
@@ -137,7 +137,7 @@ def _write(file: Path, manifest: dict[str, Any], parts: dict[str, Path]) -> None
 
 
 def restore(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="As `sdnator backup` wrote it.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Backup written by `sdnator backup`.")],
     *,
     as_json: Json = False,
 ) -> None:
@@ -145,14 +145,14 @@ def restore(
 
     The archive goes into the data folder, the configuration into the configuration folder, models
     beside the archive, and the kept model into the state folder. Existing files are kept with `.before-restore` appended to their names. An archive
-    of an older version is migrated; one of a newer version is refused. No pipeline may run.
+    of an older version is migrated; one of a newer version is refused. No pipeline may be running.
     Exit codes: 0 restored, 1 a pipeline runs or something cannot be written, 2 the file cannot be used.
 
     Example: sdnator restore sdnator-backup.tar.gz
     """
     holder = running.holder(running.state_folder())
     if holder is not None:
-        raise PipelineError(f"a pipeline runs (process {holder}): stop it with `sdnator down` first")
+        raise PipelineError(f"a pipeline is running (process {holder}): stop it with `sdnator down` first")
     data = running.data_folder()
     with tempfile.TemporaryDirectory(prefix="sdnator-restore-") as folder:
         manifest, files = _unpacked(file, Path(folder))
@@ -180,10 +180,10 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
             member = tar.extractfile(_MANIFEST)
             manifest = json.loads(member.read()) if member is not None else {}
             if not isinstance(manifest, dict) or not isinstance(manifest.get("schema"), int):
-                raise BadInput(f"{file}: this is no backup of sdnator")
+                raise BadInput(f"{file}: this is not a backup of `sdnator backup`")
             if manifest["schema"] > SCHEMA:
                 raise BadInput(
-                    f"{file} was written by sdnator {manifest.get('version')}, which is newer: update this one"
+                    f"{file} was written by sdnator {manifest.get('version')}, which is newer: update sdnator"
                 )
             listed = manifest.get("files", ())
             names = [str(name) for name in listed] if isinstance(listed, list | tuple) else []
@@ -192,7 +192,9 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
     except OSError as error:
         raise BadInput(f"{file}: {error.strerror or error}") from None
     except (tarfile.TarError, EOFError, KeyError, ValueError, RecursionError) as error:
-        raise BadInput(f"{file}: this is no backup of sdnator, or it is damaged ({error})") from None
+        raise BadInput(
+            f"{file}: this is not a backup of `sdnator backup`, or it is damaged ({error})"
+        ) from None
     return manifest, {name: folder / name for name in names if _is_ours(name)}
 
 

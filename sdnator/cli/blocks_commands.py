@@ -24,7 +24,7 @@ from apps.firewall.policy.rules import AllowList
 from apps.messages import Decision, Instruction
 from apps.standing_decisions import in_force
 from due import DueError
-from sdnator.asking import AppRequest, ask
+from sdnator.app_requests import AppRequest, ask
 from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
 from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.blocks.blocks_nft import nft_sets
@@ -33,8 +33,9 @@ from sdnator.blocks.blocks_why import as_text, decision_line, life_of
 from sdnator.blocks.lessons import lesson_lines, lessons_in_force
 from sdnator.cli.plain_table import fitted
 from sdnator.cli.switch_place import Insecure, SwitchAddress, place_of
-from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
+from sdnator.plurals import counted
+from sdnator.rights.audit_trail import note
 from sdnator.up import running
 
 blocks = typer.Typer(
@@ -57,7 +58,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard outpu
 def list_blocks(
     *,
     archive: ArchiveOption = "",
-    every: Annotated[bool, typer.Option("--all", help="Include lifted ones.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Include lifted decisions.")] = False,
     nft: Annotated[
         bool, typer.Option("--nft", help="Print sets for `nft -f`, for hosts without a switch.")
     ] = False,
@@ -87,7 +88,9 @@ def _as_value(decision: Decision, answers: Collection[PlaceAnswer]) -> dict[str,
 
 @blocks.command("why")
 def why(
-    decision: Annotated[str, typer.Argument(metavar="ID", help="As `blocks list` shows it.")],
+    decision: Annotated[
+        str, typer.Argument(metavar="ID", help="ID of a decision, as shown by `blocks list`.")
+    ],
     *,
     archive: ArchiveOption = "",
     as_json: JsonOption = False,
@@ -134,11 +137,11 @@ def remove_block(
 @blocks.command("false-alarm")
 def false_alarm(
     subject: Annotated[
-        str, typer.Argument(metavar="ID", help="Of a decision, as `blocks list --all` shows it.")
+        str, typer.Argument(metavar="ID", help="ID of a decision, as shown by `blocks list --all`.")
     ],
     *,
     revoke: Annotated[
-        bool, typer.Option("--revoke", help="Take it back: its evidence counts in full again.")
+        bool, typer.Option("--revoke", help="Revoke a false alarm: its evidence counts in full again.")
     ] = False,
     reason: ReasonOption = "",
     updates: UpdatesOption = "",
@@ -146,8 +149,8 @@ def false_alarm(
 ) -> None:
     """Undo a block or guard, and let evidence of this kind about this sender count a tenth from now on.
 
-    What is taught is narrow: the sender, what found it, and the service. Whatever else the sender does counts in
-    full. It holds for `rules.false_alarm_days`.
+    The lesson is narrow: this sender, this source of evidence, this service. Everything else that the sender does
+    counts in full. The lesson holds for `rules.false_alarm_days`.
 
     Example: sdnator blocks false-alarm 1f0c2a9be771 --reason "the new backup"
     """
@@ -156,7 +159,7 @@ def false_alarm(
 
 @blocks.command("false-alarms")
 def false_alarms(*, archive: ArchiveOption = "", as_json: JsonOption = False) -> None:
-    """What was called a false alarm and still counts less.
+    """List the decisions called false alarms, whose evidence still counts less.
 
     Example: sdnator blocks false-alarms
     """
@@ -165,7 +168,7 @@ def false_alarms(*, archive: ArchiveOption = "", as_json: JsonOption = False) ->
         typer.echo(json.dumps([each.to_value() for each in lessons]))
     else:
         lines = [line for each in lessons for line in lesson_lines(each)]
-        typer.echo("\n".join(lines) or "nothing was called a false alarm")
+        typer.echo("\n".join(lines) or "no decision was called a false alarm")
 
 
 @blocks.command("panic")
@@ -186,7 +189,7 @@ def panic(
     """Lift everything at once, except the guards that the settings name.
 
     If the firewall does not answer, the decisions are lifted in Data Archives and the switch is cleared
-    over P4Runtime. Its controller, if there is one, is not primary for a moment.
+    over P4Runtime. Its controller, if there is one, loses the primary role for a moment.
 
     Example: sdnator blocks panic
     """
@@ -200,6 +203,7 @@ def panic(
     guards = _lift_in_archive(archive)
     place = place_of(switch, device_id, insecure=insecure) if switch else _running_switch()
     count = lift_in_switch(place.address, place.device_id, guards, place.security)
+    note(f"lifted all decisions and cleared the switch at {place.address}", archive=archive)
     typer.echo(f"{counted(count, 'entry')} deleted in the switch at {place.address}")
 
 

@@ -35,9 +35,9 @@ def cert_init(
     days: DaysOption = 825,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a CA, a certificate for switches, and those of the roles controller, operator and viewer.
+    """Create a CA, a certificate for switches, and one for each of the roles controller, operator and viewer.
 
-    The switch's certificate holds for this machine's name and loopback, and for each --host. Keys are files of mode
+    The switch's certificate is valid for this machine's name and loopback, and for each --host. Keys are files of mode
     0600; ca.key signs further certificates: keep it where no switch and no app can read it.
 
     Example: sdnator cert init --host s1.example.net --host 10.0.0.2
@@ -77,7 +77,7 @@ def cert_add(
     days: DaysOption = 825,
     as_json: JsonOption = False,
 ) -> None:
-    """Make one more certificate: a switch's with --host, else a client's; one of that name is replaced.
+    """Create one more certificate: a switch's with --host, otherwise a client's; one of that name is replaced.
 
     Example: sdnator cert add switch-2 --host 10.0.0.3
     """

@@ -21,7 +21,7 @@ FileArgument = Annotated[
     Path | None,
     typer.Argument(
         metavar="FILE",
-        help="Default: ./sdnator.toml, else $XDG_CONFIG_HOME/sdnator/sdnator.toml.",
+        help="Default: ./sdnator.toml, else that in $XDG_CONFIG_HOME/sdnator.",
         show_default=False,
     ),
 ]
@@ -100,7 +100,7 @@ def _plain(value: Any) -> Any:
 
 @config.command("example")
 def example() -> None:
-    """Print a configuration with every option, its text and its default, all commented out.
+    """Print a configuration with every option, its description and its default, all commented out.
 
     Exit codes: 0 printed.
 

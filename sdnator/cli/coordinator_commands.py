@@ -99,7 +99,7 @@ def flow(
     *,
     url: Url = "",
     declared: Annotated[
-        bool, typer.Option("--declared", help="Show the apps' declarations, even if a pipeline runs.")
+        bool, typer.Option("--declared", help="Show the apps' declarations, even if a pipeline is running.")
     ] = False,
     as_json: Json = False,
 ) -> None:

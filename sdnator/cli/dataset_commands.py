@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from sdnator.counted import counted
 from sdnator.errors import BadInput
+from sdnator.plurals import counted
 
 if TYPE_CHECKING:
     from sdnator.datasets.catalogue import PublicDataSet
@@ -31,7 +31,18 @@ Out = Annotated[
     Path, typer.Argument(metavar="OUT.pcap", help="Capture to write; gzipped when it ends in .gz.")
 ]
 
-NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="As `sdnator dataset list` shows it.")]
+
+def _names(begun: str) -> list[str]:
+    """For the shell's completion."""
+    from sdnator.datasets.catalogue import CATALOGUE
+
+    return [name for name in CATALOGUE if name.startswith(begun)]
+
+
+NameArgument = Annotated[
+    str,
+    typer.Argument(metavar="NAME", help="Name, as shown by `sdnator dataset list`.", autocompletion=_names),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard output.")]
 
 
@@ -60,7 +71,7 @@ def make_mirai_like(
         ),
     ] = False,
     max_packets: Annotated[
-        int, typer.Option(help="Most packets of the capture.", min=1, max=250_000)
+        int, typer.Option(help="Maximum number of packets in the capture.", min=1, max=250_000)
     ] = 250_000,
 ) -> None:
     """Generate a home network with an infected camera, like Kitsune's Mirai capture.
@@ -221,7 +232,7 @@ def fetch(
     if not wanted.verified and not given and not mirror:
         console.print("note: addresses as published, not verified", highlight=False)
     request = FetchRequest(into=place, mirror=mirror, given=given or (), whole=whole, repin=repin)
-    with _writing(place), _steps() as steps:
+    with _writing(place), _kept_when_stopped(), _steps() as steps:
         found = DataSetFetch(wanted, request, typer.echo, steps).run()
     typer.echo(f"capture  {found.capture}")
     if found.labels is not None:
@@ -331,6 +342,17 @@ def _packets(what: str) -> Iterator[Callable[[int], None]]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def _kept_when_stopped() -> Iterator[None]:
+    """Ctrl-C in a long download: whoever presses it should know that nothing has to come twice."""
+    try:
+        yield
+    except BaseException as stopped:
+        if not isinstance(stopped, Exception):
+            console.print("what has come is kept; run the command again to continue", highlight=False)
+        raise
 
 
 @contextmanager

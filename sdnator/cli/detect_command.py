@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from sdnator.counted import counted
+from sdnator.plurals import counted
 
 
 def detect_command(
@@ -57,7 +57,7 @@ def detect_command(
             help="Packets that train the autoencoders.", min=1, show_default="50000, or the data set's"
         ),
     ] = None,
-    max_ae: Annotated[int, typer.Option(help="Most features per autoencoder.", min=1)] = 10,
+    max_ae: Annotated[int, typer.Option(help="Maximum number of features per autoencoder.", min=1)] = 10,
     features: Annotated[Path | None, typer.Option(help="File for all features.", metavar="FILE.npy")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -128,7 +128,7 @@ def _show(summary: dict[str, Any], out: Path) -> None:
     )
     if summary["median"] is not None:
         print(f"scores: median {summary['median']:.3g}, 99 % below {summary['p99']:.3g}")
-    print(f"above the threshold {summary['threshold']:.3g}: {counted(summary['over'], 'packet')}")
+    print(f"at or above the threshold {summary['threshold']:.3g}: {counted(summary['over'], 'packet')}")
     print(f"alerts: {summary['alerts']:,} for {', '.join(summary['alerted_senders'][:8]) or 'none'}")
     if summary.get("auc") is not None:
         print(

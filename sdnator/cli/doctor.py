@@ -39,17 +39,20 @@ class Check:
 def doctor(
     *,
     updates: Annotated[
-        str, typer.Option(help="Data Updates server to check, too.", metavar="URL", envvar="DUE_UPDATES")
+        str, typer.Option(help="Data Updates server to check as well.", metavar="URL", envvar="DUE_UPDATES")
     ] = "",
     archive: Annotated[
-        str, typer.Option(help="Data Archives to check, too.", metavar="URL", envvar="DUE_ARCHIVE")
+        str, typer.Option(help="Data Archives to check as well.", metavar="URL", envvar="DUE_ARCHIVE")
     ] = "",
-    switch: Annotated[str, typer.Option(help="P4Runtime switch to check, too.", metavar="HOST:PORT")] = "",
+    switch: Annotated[str, typer.Option(help="P4Runtime switch to check as well.", metavar="HOST:PORT")] = "",
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="--switch names one without TLS, in a lab.")
+        bool, typer.Option("--insecure", help="The switch at --switch has no TLS (for a lab).")
     ] = False,
     security: Annotated[
-        bool, typer.Option("--security", help="Check instead who could read, say or reach more than meant.")
+        bool,
+        typer.Option(
+            "--security", help="Check security instead: who could read, publish or reach more than intended."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
@@ -165,27 +168,21 @@ def check_compiler() -> Check:
     if found is None:
         return Check(
             "C compiler",
-            "optional",
+            "missing",
             "none of $CC, cc, gcc, clang",
-            "install gcc: without it the embedded switch is slow",
+            "install gcc: the embedded switch compiles its program",
         )
     return Check("C compiler", "ok", found)
 
 
 def check_kernel() -> Check:
     """Kitsune's C kernel."""
-    import warnings
+    from apps.kitsune.kernel import KernelMissing, load_kernel
 
-    from apps.kitsune.kernel import load_kernel
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        found = load_kernel()
-    if found is None:
-        remedy = (
-            "install a C compiler and reinstall sdnator: without its kernel Kitsune is dozens of times slower"
-        )
-        return Check("Kitsune kernel", "optional", "not built", remedy)
+    try:
+        load_kernel()
+    except KernelMissing as error:
+        return Check("Kitsune kernel", "missing", str(error), "install gcc and reinstall sdnator")
     return Check("Kitsune kernel", "ok", "built and loaded")
 
 
@@ -194,7 +191,12 @@ def check_folder(name: str, folder: Path) -> Check:
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     variable = "XDG_STATE_HOME" if name.startswith("state") else "XDG_DATA_HOME"
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        return Check(name, "missing", f"{existing} cannot be written", f"set {variable} to a folder of yours")
+        return Check(
+            name,
+            "missing",
+            f"{existing} cannot be written",
+            f"set {variable} to a folder that you can write to",
+        )
     free = shutil.disk_usage(existing).free
     found = f"{folder}, {free / (1 << 30):.1f} GiB free"
     if free < _LEAST_FREE:
@@ -206,7 +208,7 @@ def check_loopback() -> Check:
     """Whether parts can listen on 127.0.0.1."""
     try:
         with socket.create_server(("127.0.0.1", 0)):
-            return Check("loopback", "ok", "127.0.0.1 can be listened on")
+            return Check("loopback", "ok", "sockets can listen on 127.0.0.1")
     except OSError as error:
         return Check(
             "loopback", "missing", f"127.0.0.1: {error.strerror}", "bring it up: `ip link set lo up`"
@@ -279,7 +281,7 @@ def check_pipeline() -> Check:
         leading = ask(found.coordinator, "/health")["leading"]
     except SdnatorError as error:
         return Check("pipeline", "missing", str(error), "see `sdnator status`")
-    return Check("pipeline", "ok", f"process {found.pid}, Coordinator {'leads' if leading else 'waits'}")
+    return Check("pipeline", "ok", f"process {found.pid}, Coordinator {'active' if leading else 'standby'}")
 
 
 def check_updates(url: str) -> Check:
@@ -354,6 +356,6 @@ def _show(checks: list[Check], *, well: bool) -> None:
         if check.remedy:
             print(f"{check.name}: {check.remedy}")
     if any(check.state == "exposed" for check in checks):
-        print("something is EXPOSED: see above for what to do")
+        print("something is EXPOSED; see above what to do")
     else:
-        print("all is as it should be" if well else "a required part is MISSING: see above for what to do")
+        print("everything is as it should be" if well else "a required part is MISSING; see above what to do")

@@ -10,9 +10,9 @@ from urllib.parse import unquote, urlsplit
 from sdnator.cli.doctor import Check
 from sdnator.config import config_file
 from sdnator.config.up_settings import SwitchPlan
-from sdnator.counted import counted
 from sdnator.errors import BadInput
 from sdnator.northbound import without_user
+from sdnator.plurals import counted
 from sdnator.redaction import redacted
 from sdnator.rights.granting import OPERATOR, is_dangerous
 from sdnator.rights.identities import Identities
@@ -21,6 +21,7 @@ from sdnator.up import running
 
 _SECRETS = (
     "identities.json",
+    "readers.json",
     "users.json",
     "dashboard.link",
     "certificates/*.key",
@@ -32,7 +33,7 @@ _SECRETS = (
 )
 _SECONDS = 5.0
 _UNIX = "unix:"
-_ELSEWHERE = ("redis://", "mongodb://")
+_ELSEWHERE = ("redis://", "mongodb://", "kafka://")
 
 
 def security_checks() -> Iterator[Check]:
@@ -42,12 +43,13 @@ def security_checks() -> Iterator[Check]:
     archive = found.archive if found is not None else config.struct("up").archive or running.default_archive()
     yield check_folder_mode(state)
     yield check_secrets(state)
-    yield check_archive_mode(archive)
+    yield check_archive_mode(archive, found)
     yield check_listeners(config)
     yield check_switches(config, found)
     yield check_page_users(state, config)
     yield check_urls(config, found)
     yield check_commanding(state)
+    yield check_readers(state)
     if found is not None:
         yield check_server_rights(found)
         yield check_coordinator_token(found)
@@ -56,10 +58,10 @@ def security_checks() -> Iterator[Check]:
 def check_folder_mode(folder: Path) -> Check:
     """Whether others may look into the state folder."""
     if not folder.exists():
-        return Check("state folder", "ok", f"{folder} is not there yet")
+        return Check("state folder", "ok", f"{folder} does not exist yet")
     if others := _others(folder):
         return Check("state folder", "exposed", f"{folder} has mode {others}", f"chmod 700 {folder}")
-    return Check("state folder", "ok", f"{folder} is its owner's alone")
+    return Check("state folder", "ok", f"only its owner can read {folder}")
 
 
 def check_secrets(folder: Path) -> Check:
@@ -69,19 +71,26 @@ def check_secrets(folder: Path) -> Check:
     if wide:
         said = f"others can read {', '.join(wide)}"
         return Check(
-            "secrets", "exposed", said, f"chmod 600 {' '.join(wide)}, and make them anew: docs/security.md"
+            "secrets", "exposed", said, f"chmod 600 {' '.join(wide)}, and create new ones: docs/security.md"
         )
-    return Check("secrets", "ok", f"{len(files)} files with credentials, each its owner's alone")
+    return Check("secrets", "ok", f"{len(files)} files with credentials, each readable by its owner alone")
 
 
-def check_archive_mode(url: str) -> Check:
-    """Whether others may read the embedded archive."""
+def check_archive_mode(url: str, found: running.Running | None = None) -> Check:
+    """Whether others may read the archive."""
+    if url.startswith("mongodb"):
+        if found is None or "app=" in urlsplit(url).query:
+            return Check("archive", "ok", f"{redacted(url)}: each app has its own collections and role")
+        said = f"{redacted(url)}: every app may read and write all of it"
+        return Check(
+            "archive", "exposed", said, "run mongod --auth, and give --archive a user that may create users"
+        )
     if not url.startswith("sqlite:"):
-        return Check("archive", "ok", f"{redacted(url)}: its server decides who reads it")
+        return Check("archive", "ok", f"{redacted(url)}: held by the process itself")
     path = Path(unquote(urlsplit(url).path))
     if path.exists() and _others(path):
         return Check("archive", "exposed", f"others can read {path}", f"chmod 600 {path}")
-    return Check("archive", "ok", f"{path} is its owner's alone")
+    return Check("archive", "ok", f"only its owner can read {path}")
 
 
 def check_listeners(config: config_file.Config) -> Check:
@@ -93,7 +102,7 @@ def check_listeners(config: config_file.Config) -> Check:
     }
     wide = [f"{name}={place}" for name, place in places.items() if not _is_local(place)]
     if wide:
-        remedy = "keep it on loopback, or put a proxy with TLS and log-in before it"
+        remedy = "keep it on loopback, or put a proxy with TLS and a login in front of it"
         return Check("listeners", "exposed", f"other machines reach {', '.join(wide)} without TLS", remedy)
     return Check("listeners", "ok", "everything listens on loopback or on sockets of the state folder")
 
@@ -108,13 +117,13 @@ def check_switches(config: config_file.Config, found: running.Running | None) ->
         if one.get("security", {}).get("insecure") and not str(one["address"]).startswith(_UNIX)
     }
     if named:
-        said = f"whoever reaches the P4Runtime port of {', '.join(sorted(named))} commands it"
+        said = f"anyone who reaches the P4Runtime port of {', '.join(sorted(named))} controls the switch"
         return Check("switches", "exposed", said, "`sdnator cert init`, and leave out insecure = true")
     return Check("switches", "ok", "P4Runtime by Unix socket, or with certificates on both sides")
 
 
 def check_page_users(state: Path, config: config_file.Config) -> Check:
-    """Whether people have names at the page, or all of them share the owner's token."""
+    """Whether people sign in to the dashboard by name, or all of them share the owner's token."""
     options = config.struct("dashboard")
     if not options.enabled:
         return Check("page", "ok", "it is not served")
@@ -128,7 +137,9 @@ def check_page_users(state: Path, config: config_file.Config) -> Check:
         return Check("page", "ok", said)
     if _is_local(options.host):
         return Check("page", "ok", "there are no users: the owner's token or link signs in, and nothing else")
-    said = f"there are no users, and dashboard.host={options.host}: all who look share the owner's token"
+    said = (
+        f"there are no users, and dashboard.host={options.host}: everybody who looks shares the owner's token"
+    )
     return Check("page", "exposed", said, "`sdnator user add NAME` for each of them")
 
 
@@ -145,7 +156,10 @@ def check_urls(config: config_file.Config, found: running.Running | None) -> Che
     )
     if bare:
         return Check(
-            "backends", "exposed", f"{', '.join(bare)}: without TLS", "use rediss:// or mongodb://…?tls=true"
+            "backends",
+            "exposed",
+            f"{', '.join(bare)}: without TLS",
+            "use rediss://, kafkas:// or mongodb://…?tls=true",
         )
     return Check("backends", "ok", "no password crosses the network without TLS")
 
@@ -164,13 +178,26 @@ def check_commanding(state: Path) -> Check:
     return Check("commanding apps", "ok", "no enrolled app may command a switch, an enforcer or an app")
 
 
+def check_readers(state: Path) -> Check:
+    """Which apps outside the pipeline may read from the archive what others wrote."""
+    named = sorted(
+        f"{name} ({', '.join(one.rights.read)})"
+        for name, one in Identities(state).all.items()
+        if one.enrolled and one.rights.read
+    )
+    said = ", ".join(named) or "no enrolled app may read from the archive what others wrote"
+    return Check("reading apps", "ok", said)
+
+
 def check_server_rights(found: running.Running) -> Check:
-    """Whether Data Updates refuses whoever has no credential."""
+    """Whether Data Updates refuses connections without a credential."""
     from due.drivers.redis_wire import Wire
     from due.errors import DueError
 
     scheme, _, rest = found.updates.partition("://")
     bare = f"{scheme}://{rest.rpartition('@')[2]}"
+    if scheme.startswith("kafka"):
+        return _check_brokers(bare)
     try:
         wire = Wire(bare)
         answer = wire.call("PUBLISH", "due:sdnator.doctor", "")
@@ -178,13 +205,25 @@ def check_server_rights(found: running.Running) -> Check:
     except DueError:
         return Check("Data Updates", "ok", "nobody connects without a credential")
     if isinstance(answer, Exception):
-        return Check("Data Updates", "ok", "without a credential nothing may be said")
-    remedy = "give the server a password, and --updates a user that may make users (ACL)"
+        return Check("Data Updates", "ok", "nothing can be published without a credential")
+    remedy = "give the server a password, and --updates a user that may create users (ACL)"
+    return Check("Data Updates", "exposed", f"{redacted(bare)} lets anybody publish", remedy)
+
+
+def _check_brokers(bare: str) -> Check:
+    from sdnator.errors import PipelineError
+    from sdnator.rights.keeping import try_updates
+
+    try:
+        try_updates(bare)
+    except PipelineError:
+        return Check("Data Updates", "ok", "nobody connects without a credential")
+    remedy = "use brokers with SASL and an authorizer, and give --updates a super user: docs/security.md"
     return Check("Data Updates", "exposed", f"{redacted(bare)} lets anybody publish", remedy)
 
 
 def check_coordinator_token(found: running.Running) -> Check:
-    """Whether the Coordinator's API refuses whoever has no token."""
+    """Whether the Coordinator's API refuses requests without a token."""
     from urllib.request import ProxyHandler, build_opener
 
     url = without_user(found.coordinator)
@@ -192,10 +231,10 @@ def check_coordinator_token(found: running.Running) -> Check:
         with build_opener(ProxyHandler({})).open(f"{url}/apps", timeout=_SECONDS):
             pass
     except HTTPError as error:
-        return Check("Coordinator", "ok", f"{url} answers {error.code} to whoever has no token")
+        return Check("Coordinator", "ok", f"{url} answers {error.code} without a token")
     except (URLError, OSError) as error:
         return Check("Coordinator", "ok", f"{url} does not answer: {error}")
-    return Check("Coordinator", "exposed", f"{url} shows anybody everything", "restart the pipeline")
+    return Check("Coordinator", "exposed", f"{url} shows everything to anybody", "restart the pipeline")
 
 
 def _others(path: Path) -> str:

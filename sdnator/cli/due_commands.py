@@ -18,10 +18,10 @@ import typer
 from sdnator.cli.item_rates import SECONDS, Rates, headline
 from sdnator.cli.live_items import live_items
 from sdnator.cli.plan_question import is_asked_of_adapter
-from sdnator.counted import counted
 from sdnator.errors import BadInput, PipelineError
 from sdnator.northbound import latest
 from sdnator.notation import brief, duration_ns, instant_ns, local_time, typed_key
+from sdnator.plurals import counted
 from sdnator.up import running
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def observe(
     updates: Updates = "",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per item and line.")] = False,
     plot: Annotated[
-        bool, typer.Option("--plot", help="A line of rates with a sparkline each second, instead of items.")
+        bool, typer.Option("--plot", help="Show rates with a sparkline, every second, instead of items.")
     ] = False,
 ) -> None:
     """Show items as they arrive.  While it runs, producers make the data on demand.
@@ -93,7 +93,7 @@ def observe(
         shown.end()
         missed, mean = lost(), rates.mean(time.monotonic())
     more = f", {missed:,} missed: they arrived faster than they could be shown" if missed else ""
-    hint = "" if rates.items else "; `sdnator keys` shows what is made"
+    hint = "" if rates.items else "; `sdnator keys` shows what is produced"
     rows = f", {rates.records:,} records" if rates.records != rates.items else ""
     print(f"sdnator: {counted(rates.items, 'item')}{rows}, {mean:,.1f} a second{more}{hint}", file=sys.stderr)
 
@@ -176,7 +176,7 @@ def get(
         str, typer.Option(help="Start: 1h or 7d ago, or a local time such as 2024-05-01T12:00.")
     ] = "",
     until: Annotated[str, typer.Option(help="End, like --since.")] = "",
-    limit: Annotated[int, typer.Option(help="Most items to show, the newest.", min=1)] = 1_000,
+    limit: Annotated[int, typer.Option(help="Maximum number of items to show, the newest.", min=1)] = 1_000,
     archive: Archive = "",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per item and line.")] = False,
 ) -> None:

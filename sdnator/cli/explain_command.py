@@ -39,7 +39,7 @@ def explain(
     insecure: Insecure = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Explain a key: who wants it, who makes it at what rate, its plan and cost, its results and their archive.
+    """Explain a key: who wants it, who produces it and at what rate, its plan and cost, its results and their archive.
 
     Example: sdnator explain network.traffic_query.sonata.new_tcp:threshold=10
     """
@@ -64,7 +64,7 @@ def _of(found: running.Running | None) -> running.Running:
 
 
 def _coordinator(url: str, key: str) -> Section:
-    """Who wants the key, who makes it, and at what rate."""
+    """Who wants the key, who produces it, and at what rate."""
     from due import Key
 
     this = Key.parse(key)
@@ -204,13 +204,13 @@ def _wanted_lines(shown: Section) -> Iterator[str]:
         rate = "" if one["frequency"] is None else f", at {one['frequency']} Hz"
         yield f"{one['app_id']} wants {one['key']}{rate}"
     if not known["wanted_by"]:
-        yield "nobody wants it; `sdnator observe` does while it runs"
+        yield "nobody wants it; `sdnator observe` would, while it runs"
     for capability, delivery, producer in dict.fromkeys(
         (one["capability"], one["delivery"], one["producer"]) for one in known["made_by"]
     ):
-        yield f"{producer} makes {capability} ({delivery})"
+        yield f"{producer} produces {capability} ({delivery})"
     if not known["made_by"]:
-        yield "no app makes it; `sdnator keys` shows what is made"
+        yield "no app produces it; `sdnator keys` shows what is produced"
     for one in known["assigned"]:
         rate = "every item" if one["frequency"] is None else f"{one['frequency']:g} Hz"
         yield f"assigned to {one['app_id']} (instance {one['active']}, epoch {one['epoch']}): {rate}"
@@ -225,6 +225,8 @@ def _plan_lines(shown: Section) -> Iterator[str]:
     if plan["state"] in ("refused", "follows"):
         yield f"{plan['state']}: {plan['reason']}"
         return
+    if "auto" in plan:
+        yield plan["auto"]["text"]
     yield "in force" if plan["state"] == "running" else "not in force; if somebody wanted it now:"
     rows = [(one["text"].removeprefix("    "), one["place"], one["why"]) for one in plan["operators"]]
     yield plain_table(("operator", "runs", "why"), rows)
@@ -264,7 +266,7 @@ def _came_lines(shown: Section) -> Iterator[str]:
         yield f"{came['overflow']:,} of the reports because a key had no cell"
     if came["late_reads"]:
         yield f"{came['late_reads']:,} cells were read too late"
-    yield f"host: the adapter takes {cost['adapter_cpu_share']:.1%} of a core for all its queries"
+    yield f"host: the adapter uses {cost['adapter_cpu_share']:.1%} of a core for all its queries"
 
 
 def _archive_lines(shown: Section) -> Iterator[str]:

@@ -23,13 +23,15 @@ def list_incidents(
     *,
     since: Annotated[
         str,
-        typer.Option(help="Reported on since: 1h or 7d ago, or a local time such as 2024-05-01T12:00."),
+        typer.Option(
+            help="Only those reported on since 1h or 7d ago, or since a local time such as 2024-05-01T12:00."
+        ),
     ] = "",
-    only_open: Annotated[bool, typer.Option("--open", help="Only those that are not over.")] = False,
+    only_open: Annotated[bool, typer.Option("--open", help="Only open incidents.")] = False,
     archive: ArchiveOption = "",
     as_json_list: JsonOption = False,
 ) -> None:
-    """Incidents, oldest first: when, what, who, whom, what was done, packets stopped.
+    """List incidents, oldest first: time, kind, attacker, victims, remedy, packets stopped.
 
     Example: sdnator incidents list --since 24h
     """
@@ -51,16 +53,18 @@ def list_incidents(
 
 @incidents.command("show")
 def show_incident(
-    name: Annotated[str, typer.Argument(metavar="ID", help="Of an incident, or of a decision made in one.")],
+    name: Annotated[str, typer.Argument(metavar="ID", help="ID of an incident, or of a decision in one.")],
     *,
     archive: ArchiveOption = "",
     as_json_object: JsonOption = False,
 ) -> None:
-    """All about one incident: evidence, decisions, packets stopped.
+    """Show everything about one incident: evidence, decisions, packets stopped.
 
     Example: sdnator incidents show 1f0c2a9be771
     """
     found = incident_of(archive, name)
     if found is None:
-        raise BadInput(f"no incident has the id {name}, or a decision with it; see `sdnator incidents list`")
+        raise BadInput(
+            f"no incident, and no decision in one, has the id {name}; see `sdnator incidents list`"
+        )
     typer.echo(json.dumps(as_json(found)) if as_json_object else "\n".join(map(fitted, as_text(found))))

@@ -1,5 +1,6 @@
 """Commands whose modules are imported when they are called: `sdnator --help` needs none of them."""
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
@@ -9,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command, get_group
 
+_INSIDE_A_PARAGRAPH = re.compile(r"(?<!\n)\n(?!\n|Exit codes: )")
 EXIT_CODES = "Exit codes: 0 done, 1 failure, 2 bad input or misuse, 130 interrupted."
 
 
@@ -27,7 +29,7 @@ class LazyGroup(TyperGroup):
             return _loaded(cmd_name, place)
         command = super().get_command(ctx, cmd_name)
         if command is not None and not self._listing:
-            _show_no_type_of_flags(command)
+            _prepare(command)
         return command
 
     def get_params(self, ctx: Any) -> Any:
@@ -73,8 +75,20 @@ def _loaded(name: str, place: str) -> Any:
         command = get_command(alone)
     command.name = name
     _tell_exit_codes(command)
-    _show_no_type_of_flags(command)
+    _prepare(command)
     return command
+
+
+def _prepare(command: Any) -> None:
+    _show_no_type_of_flags(command)
+    _let_text_flow(command)
+
+
+def _let_text_flow(command: Any) -> None:
+    """Typer breaks lines of help where the docstring does, whatever the terminal's width."""
+    command.help = _INSIDE_A_PARAGRAPH.sub(" ", command.help or "") or None
+    for inner in getattr(command, "commands", {}).values():
+        _let_text_flow(inner)
 
 
 def _tell_exit_codes(command: Any) -> None:

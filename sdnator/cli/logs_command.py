@@ -61,7 +61,7 @@ def logs(
     *,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Show new lines until Ctrl-C.")] = False,
     lines: Annotated[
-        int, typer.Option("--lines", "-n", help="Number of last lines of each part.", min=0)
+        int, typer.Option("--lines", "-n", help="Number of lines to show of each part, the last ones.", min=0)
     ] = 20,
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object per line: part and line, parsed if it is JSON.")

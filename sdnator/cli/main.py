@@ -28,7 +28,7 @@ COMMANDS = {
     ),
     "audit": (
         "sdnator.cli.audit_command:audit",
-        "Show who signed in, was refused, and told the firewall what.",
+        "Show the audit trail: sign-ins, refusals, changes of users and apps, instructions to firewall and detector.",
     ),
     "backup": (
         "sdnator.cli.backup_commands:backup",
@@ -45,7 +45,7 @@ COMMANDS = {
     ),
     "counters": (
         "sdnator.cli.switch_commands:counters",
-        "Show counters of a switch's entries, above all of blocks.",
+        "Show the counters of a switch's entries, such as the drops of each block.",
     ),
     "dataset": (
         "sdnator.cli.dataset_commands:dataset",
@@ -69,7 +69,7 @@ COMMANDS = {
     ),
     "explain": (
         "sdnator.cli.explain_command:explain",
-        "Explain a key: who wants it, who makes it at what rate, its plan and cost, its results and their archive.",
+        "Explain a key: who wants it, who produces it and at what rate, its plan and cost, its results and their archive.",
     ),
     "flow": ("sdnator.cli.coordinator_commands:flow", "Draw the data flow: producers, keys, consumers."),
     "get": (
@@ -82,7 +82,7 @@ COMMANDS = {
         "List all keys with producers, consumers and delivery.",
     ),
     "logs": ("sdnator.cli.logs_command:logs", "Show the logs of the pipeline's parts."),
-    "model": ("sdnator.cli.model_commands:model", "Kitsune's model: show it, train it anew."),
+    "model": ("sdnator.cli.model_commands:model", "Kitsune's model: show it, retrain it."),
     "observe": ("sdnator.cli.due_commands:observe", "Show items as they arrive."),
     "program": (
         "sdnator.cli.program_commands:program",
@@ -193,9 +193,9 @@ def replay(
     train: Annotated[
         int | None,
         typer.Option(
-            help="Packets to train on, one in eleven of them for the feature map.",
+            help="Packets to train on; the first eleventh of them trains the feature map.",
             min=11,
-            show_default="55000, or as the data set's publication",
+            show_default="55000, or as published with the data set",
         ),
     ] = None,
     fm_grace: Annotated[int | None, typer.Option(help="Packets that train the feature map.", min=1)] = None,
@@ -212,17 +212,17 @@ def replay(
     window: Annotated[
         int | None,
         typer.Option(
-            help="Most packets in flight.",
+            help="Maximum number of packets in flight.",
             min=1,
             max=65_536,
-            show_default="65536 while nothing can be blocked, else 128",
+            show_default="65536 while nothing can be blocked, otherwise 128",
         ),
     ] = None,
     telemetry: Annotated[
         str | None,
         typer.Option(
             help="How packet headers reach the controller: packet-in or digest.",
-            show_default="digest on the embedded switch, else packet-in",
+            show_default="digest on the embedded switch, otherwise packet-in",
         ),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for the report.", metavar="DIR")] = None,
@@ -230,13 +230,14 @@ def replay(
         Path | None, typer.Option(help="Folder to keep logs and archive in.", metavar="DIR")
     ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="--switch HOST:PORT is one without TLS, in a lab.")
+        bool, typer.Option("--insecure", help="The switch at --switch HOST:PORT has no TLS (for a lab).")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Replay a capture through switch, controller, Kitsune, Sonata adapter and firewall.
 
-    With labels or a report there are two passes: Kitsune alone, then with blocking.
+    With labels or a report there are two passes: a dry run, then with blocking.
+    Without, a dry run of a long capture goes first if that saves time.
     Exit codes: 0 replayed, 1 a part of the pipeline failed, 2 bad input or misuse.
 
     Example: sdnator replay mirai.pcap --labels mirai.labels.csv --report report

@@ -1,4 +1,4 @@
-"""`sdnator model …`: what Kitsune has learnt, and how to have it learn anew."""
+"""`sdnator model …`: what Kitsune has learnt, and how to retrain it."""
 
 import json
 import time
@@ -12,13 +12,13 @@ import typer
 from apps.kitsune.kept_model import models_aside, set_aside
 from apps.kitsune.model_file import ModelFileError, load_model
 from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder
-from sdnator.asking import AppRequest, ask
+from sdnator.app_requests import AppRequest, ask
 from sdnator.blocks.blocks_archive import archive_url
 from sdnator.errors import BadInput, PipelineError
 from sdnator.model_words import model_lines, model_of
 from sdnator.up import running
 
-model = typer.Typer(help="Kitsune's model: show it, train it anew.", no_args_is_help=True)
+model = typer.Typer(help="Kitsune's model: show it, retrain it.", no_args_is_help=True)
 
 _ANSWER_SECONDS: Final = 10.0
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard output.")]
@@ -26,7 +26,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard outpu
 
 @model.command("show")
 def show(*, as_json: JsonOption = False) -> None:
-    """What the model of the running pipeline has learnt; without one, what the kept file holds.
+    """Show what the model of the running pipeline has learnt; without one, what the kept file holds.
 
     Example: sdnator model show
     """
@@ -52,7 +52,7 @@ def show(*, as_json: JsonOption = False) -> None:
             nl=False,
         )
         typer.echo(
-            f"  kept in {path}; `sdnator up` takes it up where switches, ports and settings are the same"
+            f"  kept in {path}; `sdnator up` uses it again if switches, ports and settings are the same"
         )
     for old in aside:
         typer.echo(f"  older: {old}")
@@ -63,13 +63,13 @@ def retrain(
     *,
     beside: Annotated[
         bool,
-        typer.Option("--beside", help="Train another model beside it, which takes over if it is no worse."),
+        typer.Option("--beside", help="Train a second model beside it, which takes over if it is no worse."),
     ] = False,
 ) -> None:
-    """Throw the model away and train on the next packets; the old file is kept beside.
+    """Discard the model and train on the next packets; the old file is kept under another name.
 
-    A running Kitsune does so at once; until it has trained nobody is blocked anew. With --beside the model in use goes
-    on until the other is trained and both have scored the same packets. Without a pipeline the next `sdnator up`
+    A running Kitsune does so at once; until it has trained, nobody else is blocked. With --beside the model in use
+    stays until the other is trained and both have scored the same packets. Without a pipeline the next `sdnator up`
     trains.
 
     Example: sdnator model retrain --beside
@@ -83,9 +83,9 @@ def retrain(
         try:
             aside = set_aside(path)
         except OSError as error:
-            raise BadInput(f"{path}: {error.strerror}; the model stays") from None
+            raise BadInput(f"{path}: {error.strerror}; the model was not changed") from None
         typer.echo(
-            f"the next `sdnator up` trains anew; the old model is kept as {aside}"
+            f"the next `sdnator up` trains again; the old model is kept as {aside}"
             if aside is not None
             else f"no model is kept in {path}; the next `sdnator up` trains"
         )

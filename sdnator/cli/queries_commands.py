@@ -55,7 +55,7 @@ def templates() -> dict[str, Template]:
 def list_queries(
     *, as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False
 ) -> None:
-    """List all queries and raw streams, one a line; `queries show NAME` tells more.
+    """List all queries and raw streams, one per line; `queries show NAME` shows details.
 
     Example: sdnator queries list
     """
@@ -72,7 +72,7 @@ def list_queries(
 
 @queries.command("show")
 def show_query(
-    name: Annotated[str, typer.Argument(help="Name of a query, as `queries list` shows it.")],
+    name: Annotated[str, typer.Argument(help="Name of a query, as shown by `queries list`.")],
     *,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
@@ -119,8 +119,10 @@ def try_queries(
     capture: Annotated[
         list[Path], typer.Option(help="pcap or pcapng; several are read one after the other.")
     ],
-    most: Annotated[int, typer.Option(help="Most results to show of each query.", min=0, max=100_000)] = 100,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON line for each query.")] = False,
+    most: Annotated[
+        int, typer.Option(help="Maximum number of results to show per query.", min=0, max=100_000)
+    ] = 100,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line per query.")] = False,
 ) -> None:
     """Try the queries of a file over a capture: plan, rows of each operator, cost, results.
 
@@ -137,7 +139,9 @@ def explain_query(
     updates: Updates = "",
     empty: Annotated[
         bool,
-        typer.Option("--empty", help="Plan for a switch without other queries, even if a pipeline runs."),
+        typer.Option(
+            "--empty", help="Plan for a switch without other queries, even if a pipeline is running."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
@@ -219,7 +223,7 @@ def run_query(
         list[Path] | None, typer.Option(help="pcap or pcapng; several are read one after the other.")
     ] = None,
     since: Annotated[
-        str, typer.Option(help="Use archived packets of this time instead: 30s, 10m, 1h, 7d.")
+        str, typer.Option(help="Use archived packets of this period instead: 30s, 10m, 1h, 7d.")
     ] = "",
     archive: Annotated[
         str,
@@ -233,7 +237,7 @@ def run_query(
     master: Annotated[
         str, typer.Option(help="Where Spark runs: local[N] or spark://HOST:PORT.")
     ] = "local[2]",
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON line for each result.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line per result.")] = False,
 ) -> None:
     """Run a query over captures or the archive; results are the same as live.
 

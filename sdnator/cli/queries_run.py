@@ -24,9 +24,9 @@ from due import Item, RecordBatch
 from due.backends import open_archive
 from due.drivers.base import ArchiveDriver
 from sdnator.capture.captures import Capture
-from sdnator.counted import counted
 from sdnator.errors import BadInput
 from sdnator.notation import duration_ns
+from sdnator.plurals import counted
 
 _WIDTH = 256
 _BATCH = 16_384
@@ -78,7 +78,7 @@ class PastPackets:
         if bare:
             notes.append(f"{bare:,} packets without payload: the archive holds headers only; use --capture")
         if late:
-            notes.append(f"{late:,} packets came after the result of their window")
+            notes.append(f"{late:,} packets arrived after the result of their window")
         return "; ".join(notes)
 
 

@@ -1,4 +1,4 @@
-"""`sdnator queries fields` and `test`: what a query can be made of, and what one does with a capture."""
+"""`sdnator queries fields` and `test`: the fields of queries, and what a query does with a capture."""
 
 import time
 from collections.abc import Iterator
@@ -24,8 +24,8 @@ from due import RecordBatch
 from sdnator.capture.captures import CaptureError
 from sdnator.cli.plain_table import plain_table
 from sdnator.cli.queries_run import PastPackets, Piece, as_line, as_text, captured
-from sdnator.counted import counted
 from sdnator.errors import BadInput
+from sdnator.plurals import counted
 
 _MILLION: Final = 1_000_000
 
@@ -224,7 +224,7 @@ def tested_text(one: Tested) -> str:
 
 
 def _cost(one: Tested) -> str:
-    cpu = f"on the host alone it takes {_per_million(one):.2f} s of CPU a million packets"
+    cpu = f"on the host alone it takes {_per_million(one):.2f} s of CPU per million packets"
     share = one.tuples / max(1, one.packets)
     if one.plan.in_switch:
         return (

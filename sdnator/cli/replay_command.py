@@ -15,9 +15,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from dataplane.p4runtime.listening import is_address
-from sdnator.counted import counted
+from sdnator.config.planned_switches import require_compiler
 from sdnator.datasets.names import named_capture
 from sdnator.errors import BadInput
+from sdnator.plurals import counted
 from sdnator.replay import run as replay_run
 from sdnator.replay.loop import ReplayOptions, Telemetry
 from sdnator.replay.packet_accounting import PacketAccounting
@@ -101,6 +102,7 @@ def _check_model(request: ReplayRequest) -> None:
 def check_switch(switch: str, inject: str | None) -> None:
     """Refuse a switch that cannot be used; raises BadInput."""
     if switch == "embedded":
+        require_compiler()
         return
     if switch == "bmv2":
         if shutil.which("simple_switch_grpc") is None:

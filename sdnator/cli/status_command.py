@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import typer
 
 from sdnator.cli.plain_table import plain_table
-from sdnator.counted import counted
 from sdnator.errors import PipelineError
 from sdnator.model_words import model_lines, model_of
 from sdnator.northbound import without_user
+from sdnator.plurals import counted
 from sdnator.redaction import redacted
 from sdnator.up import running
 from sdnator.up.running import shown
@@ -123,7 +123,7 @@ def trouble_lines(health: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             yield f"{name} logged too much: {one['suppressed_lines']:,} lines were suppressed"
         if one.get("out_of_range"):
             times = counted(one["out_of_range"], "time")
-            yield f"the program of {name} reached beyond the end of an array {times}: it is damaged, or not ours"
+            yield f"the program of {name} reached beyond the end of an array {times}: it is damaged, or not the product's own"
 
 
 def _age(started: int) -> str:
@@ -224,7 +224,7 @@ def down(
     timeout: Annotated[float, typer.Option(help="Seconds to wait until it has ended.", min=0)] = 30.0,
     as_json: Json = False,
 ) -> None:
-    """Stop the pipeline of `sdnator up` and wait until it has ended.  No error if none runs.
+    """Stop the pipeline of `sdnator up` and wait until it has ended.  No error if none is running.
 
     Exit codes: 0 nothing runs any more, 1 it did not end in time.
 

@@ -49,7 +49,7 @@ def tables(
 def counters(
     switch: SwitchArgument = "", *, device_id: DeviceId = 1, insecure: Insecure = False, as_json: Json = False
 ) -> None:
-    """Show counters of a switch's entries, above all of blocks.
+    """Show the counters of a switch's entries, such as the drops of each block.
 
     Example: sdnator counters s1
     """

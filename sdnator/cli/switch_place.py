@@ -21,7 +21,7 @@ SwitchArgument = Annotated[
         metavar="SWITCH",
     ),
 ]
-Insecure = Annotated[bool, typer.Option("--insecure", help="HOST:PORT is a switch without TLS, in a lab.")]
+Insecure = Annotated[bool, typer.Option("--insecure", help="The switch at HOST:PORT has no TLS (for a lab).")]
 DeviceId = Annotated[int, typer.Option(help="P4Runtime device id, for HOST:PORT.", min=1)]
 
 

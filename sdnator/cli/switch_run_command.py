@@ -36,9 +36,6 @@ def switch(
     cpu_port: Annotated[
         int, typer.Option(help="Number of the port to the controller.", min=1, max=510)
     ] = 510,
-    backend: Annotated[
-        str, typer.Option(help="Compiler target: auto, c or python.", metavar="KIND")
-    ] = "auto",
     tls_cert: Annotated[str, typer.Option(help="PEM certificate of the server.", metavar="FILE")] = "",
     tls_key: Annotated[str, typer.Option(help="PEM private key of the server.", metavar="FILE")] = "",
     tls_client_ca: Annotated[
@@ -48,14 +45,15 @@ def switch(
         list[str] | None,
         typer.Option(
             help="Rights of clients by the name of their certificate: some of tables, packet-out and pipeline; "
-            "default: controller all, operator all but pipeline, viewer none but reading.",
+            "default: controller all, operator all but pipeline, viewer read only.",
             metavar="NAME=RIGHTS",
         ),
     ] = None,
     insecure: Annotated[
         bool,
         typer.Option(
-            "--insecure", help="HOST:PORT without certificates: whoever reaches it commands, in a lab."
+            "--insecure",
+            help="HOST:PORT without certificates, for a lab: anyone who reaches it controls the switch.",
         ),
     ] = False,
     as_json: Annotated[
@@ -72,7 +70,7 @@ def switch(
     command += ["--grpc", grpc] if grpc else []
     command += ["--insecure"] if insecure else []
     command += [part for each in tls_rights or () for part in ("--tls-rights", each)]
-    command += ["--backend", backend, "--state-json", "-"]
+    command += ["--state-json", "-"]
     for port in ports or []:
         command += ["--port", port]
     for option, value in (("cert", tls_cert), ("key", tls_key), ("client-ca", tls_client_ca)):

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from sdnator.config.planned_switches import require_compiler
 from sdnator.demos.syn_flood.demo import Second, SynFloodOptions, SynFloodResult, Told, note, run_syn_flood
 from sdnator.demos.syn_flood.report import Panel, panel, write_report
 from sdnator.demos.syn_flood.trial import TrialHosts, TrialOutcome
@@ -50,9 +51,11 @@ def syn_flood_command(
     Example: sdnator demo syn-flood --spoofed
     """
     if spoofed and hundred:
-        raise BadInput("--spoofed and --hundred exclude each other")
+        raise BadInput("--spoofed and --hundred cannot be combined; give one of them")
     if switch not in ("embedded", "bmv2"):
         raise BadInput(f"--switch {switch}: give embedded or bmv2")
+    if switch == "embedded":
+        require_compiler()
     options = SynFloodOptions(
         sources="spoofed" if spoofed else "hundred" if hundred else "one",
         version=6 if ipv6 else 4,

@@ -39,7 +39,7 @@ def up(
     config: Annotated[
         Path | None,
         typer.Option(
-            help="Configuration; default: ./sdnator.toml, else $XDG_CONFIG_HOME/sdnator/sdnator.toml.",
+            help="Configuration; default: ./sdnator.toml, else that in $XDG_CONFIG_HOME/sdnator.",
             metavar="FILE",
             show_default=False,
         ),
@@ -67,7 +67,7 @@ def up(
     ] = "",
     insecure: Annotated[
         bool,
-        typer.Option("--insecure", help="Speak P4Runtime with the switch without TLS over TCP, in a lab."),
+        typer.Option("--insecure", help="Use P4Runtime over TCP without TLS for the switch (for a lab)."),
     ] = False,
     device_id: Annotated[int | None, typer.Option(help="P4Runtime device id of the switch.", min=1)] = None,
     updates: Annotated[
@@ -113,6 +113,7 @@ def up(
     Without options everything is embedded. Options override SDNATOR_… variables, which override the
     configuration file. A part that dies or hangs is restarted, without limit: after three deaths in a row
     `sdnator status` calls it degraded. Only one pipeline runs per user.
+
     SIGHUP: started from a terminal, the pipeline ends with it. As a service it reads the configuration
     again, restarts the parts whose settings have changed, and names changes that need a restart of all.
     Exit codes: 0 stopped, 1 a part did not start or one runs already, 2 misuse.
@@ -153,7 +154,7 @@ def _keep_up(plan: "StandingPlan", given: Given, reloads: list[int], *, as_json:
     try:
         with StandingPipeline(plan, _tell) as pipeline, ExitStack() as stack:
             report = UpReport(pipeline, str(given.file() or ""), started, stack)
-            _announce(report.write(), as_json=as_json)
+            _announce(report.write(), pipeline.uncontrolled, as_json=as_json)
             _watch(pipeline, report, given, reloads)
     except P4ProgramError as error:
         raise PipelineError(str(error)) from None
@@ -194,9 +195,9 @@ def _reload(pipeline: "StandingPipeline", given: Given) -> None:
     pipeline.reload(plan)
 
 
-def _announce(found: running.Running, *, as_json: bool) -> None:
+def _announce(found: running.Running, uncontrolled: str, *, as_json: bool) -> None:
     if as_json:
-        print(json.dumps({"ready": True, **shown(found)}), flush=True)
+        print(json.dumps({"ready": True, "uncontrolled": uncontrolled, **shown(found)}), flush=True)
         return
     updates, archive = redacted(found.updates), redacted(found.archive)
     lines = [
@@ -217,6 +218,10 @@ def _announce(found: running.Running, *, as_json: bool) -> None:
     print(f"for your own apps: export DUE_UPDATES={quote(updates)} DUE_ARCHIVE={quote(archive)}")
     if (updates, archive) != (found.updates, found.archive):
         print("where … stands for user and password, which are not shown")
+    if uncontrolled:
+        print(f"NOT under control: {uncontrolled}")
+        print("The apps run, and the controller tries again; Ctrl-C or `sdnator down` ends them.", flush=True)
+        return
     print("The pipeline runs; Ctrl-C or `sdnator down` ends it.", flush=True)
 
 

@@ -1,4 +1,4 @@
-"""`sdnator user`: who may sign in to the page, and as what."""
+"""`sdnator user`: who may sign in to the dashboard, and as what."""
 
 import json
 import sys
@@ -9,6 +9,7 @@ import typer
 
 from sdnator.cli.plain_table import plain_table
 from sdnator.errors import BadInput, PipelineError
+from sdnator.rights.audit_trail import note
 from sdnator.rights.sign_in_link import new_link
 from sdnator.rights.users import MOST, UserRole, Users
 from sdnator.up import running
@@ -27,7 +28,7 @@ def user_add(
     name: NameArgument,
     *,
     role: Annotated[
-        str, typer.Option(help="viewer: looks; operator: undoes blocks and allows, too.")
+        str, typer.Option(help="viewer: may look; operator: may also undo blocks and allow addresses.")
     ] = "viewer",
     password_stdin: StdinOption = False,
 ) -> None:
@@ -39,6 +40,7 @@ def user_add(
         raise BadInput(f"--role {role}: give viewer or operator")
     chosen: UserRole = "operator" if role == "operator" else "viewer"
     Users(running.state_folder()).add(name, chosen, _password(stdin=password_stdin))
+    note(f"added user {name}, {role}")
     print(f"{name} may sign in as {role}")
 
 
@@ -67,17 +69,19 @@ def user_passwd(name: NameArgument, *, password_stdin: StdinOption = False) -> N
     Example: sdnator user passwd ada
     """
     Users(running.state_folder()).change_password(name, _password(stdin=password_stdin))
-    print(f"{name} signs in with the new password from now on")
+    note(f"changed the password of user {name}")
+    print(f"{name} now signs in with the new password")
 
 
 @app.command("remove")
 def user_remove(name: NameArgument) -> None:
-    """Let somebody sign in no more; the user's sessions end.
+    """Withdraw somebody's sign-in; the user's sessions end.
 
     Example: sdnator user remove ada
     """
     Users(running.state_folder()).remove(name)
-    print(f"{name} may sign in no more")
+    note(f"removed user {name}")
+    print(f"{name} can no longer sign in")
 
 
 @app.command("link")
@@ -88,11 +92,13 @@ def user_link() -> None:
     """
     found = running.need()
     if not found.dashboard:
-        raise PipelineError("the pipeline serves no page: start it without --no-dashboard")
+        raise PipelineError("the pipeline serves no dashboard: start it without --no-dashboard")
     try:
-        print(new_link(running.state_folder(), found.dashboard))
+        link = new_link(running.state_folder(), found.dashboard)
     except OSError as error:
         raise PipelineError(f"{error.filename}: {error.strerror}") from None
+    note("created a link that signs in as the owner")
+    print(link)
 
 
 def _password(*, stdin: bool) -> str:

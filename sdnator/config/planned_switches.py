@@ -110,6 +110,17 @@ def _port_kind(option: str, kind: str, switch: str, *, look: bool) -> str:
     return kind
 
 
+def require_compiler() -> None:
+    """The embedded switch compiles its program; raises BadInput where nothing can."""
+    from dataplane.compiler.c_build import compiler
+
+    if compiler() is None:
+        raise BadInput(
+            "the embedded switch needs a C compiler, and there is none ($CC, cc, gcc, clang): install gcc, "
+            "or use a switch of your own (--switch HOST:PORT)"
+        )
+
+
 def parse_wires(options: Sequence[str] | None, ports: Mapping[int, str], switch: str) -> dict[int, int]:
     """Ingress port to egress port, both ways; raises BadInput naming the wrong pair."""
     if not options:
@@ -124,7 +135,7 @@ def parse_wires(options: Sequence[str] | None, ports: Mapping[int, str], switch:
             raise BadInput(f"--wire {option}: give two ports, such as 1-2, or none")
         for near, far in (ends, ends[::-1]):
             if near in forward:
-                raise BadInput(f"--wire {option}: port {near} is joined already")
+                raise BadInput(f"--wire {option}: port {near} is already joined to another port")
             if switch in ("embedded", "bmv2") and near not in ports:
                 raise BadInput(f"--wire {option}: there is no port {near}; add --port {near}=veth:INTERFACE")
             forward[near] = far

@@ -38,8 +38,8 @@ def check_security(switch: PlannedSwitch, controller: Mapping[str, Any]) -> None
     check(security_of(switch, controller), address)
     if switch.kind == "embedded" and not (switch.tls_certificate and switch.tls_key):
         raise BadInput(
-            f"listen = {address}: name tls_certificate and tls_key of the switch (`sdnator cert init` makes them), "
-            "or write insecure = true in a lab"
+            f"listen = {address}: set tls_certificate and tls_key of the switch (`sdnator cert init` creates them), "
+            "or insecure = true in a lab"
         )
 
 

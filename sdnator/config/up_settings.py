@@ -13,9 +13,9 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     archive: str = ""
     """Data Archives, mongodb:// or sqlite:///; empty: a file in the data folder."""
     quota: float = 10.0
-    """GiB that the embedded archive may take; the oldest items go first."""
+    """Size limit of the embedded archive, GiB; the oldest items are deleted first."""
     keep_model: bool = True
-    """Keep Kitsune's model in the state folder, and take it up at the next start where switches, ports and settings
+    """Keep Kitsune's model in the state folder, and use it again at the next start if switches, ports and settings
     are the same; off: train at every start, unless `kitsune.load_model` or `--model` names a model."""
 
     def __post_init__(self) -> None:
@@ -24,7 +24,7 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class GrantPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Rights of one app on Data Updates beyond what it declares; a table for each app. Dangerous keys, which command
+    """Rights of one app beyond what it declares; a table for each app. Dangerous keys, which command
     switches and apps, are granted to apps that are not the product's only if they are named here."""
 
     app: str = ""
@@ -33,14 +33,16 @@ class GrantPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """Key patterns that it may publish."""
     observe: tuple[str, ...] = ()
     """Key patterns that it may observe."""
+    read: tuple[str, ...] = ()
+    """Key patterns that it may read from Data Archives, where these know apps; what it wrote itself it may always."""
     declared: bool = True
-    """It may publish and observe what it declares, too, without the dangerous keys."""
+    """It may also publish and observe what it declares, except the dangerous keys."""
 
     def __post_init__(self) -> None:
         from due.errors import InvalidKey  # here, because `sdnator --help` needs none of it
         from due.keys import Key
 
-        for name in ("publish", "observe"):
+        for name in ("publish", "observe", "read"):
             for pattern in getattr(self, name):
                 try:
                     Key.parse(pattern)
@@ -56,7 +58,7 @@ class LearnPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     age_s: float = 300.0
     """Seconds without a frame after which a learnt MAC address is removed."""
     limit: int = 8192
-    """Most MAC addresses to learn; frames to further ones are flooded to all of the ports."""
+    """Maximum number of MAC addresses to learn; frames to others are flooded to all of the ports."""
 
     def __post_init__(self) -> None:
         if len(self.ports) == 1 or len(set(self.ports)) < len(self.ports):
@@ -85,12 +87,12 @@ class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     fail: Literal["open", "closed"] = "open"
     """Without a controller: open keeps port forwarding, closed removes it."""
     mirror: bool = False
-    """The switch sees copies only, as behind a mirror (SPAN) port or a tap: it decides, but claims to stop nothing."""
+    """The switch sees copies only, as behind a mirror (SPAN) port or a tap: decisions about it are dry runs."""
     listen: str = ""
     """HOST:PORT on which a switch that `sdnator up` starts serves P4Runtime; empty: a Unix socket that only its
     user can reach (embedded), or 127.0.0.1 (BMv2). The embedded switch needs TLS there, or `insecure`."""
     insecure: bool = False
-    """P4Runtime over TCP without TLS: whoever reaches its port may command the switch. For a stock BMv2 in a lab."""
+    """P4Runtime over TCP without TLS: anyone who reaches the port controls the switch. For a stock BMv2 in a lab."""
     tls_certificate: str = ""
     """File of the certificate with which an embedded switch listens on HOST:PORT; clients need one that
     `p4runtime_ctrl.tls_ca` signed."""
@@ -119,7 +121,7 @@ class MetricsSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     host: str = "127.0.0.1"
     """Address on which each app serves its metrics; empty: none."""
     token_file: str = ""
-    """File with what requests for metrics bring as `Authorization: Bearer …`, 16 characters or more; empty: whoever
-    reaches the endpoints reads them."""
+    """File with the token that requests for metrics must send as `Authorization: Bearer …`, 16 characters or more; empty:
+    anyone who reaches the endpoints can read them."""
     targets: str = ""
     """File to which the endpoints are written for Prometheus (file_sd_configs); empty: none."""

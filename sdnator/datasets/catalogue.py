@@ -173,7 +173,7 @@ def _ctu13(number: int, day: str, malware: str) -> PublicDataSet:
         ),
         label_form="binetflow",
         clock_offset_hours=_CENTRAL_EUROPEAN_SUMMER,
-        note="frames are cut after their headers; a university's traffic, so the captures are large",
+        note="frames are truncated after their headers; a university's traffic, so the captures are large",
     )
 
 

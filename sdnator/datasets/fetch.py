@@ -159,10 +159,10 @@ def _interrupted(part: _Part, error: Exception | None) -> Interrupted:
     reason = getattr(error, "reason", error) or "the server closes the connection too early"
     if not part.size:
         return Interrupted(
-            f"{part.url}: nothing came ({reason}); check the connection, or fetch it from another server"
+            f"{part.url}: no data arrived ({reason}); check the connection, or fetch it from another server"
         )
     return Interrupted(
-        f"{part.url}: download broken off after {part.size:,} bytes ({reason}); "
+        f"{part.url}: download interrupted after {part.size:,} bytes ({reason}); "
         "run the command again to continue where it ended"
     )
 

@@ -60,7 +60,7 @@ def labels_of_flows(capture: Path, flows: Iterable[LabelledFlow]) -> FlowLabels:
     if count and not found:
         raise FlowTableError(
             f"{capture}: none of {count:,} flows that are labelled as attacks has a packet in it; give the table "
-            "that belongs to this capture, and check what its clock is ahead of UTC"
+            "that belongs to this capture, and check by how much its clock is ahead of UTC"
         )
     return FlowLabels(packets.labels(), count, found)
 

@@ -87,7 +87,9 @@ def read_flow_table(
         try:
             yield from _flows(path, lines, round(clock_offset_hours * 3_600) * _NS)
         except (EOFError, gzip.BadGzipFile, zlib.error, csv.Error) as error:
-            raise MalformedFlowTable(f"{path}: not a whole table ({error}); fetch or copy it again") from None
+            raise MalformedFlowTable(
+                f"{path}: an incomplete table ({error}); fetch or copy it again"
+            ) from None
         except OSError as error:
             raise MissingFlowTable(f"{path}: cannot be read ({error.strerror})") from None
 
@@ -283,7 +285,7 @@ def _numbered(path: Path, file: TextIO) -> _Lines:
         number += 1
         if len(line) > MAX_LINE:
             raise MalformedFlowTable(
-                f"{path}: line {number:,} is longer than {MAX_LINE:,} characters; this is no table of flows"
+                f"{path}: line {number:,} is longer than {MAX_LINE:,} characters; this is not a table of flows"
             )
         yield number, line.rstrip("\r\n")
 

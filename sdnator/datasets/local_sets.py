@@ -47,7 +47,7 @@ def find(name: str) -> LocalDataSet | None:
     gone = [path for path in (found.capture, found.labels) if path is not None and not path.is_file()]
     if gone:
         raise BadInput(
-            f"{gone[0]}: data set {name} was fetched to there, but the file has gone; "
+            f"{gone[0]}: data set {name} was fetched to this path, but the file is gone; "
             f"run `sdnator dataset fetch {name}` again"
         )
     return found

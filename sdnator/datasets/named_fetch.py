@@ -127,8 +127,9 @@ class DataSetFetch:
         return True
 
     def _not_found(self, places: list[str]) -> NotThere:
+        others = f", nor at {len(places) - 1} other addresses that it may have" if len(places) > 1 else ""
         return NotThere(
-            f"{self._wanted.name}: not found at {', '.join(places)}; "
+            f"{self._wanted.name}: not found at {places[0]}{others}; "
             f"{self._elsewhere()}give another server with --mirror URL, or a file that you have with --from FILE "
             f"(see {self._wanted.publication.homepage})"
         )
@@ -204,7 +205,7 @@ class DataSetFetch:
         found, published = len(read_labels(path)), self._wanted.packets
         if published is not None and found != published:
             self._report(
-                f"note: {path} has {found:,} labels, and the publication speaks of {published:,} packets"
+                f"note: {path} has {found:,} labels, but the publication mentions {published:,} packets"
             )
 
     def _flows(self, path: Path) -> Iterator[LabelledFlow]:
@@ -218,7 +219,7 @@ class DataSetFetch:
         if capture is None:
             raise BadInput(
                 f"{self._wanted.name}: no capture among {', '.join(map(str, self._request.given)) or 'the files'}; "
-                "give it with --from, too"
+                "also give it with --from"
             )
         labels = self._labels(capture) if pieces.labels else (before.labels if before else None)
         if labels is None:

@@ -42,7 +42,7 @@ def named_capture(word: Path, labels: Path | None = None) -> NamedCapture:
     found = local_sets.find(wanted.name)
     if found is None:
         raise BadInput(
-            f"data set {wanted.name} has not been fetched, and no file is called so; "
+            f"data set {wanted.name} has not been fetched, and there is no file of that name; "
             f"run `sdnator dataset fetch {wanted.name}`"
         )
     chosen = labels or found.labels

@@ -121,14 +121,16 @@ def extract(
                     suffix = ".gz" if member.filename.lower().endswith(".gz") else ""
                     found.append(_extract(archive, file, member, folder / f"{name}{suffix}", progress))
     except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError, IndexError) as error:
-        raise UnpackError(f"{archive}: not a whole zip file ({error}); fetch or copy it again") from None
+        raise UnpackError(f"{archive}: an incomplete zip file ({error}); fetch or copy it again") from None
     return found
 
 
 def _members(archive: Path, file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     everything = file.infolist()
     if len(everything) > _MOST_MEMBERS:
-        raise UnpackError(f"{archive}: {len(everything):,} members; no data set of the catalogue has so many")
+        raise UnpackError(
+            f"{archive}: {len(everything):,} members; no data set of the catalogue has that many"
+        )
     return {
         _plain(Path(each.filename).name.removesuffix(".gz")): each for each in everything if not each.is_dir()
     }

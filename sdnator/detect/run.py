@@ -80,7 +80,7 @@ def detect(
             states=run.states,
             alerts=run.alerts,
             labels=labels,
-            line=detector.line,
+            line=detector.threshold,
             summary=summary,
         )
     return summary
@@ -118,7 +118,7 @@ class _Run:
 def _detector(options: DetectOptions) -> Detector:
     if options.model and options.retrain_from:
         raise BadInput(
-            "--model and --retrain-from exclude each other; the first scores, the second trains on"
+            "--model and --retrain-from cannot be combined: the first scores, the second continues training"
         )
     path, kernel = options.model or options.retrain_from, load_kernel()
     try:
@@ -164,8 +164,8 @@ def _summary(options: DetectOptions, run: _Run, labels: Labels | None) -> dict[s
         "training_packets": int(np.count_nonzero(~scored)),
         "scored": len(scores),
         "not_finite": len(scores) - len(finite),
-        "threshold": detector.line,
-        "over": int(np.count_nonzero(~(scores < detector.line))),
+        "threshold": detector.threshold,
+        "over": int(np.count_nonzero(~(scores < detector.threshold))),
         "median": float(np.median(finite)) if len(finite) else None,
         "p99": float(np.quantile(finite, 0.99)) if len(finite) else None,
         "alerts": len(run.alerts),
@@ -188,7 +188,7 @@ def _age(run: _Run, scores: npt.NDArray[np.float64]) -> dict[str, Any]:
     detector = run.detector
     benign = detector.calibration.benign
     age = run.times_ns[0] / 1e9 - detector.trained_at_us / 1e6
-    drift = None if benign is None else benign.drift(scores[scores < detector.line])
+    drift = None if benign is None else benign.drift(scores[scores < detector.threshold])
     return {"model_age_s": float(age), "benign_drift": drift}
 
 
@@ -197,11 +197,11 @@ def _cautions(options: DetectOptions, run: _Run) -> list[str]:
     gaps = np.diff(run.times_ns) / 1e9
     if len(gaps) and float(np.abs(gaps).max()) > _YEAR_S:
         found.append(
-            f"the capture's clock jumps by {np.abs(gaps).max() / _YEAR_S:.0f} years; rates around it mislead"
+            f"the capture's clock jumps by {np.abs(gaps).max() / _YEAR_S:.0f} years; rates around the jump are misleading"
         )
     if len(gaps) and float(gaps.min()) < 0 and options.mode == "bounded":
         found.append(
-            f"{int(np.count_nonzero(gaps < 0)):,} packets are older than the one before: taken as simultaneous"
+            f"{int(np.count_nonzero(gaps < 0)):,} packets are older than the one before: treated as simultaneous"
         )
     clipped = run.detector.model.clip
     if clipped and bool((run.scores > math.sqrt(clipped)).any()):

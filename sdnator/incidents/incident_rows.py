@@ -8,8 +8,8 @@ from msgspec import structs
 
 from apps.evidence import Kind
 from apps.incidents import REMEDY_WORDS, Incident, IncidentAction, IncidentCost
-from sdnator.counted import counted
 from sdnator.notation import local_time
+from sdnator.plurals import counted
 
 KINDS: Final[dict[Kind, str]] = {
     "scan": "scan",

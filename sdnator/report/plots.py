@@ -164,9 +164,7 @@ def _legend(figure: Figure, curves: Sequence[Curve]) -> None:
         handles.append(dot(ATTACK, "attack packet"))
     if any((curve.state == PacketState.DROPPED).any() for curve in curves):
         handles.append(dot(DROPPED, "dropped by the switch (no score)"))
-    handles.append(
-        Line2D([], [], color=INK, linewidth=0.9, linestyle=(0, (5, 4)), label="line of an anomaly")
-    )
+    handles.append(Line2D([], [], color=INK, linewidth=0.9, linestyle=(0, (5, 4)), label="threshold"))
     if any(curve.blocks for curve in curves):
         handles.append(Line2D([], [], color=BLOCK, linewidth=1.0, label="block"))
     figure.legend(handles=handles, loc="upper right", ncols=len(handles), frameon=False, fontsize=9)

@@ -12,8 +12,8 @@ from sdnator.report.writer import PassData, ReportData, write_report
 def write_replay_report(folder: Path, outcome: ReplayOutcome, figures: Mapping[str, Any]) -> Path:
     """Write the report of a replay; returns the path of its `index.html`, raises ReportError."""
     passes = []
-    if outcome.alone is not None:
-        passes.append(_pass_data("Kitsune alone", outcome.alone))
+    if outcome.dry_run is not None:
+        passes.append(_pass_data("Kitsune alone", outcome.dry_run))
     if outcome.blocking is not None:
         passes.append(_pass_data("with blocking", outcome.blocking))
     survey = outcome.survey

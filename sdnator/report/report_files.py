@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.enforcement import SWITCHES, place_text
 from apps.firewall.enforcement.eve import (
     Event,
     decision_event,
@@ -114,7 +115,7 @@ def block_rows(decisions: Sequence[Decision], confirmations: Sequence[Confirmati
 
 
 def write_decisions(path: Path, decisions: Sequence[Decision], confirmations: Sequence[Confirmation]) -> None:
-    """decisions.csv: what was decided, why, and what the switch made of it."""
+    """decisions.csv: what was decided, why, and the switch's answer."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, _DECISION_COLUMNS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
@@ -127,13 +128,21 @@ def write_eve(path: Path, events: Iterable[Event]) -> None:
         file.writelines(f"{line_of(event)}\n" for event in events)
 
 
-def incident_events(reports: Iterable[Incident], decisions: Iterable[Decision]) -> list[Event]:
-    """What the firewall's own EVE file would hold: reports of incidents, and decisions outside of them."""
+def incident_events(
+    reports: Iterable[Incident], decisions: Iterable[Decision], confirmations: Iterable[Confirmation]
+) -> list[Event]:
+    """What the firewall's own EVE file would hold: reports of incidents, and decisions outside of them, before and
+    after the switch has confirmed them."""
     told = [each for each in reports if each.change != "more"]
     within = {action.decision for each in told for action in each.actions}
+    alone = [each for each in decisions if each.id not in within]
+    places = {
+        each.id: place_text(SWITCHES, each.switch) for each in confirmations if each.state == "installed"
+    }
     return [
         *(incident_event(each) for each in told),
-        *(decision_event(each) for each in decisions if each.id not in within),
+        *(decision_event(each) for each in alone),
+        *(decision_event(each, [places[each.id]]) for each in alone if each.id in places),
     ]
 
 

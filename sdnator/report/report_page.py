@@ -155,8 +155,8 @@ def _tiles(summary: Mapping[str, Any]) -> Iterator[str]:
 def _explanation(summary: Mapping[str, Any]) -> str:
     both = "The upper plot is Kitsune alone, the lower one the same capture with blocking. "
     return (
-        f"<p>Each dot is a packet, with the anomaly score that Kitsune gave it; packets over the dashed line are "
-        f"anomalous. {both if summary.get('mitigation') else ''}"
+        f"<p>Each dot is a packet, with the anomaly score that Kitsune gave it; packets at or above the dashed "
+        f"line, the threshold, are anomalous. {both if summary.get('mitigation') else ''}"
         "Packets that the switch drops are not scored and are drawn below the scale. "
         "Answers of an attack's victims count as benign.</p>"
     )

@@ -199,7 +199,7 @@ def _facts(data: ReportData, each: PassData) -> dict[str, float]:
 
 def _events(data: ReportData) -> list[dict[str, Any]]:
     shown = data.reported
-    events = report_files.incident_events(shown.reports, shown.decisions)
+    events = report_files.incident_events(shown.reports, shown.decisions, shown.confirmations)
     if data.eth_src is not None and data.ipv4_src is not None:
         events += report_files.drop_events(data.time_ns, shown.state, data.eth_src, data.ipv4_src)
     return sorted(events, key=lambda event: str(event["timestamp"]))

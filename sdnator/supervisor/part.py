@@ -23,7 +23,7 @@ Shown = Literal["waiting", "starting", "running", "restarting", "degraded"]
 _LONGEST_LOOK_S = 1.0
 _END_SECONDS = 10.0
 _PREPARE_AFTER_S = 3.0
-"""A part that was restarted has the machine for itself for so long."""
+"""For this long after a restart no spare is prepared, so that the part has the machine to itself."""
 _PREPARE_EVERY_S = 1.0
 _PREPARE_AGAIN_S = 60.0
 _TOLD_DEATHS = 5
@@ -156,7 +156,7 @@ class Part:
             self._silence = Silence(self.spec.silence_s)
             self._suspension = Silence(self.spec.suspended_s)
             if self.deaths:
-                self._say(f"{self.spec.name} runs again", now)
+                self._say(f"{self.spec.name} is running again", now)
             self.was_ready = True
             return True
         if (ended := process.ended()) is not None:

@@ -14,9 +14,9 @@
     P4RuntimeClient  talks to a switch as a controller does; EntryBuilder makes entries by their names
     SwitchTarget     a switch as a process that can be killed, stopped and started again
     ControllerRun    Data Updates, Coordinator, switch and controller as processes; Heard: what they said
-    Cable            between controller and switch, to be cut
+    Cable            a connection between controller and switch that can be cut
 
-Traffic is made by `sdnator.testing.packet_rows` (columns), `.query_traffic` (frames of attacks) and `.switch_traffic`
+Traffic comes from `sdnator.testing.packet_rows` (columns), `.query_traffic` (frames of attacks) and `.switch_traffic`
 (entries and frames for a switch); `.capture_samples`, `.table_samples` and `.switch_entities` hold genuine inputs.
 `sdnator.testing.oracles` computes what the product does the slow and obvious way.
 

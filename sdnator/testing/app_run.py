@@ -1,4 +1,4 @@
-"""One app's service in this process, on memory://, and the world around it."""
+"""One app's service in this process, on memory://, with stand-ins for its surroundings."""
 
 import itertools
 import os
@@ -104,9 +104,9 @@ class AppRun:
         """Write an item that the app may want, as the app whose name a key `network.<kind>.<app>.…` has.
 
         Args:
-            key: concrete.
+            key: a concrete key.
             value: any DUE value.
-            event_time: when what it describes happened, ns; None: now.
+            event_time: when the described event happened, ns; None: now.
         """
         writer = self._writer(key)
         writer.write(key, value, event_time=event_time)
@@ -135,7 +135,7 @@ class AppRun:
         return self._world.get(key)
 
     def health(self) -> dict[str, Any]:
-        """What the app says of itself."""
+        """The app's own health report."""
         return dict(self.service.health())
 
     def _engine(self, app_id: str, options: Options, stack: ExitStack, **declared: Any) -> Engine:
@@ -147,7 +147,7 @@ class AppRun:
         return engine
 
     def _writer(self, key: str) -> Engine:
-        """The engine of the app that may write a key; apps refuse what another one writes."""
+        """The engine of the app that may write a key; apps refuse items that another app writes under it."""
         app = (writer_of(key) if key.startswith("network.") else "") or _WORLD
         if app not in self._writers:
             capabilities = [Capability(each, delivery="reliable") for each in self._reliable]

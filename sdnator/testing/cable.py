@@ -7,9 +7,9 @@ from typing import Self
 
 
 class Cable:
-    """`with Cable(address) as cable:` relays from `cable.address`; `cut()` holds all bytes, `mend()` lets go.
+    """`with Cable(address) as cable:` relays from `cable.address`; `cut()` holds back all bytes, `mend()` ends that.
 
-    While cut, new connections are accepted by nobody; those that were open stay open and silent, as with
+    While it is cut, nobody accepts new connections; open ones stay open and silent, as with
     a pulled plug.  `mend` ends the silent ones, as a peer that gave up would have.
 
     Args:
@@ -37,11 +37,11 @@ class Cable:
         self._end_all()
 
     def cut(self) -> None:
-        """From now on no byte passes."""
+        """Let no byte pass from now on."""
         self._whole.clear()
 
     def mend(self) -> None:
-        """End what was open, and let new connections through."""
+        """End the open connections, and let new ones through."""
         self._end_all()
         self._whole.set()
 

@@ -1,4 +1,4 @@
-"""The controller among real processes: Data Updates, Coordinator, a switch, and engines of the test's own.
+"""The controller among real processes: Data Updates, Coordinator, a switch, and the test's own engines.
 
 with ControllerRun(folder) as stage:
     stage.controller()
@@ -45,7 +45,7 @@ class ControllerRun:
         veth: interface of port 1; empty: a capture port, which `feed` feeds.  Port 2 leads nowhere.
         switch_options: of the controller's settings of the switch, instead of the usual ones.
 
-    The parts are not started again when they die: that is what tests of faults look at.
+    Parts that die are not restarted: tests of faults look at that.
     """
 
     def __init__(

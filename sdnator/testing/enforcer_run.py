@@ -1,4 +1,4 @@
-"""One enforcer as a process of its own, told by a firewall that is played by the test.
+"""One enforcer as a separate process; the test plays the firewall.
 
 with EnforcerRun(folder, "apps.enforcers.nftables.service", {"place": "gw"}) as run:
     run.start()

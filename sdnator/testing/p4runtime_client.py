@@ -1,4 +1,4 @@
-"""A P4Runtime client for tests and benchmarks: one stream, requests that block, and entries by their names."""
+"""A P4Runtime client for tests and benchmarks: one stream, requests that block, and entries built by name."""
 
 import queue
 import threading
@@ -101,7 +101,7 @@ class P4RuntimeClient:
         return self.arbitrations.get(timeout=TIMEOUT_S)
 
     def ask_for_arbitration(self) -> None:
-        """Ask to be primary without waiting for what comes of it."""
+        """Ask to be primary without waiting for the answer."""
         request = p4runtime.StreamMessageRequest()
         request.arbitration.device_id = self.device_id
         if self.role:

@@ -1,4 +1,4 @@
-"""Packets as columns: blank ones, those of a table of tshark's, and tshark's fields of columns."""
+"""Packets as columns: blank ones, those of a tshark table, and tshark's fields for given columns."""
 
 import gzip
 import socket
@@ -36,7 +36,7 @@ FIELDS = [
 
 
 def blank(count: int, **columns: Any) -> RecordBatch:
-    """A batch of packets in which only the given columns say something.
+    """A batch of packets in which only the given columns are set.
 
     Args:
         count: n, the number of packets.

@@ -85,7 +85,7 @@ class RoutedLab:
         return UdpPath(sender, receiver)
 
     def nft(self, *arguments: str) -> str:
-        """Run nft on the gateway, as somebody else would.
+        """Run nft on the gateway, as another program would.
 
         Raises:
             BadInput: with what nft says.
@@ -139,7 +139,7 @@ class UdpPath:
         return self._number
 
     def came(self, seconds: float = 0.0) -> list[int]:
-        """Numbers of the packets that have come, after waiting for the first of them at most `seconds`."""
+        """Numbers of the packets that have arrived, after waiting for the first of them at most `seconds`."""
         numbers: list[int] = []
         while select.select([self._receiver], [], [], 0.0 if numbers else seconds)[0]:
             numbers.append(int.from_bytes(self._receiver.recv(64), "big"))

@@ -5,13 +5,14 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Self
 
+from dataplane.compiler.c_machine import CMachine
+from dataplane.compiler.machine import MachineMaker
 from dataplane.p4runtime.device import Device
 from dataplane.p4runtime.listening import default_address
 from dataplane.p4runtime.server import P4RuntimeServer
 from dataplane.p4runtime.trust import TrustedPrograms
 from dataplane.packet_loop import PacketClock, PacketLoop
 from dataplane.ports.port import MemoryPort, Port
-from dataplane.v1model.switch import Backend
 from sdnator.testing.waiting import wait_for
 
 DEVICE_ID = 1
@@ -30,7 +31,7 @@ class SwitchDouble:
     Args:
         ports: port number to port; None: MemoryPorts 1, 2 and 3.
         driven: time comes with the frames, as in a replay, instead of from this machine's clock.
-        backend: python, or c, which compiles each program.
+        maker: what turns programs into something that runs.
         queue: packet-ins that wait for a slow controller before more are dropped and counted.
         roles: that controllers may claim beside the default one.
         programs: which may be loaded; None: the product's own only.
@@ -43,7 +44,7 @@ class SwitchDouble:
         *,
         ports: Mapping[int, Port] | None = None,
         driven: bool = False,
-        backend: Backend = "python",
+        maker: MachineMaker = CMachine,
         queue: int = 4096,
         roles: Iterable[str] = ("guard",),
         programs: TrustedPrograms | None = None,
@@ -54,7 +55,7 @@ class SwitchDouble:
         self.clock = PacketClock(driven=driven)
         self.device = Device(
             DEVICE_ID,
-            backend=backend,
+            maker=maker,
             queue=queue,
             ports=self.ports,
             clock=self.clock.now,

@@ -1,4 +1,4 @@
-"""A switch as a process of its own that a test stops, kills and starts again: the embedded one, or BMv2."""
+"""A switch as a separate process that a test can stop, kill and start again: the embedded one, or BMv2."""
 
 import os
 import signal
@@ -39,7 +39,7 @@ class SwitchTarget:
         return self._address
 
     def start(self) -> None:
-        """Start it, and return when it serves.
+        """Start it, and return when it is ready to serve.
 
         Raises:
             PipelineError: the embedded switch ended; the text has its last words.
@@ -65,14 +65,14 @@ class SwitchTarget:
         return switch
 
     def kill(self) -> None:
-        """As `kill -9` does; nothing where it does not run."""
+        """Kill it as `kill -9` does; does nothing if it is not running."""
         process, self._process = self._process, None
         if process is not None:
             os.kill(process.pid, signal.SIGKILL)
             process.close()
 
     def stop(self) -> None:
-        """End it in order; nothing where it does not run."""
+        """Shut it down in order; does nothing if it is not running."""
         process, self._process = self._process, None
         if isinstance(process, Child):
             process.stop()
@@ -85,7 +85,7 @@ class SwitchTarget:
         self._signal(signal.SIGSTOP)
 
     def resume(self) -> None:
-        """Let it go on after `pause`."""
+        """Let it continue after `pause`."""
         self._signal(signal.SIGCONT)
 
     def _signal(self, number: signal.Signals) -> None:

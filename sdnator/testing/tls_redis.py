@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import urlencode
 
+from due.drivers.embedded_redis import SUBSCRIBER_LIMIT
 from due.drivers.redis_wire import Wire, as_user
 from due.errors import UpdatesUnavailable
 from sdnator.private_files import write_private
@@ -31,7 +32,7 @@ class TlsRedis:
 
     Args:
         folder: for certificates, users and the log.
-        users: the text of its ACL file; None: whoever has a certificate may do everything.
+        users: the text of its ACL file; None: any client with a certificate may do everything.
         admin: user and password of an administrator in it.
     """
 
@@ -63,7 +64,7 @@ class TlsRedis:
 
     @property
     def admin_url(self) -> str:
-        """For whoever makes users; `url` where there are none."""
+        """With the right to make users; `url` where there are none."""
         return as_user(self.url, *self._admin) if self._admin is not None else self.url
 
     def __enter__(self) -> Self:
@@ -102,7 +103,9 @@ class TlsRedis:
         if self._users is not None:
             write_private(self._folder / "users.acl", self._users())
             arguments["aclfile"] = self._folder / "users.acl"
-        return [part for name, value in arguments.items() for part in (f"--{name}", str(value))]
+        # as the embedded server: a reader that gets no core for seconds is not cut off
+        limit = ["--client-output-buffer-limit", "pubsub", *SUBSCRIBER_LIMIT]
+        return [*(part for name, value in arguments.items() for part in (f"--{name}", str(value))), *limit]
 
     def _wait(self) -> None:
         deadline = time.monotonic() + _START_SECONDS

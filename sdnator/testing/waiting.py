@@ -1,4 +1,4 @@
-"""Waiting for what other threads and processes do, with an end and a reason."""
+"""Waiting for other threads and processes, with a deadline and a reason."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ _LOOK_S = 0.01
 
 
 class TookTooLong(AssertionError):
-    """What a test waited for did not come; the text says what there was instead."""
+    """A condition did not hold in time; the text says what was found instead."""
 
 
 def wait_for(condition: Callable[[], object], seconds: float = 90.0, why: Callable[[], object] = str) -> None:

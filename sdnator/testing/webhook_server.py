@@ -1,4 +1,4 @@
-"""An HTTP server that takes blocks as somebody else's firewall would, for tests of `webhook_enforcer`."""
+"""An HTTP server that accepts blocks as another firewall would, for tests of `webhook_enforcer`."""
 
 import hmac
 import json
@@ -16,7 +16,7 @@ _OLD_S = 300
 
 
 class WebhookServer:
-    """Keeps blocks by id, checks signatures, answers the same request the same.
+    """Keeps blocks by id, checks signatures, and gives the same answer to the same request.
 
     Args:
         tls: of the server; None: plain HTTP.

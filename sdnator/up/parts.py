@@ -14,7 +14,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
@@ -32,7 +32,7 @@ from sdnator.config.planned_switches import PlannedSwitch
 from sdnator.config.switch_security import security_of, switch_options
 from sdnator.private_files import kept_secret
 from sdnator.rights.granting import OPERATOR, granted
-from sdnator.rights.identities import ADMIN, made, observable
+from sdnator.rights.identities import ADMIN, READERS, made, observable
 from sdnator.supervisor import Child, PartSpec, RestartPolicy
 from sdnator.supervisor.app_command import Backends, app_command
 from sdnator.supervisor.spec import PartProcess
@@ -71,9 +71,11 @@ class UpParts:
         self.identities = made(plan.state, {name: one.rights for name, one in self.granted.items()})
         self.enforced = True
         """Whether the server takes users; otherwise all parts use the given credential."""
+        self.archive_of: Callable[[str], str] = lambda _name: plan.archive
+        """URL of Data Archives for a part, with its own credential where the server takes users."""
         self._server = None if plan.updates else self._embedded_server()
         self.server = self._server.admin_url if self._server is not None else plan.updates
-        """URL of Data Updates for whoever makes users there."""
+        """URL of Data Updates with the right to make users there."""
         self.updates = self._operators_url()
         self._programs = {each.name: self._switch(each) for each in plan.switches if _is_ours(each)}
         self._foreign_base_us = 0
@@ -216,10 +218,10 @@ class UpParts:
     def backends(self, name: str) -> Backends:
         """Places of both backends, with the app's own credential."""
         if not self.enforced:
-            return Backends(updates=self.updates, archive=self.plan.archive, options=self.plan.engine)
+            return Backends(updates=self.updates, archive=self.archive_of(name), options=self.plan.engine)
         options = {**self.plan.engine, **observable(self.granted[name].rights)}
         updates = self.identities.url(self.updates, name)
-        return Backends(updates=updates, archive=self.plan.archive, options=options)
+        return Backends(updates=updates, archive=self.archive_of(name), options=options)
 
     def share_credential(self) -> None:
         """All parts use the given credential, for it may make no users."""
@@ -233,7 +235,8 @@ class UpParts:
                 "token": self._coordinator_token,
                 "metrics_token": metrics_token(self.plan.metrics_token_file),
             }
-            return {**own, "address_file": str(self.address_file), **secrets_of_http}
+            places = {"address_file": str(self.address_file), "readers_file": str(self.plan.state / READERS)}
+            return {**own, **places, **secrets_of_http}
         if name == "dashboard":
             return {**(self.plan.dashboard or {}), **self._dashboard_places()}
         if name == "p4runtime_ctrl":

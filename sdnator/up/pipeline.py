@@ -3,14 +3,14 @@
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
-from due.drivers.redis_wire import Wire
-from due.errors import DueError, InvalidOption
-from sdnator.errors import BadInput, PipelineError
 from sdnator.redaction import redacted
-from sdnator.rights.rights_keeper import RightsKeeper, RightsRefused
+from sdnator.rights.granting import OPERATOR
+from sdnator.rights.keeping import keeper_of, keeps_archives, try_updates
+from sdnator.rights.watching_keeper import RightsRefused
 from sdnator.supervisor import LogLimits, PartReport, Supervisor
 from sdnator.supervisor.log_rotation import put_aside
 from sdnator.up.parts import UpParts
@@ -34,7 +34,7 @@ class StandingPipeline:
             file_bytes=chosen.file_bytes, files=chosen.log_files, minute_bytes=chosen.minute_bytes
         )
         self._supervisor = Supervisor(self._parts.specs(), tell, self._limits)
-        self._keeper = RightsKeeper(self._parts.server, self._parts.identities)
+        self._keeper = keeper_of(self._parts.server, self._parts.identities)
 
     def __enter__(self) -> Self:
         try:
@@ -56,12 +56,13 @@ class StandingPipeline:
             put_aside(log, self._limits.files)
         self._parts.address_file.unlink(missing_ok=True)
         if self.plan.updates:
-            _try(self.plan.updates)
+            try_updates(self.plan.updates)
             self._make_users()
+        self._make_archive_users()
         for name, one in self._parts.granted.items():
             if one.withheld:
                 keys = ", ".join(one.withheld)
-                self._tell(f"{name} may not publish {keys}: name it in [[grants]] if it is to command")
+                self._tell(f"{name} may not publish {keys}: add [[grants]] for it if it should")
         self._supervisor.start()
         if self._parts.enforced:
             self._keeper.start()
@@ -74,9 +75,31 @@ class StandingPipeline:
         except RightsRefused as error:
             self._parts.share_credential()
             self._tell(
-                f"every app may do everything on Data Updates, for --updates' user may make no users ({error}): "
-                "give it the right to ACL"
+                f"every app may do everything on Data Updates, because the user of --updates may not create users ({error}): "
+                "grant it ACL"
             )
+
+    def _make_archive_users(self) -> None:
+        """On MongoDB: a user and collections for each app; all share the archive where none can be made."""
+        if not keeps_archives(self.plan.archive):
+            return
+        from sdnator.rights.mongo_keeper import MongoRightsKeeper, apps_url
+
+        identities = self._parts.identities
+        keeper = MongoRightsKeeper(self.plan.archive, identities)
+        try:
+            keeper.apply()
+        except RightsRefused as error:
+            self._tell(f"every app may read and write all of Data Archives: {redacted(str(error))}")
+        else:
+            self._parts.archive_of = partial(apps_url, self.plan.archive, identities)
+            keeper.start()
+            self._stack.callback(keeper.stop)
+
+    @property
+    def archive(self) -> str:
+        """URL of Data Archives for the operator; may hold a password."""
+        return self._parts.archive_of(OPERATOR)
 
     @property
     def plan(self) -> StandingPlan:
@@ -108,8 +131,13 @@ class StandingPipeline:
 
     @property
     def dashboard(self) -> str:
-        """URL of the page; empty where there is none."""
+        """URL of the dashboard; empty where there is none."""
         return self.endpoints("dashboard").get("dashboard", "")
+
+    @property
+    def uncontrolled(self) -> str:
+        """Switches that the controller had not under control when it was ready, and why; empty: none."""
+        return self.endpoints("uncontrolled").get("p4runtime_ctrl", "")
 
     def endpoints(self, what: str) -> dict[str, str]:
         """Addresses from the parts' ready lines, by part: `metrics`, `http`."""
@@ -159,13 +187,3 @@ class StandingPipeline:
             self._supervisor.stop()
         finally:
             self._stack.close()
-
-
-def _try(updates: str) -> None:
-    """Whether a given server is there, before anything is started."""
-    try:
-        Wire(updates).close()
-    except InvalidOption as error:
-        raise BadInput(f"--updates: {redacted(str(error))}") from None
-    except DueError as error:
-        raise PipelineError(redacted(str(error))) from None

@@ -10,7 +10,7 @@ import msgspec
 
 from sdnator import app_catalogue
 from sdnator.config import config_file
-from sdnator.config.planned_switches import PlannedSwitch, planned
+from sdnator.config.planned_switches import PlannedSwitch, planned, require_compiler
 from sdnator.config.switch_security import check_security
 from sdnator.errors import BadInput
 from sdnator.up import running
@@ -179,6 +179,8 @@ def _switches(config: "Config", given: Given) -> "list[SwitchPlan]":
 def _planned(plan: "SwitchPlan", controller: "Mapping[str, Any]") -> PlannedSwitch:
     try:
         made = planned(plan)
+        if made.kind == "embedded":
+            require_compiler()
         check_security(made, controller)
     except BadInput as error:
         raise BadInput(f"switch {plan.name}: {error}" if plan.name != "s1" else str(error)) from None
@@ -220,7 +222,9 @@ def _make_token(path: Path) -> None:
     except FileExistsError:
         return
     except OSError as error:
-        raise BadInput(f"{path}: {error.strerror}; set XDG_STATE_HOME to a folder of yours") from None
+        raise BadInput(
+            f"{path}: {error.strerror}; set XDG_STATE_HOME to a folder that you can write to"
+        ) from None
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
         file.write(secrets.token_urlsafe(24) + "\n")
 
@@ -241,5 +245,7 @@ def _own_archive() -> str:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise BadInput(f"{folder}: {error.strerror}; set XDG_DATA_HOME to a folder of yours") from None
+        raise BadInput(
+            f"{folder}: {error.strerror}; set XDG_DATA_HOME to a folder that you can write to"
+        ) from None
     return running.default_archive()

@@ -54,7 +54,7 @@ class UpReport:
             pid=os.getpid(),
             started=self._started,
             updates=pipeline.updates,
-            archive=plan.archive,
+            archive=pipeline.archive,
             coordinator=pipeline.coordinator,
             switch=switches[0],
             switches=switches,

@@ -51,7 +51,7 @@ class Running:
     out_of_range."""
     logs: str = ""
     dashboard: str = ""
-    """URL of the page; empty: there is none."""
+    """URL of the dashboard; empty: there is none."""
     token_file: str = ""
     """File with the token that signs in there."""
     metrics: Mapping[str, str] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Running:
     config: str = ""
     """File that was read."""
     model: str = ""
-    """What became of the kept model at the last start of Kitsune; empty: none is kept."""
+    """What happened to the kept model at the last start of Kitsune; empty: none is kept."""
     schema: int = SCHEMA
 
 
@@ -107,7 +107,9 @@ def claimed(folder: Path) -> Iterator[None]:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(folder / "run.lock", os.O_RDWR | os.O_CREAT, 0o600)
     except OSError as error:
-        raise BadInput(f"{folder}: {error.strerror}; set XDG_STATE_HOME to a folder of yours") from None
+        raise BadInput(
+            f"{folder}: {error.strerror}; set XDG_STATE_HOME to a folder that you can write to"
+        ) from None
     try:
         _lock(descriptor, folder)
         (folder / "run.json").unlink(missing_ok=True)
@@ -128,7 +130,7 @@ def _lock(descriptor: int, folder: Path) -> None:
         except BlockingIOError:
             if time.monotonic() > deadline:
                 raise PipelineError(
-                    f"a pipeline runs already ({folder}): stop it with `sdnator down`"
+                    f"a pipeline is already running ({folder}): stop it with `sdnator down`"
                 ) from None
             time.sleep(0.02)
         else:

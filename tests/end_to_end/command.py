@@ -12,9 +12,12 @@ SECONDS = 170
 
 
 def sdnator(
-    *arguments: str | Path, seconds: float = SECONDS, environment: Mapping[str, str] | None = None
+    *arguments: str | Path,
+    seconds: float = SECONDS,
+    environment: Mapping[str, str] | None = None,
+    given: str = "",
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end, standard output and error as text."""
+    """Run the command to its end, standard output and error as text; `given` is its standard input, if not empty."""
     command = [sys.executable, "-m", "sdnator.cli.main", *map(str, arguments)]
     return subprocess.run(
         command,
@@ -22,6 +25,7 @@ def sdnator(
         text=True,
         timeout=seconds,
         check=False,
+        input=given or None,
         env=os.environ | dict(environment or {}),
     )
 

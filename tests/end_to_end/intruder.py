@@ -20,7 +20,9 @@ from urllib.parse import quote
 import grpc
 import redis
 
-from due.drivers.redis_streams import stream_name
+from coordinator.openapi import document
+from due.drivers.redis_leases import lease_name
+from due.drivers.redis_streams import stream_name, work_name
 from due.drivers.redis_wire import client
 from p4rt import P4RuntimeStub, p4runtime
 
@@ -35,6 +37,7 @@ COMMANDS = (
     "network.packet_out.mine.s1",
     "due.assignment.firewall",
 )
+ALERTS = "network.anomaly.kitsune.alert"
 FRAMES = "network.frames.p4runtime_ctrl.s1.all"
 _REGEX = {"dataKey": {"$regex": r"^((\w|\.)+)+!$"}}
 _TIMEOUT_S = 60.0
@@ -74,13 +77,15 @@ def _bearer(token: str) -> dict[str, str]:
 
 
 def _by_http(place: str, token: str) -> dict[str, str]:
-    """Whole frames, and the query that once froze the Coordinator."""
+    """Whole frames, the query that once froze the Coordinator, and every path; /metrics has a token of its own."""
     rights = _bearer(token)
     query = quote(json.dumps(_REGEX))
+    paths = [path.replace("{app_id}", "firewall") for path in document()["paths"] if path != "/metrics"]
     return {
+        **{path: _attempt(partial(_request, place, path, rights)) for path in paths if path != "/get"},
+        "archive": _attempt(lambda: _request(place, f"/get?key={ALERTS}", rights)),
         "frames": _attempt(lambda: _request(place, f"/observe?key={FRAMES}", rights | _UPGRADE)),
         "regex": _attempt(lambda: _request(place, f"/get?query={query}", rights)),
-        "apps": _attempt(lambda: _request(place, "/apps", rights)),
     }
 
 
@@ -144,6 +149,10 @@ def _by_updates(url: str) -> dict[str, str]:
         attempts[f"publish {key}"] = ("PUBLISH", f"due:{key}", "x")
         attempts[f"add {key}"] = ("XADD", stream_name(key), "MAXLEN", "1", "*", "f", "x")
     attempts["observe frames"] = ("SUBSCRIBE", f"due:{FRAMES}")
+    work, lease = work_name("firewall", ALERTS), lease_name("firewall", ALERTS)
+    attempts["take the firewall's work"] = ("XREADGROUP", "GROUP", "firewall", "x", "STREAMS", work, ">")
+    attempts["acknowledge for the firewall"] = ("XACK", work, "firewall", "1-1")
+    attempts["leave for the firewall"] = ("HSET", lease, "x", "0")
     attempts["read frames"] = ("XRANGE", stream_name(FRAMES), "-", "+")
     try:
         return {name: _attempt(partial(server.execute_command, *words)) for name, words in attempts.items()}

@@ -133,7 +133,7 @@ def running(capture, tmp_path):
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {MARK: run}
     )
-    log = keep / "kitsune-alone" / "logs" / "p4runtime_ctrl.log"
+    log = keep / "dry-run" / "logs" / "p4runtime_ctrl.log"
     deadline = time.monotonic() + SECONDS
     while not (log.exists() and "primary" in log.read_text()):
         assert time.monotonic() < deadline

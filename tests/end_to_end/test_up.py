@@ -125,7 +125,14 @@ def test_all_parts_run_and_all_apps_are_active(standing):
     assert all(part["alive"] for part in found["parts"].values())
     assert {found["apps"][app] for app in APPS} == {"active"}
     assert found["pid"] == said["pid"]
+    assert said["uncontrolled"] == ""
     assert "kitsune" in operator.run("status").stdout
+
+
+def test_a_switch_that_is_not_there_is_named_at_the_start(operator):
+    with operator.up("--switch", "127.0.0.1:1", "--insecure") as (_, said):
+        assert said["uncontrolled"].startswith("s1: ")
+        assert "127.0.0.1:1" in said["uncontrolled"]
 
 
 def test_the_kept_model_is_taken_up_shown_and_thrown_away(operator):
@@ -140,10 +147,10 @@ def test_the_kept_model_is_taken_up_shown_and_thrown_away(operator):
     detector.process(mixed(400), "s1")
     KeptModel(path, trained_for(SMALL, {"s1": ["embedded"]})).keep(detector)
     with operator.up() as (_, said):
-        assert said["model"].startswith("took up the model of")
+        assert said["model"].startswith("using the kept model of")
         until(lambda: (operator.well() or {}).get("training", {}).get("done"))
         assert "model: trained until" in operator.run("status").stdout
-        assert "training anew on the next 221 packets" in operator.run("model", "retrain").stdout
+        assert "training again, on the next 221 packets" in operator.run("model", "retrain").stdout
         until(lambda: "training 0 %, waiting for packets" in operator.run("model", "show").stdout)
         assert not path.exists()
     KeptModel(path, trained_for(SMALL, {"s1": ["embedded"]})).keep(detector)

@@ -21,7 +21,7 @@ def test_training_says_how_far_it_is_how_long_it_takes_and_where_packets_come_fr
         ({"seconds_left": 20.0}, "43 %, about 20 s left"),
         ({"seconds_left": 20_000.0}, "43 %, about 6 h left"),
         ({"seconds_left": 1e6}, "43 %, about 12 days left"),
-        ({"seconds_left": None}, "43 %, no telling how long"),
+        ({"seconds_left": None}, "43 %, time left unknown"),
         ({"seconds_left": None, "packets": 0}, "0 %, waiting for packets"),
         ({"packets": 54_999}, "99 %"),
     ],

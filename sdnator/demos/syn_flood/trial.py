@@ -48,7 +48,7 @@ class Trial:
     """Number of the service; each trial has its own."""
     seconds: float
     after_rule: float | None = None
-    """End so many seconds after the rule; `seconds` at most."""
+    """End this many seconds after the rule, but after `seconds` at most."""
     rate: int = 5000
     """SYNs a second."""
     known_rate: float = 20.0
@@ -155,7 +155,7 @@ class TrialHosts:
                 return
             since = time.monotonic() - begun
             if since > seconds:
-                raise PipelineError(f"{what} did not come within {seconds:.0f} s")
+                raise PipelineError(f"waited in vain for {what}, for {seconds:.0f} s")
             if show is not None and since >= shown:
                 show()
                 shown += 1.0
@@ -169,7 +169,7 @@ class TrialHosts:
             self.wait_until(known, _LATE_S, "known sources in the switch")
 
     def wait_guarded(self, services: int) -> None:
-        """Wait until so many services are guarded in the switch."""
+        """Wait until this many services are guarded in the switch."""
         guarded = partial(self._has_entries, "protect", services)
         self.wait_until(guarded, _LATE_S, "guards in the switch")
 

@@ -62,8 +62,8 @@ def test_options_end_at_the_end_mark():
 @pytest.mark.parametrize(
     ("tail", "words"),
     [
-        (b"\x01\x00\x00\x00" + b"\x0d\x00\x00\x00" + bytes(8), "which cannot be"),
-        (b"\x01\x00\x00\x00" + b"\xff\xff\xff\x7f" + bytes(8), "which cannot be"),
+        (b"\x01\x00\x00\x00" + b"\x0d\x00\x00\x00" + bytes(8), "which is impossible"),
+        (b"\x01\x00\x00\x00" + b"\xff\xff\xff\x7f" + bytes(8), "which is impossible"),
         (b"\x01\x00\x00\x00" + b"\x14\x00\x00\x00" + bytes(12), "two lengths"),
         (b"\x01\x00\x00", "header of a block"),
         (_block(1, b"\1\0\0\0"), "description of an interface"),

@@ -121,10 +121,10 @@ def test_other_header_and_missing_file(tmp_path):
 def test_cut_gzip(tmp_path):
     path = tmp_path / "table.tsv.gz"
     path.write_bytes(gzip.compress("\n".join([TSHARK_HEADER, *[TSHARK_UDP] * 50]).encode())[:-9])
-    with pytest.raises(MalformedTsv, match="not a whole table"):
+    with pytest.raises(MalformedTsv, match="an incomplete table"):
         list(read_rows(path))
     path.write_bytes(b"\x1f\x8b\x00\x00junk")
-    with pytest.raises(MalformedTsv, match="not a whole table"):
+    with pytest.raises(MalformedTsv, match="an incomplete table"):
         list(read_rows(path))
 
 

@@ -105,11 +105,16 @@ def test_what_cannot_be_enrolled_is_refused_with_the_reason(state, arguments, wo
 
 def test_who_has_a_credential_is_listed_with_the_keys(state):
     assert "no app has a credential" in run("list")
-    run("enrol", "mine", "--publish", "a.b", "--observe", "c.**")
+    run("enrol", "mine", "--publish", "a.b", "--observe", "c.**", "--read", "d.*")
     run("enrol", "other", "--publish", "network.block.other.*", "--command")
-    assert "mine (enrolled)\n  publishes a.b\n  observes  c.**" in run("list")
+    assert "mine (enrolled)\n  publishes a.b\n  observes  c.**\n  reads     d.*" in run("list")
     shown = json.loads(run("list", "--json"))
-    assert shown["other"] == {"enrolled": True, "publish": ["network.block.other.*"], "observe": []}
+    assert shown["other"] == {
+        "enrolled": True,
+        "publish": ["network.block.other.*"],
+        "observe": [],
+        "read": [],
+    }
     secret = Identities(state).all["mine"].password
     assert secret not in run("list")
 

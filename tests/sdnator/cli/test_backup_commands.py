@@ -106,7 +106,7 @@ def archive_of_version(home, version):
     ("manifest", "word"),
     [
         ({"schema": 99, "version": "9.9"}, "newer"),
-        ({}, "no backup"),
+        ({}, "not a backup"),
         ({"schema": 1, "files": ["archive.db"]}, "damaged"),
     ],
 )

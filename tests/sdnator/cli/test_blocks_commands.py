@@ -129,7 +129,7 @@ def test_what_cannot_be_done_is_said_at_once_and_leaves_nothing(monkeypatch, tmp
     for variable in ("DUE_UPDATES", "DUE_ARCHIVE"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SdnatorError, match=r"no IP address|no pipeline is running|10\.0\.0\.300"):
+    with pytest.raises(SdnatorError, match=r"not an IP address|no pipeline is running|10\.0\.0\.300"):
         run(group, *words)
     assert list(tmp_path.iterdir()) == []
 

@@ -57,6 +57,15 @@ def test_an_enrolled_app_that_may_command_is_named(state):
     assert found.found == "mine (network.block.mine.*)"
 
 
+def test_who_reads_the_archive_from_outside_is_named(state):
+    identities = Identities(state)
+    with identities.changing():
+        identities.put("mine", Rights(app="mine", publish=("a.b",), read=("network.**",)), enrolled=True)
+        identities.put("other", Rights(app="other", observe=("**",)), enrolled=True)
+    (found,) = [check for check in security_checks() if check.name == "reading apps"]
+    assert found.found == "mine (network.**)"
+
+
 @pytest.mark.parametrize(
     ("text", "exposed"),
     [

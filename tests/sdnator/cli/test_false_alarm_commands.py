@@ -52,4 +52,4 @@ def test_a_false_alarm_is_undone_explained_and_taken_back(firewall, kitsune):
     with pytest.raises(BadInput, match="already"):
         run(blocks, "false-alarm", name, *both)
     assert "in full again" in run(blocks, "false-alarm", name, "--revoke", *both)
-    wait_for(lambda: "nothing was called" in run(blocks, "false-alarms", *archive))
+    wait_for(lambda: "no decision was called" in run(blocks, "false-alarms", *archive))

@@ -60,7 +60,7 @@ def test_one_is_shown_by_its_id_or_by_a_decision(archive):
     assert shown == run(incidents, "show", life()[0].id, "--archive", archive)
     assert "attacker: 192.168.2.108 (5c:cf:7f:05:f2:c6, port 1 of s1)" in shown
     assert json.loads(run(incidents, "show", "d1", "--json", "--archive", archive))["state"] == "over"
-    with pytest.raises(BadInput, match="no incident has the id nobody"):
+    with pytest.raises(BadInput, match="has the id nobody"):
         run(incidents, "show", "nobody", "--archive", archive)
 
 

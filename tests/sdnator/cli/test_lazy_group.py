@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from importlib import import_module
+from itertools import pairwise
 
 import pytest
 import typer
@@ -39,6 +40,18 @@ def test_every_command_answers_help(name):
     assert "Exit codes: " in done.stdout
 
 
+@pytest.mark.parametrize("words", [*([name] for name in COMMANDS), ["app", "enrol"], ["restore"]])
+def test_help_flows_to_the_width_of_the_terminal(words):
+    """On 80 columns no word is cut, and no line ends early because the source's did."""
+    shown = CliRunner().invoke(app, [*words, "--help"], env=WIDE | {"COLUMNS": "80"}).stdout
+    prose = shown.partition("╭")[0].splitlines()
+    for line, after in pairwise(each.strip() for each in prose):
+        word = after.partition(" ")[0]
+        if line and after and not word.endswith(":") and word not in ("Exit", "Usage:"):
+            assert len(line) + len(word) + 3 > 78, line
+    assert "…" not in shown.replace("SDNATOR_…", "")
+
+
 def test_the_list_imports_none_of_them():
     """Each heavy module costs a share of the 300 ms in which `sdnator --help` has to answer."""
     done = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
@@ -70,3 +83,6 @@ def test_shells_complete_commands_and_options(shell):
     words = {"COMP_WORDS": "sdnator status --js", "COMP_CWORD": "2"}
     asked |= words | {"_TYPER_COMPLETE_ARGS": "sdnator status --js"}
     assert "--json" in CliRunner().invoke(app, [], env=asked, prog_name="sdnator").output
+    words = {"COMP_WORDS": "sdnator dataset fetch mi", "COMP_CWORD": "3"}
+    asked |= words | {"_TYPER_COMPLETE_ARGS": "sdnator dataset fetch mi"}
+    assert "mirai" in CliRunner().invoke(app, [], env=asked, prog_name="sdnator").output

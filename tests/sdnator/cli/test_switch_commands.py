@@ -33,7 +33,7 @@ def address():
 
     from p4rt import P4RuntimeStub
 
-    command = [sys.executable, "-m", "dataplane", "--backend", "python"]
+    command = [sys.executable, "-m", "dataplane"]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout is not None

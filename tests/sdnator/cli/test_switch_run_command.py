@@ -19,8 +19,6 @@ def start(*arguments):
         "--grpc",
         "127.0.0.1:0",
         "--insecure",
-        "--backend",
-        "python",
         *arguments,
     ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -19,7 +19,8 @@ KERNEL = {
 
 
 @pytest.mark.parametrize(
-    ("options", "why"), [({"spoofed": True, "hundred": True}, "exclude"), ({"switch": "x"}, "bmv2")]
+    ("options", "why"),
+    [({"spoofed": True, "hundred": True}, "cannot be combined"), ({"switch": "x"}, "bmv2")],
 )
 def test_misuse_is_named(options, why):
     """Before anything is started."""

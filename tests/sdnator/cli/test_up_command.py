@@ -117,7 +117,7 @@ def test_two_ports_are_a_wire_by_themselves():
         (["1"], "two ports"),
         (["1-1"], "two ports"),
         (["1-x"], "1 to 509"),
-        (["1-2", "2-3"], "joined already"),
+        (["1-2", "2-3"], "already joined"),
         (["1-4"], "no port 4"),
     ],
 )

@@ -14,6 +14,7 @@ from due import DB_ONLY, PRODUCER, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.cli.main import app as program
 from sdnator.errors import BadInput, PipelineError
+from sdnator.rights.audit_trail import unix_user
 from sdnator.rights.sign_in_link import FILE, used_up
 from sdnator.rights.users import Users
 from sdnator.up import running
@@ -49,6 +50,36 @@ def test_somebody_comes_changes_the_password_and_goes(state):
     assert Users(state).verified("ada", PASSWORD) is None
     run("user", "remove", "ada")
     assert set(Users(state).all) == {"bob"}
+
+
+def test_what_is_done_on_the_command_line_is_kept_with_the_name_of_the_unix_user(monkeypatch):
+    monkeypatch.delenv("SUDO_UID", raising=False)
+    run("user", "add", "ada", "--password-stdin", given=PASSWORD + "\n")
+    run("user", "passwd", "ada", "--password-stdin", given="another password\n")
+    run("user", "remove", "ada")
+    run("app", "enrol", "mine", "--publish", "network.anomaly.mine.**")
+    run("app", "remove", "mine")
+    text = run("audit", "--json")
+    deeds = json.loads(text)["deeds"]
+    assert {(one["who"], one["source"]) for one in deeds} == {(unix_user(), "command line")}
+    assert [one["deed"] for one in deeds] == [
+        "added user ada, viewer",
+        "changed the password of user ada",
+        "removed user ada",
+        "enrolled app mine: publish network.anomaly.mine.**; observe nothing; read nothing",
+        "revoked the credential of app mine",
+    ]
+    assert PASSWORD not in text
+    assert "another" not in text
+    monkeypatch.setenv("DUE_ARCHIVE", "sqlite:///proc/no/such/place.db")
+    run("user", "add", "bob", "--password-stdin", given=PASSWORD + "\n")
+    assert run("user", "list").startswith("name")
+
+
+def test_whoever_became_root_is_told_too(monkeypatch):
+    monkeypatch.setattr("sdnator.rights.audit_trail.os.geteuid", lambda: 0)
+    monkeypatch.setenv("SUDO_UID", "4294967290")
+    assert unix_user() == "root (4294967290)"
 
 
 def test_a_role_that_is_none_is_misuse():
@@ -95,7 +126,7 @@ def test_who_did_what_is_read_from_the_archive(tmp_path):
         ("operator", "", "panic (now)"),
     ]
     assert "unblock x" in run("audit", "--archive", archive, "--who", "ada")
-    assert run("audit", "--archive", archive, "--who", "bob") == "nothing was done\n"
+    assert run("audit", "--archive", archive, "--who", "bob") == "nothing was done in that time\n"
 
 
 _WAY_IN = """

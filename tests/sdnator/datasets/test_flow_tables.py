@@ -101,7 +101,7 @@ def test_missing_and_cut_tables(tmp_path):
     with pytest.raises(MissingFlowTable):
         list(read_flow_table(tmp_path))
     (tmp_path / "cut").write_bytes(gzip.compress(ZEEK.encode())[:-40])
-    with pytest.raises(MalformedFlowTable, match="not a whole table"):
+    with pytest.raises(MalformedFlowTable, match="an incomplete table"):
         list(read_flow_table(tmp_path / "cut"))
 
 

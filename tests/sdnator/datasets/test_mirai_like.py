@@ -105,8 +105,6 @@ def test_the_house_resembles_the_public_capture(seed):
 
 def _scores(frames: list[WireFrame]) -> tuple[np.ndarray, int]:
     kernel = load_kernel()
-    if kernel is None:
-        pytest.skip("needs the C kernel: the Python twin takes minutes here")
     batch, features, net = _batch(frames), AfterImage(kernel=kernel), KitNet(kernel=kernel)
     parts = [
         net.process(features.update({name: batch[name][at : at + 4_096] for name in batch.columns}))[0]

@@ -4,6 +4,10 @@ import bz2
 import gzip
 import hashlib
 import io
+import signal
+import socket
+import subprocess
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +22,7 @@ from sdnator.datasets import frames, local_sets
 from sdnator.datasets.catalogue import CATALOGUE
 from sdnator.datasets.names import named_capture
 from sdnator.errors import BadInput
+from sdnator.testing.waiting import wait_for
 from tests.sdnator.datasets.publisher import UCI, Publisher, serving
 
 T0 = 1_313_000_000 * 10**9 - 10**9 * (1_313_000_000 % 60)
@@ -81,7 +86,7 @@ def test_mirai_by_name_from_a_mirror(publisher, capture):
     digest = hashlib.sha256(gzip.compress(capture, mtime=0)).hexdigest()
     assert f"SHA-256 {digest} (pinned from now on)" in said
     assert "CC BY 4.0" in said
-    assert "60 labels, and the publication speaks of 764,137 packets" in said
+    assert "60 labels, but the publication mentions 764,137 packets" in said
     found = named_capture(Path("mirai"))
     assert found.labels is not None
     assert len(read_labels(found.labels)) == 60
@@ -121,6 +126,7 @@ def test_a_download_goes_on_where_it_ended(publisher, capture):
 def test_what_is_not_the_file(publisher, capture):
     """404, a portal's page, a truncated gzip and something else: each its own clear error."""
     assert "not found at" in (text := _fail("fetch", "mirai", "--mirror", publisher.url))
+    assert "nor at 5 other addresses" in text, "all of them would fill a screen"
     assert "--whole (17.7 GB)" in text
     place = f"{UCI}/mirai/Mirai_pcap.pcap.gz"
     publisher.pages[place] = b"<html>Please register</html>"
@@ -144,7 +150,7 @@ def test_a_pinned_checksum_must_match(publisher, capture, tmp_path):
     _run("fetch", "mirai", "--mirror", publisher.url)
     for path in (tmp_path / "share" / "sdnator" / "datasets" / "mirai").iterdir():
         path.unlink()
-    assert "the file has gone" in _fail_named("mirai")
+    assert "the file is gone" in _fail_named("mirai")
     publisher.files[f"{UCI}/mirai/Mirai_pcap.pcap.gz"] = gzip.compress(capture, 1, mtime=5)
     text = _fail("fetch", "mirai", "--mirror", publisher.url)
     assert "--repin" in text
@@ -317,3 +323,24 @@ def test_damaged_records_say_what_to_do(tmp_path):
     assert "delete it" in _fail_named("mirai")
     (local_sets.folder() / "mirai.json").write_text("[1]")
     assert "not a record" in _fail_named("mirai")
+
+
+def test_who_interrupts_a_download_is_told_that_it_goes_on(tmp_path, monkeypatch):
+    """Ctrl-C in the real program, once some bytes of the capture are here."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+        command = [sys.executable, "-m", "sdnator.cli.main", "dataset", "fetch", "mirai", "--mirror", url]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+        connection, _ = server.accept()
+        with connection:
+            connection.recv(4096)
+            connection.sendall(
+                b'HTTP/1.1 200 OK\r\nETag: "1"\r\nContent-Length: 5000000\r\n\r\n' + bytes(300_000)
+            )
+            folder = tmp_path / "data" / "sdnator" / "datasets" / "mirai"
+            wait_for(lambda: any(each.stat().st_size for each in folder.glob(".*.part")))
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "what has come is kept; run the command again to continue" in said

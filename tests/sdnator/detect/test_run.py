@@ -103,7 +103,7 @@ def test_nanosecond_captures_keep_their_times(tmp_path):
     [
         ({"fm_grace": 5_000}, "training alone needs 6,501"),
         ({"model": "none.npz"}, "no such model"),
-        ({"model": "a", "retrain_from": "b"}, "exclude each other"),
+        ({"model": "a", "retrain_from": "b"}, "cannot be combined"),
         ({"labels": "none.csv"}, "none.csv"),
         ({"threshold": -1.0}, "threshold=-1.0"),
         ({"features": "no/such/folder/f.npy"}, "cannot be written"),

@@ -85,14 +85,18 @@ def test_answers_of_an_extended_block_stand_in_their_own_rows(tmp_path):
 
 
 def test_events_are_those_of_the_firewalls_own_file():
-    """Reports of incidents without mere updates, and decisions that belong to none."""
+    """Reports of incidents without mere updates, and decisions that belong to none: blocked once that is confirmed."""
     by_hand = decision(id="d9", target=Target(kind="ip", address="10.0.0.9"))
     *told, last = incidents()
     update = structs.replace(last, change="more")
-    events = report_files.incident_events([*told, update], [decision(), by_hand])
+    answers = [confirmation(), confirmation(id="d9")]
+    events = report_files.incident_events([*told, update], [decision(), by_hand], answers)
     signatures = [event["alert"]["signature"] for event in events]
-    assert signatures == ["SDNATOR traffic unlike training"] * 3 + ["SDNATOR block"]
-    assert (events[-1]["src_ip"], events[-1]["alert"]["action"]) == ("10.0.0.9", "blocked")
+    assert signatures == ["SDNATOR traffic unlike training"] * 3 + ["SDNATOR block"] * 2
+    assert [(each["src_ip"], each["alert"]["action"]) for each in events[-2:]] == [
+        ("10.0.0.9", "allowed"),
+        ("10.0.0.9", "blocked"),
+    ]
 
 
 def test_drops_are_counted_by_second_and_sender():

@@ -12,6 +12,7 @@ from apps.messages import Answer
 from due import CONSUMER, PRODUCER, Capability, DueError, Engine, Item
 from due.config import Options
 from sdnator.errors import BadInput, PipelineError
+from sdnator.rights.audit_trail import note
 from sdnator.up import running
 
 _LOOK_SECONDS: Final = 0.5
@@ -23,7 +24,7 @@ class AppRequest:
     """An instruction and where its answer comes."""
 
     app: str
-    """Who is asked."""
+    """The app that is asked."""
     key: str
     answer: str
     """Key of the answer."""
@@ -71,6 +72,9 @@ def ask(question: AppRequest, updates: str, archive: str, patience: float) -> st
         ) from error
     finally:
         engine.close()
+    words = " ".join(str(question.value.get(name) or "") for name in ("verb", "subject", "reason")).split()
+    outcome = "told" if answer.done else "was refused by"
+    note(f"{outcome} the {question.app}: {' '.join(words)}", instruction=question.id, archive=archive)
     if not answer.done:
         raise BadInput(answer.text)
     return answer.text

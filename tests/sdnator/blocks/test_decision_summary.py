@@ -4,7 +4,7 @@ import pytest
 from msgspec import structs
 
 from apps.messages import Decision, Exhibit, Target
-from sdnator.blocks.five_lines import five_lines
+from sdnator.blocks.decision_summary import five_lines
 from tests.apps.firewall.incidents.samples import decision
 from tests.sdnator.incidents.samples import life
 

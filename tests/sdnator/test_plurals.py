@@ -2,7 +2,7 @@
 
 import pytest
 
-from sdnator.counted import counted
+from sdnator.plurals import counted
 
 
 @pytest.mark.parametrize(
