@@ -11,6 +11,7 @@ of the paper (block at the first score over the threshold) and the rule of secon
     innocent_blocks           blocks during attacks of somebody who is not the attacker, the victim included
     novelty_blocks            blocks in benign novelty
     false_blocks_per_day, …_upper95   blocks a day of benign traffic, and the upper end of its 95 % interval
+    captured                  how many captured attacks there are, held back or not; or why none
     real_benign               the benign part of the real capture: packets behind training, blocks
     by_attack                 with the packets dropped and challenged, and the packets and hosts of others that were hit;
                               `peak_score` and `over_1` are Kitsune's scores of the attack's packets, those dropped
@@ -97,6 +98,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             key: str(value) if isinstance(value, Path) else value for key, value in vars(chosen).items()
         },
     }
+    captured = _captured(chosen.data)
+    figures["captured"] = len(captured) if captured else f"not run: no data in {chosen.data}"
+    if not captured:
+        print(f"captured attacks: {figures['captured']}", flush=True)
     rows: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
     novelty: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
     for name in chosen.networks:

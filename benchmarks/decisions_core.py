@@ -163,7 +163,7 @@ class DecisionRun:
                 )
             self.decider.settled(proposal)
         elif proposal.limit is not None:
-            victim = evidence.victims[0]
+            victim = proposal.evidence.victims[0]
             made = self._limits.open(victim, proposal.limit, proposal.reason, (), evidence)
             self._meters.decide(made)
             self.decided += [DecidedAction(evidence.event_time, each.reason, limited=victim) for each in made]

@@ -7,6 +7,10 @@ two veth ports.  *Block* is the time from the firewall's `write` of the decision
 *gone* the time from the `write` of its end to the first one that arrives again; *expiry* (nftables alone) the time
 from the moment at which a block ends by itself, without anybody's word.  What the firewall needs to decide is not in it,
 Data Updates, Coordinator (switch) and the enforcer are.  A round is one decision and its end.
+
+In the switch a block ends by the firewall's word: *expiry* there is the time from the end that a decision names to the
+confirmation that its entry is gone, with the real firewall, while packets of another sender pass and in silence.  The
+blocked sender is silent, because a block of one that goes on sending is extended.
 """
 
 import socket
@@ -19,14 +23,15 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Final, Protocol
+from uuid import uuid4
 
 from msgspec import structs
 
-from apps.messages import Decision, Target
+from apps.messages import Decision, Instruction, Target
 from benchmarks.measure import arguments, bars, machine, table, write_json
-from due import Capability
+from due import Capability, Item
 from sdnator.capture.interfaces import VethPair
-from sdnator.testing.controller_run import ControllerRun, frame
+from sdnator.testing.controller_run import PACKETS, ControllerRun, frame
 from sdnator.testing.enforcer_run import EnforcerRun
 from sdnator.testing.routed_lab import FORWARD, SENDERS, RoutedLab
 from sdnator.testing.switch_target import SwitchTarget
@@ -34,9 +39,13 @@ from sdnator.testing.waiting import wait_for
 
 ROUNDS: Final = 100
 EXPIRIES: Final = 10
-EXPIRES_S: Final = 1.5
+EXPIRES_S: Final = 2.0
 BAR_MS: Final = 1000.0
 GAP_S: Final = 0.0005
+INSTRUCTION: Final = "network.instruction.operator.firewall"
+BLOCKS: Final = "network.block.firewall.*"
+CONFIRMED: Final = "network.confirmation.p4runtime_ctrl.*"
+STATE: Final = "network.switch.p4runtime_ctrl.*"
 _CALM_S: Final = 0.05
 """No packet for this long: the block stands."""
 
@@ -49,10 +58,11 @@ class PacketPath(Protocol):
 
 
 class Stream:
-    """Packets, one every half millisecond, and when each was sent and arrived; a context manager."""
+    """Packets, one every `gap_s` seconds, and when each was sent and arrived; a context manager."""
 
-    def __init__(self, path: PacketPath) -> None:
+    def __init__(self, path: PacketPath, gap_s: float = GAP_S) -> None:
         self._path = path
+        self._gap_s = gap_s
         self._stopping = threading.Event()
         self.last = 0.0
         """Monotonic time at which the last packet arrived."""
@@ -85,7 +95,7 @@ class Stream:
         return self.last - began
 
     def _send(self) -> None:
-        while not self._stopping.wait(GAP_S):
+        while not self._stopping.wait(self._gap_s):
             self._path.send()
 
     def _receive(self) -> None:
@@ -145,6 +155,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if name == "nftables":
                 ends = [_expiry(stream, decide, make) for _ in range(expiries)]
                 figures |= _figures("nftables_expiry_ms", ends)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, ends in _switch_expiries(Path(folder), expiries).items():
+            figures |= _figures(f"switch_expiry_{name}_ms", ends)
     table(("figure", "ms"), sorted(figures.items()))
     bars("milliseconds", {name: value for name, value in figures.items() if name.endswith("p99")})
     missed = [name for name, value in figures.items() if value > BAR_MS]
@@ -208,7 +221,7 @@ def _nftables(folder: Path) -> Iterator[Stage]:
 
 
 @contextmanager
-def _switch(folder: Path) -> Iterator[Stage]:
+def _switch_run(folder: Path) -> Iterator[tuple[ControllerRun, PathThroughSwitch]]:
     """An embedded switch between two veth pairs, its controller, and the Coordinator."""
     with ExitStack() as stack:
         first, second = (VethPair.make(stack, name) for name in ("bena", "benb"))
@@ -216,16 +229,79 @@ def _switch(folder: Path) -> Iterator[Stage]:
         run.target = SwitchTarget("embedded", folder, ports=(f"1=veth:{first.far}", f"2=veth:{second.far}"))
         stack.enter_context(run)
         run.controller()
-        made = [Capability("network.block.firewall.*", delivery="reliable", archive="always")]
-        engine = run.engine("firewall", capabilities=made)
         wire = PathThroughSwitch(first.near, second.near)
         stack.callback(wire.close)
+        yield run, wire
+
+
+@contextmanager
+def _switch(folder: Path) -> Iterator[Stage]:
+    """Decisions straight to the switch's controller."""
+    with _switch_run(folder) as (run, wire):
+        made = [Capability("network.block.firewall.*", delivery="reliable", archive="always")]
+        engine = run.engine("firewall", capabilities=made)
 
         def decide(decision: Decision) -> None:
             engine.write("network.block.firewall.ipv4", decision.to_value())
             engine.flush()
 
         yield wire, decide, _block_of_sender
+
+
+class FirewallRun:
+    """The real firewall beside the controller of a run; blocks by hand, and when their entries are gone."""
+
+    def __init__(self, run: ControllerRun) -> None:
+        run.run("apps.firewall.service", {"detect": False, "learn": False, "arp": "off"})
+        self._operator = run.engine("operator", capabilities=[Capability(INSTRUCTION, delivery="reliable")])
+        self._ends: dict[str, int] = {}
+        self._removed: dict[str, int] = {}
+        self._behind = 1 << 62
+        """Wall time minus the switch's, ns: the least of all reports, which are never early."""
+        for key, told in ((BLOCKS, self._decided), (CONFIRMED, self._confirmed), (STATE, self._stated)):
+            run.engine(f"observer{len(key)}").observe(key).subscribe(told)
+
+    def hear_time(self) -> None:
+        """Wait until some reports have told how the switch's time and the wall's differ."""
+        seen = self._reports + 3
+        wait_for(lambda: self._reports >= seen)
+
+    _reports = 0
+
+    def end_of(self, address: str) -> float:
+        """Seconds from the end of a block to the confirmation that its entry is gone."""
+        order = Instruction(id=uuid4().hex, verb="block", subject=address, seconds=int(EXPIRES_S))
+        before = set(self._ends)
+        self._operator.write(INSTRUCTION, order.to_value())
+        wait_for(lambda: self._ends.keys() - before)
+        (made,) = self._ends.keys() - before
+        wait_for(lambda: made in self._removed)
+        return (self._removed[made] - self._ends[made] - self._behind) / 1e9
+
+    def _decided(self, item: Item) -> None:
+        if item.value["action"] == "block":
+            self._ends[item.value["id"]] = item.value["expires"]
+
+    def _confirmed(self, item: Item) -> None:
+        if item.value["state"] == "removed":
+            self._removed[item.value["id"]] = time.time_ns()
+
+    def _stated(self, item: Item) -> None:
+        if item.value["event_time"]:
+            self._behind = min(self._behind, time.time_ns() - item.value["event_time"])
+            self._reports += 1
+
+
+def _switch_expiries(folder: Path, count: int) -> dict[str, list[float]]:
+    with _switch_run(folder) as (run, wire):
+        firewall = FirewallRun(run)
+        run.engine("listener").observe(PACKETS).subscribe(
+            lambda _: None
+        )  # without one the switch sends no packet, and no time
+        with Stream(wire, _CALM_S / 5):
+            firewall.hear_time()
+            found = {"busy": [firewall.end_of(f"10.0.1.{number}") for number in range(1, count + 1)]}
+        return found | {"silent": [firewall.end_of(f"10.0.2.{number}") for number in range(1, count + 1)]}
 
 
 def _block_of_sender(seconds: float) -> Decision:

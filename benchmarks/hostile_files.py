@@ -90,14 +90,14 @@ _KINDS: tuple[type[Any], ...] = (
 
 
 def _settings(path: Path) -> None:
-    refused: list[InvalidOption] = []
+    refused: list[str] = []  # not the errors, which would hold this frame, and it them
     for kind in _KINDS:
         try:
             read_struct(str(path), kind)
         except InvalidOption as error:
-            refused.append(error)
+            refused.append(str(error))
     if len(refused) == len(_KINDS):
-        raise refused[0]
+        raise InvalidOption(refused[0])
 
 
 _SETTINGS = (

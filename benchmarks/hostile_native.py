@@ -14,7 +14,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from apps.kitsune.afterimage import WIDTH, AfterImage
-from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, Kernel, load_kernel
+from apps.kitsune.kernel import PACKET_FIELDS, ColumnError, load_kernel
 from apps.kitsune.kitnet import KitNet
 from apps.kitsune.service import packets_in
 from apps.messages import MessageError
@@ -45,9 +45,7 @@ _RECIPROCALS = (0, 1 << 32, (1 << 64) - 1, *map(hostile_traffic.reciprocal, (10,
 
 class _Kitsune:
     def __init__(self) -> None:
-        kernel = load_kernel(kernel_library())
-        assert kernel is not None
-        self.kernel: Kernel = kernel
+        self.kernel = load_kernel(kernel_library())
         self._inputs = 0
 
     def images(self) -> Sequence[AfterImage]:
@@ -120,7 +118,7 @@ class _OwnSwitch:
 
     def __init__(self) -> None:
         sanitized_switches()
-        self._switch = Switch(load(find().bmv2_json.read_bytes()), cpu_port=_CPU, backend="c")
+        self._switch = Switch(load(find().bmv2_json.read_bytes()), cpu_port=_CPU)
         self._switch.set_ports([1, 2, 3])
         self._switch.set_clone_session(1, [Replica(_CPU, 1)])
         self._switch.set_multicast_group(1, [Replica(port, port) for port in (1, 2, 3)])
@@ -164,7 +162,7 @@ def _own_switch() -> _OwnSwitch:
 @cache
 def _device() -> AttackedDevice:
     sanitized_switches()
-    return AttackedDevice("c")
+    return AttackedDevice()
 
 
 def _attack_own(data: bytes) -> None:

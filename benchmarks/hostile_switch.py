@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from benchmarks.hostile_messages import frames
 from benchmarks.hostile_mutation import mutate_json, mutate_protobuf
 from benchmarks.hostile_target import DecoderTarget
-from dataplane.compiler import build, layout
+from dataplane.compiler import layout
 from dataplane.compiler.c_code import generate
 from dataplane.errors import DataplaneError, ProgramError
 from dataplane.p4runtime.device import Device
@@ -26,7 +26,6 @@ from dataplane.p4runtime.trust import AnyProgram
 from dataplane.packet_loop import PacketClock, PacketLoop
 from dataplane.ports.port import MemoryPort
 from dataplane.v1model.program import load
-from dataplane.v1model.switch import Backend
 from p4rt import open_channel, p4info, p4runtime, status
 from sdnator.p4_program import find
 from sdnator.testing.p4runtime_client import EntryBuilder, delete, insert, modify, program_config
@@ -64,8 +63,8 @@ def _set_request(action: int) -> Any:
 class AttackedDevice:
     """A device with a primary controller, whose pipeline is set anew now and then."""
 
-    def __init__(self, backend: Backend, program: Any = None) -> None:
-        self.device = Device(1, backend=backend, clock=lambda: 0, programs=AnyProgram())
+    def __init__(self, program: Any = None) -> None:
+        self.device = Device(1, clock=lambda: 0, programs=AnyProgram())
         update = p4runtime.MasterArbitrationUpdate(device_id=1)
         update.election_id.low = 1
         self.stream = self.device.open_stream()
@@ -109,8 +108,8 @@ class AttackedDevice:
 
 
 @cache
-def _device(backend: Backend) -> AttackedDevice:
-    return AttackedDevice(backend)
+def _device() -> AttackedDevice:
+    return AttackedDevice()
 
 
 def _writes() -> tuple[bytes, ...]:
@@ -144,7 +143,6 @@ def _program(data: bytes) -> None:
     """A program that loads is compiled, except by gcc."""
     program = load(data)
     generate(program, layout.make(program))
-    build(program, 510, "python").close()
 
 
 def _p4info(data: bytes) -> None:
@@ -187,7 +185,7 @@ class _LiveServer:
         self._clock = PacketClock(driven=False)
         ports = {number: MemoryPort() for number in (1, 2, 3)}
         self._port = ports[1]
-        self.device = Device(1, backend="python", ports=ports, clock=self._clock.now, programs=AnyProgram())
+        self.device = Device(1, ports=ports, clock=self._clock.now, programs=AnyProgram())
         folder = tempfile.mkdtemp(prefix="hostile-")
         self._server = P4RuntimeServer(self.device, f"unix:{folder}/socket")
         self._loop = PacketLoop(self.device, ports, self._clock)
@@ -272,20 +270,17 @@ def _mutate_call(chance: random.Random, seeds: Sequence[bytes]) -> bytes:
     return seed[:1] + mutate_protobuf(chance, (seed[1:],))
 
 
-def _on_device(call: str, backend: Backend) -> Callable[[bytes], object]:
+def _on_device(call: str) -> Callable[[bytes], object]:
     def decode(data: bytes) -> object:
-        return getattr(_device(backend), call)(data)  # made with the first input, not at import
+        return getattr(_device(), call)(data)  # made with the first input, not at import
 
     return decode
 
 
-def _frames_of(backend: Backend) -> Callable[[bytes], object]:
-    def decode(data: bytes) -> object:
-        pipeline = _device(backend).refreshed().pipeline
-        assert pipeline is not None
-        return pipeline.switch.process(1 + len(data) % 3, data[:65_535], 5)
-
-    return decode
+def _frames(data: bytes) -> object:
+    pipeline = _device().refreshed().pipeline
+    assert pipeline is not None
+    return pipeline.switch.process(1 + len(data) % 3, data[:65_535], 5)
 
 
 _PROGRAMS = tuple(Path(PROGRAM).with_name(f"{name}.json").read_bytes() for name in ("features",))
@@ -293,19 +288,15 @@ _PROGRAMS = tuple(Path(PROGRAM).with_name(f"{name}.json").read_bytes() for name 
 TARGETS = (
     DecoderTarget("bmv2 json", _program, (ProgramError, DataplaneError), _PROGRAMS, mutate_json),
     DecoderTarget("p4info", _p4info, (DecodeError,), _p4infos(), mutate_protobuf),
-    DecoderTarget(
-        "p4runtime write", _on_device("write", "python"), (DecodeError, Refused), _writes(), mutate_protobuf
-    ),
-    DecoderTarget(
-        "p4runtime read", _on_device("read", "python"), (DecodeError, Refused), _reads(), mutate_protobuf
-    ),
+    DecoderTarget("p4runtime write", _on_device("write"), (DecodeError, Refused), _writes(), mutate_protobuf),
+    DecoderTarget("p4runtime read", _on_device("read"), (DecodeError, Refused), _reads(), mutate_protobuf),
     DecoderTarget(
         "p4runtime stream",
-        _on_device("stream_message", "python"),
+        _on_device("stream_message"),
         (DecodeError, Refused),
         stream_messages(),
         mutate_protobuf,
     ),
     DecoderTarget("p4runtime server", _live, (), _live_seeds(), _mutate_call),
-    DecoderTarget("switch frames", _frames_of("python"), (), tuple(frames())),
+    DecoderTarget("switch frames", _frames, (), tuple(frames())),
 )

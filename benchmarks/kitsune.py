@@ -92,8 +92,6 @@ def figures_of(data: Path, rounds: int, naive_rounds: int, scale: float) -> dict
 def vectors() -> str:
     """For which vector instructions KitNET's loops in use were compiled."""
     kernel = load_kernel()
-    if kernel is None:
-        return "no kernel"
     name: bytes = kernel.ffi.string(kernel.lib.kitnet_vectors())
     return name.decode()
 

@@ -1,7 +1,8 @@
 """A producer here and a consumer in another process, for DUE and for its peers.
 
 Each `run_*` sends `count` messages and returns messages per second, from the first write until the
-last callback in the other process.
+last callback in the other process.  Best-effort messages may be lost, as when a server cuts a subscriber off:
+DUE's rate is of those that arrived, and `due_delivery` tells how many these were.
 """
 
 import os
@@ -10,13 +11,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import msgspec
 import redis
 
 from benchmarks import worker
-from due import CONSUMER, PRODUCER, PUB_ONLY, Engine, Item, Options, RecordBatch
+from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Item, Options, RecordBatch
 
 FRAME = 860
 """Messages of 100 bytes in a frame of DUE."""
@@ -24,15 +25,25 @@ _MOST_FRAMES = 8
 _AROUND_S = 0.3
 KEY = "bench.pairs.app.message"
 CHANNEL = "bench"
+_STILL_S = 20.0
+"""After this long without a message, once all are written, the rest is lost: longer than any reconnection."""
 
 Runner = Callable[[str, int, int], float]
 
 
-def engine(url: str, app: str, role: Any, **options: Any) -> Engine:
-    """An engine without a Coordinator."""
+class MeasuredRun(NamedTuple):
+    """What came of the messages of one run."""
+
+    rate: float
+    """Messages a second, of those that arrived."""
+    lost: int
+
+
+def engine(url: str, app: str, role: Any, *, reliable: bool = False, **options: Any) -> Engine:
+    """An engine without a Coordinator; `reliable`: it writes KEY so."""
     made = Engine(Options(coordinated=False, **options))
     made.set_pubsub(url)
-    made.init(app, role)
+    made.init(app, role, capabilities=[Capability(KEY, delivery="reliable")] if reliable else [])
     return made
 
 
@@ -56,19 +67,38 @@ def other_process(target: Callable[..., None], *arguments: Any) -> Iterator[Conn
         here.close()
 
 
-def run_due(url: str, size: int, count: int, consumers_url: str = "") -> float:
-    """DUE with its defaults, one callback per message; the consumer may have a credential of its own."""
-    with other_process(_due_consumer, consumers_url or url, count) as pipe:
-        producer = engine(url, "producer", PRODUCER)
+def run_due(url: str, size: int, count: int) -> float:
+    """DUE with its defaults, one callback per message."""
+    found = due_delivery(url, size, count)
+    if found.lost:
+        print(f"{found.lost} of {count} best-effort messages of {size} bytes were lost")
+    return found.rate
+
+
+def due_delivery(
+    url: str,
+    size: int,
+    count: int,
+    consumers_url: str = "",
+    *,
+    reliable: bool = False,
+    still: float = _STILL_S,
+) -> MeasuredRun:
+    """The same, and how many messages were lost; the consumer may have a credential of its own."""
+    with other_process(_due_consumer, consumers_url or url, count, "consumer", still) as pipe:
+        producer = engine(url, "producer", PRODUCER, reliable=reliable)
         payload, write = bytes(size), producer.write
         flags = [PUB_ONLY]
         start = time.monotonic()
         for _ in range(count):
             write(KEY, payload, flags)
         producer.flush()
-        rate = count / (_finished(pipe) - start)
+        pipe.send("written")
+        ended, left = _arrived(pipe)
         producer.close()
-    return rate
+    if left and reliable:
+        raise RuntimeError(f"{left} of {count} reliable messages did not arrive")
+    return MeasuredRun((count - left) / (ended - start), left)
 
 
 def producer_cost(url: str, size: int, count: int, consumers: int) -> float:
@@ -85,7 +115,7 @@ def producer_cost(url: str, size: int, count: int, consumers: int) -> float:
         producer.flush()
         cost = (time.process_time() - before) / count * 1e6
         for pipe in pipes:
-            _finished(pipe)
+            _arrived(pipe)
         producer.close()
     return cost
 
@@ -130,7 +160,7 @@ def run_records(url: str, rows: int, count: int) -> float:
         start = time.monotonic()
         for _ in range(count):
             producer.write(KEY, batch, [PUB_ONLY])
-        rate = rows * count / (_finished(pipe) - start)
+        rate = rows * count / (_arrived(pipe)[0] - start)
         producer.close()
     return rate
 
@@ -184,19 +214,38 @@ def _finished(pipe: Connection) -> float:
     return float(pipe.recv())
 
 
-def _due_consumer(pipe: Connection, url: str, count: int, app: str = "consumer") -> None:
+def _arrived(pipe: Connection) -> tuple[float, int]:
+    """When the last message arrived (monotonic, s), and how many did not."""
+    if not pipe.poll(120):
+        raise RuntimeError("the consumer did not receive everything within 120 s")
+    ended, left = pipe.recv()
+    return float(ended), int(left)
+
+
+def _due_consumer(
+    pipe: Connection, url: str, count: int, app: str = "consumer", still: float = _STILL_S
+) -> None:
     consumer = engine(url, app, CONSUMER)
-    left = [count]
+    left, ended = [count], [0.0]
 
     def callback(_item: Item) -> None:
+        if left[0] == 1:
+            ended[0] = time.monotonic()
         left[0] -= 1
-        if not left[0]:
-            pipe.send(time.monotonic())
 
     consumer.observe(KEY).subscribe(callback)
     pipe.send("ready")
+    before, changed = count, time.monotonic()
     while left[0] > 0:
         time.sleep(0.02)
+        now, there = time.monotonic(), left[0]
+        if there != before or not pipe.poll():  # until the producer says so, there is more to come
+            before, changed = there, now
+        elif now - changed > still:
+            pipe.send((changed, there))
+            break
+    else:
+        pipe.send((ended[0], 0))
     consumer.close()
 
 

@@ -1,11 +1,15 @@
 """What rights and TLS cost: DUE over servers of one kind without and with them, in turns.
 
+Best-effort and reliable messages, and the latency of single ones.  Best-effort rates are of what arrived:
+Debian's redis-server 7.0 cuts a subscriber off that falls behind over TLS (docs/security.md).
+
 embedded server, Unix socket:  everybody may do everything │ a user for each app      ─► secured_vs_open
 redis-server, loopback TCP:    users, in clear             │ users, TLS, certificates ─► tls_vs_tcp
 """
 
 import secrets
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -14,7 +18,7 @@ from typing import NamedTuple
 
 from benchmarks.latency import MESSAGES, Latencies, one_way, percentile
 from benchmarks.measure import interleaved, table
-from benchmarks.pairs import KEY, run_due
+from benchmarks.pairs import KEY, MeasuredRun, due_delivery
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_rights import Rights
 from sdnator.rights.identities import ADMIN, Identities, made
@@ -38,16 +42,26 @@ def secured_figures(rounds: int, scale: float) -> dict[str, object]:
     """Messages a second and latency without and with rights, in clear and with TLS, and the ratios."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         ways, without_tls = _ways(stack, Path(folder))
-        rates = _rates(ways, rounds, scale)
+        rates, lost = _rates(ways, rounds, scale)
+        reliable, _ = _rates(ways, rounds, scale, reliable=True)
         latency = _latencies(ways, rounds, scale)
-    rows = [[name, size, rate] for name, by_size in rates.items() for size, rate in by_size.items()]
-    table(["way", "bytes", "messages/s"], rows)
+    for kind, found, gone in (("best effort", rates, lost), ("reliable", reliable, {})):
+        rows = [
+            [name, size, rate, gone.get(name, {}).get(size, 0.0)]
+            for name, by_size in found.items()
+            for size, rate in by_size.items()
+        ]
+        table([f"way, {kind}", "bytes", "messages/s", "share lost"], rows)
     table(["way", "p50, µs", "p99, µs"], [[name, *found.values()] for name, found in latency.items()])
     print(without_tls, end="")
     return {
         **{f"{name}_msgs_per_s": by_size for name, by_size in rates.items()},
+        "best_effort_lost_share": lost,
         "secured_vs_open": _ratio(rates, "secured", "open"),
         "tls_vs_tcp": _ratio(rates, "tls", "tcp"),
+        **{f"{name}_reliable_msgs_per_s": by_size for name, by_size in reliable.items()},
+        "secured_vs_open_reliable": _ratio(reliable, "secured", "open"),
+        "tls_vs_tcp_reliable": _ratio(reliable, "tls", "tcp"),
         "latency_us": latency,
     }
 
@@ -66,17 +80,31 @@ def _ways(stack: ExitStack, folder: Path) -> tuple[dict[str, _Way], str]:
     return found, ""
 
 
-def _rates(ways: dict[str, _Way], rounds: int, scale: float) -> dict[str, dict[str, float]]:
+def _rates(
+    ways: dict[str, _Way], rounds: int, scale: float, *, reliable: bool = False
+) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """By way and size: messages a second, the median of the rounds, and the share lost in all of them."""
     rates: dict[str, dict[str, float]] = {name: {} for name in ways}
+    lost: dict[str, dict[str, float]] = {name: {} for name in ways}
     for size in SIZES:
-        count = max(1000, int(COUNTS[size] * scale))
-        peers = {
-            name: partial(run_due, way.producers_url, size, count, way.consumers_url)
-            for name, way in ways.items()
-        }
-        for name, rate in interleaved(peers, rounds).items():
+        count, found = max(1000, int(COUNTS[size] * scale)), defaultdict[str, list[MeasuredRun]](list)
+
+        def peer(
+            name: str,
+            size: int = size,
+            count: int = count,
+            found: defaultdict[str, list[MeasuredRun]] = found,
+        ) -> float:
+            one = due_delivery(
+                ways[name].producers_url, size, count, ways[name].consumers_url, reliable=reliable
+            )
+            found[name].append(one)
+            return one.rate
+
+        for name, rate in interleaved({name: partial(peer, name) for name in ways}, rounds).items():
             rates[name][str(size)] = rate
-    return rates
+            lost[name][str(size)] = sum(one.lost for one in found[name]) / (rounds * count)
+    return rates, lost
 
 
 def _latencies(ways: dict[str, _Way], rounds: int, scale: float) -> dict[str, dict[str, float]]:

@@ -86,7 +86,7 @@ def evidence_of(capture: Path, names: Sequence[str] = tuple(CATALOGUE)) -> list[
 
     seen, running, begin_us = 0, queries.requests, 0
     control.want((), running)
-    for base_us, batch in _batches(capture):
+    for base_us, batch in batches_of(capture):
         control.switch(_SWITCH, base_us)
         begin_us = begin_us or int(batch["time_us"][0])
         take(control.packets(_SWITCH, "q0", batch, float(seen)))
@@ -107,7 +107,7 @@ def _last_ns(capture: Path) -> int:
         return max(frame.time_ns for frame in frames)
 
 
-def _batches(capture: Path) -> Iterator[tuple[int, RecordBatch]]:
+def batches_of(capture: Path) -> Iterator[tuple[int, RecordBatch]]:
     """Clock zero and packets, in parts one of which ends where training does."""
     seen = 0
     for piece in captured([capture]):

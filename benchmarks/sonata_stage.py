@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class SonataStage(ControllerRun):
         self._wire = VethPair.make(self._cable, "so") if kind == "bmv2" else None
         super().__init__(folder, kind=kind, veth=self._wire.far if self._wire is not None else "")
 
-    def __enter__(self) -> "SonataStage":
+    def __enter__(self) -> Self:
         super().__enter__()
         self._adapter = self.run("apps.sonata_adapter.service", {"base_us": {"s1": BASE_US}})
         self._observer = self.engine("observer")
@@ -212,11 +212,11 @@ class SonataStage(ControllerRun):
         for query in queries:
             subscriptions.append(self._observer.observe(f"{PREFIX}.{query}").subscribe(lambda _item: None))
             time.sleep(0.01)
-        wait_for(self._settled, 60, self.log)
+        wait_for(self._settled, 240, self.log)
         for subscription in subscriptions:
             subscription.dispose()
             time.sleep(0.005)
-        wait_for(lambda: not self._telemetry, 60, self.log)
+        wait_for(lambda: not self._telemetry, 240, self.log)
         sent = self._sent
         wait_for(lambda: self._done >= sent, 60)
         return max(0, sent - before[0] - (self._forwarded - before[1]))
@@ -248,11 +248,22 @@ def equal_to_naive(
     zero: int | None = None,
 ) -> list[str]:
     """Queries whose results differ from the naive evaluator's; `zero`: as of `SonataStage.play`."""
+    return wrong_results(tuple(CATALOGUE), frames, results, base_us, zero)
+
+
+def wrong_results(
+    names: Iterable[str],
+    frames: Sequence[TimedFrame],
+    results: dict[str, list[dict[str, Any]]],
+    base_us: int,
+    zero: int | None = None,
+) -> list[str]:
+    """Those of some queries whose results differ from the naive evaluator's."""
     zero = frames[0].time_us // 10**6 * 10**6 if zero is None else zero
     packets = [sonata.read(frame.time_us - zero, frame.length, frame.data) for frame in frames]
     wrong = []
-    for name, template in CATALOGUE.items():
-        parameters = {each.name: each.default for each in template.parameters}
+    for name in names:
+        parameters = {each.name: each.default for each in CATALOGUE[name].parameters}
         truth = {(found.window, found.fields) for found in sonata.evaluate(name, packets, parameters)}
         length_ns = int(parameters["window"]) * 10**6
         mine = [_row(value, length_ns, base_us) for value in results[name]]

@@ -3,6 +3,10 @@
 pipeline_pps: frames per second of the full program with 11 queries active and mixed traffic, batches of
 1,024 frames from Python to Python, median of the rounds.  block_10k_ratio: the rate with 10,000 block_src
 and 1,000 ternary block entries over that with 10, in the thread's own time, runs alternating.
+pipeline_full_pps: the same with the entries that adapter and controller write for all eleven queries, and 10,000
+blocks.  *_cpu_pps: frames per second of this thread's own time, which other programs hardly change; *_range: the
+least and the most of the rounds.  pipeline_full_block_*: by blocks of frames, as ports hand them in, with no Python
+object for a frame that leaves.
 """
 
 import statistics
@@ -12,9 +16,13 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
+
 from benchmarks import measure
+from benchmarks.switch_product import product_switch
+from dataplane.frame_block import FrameBlock
 from dataplane.v1model.program import load
-from dataplane.v1model.switch import Backend, Replica, Switch
+from dataplane.v1model.switch import Replica, Switch
 from dataplane.v1model.tables import Exact, Lpm, Range, TableEntry, Ternary
 from dataplane.v1model.tree import Program
 
@@ -45,25 +53,34 @@ def figures_of(seconds: float, rounds: int) -> dict[str, Any]:
     """All figures; `seconds` of traffic for each round."""
     program = load(_PROGRAM.read_bytes())
     started = time.perf_counter()
-    few = prepared(program, "auto", blocks=10, ternary=10)
+    few = prepared(program, blocks=10, ternary=10)
     compiled = time.perf_counter() - started
-    many = prepared(program, "auto", blocks=10_000, ternary=1000)
-    plain = prepared(program, "python", blocks=10, ternary=10)
+    many = prepared(program, blocks=10_000, ternary=1000)
+    full = product_switch(program)
+    insert_blocks(full, blocks=10_000, ternary=0)
     frames = traffic(20 * _BATCH)
-    walls: dict[str, list[float]] = {"few": [], "python": []}
+    ways: dict[str, Callable[[], tuple[float, float]]] = {
+        "pipeline": lambda: rate(few, frames, seconds),
+        "pipeline_full": lambda: rate(full, frames, seconds),
+        "pipeline_full_block": lambda: rate(full, frames, seconds, in_blocks=True),
+    }
+    walls: dict[str, list[float]] = {name: [] for name in ways}
+    own: dict[str, list[float]] = {name: [] for name in ways}
     ratios = []
     for _ in range(rounds):
-        wall, busy = rate(few, frames, seconds)
-        walls["few"].append(wall)
-        ratios.append(rate(many, frames, seconds)[1] / busy)
-        walls["python"].append(rate(plain, frames[: 2 * _BATCH], seconds / 3)[0])
+        for name, way in ways.items():
+            wall, busy = way()
+            walls[name].append(wall)
+            own[name].append(busy)
+        ratios.append(rate(many, frames, seconds)[1] / own["pipeline"][-1])
     return {
-        "backend": few.backend,
-        "pipeline_pps": round(statistics.median(walls["few"])),
+        **{f"{name}_pps": round(statistics.median(found)) for name, found in walls.items()},
+        **{f"{name}_cpu_pps": round(statistics.median(found)) for name, found in own.items()},
+        **{f"{name}_cpu_range": [round(min(found)), round(max(found))] for name, found in own.items()},
         "block_10k_ratio": round(statistics.median(ratios), 3),
-        "pipeline_python_pps": round(statistics.median(walls["python"])),
         "pipeline_load_s": round(compiled, 2),
         **shares(few, frames),
+        **{f"full_{name}": share for name, share in shares(full, frames).items()},
         **bad_frames(few, frames, round(_BAD_FRAMES * min(1.0, seconds / _SECONDS))),
     }
 
@@ -97,32 +114,46 @@ def _bad(random: Random, frames: Sequence[bytes]) -> bytes:
     return bytes(data[: random.randint(0, len(data))])
 
 
-def rate(switch: Switch, frames: Sequence[bytes], seconds: float) -> tuple[float, float]:
+def rate(
+    switch: Switch, frames: Sequence[bytes], seconds: float, *, in_blocks: bool = False
+) -> tuple[float, float]:
     """Frames per second of the clock on the wall and of this thread's, over about `seconds`.
 
     The frames' own clock runs at 1 µs a frame.
     """
+    starts = range(0, len(frames), _BATCH)
+    none: list[int] = []
+    blocks = [FrameBlock.of(none, none, frames[start : start + _BATCH]) for start in starts]
     sent = 0
     started, busy = time.perf_counter(), time.thread_time()
     while True:
-        for first in range(0, len(frames), _BATCH):
-            batch = frames[first : first + _BATCH]
-            switch.process_many(1, batch, range(_START_US + sent, _START_US + sent + len(batch)))
-            sent += len(batch)
+        for start, block in zip(starts, blocks, strict=True):
+            first, end = _START_US + sent, _START_US + sent + len(block.captured)
+            if in_blocks:
+                times = np.arange(first, end, dtype=np.int64)
+                switch.process_block(1, FrameBlock(times, block.captured, block.captured, block.data))
+            else:
+                switch.process_many(1, frames[start : start + _BATCH], range(first, end))
+            sent += len(block.captured)
         passed = time.perf_counter() - started
         if passed >= seconds:
             return sent / passed, sent / (time.thread_time() - busy)
 
 
-def prepared(program: Program, backend: Backend, *, blocks: int, ternary: int) -> Switch:
+def prepared(program: Program, *, blocks: int, ternary: int) -> Switch:
     """The program with 11 queries, wires, a protected service and so many block entries."""
-    switch = Switch(program, backend=backend)
+    switch = Switch(program)
     switch.set_clone_session(1, [Replica(510, 1)])
     switch.tables["ingress.forward_port"].insert(TableEntry((Exact(1),), "ingress.to_port", (2,)))
-    for table, entry in block_entries(blocks, ternary):
-        switch.tables[table].insert(entry)
+    insert_blocks(switch, blocks, ternary)
     _queries(switch)
     return switch
+
+
+def insert_blocks(switch: Switch, blocks: int, ternary: int) -> None:
+    """`block_entries`, inserted."""
+    for table, entry in block_entries(blocks, ternary):
+        switch.tables[table].insert(entry)
 
 
 def block_entries(blocks: int, ternary: int) -> Iterator[tuple[str, TableEntry]]:
