@@ -1,8 +1,8 @@
-"""Builds what pyproject.toml cannot declare: the optional C libraries and the switch program's place.
+"""Builds what pyproject.toml cannot declare: the C libraries and the switch program's place.
 
 They are plain shared objects loaded with cffi (ABI mode): they include no Python header, so a
-compiler is all they need.  Without one the installation still succeeds: the first use of Kitsune says so, and
-digests are read by protobuf.
+compiler is all they need.  Without one Kitsune's cannot be built, and the installation ends with the compiler's error;
+digests would be read by protobuf.
 
 The switch program lives in `p4/`, which is no package (a package of that name would hide `p4.v1` of the
 P4Runtime wheel).  In a wheel its sources, artefacts and record are data of `sdnator`, in
@@ -64,7 +64,7 @@ setup(
                 *(f"apps/kitsune/afterimage_{part}.h" for part in ("keys", "pool", "state")),
                 *(
                     f"apps/kitsune/ledger_{part}.h"
-                    for part in ("table", "rows", "counter", "behaviour", "found", "store")
+                    for part in ("table", "rows", "counter", "behaviour", "found", "ahead", "store")
                 ),
             ],
             # equality with the published features depends on the second and third: see afterimage.c; without the last
@@ -72,7 +72,6 @@ setup(
             extra_compile_args=["-O2", "-ffp-contract=off", "-fno-builtin-pow", "-fno-trapping-math"],
             libraries=["m"],
             py_limited_api=True,
-            optional=True,
         ),
         Extension(
             "apps.p4runtime_ctrl.southbound._digest_rows",

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from importlib import import_module
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import msgspec
@@ -24,6 +24,7 @@ from dataplane.__main__ import options as switch_options
 from due import Engine
 from due import metrics as due_metrics
 from due import service as due_service
+from sdnator import __version__
 from sdnator.p4_program import find
 from sdnator.supervisor.metrics import part_metrics
 from tests.requirements import optional_program
@@ -52,7 +53,7 @@ def compose():
 
 def settings(app):
     """The settings of one app as `deploy/settings` has them."""
-    kind = import_module(APPS[app][0]).Settings
+    kind = import_module(APPS[app][0] if app in APPS else f"apps.enforcers.{app}.service").Settings
     return msgspec.json.decode((DEPLOY / "settings" / f"{app}.json").read_bytes(), type=kind)
 
 
@@ -72,7 +73,7 @@ def app_commands():
     return found
 
 
-@pytest.mark.parametrize("app", APPS)
+@pytest.mark.parametrize("app", [*APPS, "nftables"])
 def test_settings_are_those_of_the_app(app):
     """Every option in `deploy/settings` exists and has a value that the app takes."""
     settings(app)
@@ -250,6 +251,35 @@ def test_controller_learns_when_the_clock_of_the_switch_began(tmp_path):
     given = json.loads((tmp_path / "given").read_text(encoding="utf-8"))
     noted = int((tmp_path / "base_us").read_text(encoding="utf-8"))
     assert given["switches"][0]["base_us"] == noted > 1_500_000_000_000_000
+
+
+def test_nftables_has_the_right_that_it_needs_and_no_other_app_has_it():
+    """As a unit, in the unit of the whole pipeline, and the program in the image."""
+    texts = {unit.name: unit.read_text(encoding="utf-8") for unit in UNITS}
+    may = {name for name, text in texts.items() if "CAP_NET_ADMIN" in text}
+    assert may == {"sdnator-nftables.service", "sdnator-switch.service", "sdnator.service"}
+    for name in ("sdnator-nftables.service", "sdnator.service"):
+        assert re.search("^AmbientCapabilities=.*CAP_NET_ADMIN", texts[name], re.MULTILINE)
+        assert re.search("^RestrictAddressFamilies=.*AF_NETLINK", texts[name], re.MULTILINE)
+    assert " nftables " in (DEPLOY / "Dockerfile").read_text(encoding="utf-8")
+    for enforcer in ("nftables", "webhook_enforcer"):
+        assert find_spec(f"apps.enforcers.{enforcer}.service")
+
+
+def test_the_bill_of_materials_is_about_this_release(tmp_path, monkeypatch):
+    """Its main component has the version, which the project's file does not hold."""
+    loaded = spec_from_file_location("make_dist", DEPLOY / "make_dist.py")
+    make_dist = module_from_spec(loaded)
+    loaded.loader.exec_module(make_dist)
+
+    def written(*words):
+        told = {"metadata": {"component": {"name": "sdnator"}}, "components": []}
+        Path(words[-1]).write_text(json.dumps(told), encoding="utf-8")
+
+    monkeypatch.setattr(make_dist, "run", written)
+    make_dist.bill_of(Path(sys.executable), tmp_path / "bill.json")
+    told = json.loads((tmp_path / "bill.json").read_text(encoding="utf-8"))
+    assert told["metadata"]["component"] == {"name": "sdnator", "version": __version__}
 
 
 def test_units_are_what_systemd_understands(tmp_path):

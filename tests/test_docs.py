@@ -18,6 +18,7 @@ from tests.sdnator.datasets.publisher import UCI, serving
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_TYPED = "what somebody may type\n"
 MAKE_TARGETS = set(re.findall(r"^([a-z0-9]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
@@ -55,6 +56,18 @@ def fetched(capture, tmp_path_factory):
         yield publisher.url, home
 
 
+def prepared(words: list[str]) -> tuple[list[str], str]:
+    """Makes what a command about users or certificates begins with; further words, and what a person would type."""
+    if words[1:3] == ["cert", "add"]:
+        assert sdnator("cert", "init", "--out", words[words.index("--out") + 1]).returncode == 0
+    if words[1] != "user" or words[2] not in ("add", "passwd", "remove"):
+        return [], ""
+    if words[2] != "add":
+        there = sdnator("user", "add", words[3], "--password-stdin", given=_TYPED)
+        assert there.returncode == 0, there.stderr
+    return ([], "") if words[2] == "remove" else (["--password-stdin"], _TYPED)
+
+
 @pytest.mark.parametrize(("document", "line"), shell_lines(), ids=lambda text: text)
 def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch, request):
     """A `make` line names a target; an `sdnator` line runs to a good end on a small capture."""
@@ -78,9 +91,11 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
             words += ["--fm-grace", "90", "--ad-grace", "900"]
     values = {"CAPTURE.pcap": str(capture), "LABELS.csv": str(labels_path(capture)), "12000": "1000"}
     arguments = [values.get(word, word) for word in words[1:]]
-    if words[1] in ("model", "app") or "--security" in words:
+    if words[1] in ("model", "app", "user") or "--security" in words:
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
         monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    more, given = prepared(words)
+    arguments += more
     if "--model" in words:
         trained = [
             "--fm-grace",
@@ -93,7 +108,7 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
         assert sdnator("detect", str(capture), "--out", "scores", *trained).returncode == 0
     if words[1] == "replay" and "--train" not in words and "--model" not in words:
         arguments += ["--train", "1000"]
-    done = sdnator(*arguments)
+    done = sdnator(*arguments, given=given)
     assert done.returncode == 0, done.stderr[-2000:]
 
 

@@ -107,7 +107,7 @@ ROOMS = {
     "sdnator/capture": {
         "sdnator.capture",
         "sdnator.errors",
-        "sdnator.counted",
+        "sdnator.plurals",
         "due",
         "apps.packets",
         "apps.messages",
