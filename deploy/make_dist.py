@@ -14,7 +14,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tarfile
 import tempfile
 import venv
 import zipfile
@@ -72,8 +71,7 @@ def wheel_for(machine: str, sdist: Path, out: Path) -> Path:
         more["_PYTHON_HOST_PLATFORM"] = f"linux-{machine}"
     with tempfile.TemporaryDirectory() as name:
         base = Path(name)
-        with tarfile.open(sdist) as file:
-            file.extractall(base, filter="data")
+        run("tar", "-xf", sdist, "-C", base)
         (source,) = base.glob("sdnator-*")
         run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", base, source, more=more)
         (built,) = base.glob("*.whl")

@@ -23,6 +23,8 @@ from due.drivers.redis_streams import (
     CARE_SECONDS,
     LEAST_PAUSE,
     LIFETIME_S,
+    NOBODY,
+    NOTHING,
     PRODUCERS,
     StreamEntry,
     StreamLedger,
@@ -55,8 +57,8 @@ _MESSAGE = "message"
 """A best-effort message whose reply is pending; lost with the connection."""
 _COMMAND = "command"
 """A command of our own whose reply is pending."""
-_Awaited = StreamEntry | Question | str | int
-"""What a reply belongs to; a number is the `now` of a probe."""
+_Awaited = StreamEntry | StreamLedger | Question | str | int
+"""What a reply belongs to: a number is the `now` of a probe, a ledger awaits how many heard of its stream."""
 
 
 class RedisUpdates:
@@ -250,11 +252,11 @@ class RedisPublisher:
                     self._wire.make_room()
             return ledger
 
-    def _command(self, *arguments: bytes | str | int) -> None:
+    def _command(self, *arguments: bytes | str | int, awaited: _Awaited = _COMMAND) -> None:
         """Send a command of our own; its reply is taken later."""
         assert self._wire is not None  # noqa: S101 - callers checked
         self._wire.send(*arguments)
-        self._outstanding.append(_COMMAND)
+        self._outstanding.append(awaited)
 
     def _care(self, now: float) -> None:
         """Renew the expiry of streams in use; the others are announced again at their next use."""
@@ -284,7 +286,7 @@ class RedisPublisher:
                 now = int(time.time())
                 self._command(b"ZADD", self._announced, now, ledger.path)
                 self._command(b"ZREMRANGEBYSCORE", self._announced, b"-inf", now - LIFETIME_S)
-                self._command(b"PUBLISH", self._announced, ledger.path)
+                self._command(b"PUBLISH", self._announced, ledger.path, awaited=ledger)
                 self._command(b"EXPIRE", self._announced, LIFETIME_S)
                 self._command(b"EXPIRE", stream_name(ledger.path), LIFETIME_S)
                 self._command(b"EXPIRE", readers_name(ledger.path), LIFETIME_S)
@@ -379,7 +381,9 @@ class RedisPublisher:
         """Forget what the readers have acknowledged, here and on the server."""
         ledger = question.ledger
         ledger.asked = False
-        ledger.acknowledged(question.answer())
+        up_to = question.answer()
+        early = up_to == NOBODY and ledger.awaits_readers(time.monotonic())
+        ledger.acknowledged(NOTHING if early else up_to)
         for group in question.placed & ledger.places:
             ledger.places.discard(group)
             self._command(b"XGROUP", b"DESTROY", stream_name(ledger.path), group)
@@ -427,6 +431,8 @@ class RedisPublisher:
                 self._refused(reply, awaited)
             elif isinstance(awaited, StreamEntry):
                 awaited.id = parse_id(reply)
+            elif isinstance(awaited, StreamLedger):
+                awaited.announced(int(reply), time.monotonic())
 
     def _refused(self, reply: Exception, awaited: _Awaited) -> None:
         self._counts["refused"] += 1

@@ -27,6 +27,8 @@ LIFETIME_S = 86_400
 """Streams and leases expire after this long without a producer and a reader, seconds."""
 CARE_SECONDS = 60.0
 """Seconds between two renewals of a stream's expiry."""
+HEARING_SECONDS = 3.0
+"""How long a producer waits for readers of a path that it has just announced to somebody."""
 LEAST_PAUSE = 0.0025
 """Least seconds between two questions about the readers' progress."""
 
@@ -89,6 +91,8 @@ class StreamLedger:
         """The stream is announced, and its expiry was renewed within the last `CARE_SECONDS`."""
         self.written = False
         """Written to since its expiry was renewed."""
+        self._heard_at: float | None = None
+        """When its first announcement reached somebody, s, monotonic; negative infinity: nobody."""
         self.groups: tuple[bytes, ...] = ()
         """Live groups of readers, as of the last answer."""
         self.known: tuple[bytes, ...] = ()
@@ -125,6 +129,15 @@ class StreamLedger:
     def excess(self, share: float) -> int:
         """Bytes that are kept beyond this share of the window."""
         return max(0, self.kept_bytes - int(share * self._window)) if self.kept else 0
+
+    def announced(self, listeners: int, now: float) -> None:
+        """An announcement was published; only the first one is news.  `now`: s, monotonic."""
+        if self._heard_at is None:
+            self._heard_at = now if listeners else float("-inf")
+
+    def awaits_readers(self, now: float) -> bool:
+        """Whether who heard the first announcement still has time to say that it reads the stream."""
+        return self._heard_at is not None and now - self._heard_at < HEARING_SECONDS
 
     def discard(self, entry: StreamEntry) -> None:
         """Forget an entry that the server refuses for good."""

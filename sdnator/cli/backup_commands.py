@@ -187,20 +187,38 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
                 )
             listed = manifest.get("files", ())
             names = [str(name) for name in listed] if isinstance(listed, list | tuple) else []
-            # nothing but what a backup holds, whatever else the file says
-            tar.extractall(folder, [tar.getmember(name) for name in names if _is_ours(name)], filter="data")
+            files = {name: folder / name for name in names if _is_ours(name)}
+            for name, path in files.items():
+                _copy_out(tar, name, path)
     except OSError as error:
         raise BadInput(f"{file}: {error.strerror or error}") from None
     except (tarfile.TarError, EOFError, KeyError, ValueError, RecursionError) as error:
         raise BadInput(
             f"{file}: this is not a backup of `sdnator backup`, or it is damaged ({error})"
         ) from None
-    return manifest, {name: folder / name for name in names if _is_ours(name)}
+    return manifest, files
+
+
+def _copy_out(tar: tarfile.TarFile, name: str, path: Path) -> None:
+    """The content alone, and of regular files: links, owners and modes of the file are not taken over.
+
+    Not `extractall` with a filter, which Python has from 3.11.4 on only.
+    """
+    member = tar.getmember(name)
+    content = tar.extractfile(member) if member.isreg() else None
+    if content is None:
+        raise tarfile.TarError(f"{name} is no regular file")
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    with content, path.open("xb") as out:
+        shutil.copyfileobj(content, out)
 
 
 def _is_ours(name: str) -> bool:
-    path = Path(name)
-    return name in (_ARCHIVE, _CONFIG, _KEPT) or (len(path.parts) == 2 and path.parts[0] == _MODELS)
+    """Nothing but what a backup holds, whatever else the file says."""
+    if name in (_ARCHIVE, _CONFIG, _KEPT):
+        return True
+    folder, _, rest = name.partition("/")
+    return folder == _MODELS and rest not in ("", ".", "..") and "/" not in rest
 
 
 def _check_archive(path: Path) -> None:

@@ -181,12 +181,15 @@ def test_a_stream_that_begins_later_is_read_from_its_beginning(open_driver: Open
         half.close()
 
 
-def test_a_full_window_makes_the_producer_wait_for_its_readers(open_driver: Open) -> None:
+@pytest.mark.parametrize("met", [True, False], ids=["known", "new"])
+def test_a_full_window_makes_the_producer_wait_for_its_readers(open_driver: Open, met: bool) -> None:
+    """Also for one that was there first and is slow to hear of a new path."""
     driver = open_driver(window_bytes=10_000, retain_bytes=0)
     publisher, receiver = driver.publisher("writer"), driver.receiver("group", "g1")
-    receiver.follow("r.x.y")
-    publisher.append("r.x.y", b"first")
-    receiver.acknowledge(received(receiver, 1)[0])  # from here on the producer knows of this reader
+    receiver.follow("r.**")
+    if met:
+        publisher.append("r.x.y", b"first")
+        receiver.acknowledge(received(receiver, 1)[0])
     sent: list[int] = []
 
     def write() -> None:

@@ -127,10 +127,23 @@ def test_an_archive_of_a_newer_version_is_refused_and_the_old_one_stays(home):
 
 def test_a_file_that_wants_out_of_its_folder_is_left_alone(home):
     """Whoever made the file: only what a backup holds is taken from it."""
-    manifest = {"schema": 1, "files": ["../../evil", "models/../../evil"], "made": ""}
+    manifest = {"schema": 1, "files": ["../../evil", "models/../../evil", "models/.."], "made": ""}
     packed(home / "b.tar.gz", manifest, **{"../../evil": b"x", "models/../../evil": b"x"})
     run("restore", home / "b.tar.gz")
     assert not list(home.rglob("evil"))
+
+
+def test_a_link_is_no_file_of_a_backup(home):
+    """Otherwise a file of the machine would be copied to where an operator shares models."""
+    (home / "secret").write_text("x")
+    manifest = json.dumps({"schema": 1, "files": ["models/a"], "made": ""}).encode()
+    with tarfile.open(home / "b.tar.gz", "w:gz") as tar:
+        about, link = tarfile.TarInfo("manifest.json"), tarfile.TarInfo("models/a")
+        about.size, link.type, link.linkname = len(manifest), tarfile.SYMTYPE, str(home / "secret")
+        tar.addfile(about, io.BytesIO(manifest))
+        tar.addfile(link)
+    with pytest.raises(BadInput, match="models/a is no regular file"):
+        run("restore", home / "b.tar.gz")
 
 
 @pytest.mark.parametrize("files", [None, 5, "archive.db", {"a": 1}], ids=str)
