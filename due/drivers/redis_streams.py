@@ -178,8 +178,11 @@ class StreamLedger:
             self._retained_bytes += entry.size
 
     def unread(self) -> int:
-        """How many of the retained payloads a group still reads, which came when nobody seemed to."""
-        return sum(entry.id is not None and entry.id > self._read_to for entry in self.retained)
+        """How many of the retained payloads a group may still read, which came when nobody seemed to.
+
+        All of them after a restart of the server whose repair a second one cut short: repeats do no harm.
+        """
+        return sum(entry.id is None or entry.id > self._read_to for entry in self.retained)
 
     def forget_ids(self) -> None:
         """The server was restarted: earlier ids mean nothing, and its clock may be behind them."""

@@ -56,6 +56,8 @@ def test_what_a_late_group_has_not_read_is_not_behind_it_after_a_restart():
     assert ledger.unread() == 3
     ledger.acknowledged(NOTHING)
     assert ledger.unread() == 3, "an answer that says nothing changes nothing"
+    ledger.forget_ids()
+    assert ledger.unread() == 5, "the server restarts, and restarts again before it has been told everything"
 
 
 def test_what_the_server_has_not_answered_is_never_forgotten():
