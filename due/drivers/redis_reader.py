@@ -51,7 +51,7 @@ _LOOK_SECONDS = 1.0
 """Seconds between two checks of the other members; a single member checks less often."""
 _HOLD_SECONDS = 0.2
 _FRESH_SECONDS = 0.05
-"""What was read ahead is used within this time: another member may have moved the list since."""
+"""What was read ahead is used at once within this time; after it only if nobody has moved the list since."""
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
 _TRIES = 3
@@ -86,6 +86,10 @@ class StreamReader:
         """Up to where the ids of a stream are on the work list, as far as is known here."""
         self._found = ReadRound()
         self._ahead_at = 0.0
+        self._ahead_from: dict[str, str] = {}
+        """Behind which ids of the streams was read ahead."""
+        self._ahead: list[Any] = []
+        """What was read ahead and came late, as on a slow link, until it is known whether it comes next."""
         self._woken = "0-0"
         self._listless = False
         """A work list is gone."""
@@ -323,6 +327,7 @@ class StreamReader:
         self._backoff.succeeded()
         self._wire = wire
         self._expected.clear()
+        self._ahead = []
         self._found = ReadRound()
         self._at.clear()
         self._acks.extendleft(reversed(self._acks_sent))
@@ -416,8 +421,12 @@ class StreamReader:
 
     def _answered(self, reply: Any, expected: _Expected) -> None:
         kind, path, token = expected
-        if expected == _NEW or (expected == _AHEAD and time.monotonic() - self._ahead_at < _FRESH_SECONDS):
+        if expected == _NEW:
             self._put(reply)
+        elif expected == _AHEAD:
+            self._came_ahead(reply)
+        elif kind == "still":
+            self._still_next(path, reply)
         elif expected in (_OURS, _HISTORY):
             self._given(reply, again=expected == _HISTORY)
         elif kind == "place":
@@ -452,11 +461,35 @@ class StreamReader:
             command += self._packed_ahead()
         self._wire.send_packed(command)
 
+    def _came_ahead(self, reply: Any) -> None:
+        """Use what was read ahead; of what was long on its way, first ask whether it still comes next."""
+        paths = [name.decode()[len(_STREAM) :] for name, _ in reply or ()]
+        fresh = time.monotonic() - self._ahead_at < _FRESH_SECONDS
+        if fresh and all(self._at.get(path) == self._ahead_from.get(path) for path in paths):
+            self._put(reply)
+        elif paths and self._wire is not None:
+            self._ahead = reply
+            self._expected.extend(("still", path, "") for path in paths)
+            asked = (pack((b"XINFO", b"STREAM", work_name(self._group, path))) for path in paths)
+            self._wire.send_packed(b"".join(asked))
+
+    def _still_next(self, path: str, reply: Any) -> None:
+        """Whether a list still ends where a stream was read ahead from; with the last answer what does is put on it."""
+        before = self._ahead_from.get(path, "")
+        if path in self._paths and _last_id(reply) == before:
+            self._at[path] = before
+        else:
+            self._at.pop(path, None)
+        if self._expected and self._expected[0][0] == "still":
+            return
+        ahead, self._ahead = self._ahead, []
+        self._put(ahead)
+
     def _packed_ahead(self) -> bytes:
         """Ask for what comes next, to be there when the callbacks have returned; does not wait."""
         at = {path: place for path in self._requested if (place := self._at.get(path))}
         self._expected.append(_AHEAD)
-        self._ahead_at = time.monotonic()
+        self._ahead_at, self._ahead_from = time.monotonic(), at
         return pack((b"XREAD", b"COUNT", COUNT, b"STREAMS", *map(stream_name, at), *at.values()))
 
     def _given(self, reply: Any, *, again: bool) -> None:
@@ -483,7 +516,7 @@ class StreamReader:
     def _placed(self, path: str, reply: Any) -> None:
         """What is not on the work list comes behind the last id that was."""
         if path in self._paths:
-            self._at[path] = dict(zip(reply[::2], reply[1::2], strict=True))[b"last-generated-id"].decode()
+            self._at[path] = _last_id(reply)
 
     def _handed_out(self) -> list[Delivery]:
         """What is ours, in order; called when nothing is expected any more."""
@@ -594,3 +627,9 @@ class StreamReader:
                 self._counts["claimed"] += 1
                 self._claimed.append(Delivery(path, payload, token, tries.get(token.encode(), 2)))
             low = "(" + pending[-1]["message_id"].decode()
+
+
+def _last_id(reply: Any) -> str:
+    """The last id of a list, from `XINFO STREAM`."""
+    last: bytes = dict(zip(reply[::2], reply[1::2], strict=True))[b"last-generated-id"]
+    return last.decode()

@@ -93,6 +93,26 @@ def test_a_list_that_could_not_be_made_is_made_later(server, start, found):
     commands.close()
 
 
+def test_what_is_long_on_its_way_is_sent_once(server, monkeypatch):
+    """On a slow link: what was read ahead is used however late it comes, if it still comes next."""
+    monkeypatch.setattr("due.drivers.redis_reader._FRESH_SECONDS", 0.0)
+    path, commands, size, batches = "r.slow", client(server.url), 10_000, 6
+    for _ in range(batches * COUNT):
+        commands.xadd(stream_name(path), {"f": b"." * size})
+    reader = StreamReader(server.url, commands, "slow", "one", shared=False)
+    reader.add(path, "0")
+    before = commands.info("stats")["total_net_output_bytes"]
+    found: list[Delivery] = []
+    while len(found) < batches * COUNT:
+        reader._at.clear()  # as when it looks after the dead
+        found += _read(reader)
+    sent = commands.info("stats")["total_net_output_bytes"] - before
+    assert len({delivery.token for delivery in found}) == len(found)
+    assert sent < 1.1 * size * len(found)
+    reader.close()
+    commands.close()
+
+
 def test_alone_in_a_group_it_looks_after_the_dead_more_rarely(server):
     commands = client(server.url)
     reader = StreamReader(server.url, commands, "alone", "one", shared=False)
