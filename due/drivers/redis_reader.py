@@ -29,6 +29,7 @@ from due.drivers.redis_wire import Wire, pack, understood
 from due.drivers.redis_work import (
     COUNT,
     MOST_GIVEN,
+    ReadAhead,
     ReadRound,
     ServerTime,
     WorkLists,
@@ -50,8 +51,6 @@ _SILENT_SECONDS = 3.0
 _LOOK_SECONDS = 1.0
 """Seconds between two checks of the other members; a single member checks less often."""
 _HOLD_SECONDS = 0.2
-_FRESH_SECONDS = 0.05
-"""What was read ahead is used at once within this time; after it only if nobody has moved the list since."""
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
 _TRIES = 3
@@ -85,11 +84,7 @@ class StreamReader:
         self._at: dict[str, str] = {}
         """Up to where the ids of a stream are on the work list, as far as is known here."""
         self._found = ReadRound()
-        self._ahead_at = 0.0
-        self._ahead_from: dict[str, str] = {}
-        """Behind which ids of the streams was read ahead."""
-        self._ahead: list[Any] = []
-        """What was read ahead and came late, as on a slow link, until it is known whether it comes next."""
+        self._read_ahead = ReadAhead()
         self._woken = "0-0"
         self._listless = False
         """A work list is gone."""
@@ -327,7 +322,7 @@ class StreamReader:
         self._backoff.succeeded()
         self._wire = wire
         self._expected.clear()
-        self._ahead = []
+        self._read_ahead = ReadAhead()
         self._found = ReadRound()
         self._at.clear()
         self._acks.extendleft(reversed(self._acks_sent))
@@ -464,32 +459,29 @@ class StreamReader:
     def _came_ahead(self, reply: Any) -> None:
         """Use what was read ahead; of what was long on its way, first ask whether it still comes next."""
         paths = [name.decode()[len(_STREAM) :] for name, _ in reply or ()]
-        fresh = time.monotonic() - self._ahead_at < _FRESH_SECONDS
-        if fresh and all(self._at.get(path) == self._ahead_from.get(path) for path in paths):
+        if self._read_ahead.comes_next(paths, self._at):
             self._put(reply)
         elif paths and self._wire is not None:
-            self._ahead = reply
+            self._read_ahead.late = reply
             self._expected.extend(("still", path, "") for path in paths)
             asked = (pack((b"XINFO", b"STREAM", work_name(self._group, path))) for path in paths)
             self._wire.send_packed(b"".join(asked))
 
     def _still_next(self, path: str, reply: Any) -> None:
         """Whether a list still ends where a stream was read ahead from; with the last answer what does is put on it."""
-        before = self._ahead_from.get(path, "")
+        before = self._read_ahead.places.get(path, "")
         if path in self._paths and _last_id(reply) == before:
             self._at[path] = before
         else:
             self._at.pop(path, None)
-        if self._expected and self._expected[0][0] == "still":
-            return
-        ahead, self._ahead = self._ahead, []
-        self._put(ahead)
+        if not (self._expected and self._expected[0][0] == "still"):
+            self._put(self._read_ahead.take())
 
     def _packed_ahead(self) -> bytes:
         """Ask for what comes next, to be there when the callbacks have returned; does not wait."""
         at = {path: place for path in self._requested if (place := self._at.get(path))}
         self._expected.append(_AHEAD)
-        self._ahead_at, self._ahead_from = time.monotonic(), at
+        self._read_ahead = ReadAhead(at)
         return pack((b"XREAD", b"COUNT", COUNT, b"STREAMS", *map(stream_name, at), *at.values()))
 
     def _given(self, reply: Any, *, again: bool) -> None:

@@ -9,7 +9,7 @@ is put there once, by whichever member is first, because the server takes ids in
 """
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import redis
@@ -28,6 +28,8 @@ from due.errors import UpdatesUnavailable
 
 COUNT = 32
 """Most entries of a stream in one answer."""
+FRESH_SECONDS = 0.05
+"""What was read ahead is used at once within this time; after it only if nobody has moved the list since."""
 MOST_GIVEN = 2 * COUNT
 """Most ids that a list gives at once: what was just put there, and what others have left."""
 _BEGINNING = (0, 0)
@@ -85,6 +87,26 @@ class ReadRound:
     def missing(self) -> list[tuple[str, str]]:
         """What is ours and was not read here."""
         return [one for one in self.ours if one not in self.payloads]
+
+
+class ReadAhead:
+    """What was asked for while callbacks were to run, behind the ids of `places` by path."""
+
+    def __init__(self, places: Mapping[str, str] | None = None) -> None:
+        self.places = places or {}
+        self.late: list[Any] = []
+        """What came late, as on a slow link, until it is known whether it still comes next."""
+        self._asked = time.monotonic()
+
+    def comes_next(self, paths: Iterable[str], at: Mapping[str, str]) -> bool:
+        """Whether what came for these paths can be put on the lists, which end where `at` says."""
+        fresh = time.monotonic() - self._asked < FRESH_SECONDS
+        return fresh and all(at.get(path) == self.places.get(path) for path in paths)
+
+    def take(self) -> list[Any]:
+        """What came late; nothing from then on."""
+        late, self.late = self.late, []
+        return late
 
 
 class WorkLists:

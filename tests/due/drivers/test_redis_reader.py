@@ -95,7 +95,7 @@ def test_a_list_that_could_not_be_made_is_made_later(server, start, found):
 
 def test_what_is_long_on_its_way_is_sent_once(server, monkeypatch):
     """On a slow link: what was read ahead is used however late it comes, if it still comes next."""
-    monkeypatch.setattr("due.drivers.redis_reader._FRESH_SECONDS", 0.0)
+    monkeypatch.setattr("due.drivers.redis_work.FRESH_SECONDS", 0.0)
     path, commands, size, batches = "r.slow", client(server.url), 10_000, 6
     for _ in range(batches * COUNT):
         commands.xadd(stream_name(path), {"f": b"." * size})
@@ -131,7 +131,7 @@ def test_alone_in_a_group_it_looks_after_the_dead_more_rarely(server):
 @pytest.mark.parametrize("fresh", [0.0, 600.0])
 def test_a_list_that_another_member_moves_is_read_from_there(server, monkeypatch, fresh):
     """Also by a member that has read ahead, however long its callbacks take."""
-    monkeypatch.setattr("due.drivers.redis_reader._FRESH_SECONDS", fresh)
+    monkeypatch.setattr("due.drivers.redis_work.FRESH_SECONDS", fresh)
     path, commands = f"r.moved.{int(fresh)}", client(server.url)
     reader = StreamReader(server.url, commands, "group", "one", shared=False)
     reader.add(path, "0")
