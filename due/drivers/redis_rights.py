@@ -115,12 +115,17 @@ def with_membership(rights: Rights) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def acl_rules(rights: Rights) -> list[str]:
-    """The rules of `ACL SETUSER` after name and password; they replace all earlier ones."""
+    """The rules of `ACL SETUSER` after name and password; they replace all earlier ones.
+
+    The server tries one selector after the other: those for the commands of every message come first, and of those that
+    allow a command the one with the fewest patterns.
+    """
     own = rights.app
     told, heard = with_membership(rights)
     publish, observe = _globs(told), _globs(heard)
     return [
         *("resetkeys", "resetchannels", "clearselectors", "-@all", *_CONNECTION),
+        _selector(_OWN_WORK, [f"~{work_name(own, '*')}"]),
         _selector(["+publish"], _channels((*publish, f"streams:{own}"))),
         _selector(_WRITES_STREAM, _keys("~", map(stream_name, publish))),
         _selector(["+hgetall"], _keys("%R~", (lease_name("*", path) for path in publish))),
@@ -129,7 +134,6 @@ def acl_rules(rights: Rights) -> list[str]:
         _selector(["+subscribe", "+psubscribe"], _channels((*observe, "streams:*"))),
         _selector(_READS_STREAM, _keys("%R~", (*map(stream_name, observe), wake_name(own)))),
         _selector(["+sadd"], _keys("~", map(readers_name, observe))),
-        _selector(_OWN_WORK, [f"~{work_name(own, '*')}"]),
         _selector(["+xadd", "+expire"], [f"~{wake_name(own)}"]),
         _selector(_OWN_LEASES, [f"~{lease_name(own, '*')}"]),
         _selector(_OWN_ASIDE, [f"~due:poison:{own}"]),
