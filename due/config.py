@@ -90,17 +90,35 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         path = os.environ.get("DUE_CREDENTIAL", "")
         if not path or self.updates or os.environ.get("DUE_UPDATES"):
             return self
+        said = self.of_credential(path, f"$DUE_CREDENTIAL {path}")
+        return msgspec.structs.replace(self, updates=said.updates, observable=said.observable)
+
+    @classmethod
+    def of_credential(cls, path: str, name: str = "") -> "Options":
+        """The options in a credential file.
+
+        Args:
+            path: of the file, which only its owner may read.
+            name: of the file in messages; empty: its path.
+
+        Returns:
+            Defaults, but for what the file says.
+
+        Raises:
+            InvalidOption: the file cannot be read, is malformed, or somebody other than its owner can read it.
+        """
+        name = name or path
         try:
             with Path(path).open("rb") as file:
                 mode, text = os.fstat(file.fileno()).st_mode, file.read(_CREDENTIAL_BYTES)
-            said = msgspec.json.decode(text, type=Options)
+            said = msgspec.json.decode(text, type=cls)
         except OSError as error:
-            raise InvalidOption(f"$DUE_CREDENTIAL {path}: {error.strerror}") from None
+            raise InvalidOption(f"{name}: {error.strerror}") from None
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise InvalidOption(f"$DUE_CREDENTIAL {path}: {error}; enrol the app again") from None
+            raise InvalidOption(f"{name}: {error}; enrol the app again") from None
         if mode & 0o077:
-            raise InvalidOption(f"$DUE_CREDENTIAL {path}: others can read it; chmod 600 {path}")
-        return msgspec.structs.replace(self, updates=said.updates, observable=said.observable)
+            raise InvalidOption(f"{name}: others can read it; chmod 600 {path}")
+        return said
 
     def checked(self) -> "Options":
         """Check the numbers.

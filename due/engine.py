@@ -98,6 +98,15 @@ class Engine:
         return self._broken.failure if self._broken is not None else None
 
     @property
+    def updates(self) -> str:
+        """The URL of Data Updates, with the password in it; also of an embedded server that the engine has found.
+
+        Raises:
+            NotInitialised: called before `init` or after `close`.
+        """
+        return self._require().updates_url
+
+    @property
     def liveness(self) -> Liveness:
         """Whether the engine's threads still make progress, for a supervisor."""
         return self._require().liveness
@@ -302,6 +311,27 @@ class Engine:
             query = {"dataKey": Key.parse(query).text}
         session.flush_archive(_FLUSH_SECONDS)
         return session.archive.find(query, limit=limit)
+
+    def declare(
+        self,
+        *,
+        interests: Iterable[Interest] | None = None,
+        capabilities: Iterable[Capability] | None = None,
+    ) -> None:
+        """Replace what `init` declared to the Coordinator.
+
+        Args:
+            interests: the keys this app wants, beside those that it observes; None leaves them.
+            capabilities: the keys this app can write; None leaves them.
+
+        Raises:
+            InvalidOption: there are too many.
+            NotInitialised: called before `init` or after `close`.
+        """
+        self._require().declare(
+            None if interests is None else tuple(interests),
+            None if capabilities is None else tuple(capabilities),
+        )
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back whenever this app's assignments change, and once immediately.

@@ -38,7 +38,7 @@ ASSIGNMENT = "due.assignment"
 
 APP_ID = r"[A-Za-z0-9_-]{1,64}"
 """Grammar of app ids and instance ids."""
-_MOST = 16_384
+MOST_DECLARED = 16_384
 """Capabilities, interests, assignments or instances in one message."""
 _MOST_TEXT = 2048
 _MOST_PEERS = 1024
@@ -54,7 +54,7 @@ _Text = Annotated[str, msgspec.Meta(max_length=_MOST_TEXT)]
 _Host = Annotated[str, msgspec.Meta(max_length=255)]
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=_MOST_COUNT)]
 _Seconds = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_HEARTBEAT)]
-_Many = msgspec.Meta(max_length=_MOST)
+_Many = msgspec.Meta(max_length=MOST_DECLARED)
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True):

@@ -16,14 +16,22 @@ from due.config import Options
 from due.dispatcher import Dispatcher
 from due.drivers.base import ArchiveDriver
 from due.drivers.embedded_redis import EmbeddedServer, shared_server
-from due.errors import BackendError, DueError, EngineFailed, Superseded, Timeout, UpdatesUnavailable
+from due.errors import (
+    BackendError,
+    DueError,
+    EngineFailed,
+    InvalidOption,
+    Superseded,
+    Timeout,
+    UpdatesUnavailable,
+)
 from due.heartbeat_thread import HeartbeatThread
 from due.key_writer import ARCHIVE, PUBLISH, KeyWriter, Sent
 from due.keys import Key
 from due.liveness import Liveness
 from due.logs import without_passwords
-from due.membership import Member, Registration
-from due.messages import Assignment, AssignmentCallback, Interest
+from due.membership import MOST_DECLARED, Member, Registration
+from due.messages import Assignment, AssignmentCallback, Capability, Interest
 from due.observation import Observation
 from due.sender import BatchSender
 from due.threads import Failed
@@ -55,6 +63,7 @@ class Session:
         self._server: EmbeddedServer | None = None
         if not updates_url:
             updates_url, self._server = shared_server(options.folder())
+        self.updates_url = updates_url
         self._driver = open_updates(updates_url, options)
         app, me = registration.app_id, registration.instance_id
         self.publisher = self._driver.publisher(app)
@@ -238,6 +247,23 @@ class Session:
             self._observed.remove(observation)
         self._declare_interests()
         self.dispatcher.shut(observation)
+
+    def declare(
+        self, interests: tuple[Interest, ...] | None, capabilities: tuple[Capability, ...] | None
+    ) -> None:
+        """See `Engine.declare`."""
+        self.check()
+        if len(interests or ()) > MOST_DECLARED or len(capabilities or ()) > MOST_DECLARED:
+            raise InvalidOption(f"declare: at most {MOST_DECLARED} interests and capabilities")
+        if capabilities is not None:
+            with self.keeper.lock:
+                self.keeper.member.declare(time.monotonic(), capabilities=capabilities)
+            self._changed()
+        if interests is not None:
+            with self._lock:
+                self._declared = interests
+            self._declare_interests()
+        self.keeper.wake()
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """See `Engine.on_assignments`."""

@@ -1,14 +1,18 @@
 """What the documents show is what the product does: every command in them is run."""
 
 import gzip
+import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.capture.labels import labels_path, read_labels
 from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from sdnator.replay.packet_accounting import PacketState
@@ -68,6 +72,21 @@ def prepared(words: list[str]) -> tuple[list[str], str]:
     return ([], "") if words[2] == "remove" else (["--password-stdin"], _TYPED)
 
 
+def ended_after_ready(arguments: list[str], folder: Path) -> int:
+    """Start a bridge between two sites, end it when it is ready, and return its exit code."""
+    with EmbeddedServer(folder / "n") as near, EmbeddedServer(folder / "f") as far:
+        for name, server in (("near.json", near), ("far.json", far)):
+            (folder / name).write_text(json.dumps({"updates": server.url}))
+            (folder / name).chmod(0o600)
+        with subprocess.Popen(
+            [sys.executable, "-m", "sdnator.cli.main", *arguments], cwd=folder, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            assert json.loads(process.stdout.readline())["ready"] is True
+            process.terminate()
+            return process.wait(60)
+
+
 @pytest.mark.parametrize(("document", "line"), shell_lines(), ids=lambda text: text)
 def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch, request):
     """A `make` line names a target; an `sdnator` line runs to a good end on a small capture."""
@@ -91,6 +110,9 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
             words += ["--fm-grace", "90", "--ad-grace", "900"]
     values = {"CAPTURE.pcap": str(capture), "LABELS.csv": str(labels_path(capture)), "12000": "1000"}
     arguments = [values.get(word, word) for word in words[1:]]
+    if words[1] == "bridge":
+        assert ended_after_ready(arguments, tmp_path) == 0
+        return
     if words[1] in ("model", "app", "user") or "--security" in words:
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
         monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))

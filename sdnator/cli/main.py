@@ -38,6 +38,10 @@ COMMANDS = {
         "sdnator.cli.blocks_commands:blocks",
         "Blocks, guards, rate limits: list, add, remove, explain, false alarms, lift all.",
     ),
+    "bridge": (
+        "sdnator.cli.bridge_command:bridge",
+        "Join this site with another one, until Ctrl-C or SIGTERM.",
+    ),
     "cert": ("sdnator.cli.cert_commands:app", "Certificates for P4Runtime over TCP."),
     "config": (
         "sdnator.cli.config_commands:config",
@@ -119,7 +123,7 @@ COMMANDS = {
 
 
 GROUPS = {
-    "Run": ("up", "down", "demo", "detect", "switch"),
+    "Run": ("up", "down", "demo", "detect", "switch", "bridge"),
     "Look": (
         "status", "incidents", "explain", "observe", "get", "queries", "apps", "keys", "flow", "logs",
         "tables", "counters",
