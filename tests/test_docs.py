@@ -72,22 +72,12 @@ def prepared(words: list[str]) -> tuple[list[str], str]:
     return ([], "") if words[2] == "remove" else (["--password-stdin"], _TYPED)
 
 
-def ended_after_ready(arguments: list[str], folder: Path) -> int:
-    """Start a bridge between two sites, end it when it is ready, and return its exit code."""
-    with EmbeddedServer(folder / "n") as near, EmbeddedServer(folder / "f") as far:
-        for name, server in (("near.json", near), ("far.json", far)):
-            (folder / name).write_text(json.dumps({"updates": server.url}))
-            (folder / name).chmod(0o600)
-        with subprocess.Popen(
-            [sys.executable, "-m", "sdnator.cli.main", *arguments], cwd=folder, stdout=subprocess.PIPE, text=True
-        ) as process:
-            assert process.stdout is not None
-            assert json.loads(process.stdout.readline())["ready"] is True
-            process.terminate()
-            return process.wait(60)
+BRIDGE = next(line for _, line in shell_lines() if " bridge " in line and " enrol " not in line)
 
 
-@pytest.mark.parametrize(("document", "line"), shell_lines(), ids=lambda text: text)
+@pytest.mark.parametrize(
+    ("document", "line"), [each for each in shell_lines() if each[1] != BRIDGE], ids=lambda text: text
+)
 def test_command_of_the_documents_works(document, line, capture, tmp_path, monkeypatch, request):
     """A `make` line names a target; an `sdnator` line runs to a good end on a small capture."""
     words = shlex.split(line)
@@ -110,9 +100,6 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
             words += ["--fm-grace", "90", "--ad-grace", "900"]
     values = {"CAPTURE.pcap": str(capture), "LABELS.csv": str(labels_path(capture)), "12000": "1000"}
     arguments = [values.get(word, word) for word in words[1:]]
-    if words[1] == "bridge":
-        assert ended_after_ready(arguments, tmp_path) == 0
-        return
     if words[1] in ("model", "app", "user") or "--security" in words:
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
         monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
@@ -132,6 +119,20 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
         arguments += ["--train", "1000"]
     done = sdnator(*arguments, given=given)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_the_bridge_of_the_documents_works(tmp_path):
+    """It joins two sites, and ends in order."""
+    with EmbeddedServer(tmp_path / "n") as near, EmbeddedServer(tmp_path / "f") as far:
+        for name, server in (("near.json", near), ("far.json", far)):
+            (tmp_path / name).write_text(json.dumps({"updates": server.url}))
+            (tmp_path / name).chmod(0o600)
+        command = [sys.executable, "-m", "sdnator.cli.main", *shlex.split(BRIDGE)[1:]]
+        with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert json.loads(process.stdout.readline())["ready"] is True
+            process.terminate()
+            assert process.wait(60) == 0
 
 
 def test_the_notebook_of_the_documents_works(capture, tmp_path, monkeypatch, capsys):

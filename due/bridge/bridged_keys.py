@@ -1,8 +1,8 @@
 """Which keys cross a bridge in one direction: what is allowed and wanted.  Pure.
 
-    allowed a.**, wanted a.b.*   ─► receive a.b.*
-    allowed a.b.*, wanted a.**   ─► receive a.b.*
-    allowed a.*.c, wanted a.b.*  ─► receive a.*.c, and let a.b.c pass
+allowed a.**, wanted a.b.*   ─► receive a.b.*
+allowed a.b.*, wanted a.**   ─► receive a.b.*
+allowed a.*.c, wanted a.b.*  ─► receive a.*.c, and let a.b.c pass
 """
 
 from collections.abc import Iterable

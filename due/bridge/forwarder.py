@@ -151,7 +151,10 @@ class FrameForwarder:
         while self._unsettled:
             try:
                 self._target.settle(_SETTLE_S)
-            except (Timeout, UpdatesUnavailable):  # the driver has said so, and sends again what did not arrive
+            except (
+                Timeout,
+                UpdatesUnavailable,
+            ):  # the driver has said so, and sends again what did not arrive
                 if self._closing.is_set():
                     return
                 continue

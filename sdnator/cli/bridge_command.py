@@ -17,8 +17,12 @@ from sdnator.errors import BadInput
 def bridge(
     near: Annotated[Path, typer.Option(metavar="FILE", help="Credential of the bridge at this site.")],
     far: Annotated[Path, typer.Option(metavar="FILE", help="Its credential at the other site.")],
-    to_far: Annotated[list[str], typer.Option(metavar="KEY", help="Key pattern that may cross to the other site.")] = [],  # noqa: B006
-    to_near: Annotated[list[str], typer.Option(metavar="KEY", help="Key pattern that may cross to this site.")] = [],  # noqa: B006
+    to_far: Annotated[
+        list[str], typer.Option(metavar="KEY", help="Key pattern that may cross to the other site.")
+    ] = [],  # noqa: B006
+    to_near: Annotated[
+        list[str], typer.Option(metavar="KEY", help="Key pattern that may cross to this site.")
+    ] = [],  # noqa: B006
     name: Annotated[str, typer.Option(metavar="NAME", help="App id of the bridge at both sites.")] = "bridge",
     metrics: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="Serve /metrics and /healthz there.")
@@ -48,6 +52,14 @@ def bridge(
     with tempfile.TemporaryDirectory(prefix="sdnator-bridge-") as folder:
         file = Path(folder) / "settings.json"
         file.write_bytes(msgspec.json.encode(settings))
-        arguments = ["--engine", str(near), "--settings", str(file), "--archive", f"memory://{name}", "--stay"]
+        arguments = [
+            "--engine",
+            str(near),
+            "--settings",
+            str(file),
+            "--archive",
+            f"memory://{name}",
+            "--stay",
+        ]
         code = main([*arguments, *(("--metrics", metrics) if metrics else ())], name=name)
     raise typer.Exit(code)

@@ -42,7 +42,11 @@ def forwarder(sites):
     near, far = sites
     died: list[BaseException] = []
     made = FrameForwarder(
-        "test", BridgedKeys(["a.**"]), near.receiver("bridge", "b1"), Held(far.publisher("bridge")), died.append
+        "test",
+        BridgedKeys(["a.**"]),
+        near.receiver("bridge", "b1"),
+        Held(far.publisher("bridge")),
+        died.append,
     )
     made.target = made._target
     made.start()
