@@ -50,7 +50,8 @@ class FrameForwarder:
         self._name = name
         self._source, self._target = source, target
         self._lock = threading.Lock()
-        self._active = True
+        self._active = False
+        source.activate(False)
         self._busy = False
         """The forwarding thread does not read the source."""
         self._closing = threading.Event()
@@ -83,7 +84,7 @@ class FrameForwarder:
         return tuple(sorted(patterns))
 
     def activate(self, active: bool) -> None:
-        """A standby forwards nothing."""
+        """A standby, as which it begins, forwards nothing."""
         if active != self._active:
             self._active = active
             self._source.activate(active)
@@ -125,7 +126,9 @@ class FrameForwarder:
 
     def _take(self, delivery: Delivery) -> None:
         path, payload = delivery.path, delivery.payload
-        if not self.keys.may_cross(path) or not (delivery.token or self._active):
+        if not (delivery.token or self._active):
+            return  # the active instance forwards it
+        if not self.keys.may_cross(path):
             self._counts["refused"] += 1
             if delivery.token:
                 self._source.acknowledge(delivery)  # withdrawn a moment ago

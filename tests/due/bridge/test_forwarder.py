@@ -50,6 +50,7 @@ def forwarder(sites):
     )
     made.target = made._target
     made.start()
+    made.activate(True)
     yield made
     made.target.answers = True
     made.close()

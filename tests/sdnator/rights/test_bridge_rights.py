@@ -60,7 +60,9 @@ def test_reliable_items_cross_with_the_rights_of_the_documents(tmp_path):
         )
         bridge.start()
         stack.callback(bridge.stop)
-        bridge._directions["to_far"]._forwarder.want([KEY])  # no Coordinator runs that would say so
+        forwarder = bridge._directions["to_far"]._forwarder
+        forwarder.activate(True)  # no Coordinator runs that would say so
+        forwarder.want([KEY])
         maker = joined(
             stack, "kitsune", near["kitsune"], PRODUCER, capabilities=[Capability(KEY, delivery="reliable")]
         )
