@@ -4,4 +4,4 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-sys.path.insert(0, str(ROOT / "examples" / "manufacturing"))
+sys.path[:0] = [str(ROOT / "examples" / name) for name in ("manufacturing", "flow_records")]
