@@ -13,6 +13,7 @@ by more than 2e-11; on three generated infections the AUC agrees to six digits a
 same.  Where dozens of hosts all talk to each other, covariances differ visibly, the rest in rounding.
 """
 
+from collections.abc import Mapping
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -28,6 +29,15 @@ MAX_STREAMS: Final = 65_536
 MAX_LINKS: Final = 65_536
 HORIZON_S: Final = 3_000.0
 """After this idle time a stream's weight at the slowest scale is below 1e-9."""
+
+
+class CheckedColumns(Mapping[str, npt.NDArray[Any]]):
+    """A batch whose columns fit each other and are what the kernel reads."""
+
+    pointer: Any
+    """Its columns in C, beginning with those of `PACKET_FIELDS`."""
+    count: int
+    """Packets."""
 
 
 class AfterImage:
@@ -63,9 +73,10 @@ class AfterImage:
         Raises `ColumnError` for columns that are missing, of other lengths, or no numbers; `MemoryError`
         when the state cannot grow: the object is not usable afterwards.
         """
-        columns = _columns(batch)
-        out = np.empty((len(columns["time"]), WIDTH))
-        if len(out):
+        columns = batch if isinstance(batch, CheckedColumns) else _columns(batch)
+        count = columns.count if isinstance(columns, CheckedColumns) else len(columns["time"])
+        out = np.empty((count, WIDTH))
+        if count:
             self._engine.update(columns, out)
         return out
 
@@ -114,10 +125,14 @@ class _KernelEngine:
 
     def update(self, columns: Columns, out: npt.NDArray[np.float64]) -> None:
         kernel = self._kernel
-        struct = kernel.ffi.new("Columns *")
-        for name, c_type, _ in PACKET_FIELDS:
-            setattr(struct, name, kernel.pointer(f"const {c_type}", columns[name]))
-        lengths = kernel.ffi.new("long[]", [len(columns[name]) for name, _, _ in PACKET_FIELDS])
+        if isinstance(columns, CheckedColumns):
+            struct = kernel.ffi.cast("Columns *", columns.pointer)
+            lengths = kernel.ffi.new("long[]", [columns.count] * len(PACKET_FIELDS))
+        else:
+            struct = kernel.ffi.new("Columns *")
+            for name, c_type, _ in PACKET_FIELDS:
+                setattr(struct, name, kernel.pointer(f"const {c_type}", columns[name]))
+            lengths = kernel.ffi.new("long[]", [len(columns[name]) for name, _, _ in PACKET_FIELDS])
         features = kernel.pointer("double", out)
         failed = kernel.lib.afterimage_update(self._state, struct, lengths, len(out), features, out.size)
         if failed == _TOO_SHORT:

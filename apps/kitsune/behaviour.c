@@ -10,6 +10,7 @@
 typedef struct {
     Behaviour *b;
     const Row *row;
+    const Keys *keys;
     Subject sender;
     int block;
 } Turn;
@@ -54,17 +55,19 @@ static void contact_views(Behaviour *b, const Ended *ended, int64_t service, int
     int inside = is_inside(address_in(sender));
     int64_t protocol = protocol_of(service);
     int64_t named = (service & 0xFFFF) < b->limits.chosen ? service : protocol | b->limits.chosen;
-    Subject whose = with_more(*sender, (uint64_t)protocol, NOBODY);
+    Key whose = keyed_by(b, with_more(*sender, (uint64_t)protocol, NOBODY));
     struct {
-        Subject subject;
+        Key subject;
         uint64_t kind;
         Address victim;
         int64_t single;
     } view[3] = {
         {whose, kind_of(protocol, inside), NOBODY, NO_SERVICE},
-        {with_more(*sender, 0, ended->target), kind_of(protocol, inside), ended->target, NO_SERVICE},
-        {with_more(*sender, (uint64_t)service, NOBODY), kind_of(named, inside), NOBODY, service},
+        {keyed_by(b, with_more(*sender, 0, ended->target)), kind_of(protocol, inside), ended->target, NO_SERVICE},
+        {keyed_by(b, with_more(*sender, (uint64_t)service, NOBODY)), kind_of(named, inside), NOBODY, service},
     };
+    fetch_slot(&b->counter[PORTS].events, view[PORTS].subject.hash);
+    fetch_slot(&b->counter[TARGETS].events, view[TARGETS].subject.hash);
     int which = NONE;
     Seen best = {0};
     for (int what = service == UNANSWERED ? TARGETS : CONTACTS; what <= TARGETS; what++) {
@@ -83,7 +86,8 @@ static void contact_views(Behaviour *b, const Ended *ended, int64_t service, int
     }
     if (which == NONE)
         return;
-    best.nats = found_added(&b->failures, &b->limits, sender, best.total, ended->time);
+    Key reported = keyed_by(b, *sender);
+    best.nats = found_added(&b->failures, &b->limits, &reported, best.total, ended->time);
     if (best.nats)
         found(b, which, sender, view[which].victim, view[which].single, &best, ended->time, ended->arrival);
 }
@@ -101,7 +105,7 @@ static void contact_made(Behaviour *b, const Ended *ended, int block)
 
 static void count_stranger(Behaviour *b, Address victim, int64_t what, const Ended *ended, int block)
 {
-    Subject key = pair_of((uint32_t)what, is_six(victim), victim, NOBODY);
+    Key key = keyed_by(b, pair_of((uint32_t)what, is_six(victim), victim, NOBODY));
     double sums[MOST_WINDOWS];
     Seen seen;
     if (count(b, STRANGERS, &key, ended->time, 1.0, sums))
@@ -112,13 +116,14 @@ static void count_stranger(Behaviour *b, Address victim, int64_t what, const End
         found(b, STRANGERS, NULL, victim, what, &seen, ended->time, ended->arrival);
 }
 
-static int is_fresh_stranger(Behaviour *b, const Subject *key)
+static int is_fresh_stranger(Behaviour *b, Subject stranger)
 {
-    if (table_find(&b->strangers, key) != NONE)
+    Key key = keyed_by(b, stranger);
+    if (find_key(&b->strangers, &key) != NONE)
         return 0;
     if (b->strangers.live >= b->limits.kept)
         table_clear(&b->strangers);
-    added(b, &b->strangers, key);
+    added_key(b, &b->strangers, &key);
     return 1;
 }
 
@@ -129,14 +134,13 @@ static void strange(Behaviour *b, const Ended *ended, int block)
     if (block < 0 && table_find(&b->owners, &known) != NONE)
         return;
     int64_t what = flooded(ended);
-    Subject key = pair_of((uint32_t)what, is_six(source), source, target);
-    if (!is_fresh_stranger(b, &key))
+    if (!is_fresh_stranger(b, pair_of((uint32_t)what, is_six(source), source, target)))
         return;
     count_stranger(b, target, what, ended, block);
     if (protocol_of(what) != UDP)
         return;
     Subject everywhere = pair_of(ANY_UDP, is_six(source), source, target), port = pair_of(ANY_UDP, 2 | (uint64_t)is_six(target) | (uint64_t)what << 32, NOBODY, target);
-    if (is_fresh_stranger(b, &everywhere) && is_fresh_stranger(b, &port))
+    if (is_fresh_stranger(b, everywhere) && is_fresh_stranger(b, port))
         count_stranger(b, target, ANY_UDP, ended, block);
 }
 
@@ -151,24 +155,24 @@ static void callback(Behaviour *b, const Ended *ended)
     if (ended->service >> 16 != TCP >> 16 || is_by_design(ended->service) || is_by_design(ended->reverse))
         return;
     Address host = address_in(&ended->sender);
-    Subject key = pair_of(is_six(host), 0, ended->target, host);
+    Subject key = visit_of(ended->target, host);
     int32_t at = table_find(&b->visits, &key);
     if (at == NONE)
         return;
     Visit visit = *(Visit *)payload(&b->visits, at);
     if (ended->time - visit.time > b->limits.soon_s)
         return;
-    double after = ended->time - visit.time, added = found_added(&b->called, &b->limits, &visit.sender, b->callback_nats, ended->time);
+    Key whose = keyed_by(b, visit.sender);
+    double after = ended->time - visit.time, added = found_added(&b->called, &b->limits, &whose, b->callback_nats, ended->time);
     Seen seen = {added, b->callback_nats, 1, after, b->callback_usual, ended->time - after};
     if (seen.nats)
         found(b, CALLBACKS, &visit.sender, host, visit.service, &seen, ended->time, ended->arrival);
 }
 
-static void visited(Behaviour *b, const Subject *sender, Address source, Address host, int64_t service, double time)
+static void visited(Behaviour *b, const Subject *sender, const Key *key, int64_t service, double time)
 {
-    Subject key = pair_of(is_six(host), 0, source, host);
-    int32_t at = table_find(&b->visits, &key);
-    Visit *visit = at != NONE ? payload(&b->visits, at) : added(b, &b->visits, &key);
+    int32_t at = find_key(&b->visits, key);
+    Visit *visit = at != NONE ? payload(&b->visits, at) : added_key(b, &b->visits, key);
     if (!visit)
         return;
     Visit now = {*sender, service, time};
@@ -199,12 +203,6 @@ static void ping(Turn *t)
 
 /* ---- logins */
 
-static int is_login(const Behaviour *b, int64_t service)
-{
-    int64_t port = service - TCP;
-    return port >= 0 && port < 65536 && b->login_ports[port >> 3] >> (port & 7) & 1;
-}
-
 static double login_change(const Behaviour *b, Login *login, const Row *row, uint32_t length)
 {
     if (login->settled)
@@ -215,10 +213,10 @@ static double login_change(const Behaviour *b, Login *login, const Row *row, uin
     return !login->settled ? 0 : is_long ? -0.5 : 0.5;
 }
 
-static double login_weight(Turn *t, const Subject *key, uint32_t length, Subject *who)
+static double login_weight(Turn *t, const Key *key, uint32_t length, Subject *who)
 {
     Behaviour *b = t->b;
-    int32_t at = table_find(&b->logins, key);
+    int32_t at = find_key(&b->logins, key);
     if (at != NONE) {
         Login *login = payload(&b->logins, at);
         *who = login->sender;
@@ -228,7 +226,7 @@ static double login_weight(Turn *t, const Subject *key, uint32_t length, Subject
         return 0;
     if (b->logins.live >= b->limits.kept)
         table_clear(&b->logins);
-    Login *login = added(b, &b->logins, key);
+    Login *login = added_key(b, &b->logins, key);
     if (!login)
         return 0;
     login->sender = *who = t->sender;
@@ -242,16 +240,17 @@ static void login(Turn *t)
     const Row *row = t->row;
     if (!row->is_tcp || row->quoted)
         return;
-    int by_server = !is_login(b, row->service);
+    int by_server = !t->keys->is_login;
     if (by_server && (!(row->flags & (RST | FIN)) || !is_login(b, row->reverse)))
         return;
     Address source = by_server ? row->target : row->source, target = by_server ? row->source : row->target;
     int64_t service = by_server ? row->reverse : row->service, reverse = by_server ? row->service : row->reverse;
-    Subject key = pair_of(join_ports((uint64_t)service, (uint64_t)reverse), is_six(source), source, target), who;
+    Key key = by_server ? keyed_by(b, login_of(source, target, service, reverse)) : t->keys->login;
+    Subject who;
     double weight = login_weight(t, &key, by_server ? 0 : row->length, &who), sums[MOST_WINDOWS];
     if (!weight)
         return;
-    Subject subject = with_more(who, (uint64_t)service, target), whose = with_more(who, (uint64_t)service, NOBODY);
+    Key subject = keyed_by(b, with_more(who, (uint64_t)service, target)), whose = keyed_by(b, with_more(who, (uint64_t)service, NOBODY));
     uint64_t kind = kind_of(service, is_inside(source));
     if (count(b, LOGINS, &subject, row->time, weight, sums))
         return;
@@ -260,40 +259,38 @@ static void login(Turn *t)
         return;
     }
     Seen seen = counter_measure(&b->counter[LOGINS], &b->limits, &whose, sums, kind);
-    if (seen.total >= b->limits.least_nats)
-        visited(b, &who, source, target, service, row->time);
-    seen.nats = found_added(&b->counter[LOGINS].reported, &b->limits, &who, seen.total, row->time);
+    if (seen.total >= b->limits.least_nats) {
+        Key visit = by_server ? keyed_by(b, visit_of(source, target)) : t->keys->visit;
+        visited(b, &who, &visit, service, row->time);
+    }
+    Key reported = keyed_by(b, who);
+    seen.nats = found_added(&b->counter[LOGINS].reported, &b->limits, &reported, seen.total, row->time);
     if (seen.nats)
         found(b, LOGINS, &who, target, service, &seen, row->time, row->arrival);
 }
 
 /* ---- one-way traffic */
 
-static int comes_first(Address a, Address b)
-{
-    return a.hi != b.hi ? a.hi < b.hi : a.lo <= b.lo;
-}
-
 /* Both directions between the hosts of a packet: the entry, and which half is that of its sender. */
-static Exchanges *exchanges_of(Behaviour *b, const Row *row, int *mine, int make)
+static Exchanges *exchanges_of(Turn *t, int *mine, int make)
 {
-    int first = comes_first(row->source, row->target);
-    Subject key = first ? pair_of(is_six(row->source), 0, row->source, row->target) : pair_of(is_six(row->source), 0, row->target, row->source);
-    int32_t at = table_find(&b->exchanges, &key);
-    *mine = !first;
+    Table *table = &t->b->exchanges;
+    int32_t at = find_key(table, &t->keys->hosts);
+    *mine = !comes_first(t->row->source, t->row->target);
     if (at != NONE)
-        return payload(&b->exchanges, at);
-    return make ? added(b, &b->exchanges, &key) : NULL;
+        return payload(table, at);
+    return make ? added_key(t->b, table, &t->keys->hosts) : NULL;
 }
 
-static Exchange *begun_exchange(Behaviour *b, const Row *row, Exchange *half, int *mine)
+static Exchange *begun_exchange(Turn *t, Exchange *half, int *mine)
 {
+    Behaviour *b = t->b;
     if (half->is_there)
         return half;
     if (b->exchange_halves >= b->limits.kept) {
         table_clear(&b->exchanges);
         b->exchange_halves = 0;
-        Exchanges *both = exchanges_of(b, row, mine, 1);
+        Exchanges *both = exchanges_of(t, mine, 1);
         if (!both)
             return NULL;
         half = &both->half[*mine];
@@ -324,7 +321,7 @@ static void one_way(Turn *t)
     if (row->group || row->quoted || !is_some(row->source) || row->service >= ARP)
         return;
     int mine, refused = row->answer || (row->is_tcp && is_tcp_reply(row->flags));
-    Exchanges *both = exchanges_of(b, row, &mine, !refused);
+    Exchanges *both = exchanges_of(t, &mine, !refused);
     if (!both)
         return;
     Exchange *back = same_address(row->source, row->target) ? &both->half[mine] : &both->half[!mine];
@@ -332,7 +329,7 @@ static void one_way(Turn *t)
         back->back++;
     if (refused)
         return;
-    Exchange *here = begun_exchange(b, row, &both->half[mine], &mine);
+    Exchange *here = begun_exchange(t, &both->half[mine], &mine);
     if (!here)
         return;
     if (here->second != row->second) {
@@ -352,9 +349,10 @@ static void one_way(Turn *t)
         return;
     *due = alone + (alone >= 8 ? alone / 8 : 1);
     double sums[MOST_WINDOWS] = {(double)alone};
-    Subject whose = with_more(t->sender, (uint64_t)kind, NOBODY);
+    Key whose = keyed_by(b, with_more(t->sender, (uint64_t)kind, NOBODY));
     Seen seen = counter_measure(&b->counter[ONE_WAY], &b->limits, &whose, sums, (uint64_t)kind << 1 | 1);
-    seen.nats = found_added(&b->counter[ONE_WAY].reported, &b->limits, &t->sender, seen.total, row->time);
+    Key sender = keyed_by(b, t->sender);
+    seen.nats = found_added(&b->counter[ONE_WAY].reported, &b->limits, &sender, seen.total, row->time);
     seen.begun = (double)row->second;
     if (seen.nats)
         found(b, ONE_WAY, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
@@ -370,11 +368,12 @@ static void count_claim(Turn *t, int what, Address victim, double weight)
     Seen seen;
     who.word[1] &= 0xFFFF;
     who.word[2] = who.word[3] = 0; /* it may claim several addresses */
-    if (count(t->b, what, &who, row->time, weight, sums))
+    Key key = keyed_by(t->b, who);
+    if (count(t->b, what, &key, row->time, weight, sums))
         return;
     if (t->block >= 0)
         taught(t->b, what, t->block, &who, NOBODY, NO_SERVICE, 0, sums);
-    else if (weighed(t->b, what, &who, sums, 0, row->time, &seen))
+    else if (weighed(t->b, what, &key, sums, 0, row->time, &seen))
         found(t->b, what, &who, victim, row->service, &seen, row->time, row->arrival);
 }
 
@@ -421,41 +420,39 @@ static void spoke(Turn *t)
     const Row *row = t->row;
     if (!is_some(row->source))
         return;
-    Subject owner = pair_of(is_six(row->source), row->mac, row->source, NOBODY);
-    int32_t at = table_find(&t->b->owner_macs, &owner);
+    int32_t at = find_key(&t->b->owner_macs, &t->keys->owner);
     if (at != NONE)
         *(double *)payload(&t->b->owners, *(int32_t *)payload(&t->b->owner_macs, at)) = row->time;
 }
 
 /* ---- scores */
 
-static void score(Turn *t, double log)
+static void score(Turn *t, const Key *sender, double log)
 {
     Behaviour *b = t->b;
     const Row *row = t->row;
     double sums[MOST_WINDOWS];
     Seen seen;
-    if (count(b, SCORES, &t->sender, row->time, log, sums) || !weighed(b, SCORES, &t->sender, sums, 0, row->time, &seen))
+    if (count(b, SCORES, sender, row->time, log, sums) || !weighed(b, SCORES, sender, sums, 0, row->time, &seen))
         return;
-    Subject there = contact_of(row->source, row->target, row->service), back = contact_of(row->target, row->source, row->reverse);
-    int supporting = came_about(b, &there) || came_about(b, &back) || row->group || table_find(&b->senders, &t->sender) != NONE;
+    int supporting = came_about(b, &t->keys->there) || came_about(b, &t->keys->back) || row->group || find_key(&b->senders, sender) != NONE;
     BehaviourEvent *event = found(b, SCORES, &t->sender, row->target, row->service, &seen, row->time, row->arrival);
     if (event)
         event->supporting = supporting;
 }
 
-static void over(Turn *t, double score)
+static void over(Turn *t, const Key *sender, double score)
 {
     Behaviour *b = t->b;
     const Row *row = t->row;
-    int32_t at = table_find(&b->told, &t->sender);
+    int32_t at = find_key(&b->told, sender);
     if (at != NONE && row->time - *(double *)payload(&b->told, at) < b->limits.again_s)
         return;
     if (b->told.live >= b->limits.kept) {
         table_clear(&b->told);
         at = NONE;
     }
-    double *time = at != NONE ? payload(&b->told, at) : added(b, &b->told, &t->sender);
+    double *time = at != NONE ? payload(&b->told, at) : added_key(b, &b->told, sender);
     if (!time)
         return;
     *time = row->time;
@@ -498,7 +495,8 @@ static int train(Turn *t)
     if (!b->packets++)
         b->begun = row->time;
     b->seconds = fmax(row->time - b->begun, 1.0);
-    if (table_find(&b->senders, &t->sender) == NONE && added(b, &b->senders, &t->sender)) {
+    Key sender = keyed_by(b, t->sender);
+    if (find_key(&b->senders, &sender) == NONE && added_key(b, &b->senders, &sender)) {
         BehaviourEvent *event = new_event(b, NEW_SENDER, -1);
         if (event)
             set_who(event, &t->sender);
@@ -534,7 +532,7 @@ static void follow(Turn *t)
     Ended ended;
     while (next_due(t->b, t->row->time, &ended))
         contact_ended(t->b, &ended, t->block);
-    if (follow_contact(t->b, t->row, &t->sender, &ended))
+    if (follow_contact(t->b, t->row, &t->sender, t->keys, &ended))
         contact_ended(t->b, &ended, t->block);
     login(t);
     one_way(t);
@@ -544,54 +542,43 @@ static void follow(Turn *t)
     hear_outside(t);
 }
 
+/* A packet of training where `scored` is NULL. */
+static void take_row(Behaviour *b, const Row *row, const Keys *keys, uint16_t number, const double *scored, double log, double threshold)
+{
+    Turn turn = {b, row, keys, sender_of(number, row, row->source, 0), -1};
+    if (!scored)
+        turn.block = train(&turn);
+    if (is_blocked(&b->blocked, number, row->to_mac, row->target))
+        return;
+    follow(&turn);
+    if (!(log > 0))
+        return;
+    Key sender = keyed_by(b, turn.sender);
+    score(&turn, &sender, log);
+    if (*scored >= threshold)
+        over(&turn, &sender, *scored);
+}
+
 #include "ledger_ahead.h"
 
 /* ---- the interface */
 
 /* Rows first to last; they train where `logs` is NULL.  -1 when memory is short, -2 for rows out of range. */
-int behaviour_add(Behaviour *b, const PacketRows *rows, long n, long first, long last, uint16_t number, const double *scores, const double *logs, double threshold)
+int behaviour_add(Behaviour *b, const Row *rows, long n, long first, long last, uint16_t number, const double *scores, const double *logs, double threshold)
 {
     if (first < 0 || last < first || last > n)
         return -2;
     b->event_count = 0;
-    Ahead ahead[AHEAD];
+    Keys ahead[AHEAD];
     for (long i = first; i < last && i < first + AHEAD; i++)
-        look_ahead(b, rows, i, &ahead[i % AHEAD]);
+        look_ahead(b, &rows[i], number, &ahead[i % AHEAD]);
     for (long i = first; i < last && !b->failed; i++) {
         if (i + AHEAD / 2 < last)
             fetch_entries(b, &ahead[(i + AHEAD / 2) % AHEAD]);
-        Row row = ahead[i % AHEAD].row;
+        take_row(b, &rows[i], &ahead[i % AHEAD], number, logs ? scores + i : NULL, logs ? logs[i] : 0, threshold);
         if (i + AHEAD < last)
-            look_ahead(b, rows, i + AHEAD, &ahead[i % AHEAD]);
-        Turn turn = {b, &row, sender_of(number, &row, row.source, 0), -1};
-        if (!logs)
-            turn.block = train(&turn);
-        if (is_blocked(&b->blocked, number, row.to_mac, row.target))
-            continue;
-        follow(&turn);
-        if (logs && logs[i] > 0) {
-            score(&turn, logs[i]);
-            if (scores[i] >= threshold)
-                over(&turn, scores[i]);
-        }
+            look_ahead(b, &rows[i + AHEAD], number, &ahead[i % AHEAD]);
     }
-    return b->failed ? -1 : 0;
-}
-
-/* The scores of the last packets of training; logs[i] is that of the i-th of the last n. */
-int behaviour_calibrate(Behaviour *b, const double *logs, long n, int32_t blocks)
-{
-    b->event_count = 0;
-    if (n > b->tail_count)
-        return -2;
-    long per_block = (n + blocks - 1) / blocks > 1 ? (n + blocks - 1) / blocks : 1;
-    for (long i = 0; i < n && !b->failed; i++) {
-        const Trained *each = &b->tail[(b->tail_from + b->tail_count - n + i) % b->limits.calibration];
-        double sums[MOST_WINDOWS];
-        if (logs[i] > 0 && !count(b, SCORES, &each->sender, each->time, logs[i], sums))
-            taught(b, SCORES, (int)(i / per_block), &each->sender, NOBODY, NO_SERVICE, 0, sums);
-    }
-    b->tail_count = b->tail_from = 0;
     return b->failed ? -1 : 0;
 }
 

@@ -15,7 +15,7 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 5
+VERSION: Final = 6
 """Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
@@ -48,22 +48,24 @@ PACKET_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
 """Columns from which features are computed: name, C type, numpy type. `time` is in seconds."""
 
 ROW_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
-    ("time", "double", "f8"),
+    *PACKET_FIELDS,
     ("arrival", "uint64_t", "u8"),
     ("port", "uint16_t", "u2"),
-    ("length", "uint32_t", "u4"),
-    *PACKET_FIELDS[2:16],
     ("quoted", "uint8_t", "u1"),
     ("tcp_flags", "uint8_t", "u1"),
-    ("icmp_type", "int32_t", "i4"),
     ("icmp6_type", "int32_t", "i4"),
 )
-"""Columns that the ledgers read, in the order of `PacketRows` in C."""
+"""Columns that the ledgers read, in the order of `PacketRows` in C, which begins with those of `Columns`."""
 
 _LEDGERS: Final = (
     "typedef struct {"
     + "".join(f"const {c_type} *{name};" for name, c_type, _ in ROW_FIELDS)
     + """} PacketRows;
+    typedef struct Row Row;
+    long row_bytes(void);
+    void rows_read(const PacketRows *, long n, Row *);
+    long rows_benign(const Row *, long first, long last, const double *scores, double threshold, const uint64_t *macs,
+                     long m, double *out);
     typedef struct {
         int32_t most_subjects, kept, most_contacts, calibration;
         double grace_s, least_nats, most_nats, least_step, least_share, deciding_nats, half_life_s,
@@ -85,7 +87,7 @@ _LEDGERS: Final = (
     Behaviour *behaviour_new(const BehaviourLimits *, const CounterSettings *, int64_t per_block,
                              const uint16_t *logins, long n, uint64_t seed);
     void behaviour_free(Behaviour *);
-    int behaviour_add(Behaviour *, const PacketRows *, long n, long first, long last, uint16_t number,
+    int behaviour_add(Behaviour *, const Row *, long n, long first, long last, uint16_t number,
                       const double *scores, const double *logs, double threshold);
     int behaviour_calibrate(Behaviour *, const double *logs, long n, int32_t blocks);
     const BehaviourEvent *behaviour_events(const Behaviour *, long *count);
@@ -117,7 +119,7 @@ _LEDGERS: Final = (
     typedef struct Senders Senders;
     Senders *senders_new(const SenderLimits *, int32_t training, uint64_t seed);
     void senders_free(Senders *);
-    int senders_add(Senders *, const PacketRows *, long n, long trained, uint16_t number, const double *scores,
+    int senders_add(Senders *, const Row *, long n, long trained, uint16_t number, const double *scores,
                     double threshold, int32_t *peaks, long *kept);
     int senders_finish(Senders *);
     const SenderEvent *senders_events(const Senders *, long *count);
@@ -130,7 +132,7 @@ _LEDGERS: Final = (
     typedef struct Victims Victims;
     Victims *victims_new(const VictimLimits *, uint64_t seed);
     void victims_free(Victims *);
-    int victims_add(Victims *, const PacketRows *, long n, long trained);
+    int victims_add(Victims *, const Row *, long n, long trained);
     int64_t victims_rate(const Victims *, uint64_t kind, int32_t six, uint64_t hi, uint64_t lo);
     long victims_usual(const Victims *, uint64_t *out, long room);
     long victims_sources(const Victims *, uint64_t *out, long room);
@@ -155,10 +157,15 @@ _DECLARATIONS: Final = (
     int kitnet_train(Layer *ensemble, Layer *output, const double *x, long n, long width,
                      double rate, double *scratch);
     const char *kitnet_vectors(void);
+    int kitnet_moved(const Layer *ensemble, const Layer *output, const double *x, long width, const double *errors,
+                     long first, const int32_t *rows, long n, int32_t *out);
     int kitnet_score(const Layer *ensemble, const Layer *output, const double *x, long n, long width,
                      double clip, double *scratch, double *errors, double *scores);
     """
 )
+
+_TYPES: Final = {kind: np.dtype(kind) for _, _, kind in ROW_FIELDS}
+"""Reading the name of a type takes longer than comparing it."""
 
 
 class ColumnError(ValueError):
@@ -178,11 +185,11 @@ class Kernel(NamedTuple):
     def pointer(self, kind: str, array: npt.NDArray[Any]) -> Any:
         """The array's data for a parameter or field that points to `kind`; the array must be contiguous and
         outlive the call."""
-        return self.ffi.from_buffer(_array_type(kind), array)
+        return self.ffi.from_buffer(array_type(kind), array)
 
 
 @functools.cache
-def _array_type(kind: str) -> Any:
+def array_type(kind: str) -> Any:
     """A type of C, which takes longer to read than a column to hand over."""
     return cffi.FFI().typeof(f"{kind}[]")
 
@@ -215,6 +222,7 @@ def contiguous(array: npt.NDArray[Any], kind: str) -> npt.NDArray[Any]:
     """
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufb":
         raise ColumnError(f"a column holds {getattr(array, 'dtype', type(array).__name__)}, not numbers")
-    if array.dtype == kind and array.flags.c_contiguous and array.flags.aligned:
+    flags = array.flags
+    if (array.dtype is _TYPES.get(kind) or array.dtype == kind) and flags.c_contiguous and flags.aligned:
         return array
     return np.require(array, kind, ("C_CONTIGUOUS", "ALIGNED"))

@@ -5,16 +5,16 @@ A ledger takes a batch in one call and returns events: no Python object a packet
 
 import ipaddress
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from apps.kitsune.afterimage import seconds
+from apps.kitsune.afterimage import CheckedColumns, seconds
 from apps.kitsune.blocked import Blocked
-from apps.kitsune.kernel import ROW_FIELDS, ColumnError, Columns, Kernel, contiguous
+from apps.kitsune.kernel import ROW_FIELDS, ColumnError, Columns, Kernel, array_type, contiguous
 from apps.kitsune.names import ip_text, mac_text
 
 WORDS: Final = 6
@@ -23,36 +23,79 @@ _ANY_SWITCH: Final = 0xFFFF
 _LOW: Final = (1 << 64) - 1
 _SIX: Final = 1 << 16
 _VICTIM_SIX: Final = 1 << 17
+_POINTERS: Final = tuple(array_type(f"const {c_type}") for _, c_type, _ in ROW_FIELDS)
 Address = tuple[int, int, int]
 
 
-class KernelRows(Mapping[str, npt.NDArray[Any]]):
+class RowRoom:
+    """Memory for decoded packets that serves one batch after the other."""
+
+    def __init__(self) -> None:
+        self._bytes = np.empty(0, np.uint8)
+
+    def of(self, size: int) -> npt.NDArray[np.uint8]:
+        """As many bytes, or more."""
+        if len(self._bytes) < size:
+            self._bytes = np.empty(size, np.uint8)
+        return self._bytes
+
+
+class KernelRows(CheckedColumns):
     """A batch whose columns the ledgers read; made once and handed to all of them.
+
+    Args:
+        kernel: the C kernel.
+        batch: packet columns.
+        room: where the decoded packets go until it is used again; None: memory of their own.
 
     Raises:
         ColumnError: a column is missing, no number, or of another length.
     """
 
-    def __init__(self, kernel: Kernel, batch: Columns) -> None:
-        self._batch = batch
+    def __init__(self, kernel: Kernel, batch: Columns, room: RowRoom | None = None) -> None:
+        self._kernel, self._batch = kernel, batch
         try:
-            self._kept = {
-                name: contiguous(batch[name], kind) for name, _, kind in ROW_FIELDS if name != "time"
-            }
+            self.seconds = seconds(batch)
+            """Capture times."""
+            kept = [
+                self.seconds if name == "time" else contiguous(batch[name], kind)
+                for name, _, kind in ROW_FIELDS
+            ]
         except KeyError as error:
             raise ColumnError(f"the batch has no column {error}") from None
-        self._kept["time"] = seconds(batch)
-        shapes = {column.shape for column in self._kept.values()}
-        if len(shapes) != 1 or self._kept["time"].ndim != 1:
+        shapes = {column.shape for column in kept}
+        if len(shapes) != 1 or self.seconds.ndim != 1:
             raise ColumnError(f"columns of a batch are one-dimensional and equally long, not {shapes}")
-        self.count = len(self._kept["time"])
-        self.pointer = kernel.ffi.new("PacketRows *")
-        for name, c_type, _ in ROW_FIELDS:
-            setattr(self.pointer, name, kernel.pointer(f"const {c_type}", self._kept[name]))
+        self._kept = kept
+        self.count = len(self.seconds)
+        ffi, lib = kernel
+        self.pointer = ffi.new("PacketRows *", list(map(ffi.from_buffer, _POINTERS, kept)))
+        self._room = (room or RowRoom()).of(self.count * lib.row_bytes())
+        self.decoded = ffi.cast("Row *", ffi.from_buffer(self._room))
+        """The packets as the ledgers read them."""
+        lib.rows_read(self.pointer, self.count, self.decoded)
+
+    def benign(
+        self, first: int, scores: npt.NDArray[np.float64], threshold: float, macs: npt.NDArray[np.uint64]
+    ) -> tuple[int, int, float, float]:
+        """Of packets from `first` on that neither come from one of some MACs nor go to one: how many there are, how many
+        score above a threshold, the first and the last time (no number where one is none).
+
+        Args:
+            first: row.
+            scores: of all rows, float64.
+            threshold: a score.
+            macs: ascending.
+        """
+        kernel = self._kernel
+        found = kernel.ffi.new("double[3]")
+        given = kernel.pointer("double", scores), threshold, kernel.pointer("uint64_t", macs), len(macs)
+        count = kernel.lib.rows_benign(self.decoded, first, self.count, *given, found)
+        return count, int(found[0]), found[1], found[2]
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         # every reader asks for seconds first
-        return self._kept["time"] if name == "time_s" else self._batch[name]
+        return self.seconds if name == "time_s" else self._batch[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._batch)

@@ -5,40 +5,37 @@
 
 #define AHEAD 8
 
-typedef struct {
-    Row row;
-    uint32_t there, back, pair, owner;
-} Ahead;
-
-/* All tables hash with one seed. */
-static void look_ahead(const Behaviour *b, const PacketRows *rows, long i, Ahead *ahead)
+static inline void look_ahead(const Behaviour *b, const Row *row, uint16_t number, Keys *keys)
 {
-    Row *row = &ahead->row;
-    read_row(rows, i, row);
-    int six = is_six(row->source), first = comes_first(row->source, row->target);
-    Subject there = contact_of(row->source, row->target, row->service), back = contact_of(row->target, row->source, row->reverse);
-    Subject pair = first ? pair_of(six, 0, row->source, row->target) : pair_of(six, 0, row->target, row->source);
-    Subject owner = pair_of(six, row->mac, row->source, NOBODY);
-    ahead->there = hash_of(&b->known, &there);
-    ahead->back = hash_of(&b->known, &back);
-    ahead->pair = hash_of(&b->exchanges, &pair);
-    ahead->owner = hash_of(&b->owner_macs, &owner);
-    table_fetch_chain(&b->pending, ahead->back);
-    table_fetch_chain(&b->known, ahead->back);
-    table_fetch_chain(&b->pending, ahead->there);
-    table_fetch_chain(&b->known, ahead->there);
-    table_fetch_chain(&b->exchanges, ahead->pair);
-    table_fetch_chain(&b->owner_macs, ahead->owner);
+    keys->there = keyed_by(b, contact_of(row->source, row->target, row->service));
+    keys->back = keyed_by(b, contact_of(row->target, row->source, row->reverse));
+    keys->hosts = keyed_by(b, hosts_of(row));
+    keys->owner = keyed_by(b, pair_of(is_six(row->source), row->mac, row->source, NOBODY));
+    fetch_slot(&b->known, keys->back.hash);
+    fetch_slot(&b->known, keys->there.hash);
+    fetch_slot(&b->exchanges, keys->hosts.hash);
+    fetch_slot(&b->owner_macs, keys->owner.hash);
+    keys->is_login = row->is_tcp && !row->quoted && is_login(b, row->service);
+    if (!keys->is_login)
+        return;
+    keys->login = keyed_by(b, login_of(row->source, row->target, row->service, row->reverse));
+    keys->visit = keyed_by(b, visit_of(row->source, row->target));
+    fetch_slot(&b->logins, keys->login.hash);
+    if (row->flags & SYN) {
+        fetch_slot(&b->visits, keys->visit.hash);
+        Key counted = keyed_by(b, with_more(sender_of(number, row, row->source, 0), (uint64_t)row->service, row->target));
+        fetch_slot(&b->counter[LOGINS].events, counted.hash);
+    }
 }
 
-static void fetch_entries(const Behaviour *b, const Ahead *ahead)
+static inline void fetch_entries(const Behaviour *b, const Keys *keys)
 {
-    table_fetch_entry(&b->pending, ahead->back);
-    table_fetch_entry(&b->known, ahead->back);
-    table_fetch_entry(&b->pending, ahead->there);
-    table_fetch_entry(&b->known, ahead->there);
-    table_fetch_entry(&b->exchanges, ahead->pair);
-    table_fetch_entry(&b->owner_macs, ahead->owner);
+    fetch_entry(&b->known, &keys->back);
+    fetch_entry(&b->known, &keys->there);
+    fetch_entry(&b->exchanges, &keys->hosts);
+    fetch_entry(&b->owner_macs, &keys->owner);
+    if (keys->is_login)
+        fetch_entry(&b->logins, &keys->login);
 }
 
 #endif

@@ -30,7 +30,13 @@ typedef struct {
     uint64_t arrival;
     int64_t reverse;
     int32_t is_syn, half_open;
+    int32_t known; /* its number there; NONE: forgotten there */
 } Pending;
+
+typedef struct {
+    uint32_t generation;
+    int32_t pending; /* its number there, or NONE */
+} Known;
 
 typedef struct {
     int failed;
@@ -42,9 +48,15 @@ typedef struct {
     uint64_t arrival;
 } Ended;
 
+/* Of one packet: contact there and back, pair of hosts, owner of the source; to a login service also connection and visit. */
+typedef struct {
+    Key there, back, hosts, owner, login, visit;
+    int is_login;
+} Keys;
+
 typedef struct {
     double deadline;
-    Subject contact;
+    Key contact;
 } Due;
 
 /* A ring; ends of grace periods in order. */
@@ -86,7 +98,7 @@ typedef struct {
     Table failures, called;                /* Reported */
     Table visits;                          /* by who logged in, and where */
     double callback_nats, callback_usual;
-    Table pending, known, vain, proven;    /* by contact; `known` holds a generation */
+    Table pending, known, vain, proven;    /* by contact */
     Table senders, owners, owner_macs;     /* of training; `owners` when one spoke, `owner_macs` its number */
     Table exchanges, asked, logins, strangers, told, blocked, in_vain;
     uint8_t login_ports[65536 / 8];
@@ -96,7 +108,7 @@ typedef struct {
     Trained *tail;
     int64_t tail_from, tail_count;
     uint32_t generation;
-    int64_t young, exchange_halves;
+    int64_t young, exchange_halves, orphans; /* `orphans`: pending contacts that are not known any more */
     int64_t packets, per_block;
     double begun, seconds;
     double one_way_most[4][MOST_BLOCKS];
@@ -128,9 +140,9 @@ static BehaviourEvent *new_event(Behaviour *b, int what, int block)
     return event;
 }
 
-static void *added(Behaviour *b, Table *table, const Subject *key)
+static void *added_key(Behaviour *b, Table *table, const Key *key)
 {
-    int32_t at = table_add(table, key);
+    int32_t at = add_key(table, key);
     if (at == NONE) {
         b->failed = 1;
         return NULL;
@@ -138,19 +150,25 @@ static void *added(Behaviour *b, Table *table, const Subject *key)
     return payload(table, at);
 }
 
-static void put_bounded(Behaviour *b, Table *table, const Subject *key, int32_t most)
+static void *added(Behaviour *b, Table *table, const Subject *subject)
+{
+    Key key = keyed(table, *subject);
+    return added_key(b, table, &key);
+}
+
+static void put_bounded(Behaviour *b, Table *table, const Key *key, int32_t most)
 {
     if (table->live >= most)
         table_drop(table, table->oldest);
-    if (table_find(table, key) == NONE)
-        added(b, table, key);
+    if (find_key(table, key) == NONE && add_key(table, key) == NONE)
+        b->failed = 1;
 }
 
 /* ---- contacts */
 
 #define FROM_TRAINING UINT32_MAX
 
-static Subject contact_of(Address source, Address target, int64_t service)
+static inline Subject contact_of(Address source, Address target, int64_t service)
 {
     return pair_of((uint32_t)service, is_six(source), source, target);
 }
@@ -161,47 +179,66 @@ static Address contact_end(const Subject *contact, int target)
     return found;
 }
 
-static int knows(const Behaviour *b, const Subject *contact)
+/* The number of a contact's pending entry, if it has one; `known` is that of what is known of it. */
+static inline int32_t pending_of(const Behaviour *b, int32_t known, const Key *contact)
 {
-    return table_find(&b->known, contact) != NONE;
+    if (known != NONE)
+        return ((const Known *)payload(&b->known, known))->pending;
+    return b->orphans ? find_key(&b->pending, contact) : NONE;
 }
 
-static int came_about(const Behaviour *b, const Subject *contact)
+static int came_about(const Behaviour *b, const Key *contact)
 {
-    return knows(b, contact) && table_find(&b->pending, contact) == NONE && table_find(&b->vain, contact) == NONE;
+    int32_t known = find_key(&b->known, contact);
+    return known != NONE && pending_of(b, known, contact) == NONE && find_key(&b->vain, contact) == NONE;
 }
 
 static void drop_old_contacts(Behaviour *b)
 {
     for (int32_t at = b->known.oldest, newer; at != NONE; at = newer) {
         newer = head(&b->known, at)->newer;
-        uint32_t generation = *(uint32_t *)payload(&b->known, at);
-        if (generation != FROM_TRAINING && generation + 1 < b->generation)
-            table_drop(&b->known, at);
+        const Known *known = payload(&b->known, at);
+        if (known->generation == FROM_TRAINING || known->generation + 1 >= b->generation)
+            continue;
+        if (known->pending != NONE) {
+            ((Pending *)payload(&b->pending, known->pending))->known = NONE;
+            b->orphans++;
+        }
+        table_drop(&b->known, at);
     }
 }
 
-static void remember(Behaviour *b, const Subject *contact)
+static int32_t know_contact(Behaviour *b, const Key *contact, uint32_t generation)
 {
-    uint32_t *generation = added(b, &b->known, contact);
-    if (!generation)
-        return;
-    *generation = b->generation;
-    if (++b->young >= b->limits.most_contacts) {
+    int32_t at = add_key(&b->known, contact);
+    if (at == NONE) {
+        b->failed = 1;
+        return NONE;
+    }
+    Known known = {generation, NONE};
+    *(Known *)payload(&b->known, at) = known;
+    return at;
+}
+
+static int32_t remember(Behaviour *b, const Key *contact)
+{
+    int32_t at = know_contact(b, contact, b->generation);
+    if (at != NONE && ++b->young >= b->limits.most_contacts) {
         b->generation++;
         b->young = 0;
         drop_old_contacts(b);
     }
+    return at;
 }
 
-static double grace_of(const Behaviour *b, const Subject *contact)
+static double grace_of(const Behaviour *b, const Key *contact)
 {
-    return (int64_t)contact->word[0] == ARP ? b->arp_grace : b->limits.grace_s;
+    return (int64_t)contact->subject.word[0] == ARP ? b->arp_grace : b->limits.grace_s;
 }
 
-static void push_due(Behaviour *b, double time, const Subject *contact)
+static void push_due(Behaviour *b, double time, const Key *contact)
 {
-    Dues *dues = &b->dues[(int64_t)contact->word[0] != ARP];
+    Dues *dues = &b->dues[(int64_t)contact->subject.word[0] != ARP];
     if (dues->count == dues->room) {
         int64_t room = dues->room ? dues->room * 2 : 1024;
         Due *due = malloc((size_t)room * sizeof *due);
@@ -222,7 +259,7 @@ static void push_due(Behaviour *b, double time, const Subject *contact)
 }
 
 /* The queue whose turn it is at `now`, if there is one. */
-static Dues *dues_at(Behaviour *b, double now)
+static inline Dues *dues_at(Behaviour *b, double now)
 {
     Dues *first = NULL;
     for (int which = 0; which < 2; which++) {
@@ -233,39 +270,48 @@ static Dues *dues_at(Behaviour *b, double now)
     return first && first->due[first->from].deadline <= now ? first : NULL;
 }
 
-static void end_contact(Behaviour *b, const Subject *contact, int32_t at, double time, int failed, Ended *ended)
+/* Ends the contact whose pending entry is `at`. */
+static void end_contact(Behaviour *b, int32_t at, double time, int failed, Ended *ended)
 {
     const Pending *pending = payload(&b->pending, at);
-    Ended found = {failed, time, pending->sender, contact_end(contact, 0), contact_end(contact, 1), (int64_t)contact->word[0],
+    Key contact = {head(&b->pending, at)->key, head(&b->pending, at)->hash};
+    const Subject *name = &contact.subject;
+    Ended found = {failed, time, pending->sender, contact_end(name, 0), contact_end(name, 1), (int64_t)name->word[0],
                    pending->reverse, pending->is_syn, pending->half_open, pending->arrival};
     *ended = found;
-    table_drop(&b->pending, at);
+    if (pending->known != NONE)
+        ((Known *)payload(&b->known, pending->known))->pending = NONE;
+    else
+        b->orphans--;
     if (failed)
-        put_bounded(b, &b->vain, contact, b->limits.most_contacts);
+        put_bounded(b, &b->vain, &contact, b->limits.most_contacts);
     else if (found.half_open) {
-        Subject address = pair_of(contact->word[1], 0, found.source, (Address){0, 0, 0});
+        Key address = keyed(&b->proven, pair_of(name->word[1], 0, found.source, (Address){0, 0, 0}));
         put_bounded(b, &b->proven, &address, b->limits.most_contacts);
     }
+    table_drop(&b->pending, at);
 }
 
 /* The next contact whose grace period is over at `now`. */
 static int next_due(Behaviour *b, double now, Ended *ended)
 {
     for (Dues *dues; (dues = dues_at(b, now));) {
-        Subject contact = dues->due[dues->from].contact;
+        Key contact = dues->due[dues->from].contact;
+        int32_t at = find_key(&b->pending, &contact);
         dues->from = (dues->from + 1) & (dues->room - 1);
         dues->count--;
-        int32_t at = table_find(&b->pending, &contact);
+        if (dues->count)
+            fetch_slot(&b->vain, dues->due[dues->from].contact.hash); /* for the one after this */
         if (at != NONE) {
             double since = ((Pending *)payload(&b->pending, at))->time;
-            end_contact(b, &contact, at, since + grace_of(b, &contact), 1, ended);
+            end_contact(b, at, since + grace_of(b, &contact), 1, ended);
             return 1;
         }
     }
     return 0;
 }
 
-static int answered(Behaviour *b, const Row *row, const Subject *contact, int32_t at, Ended *ended)
+static int answered(Behaviour *b, const Row *row, int32_t at, Ended *ended)
 {
     if (row->is_tcp && !(row->flags & RST) && (row->flags & (SYN | ACK)) == (SYN | ACK)) {
         ((Pending *)payload(&b->pending, at))->half_open = 1;
@@ -275,40 +321,46 @@ static int answered(Behaviour *b, const Row *row, const Subject *contact, int32_
         b->arp_replies++;
         b->slowest_arp = fmax(b->slowest_arp, row->time - ((Pending *)payload(&b->pending, at))->time);
     }
-    end_contact(b, contact, at, row->time, row->is_tcp && row->flags & RST, ended);
+    end_contact(b, at, row->time, row->is_tcp && row->flags & RST, ended);
     return 1;
 }
 
+static void begin_contact(Behaviour *b, const Row *row, const Subject *sender, const Key *contact)
+{
+    int32_t known = remember(b, contact);
+    if (known == NONE || b->pending.live >= b->limits.most_contacts)
+        return;
+    int32_t at = add_key(&b->pending, contact);
+    if (at == NONE) {
+        b->failed = 1;
+        return;
+    }
+    Pending begun = {row->time, *sender, row->arrival, row->reverse, (row->flags & SYN) != 0, 0, known};
+    *(Pending *)payload(&b->pending, at) = begun;
+    ((Known *)payload(&b->known, known))->pending = at;
+    push_due(b, row->time, contact);
+}
+
 /* Follows one packet; whether it ends a contact. */
-static int follow_contact(Behaviour *b, const Row *row, const Subject *sender, Ended *ended)
+static int follow_contact(Behaviour *b, const Row *row, const Subject *sender, const Keys *keys, Ended *ended)
 {
     if (row->quoted || row->group)
         return 0;
-    Subject back = contact_of(row->target, row->source, row->reverse);
-    int32_t at = table_find(&b->pending, &back);
+    int32_t known = find_key(&b->known, &keys->back), at = pending_of(b, known, &keys->back);
     if (at != NONE)
-        return answered(b, row, &back, at, ended);
-    if (row->answer || knows(b, &back))
+        return answered(b, row, at, ended);
+    if (row->answer || known != NONE)
         return 0;
-    Subject there = contact_of(row->source, row->target, row->service);
-    at = table_find(&b->pending, &there);
+    known = find_key(&b->known, &keys->there);
+    at = pending_of(b, known, &keys->there);
     if (at != NONE) {
         int completes = ((Pending *)payload(&b->pending, at))->half_open && row->flags & ACK && !(row->flags & (RST | SYN));
         if (completes)
-            end_contact(b, &there, at, row->time, 0, ended);
+            end_contact(b, at, row->time, 0, ended);
         return completes;
     }
-    if (knows(b, &there) || (row->is_tcp && is_tcp_reply(row->flags)))
-        return 0;
-    remember(b, &there);
-    if (b->pending.live < b->limits.most_contacts) {
-        Pending *pending = added(b, &b->pending, &there);
-        if (pending) {
-            Pending begun = {row->time, *sender, row->arrival, row->reverse, (row->flags & SYN) != 0, 0};
-            *pending = begun;
-            push_due(b, row->time, &there);
-        }
-    }
+    if (known == NONE && !(row->is_tcp && is_tcp_reply(row->flags)))
+        begin_contact(b, row, sender, &keys->there);
     return 0;
 }
 

@@ -8,6 +8,7 @@
 
 #define MOST_WINDOWS 4
 #define MOST_EVENTS 1024
+#define NEAR_EVENTS 2 /* most subjects have no more */
 #define FORGOTTEN_AT_A_TIME 2
 
 /* Limits and constants, set by Python from the modules that define them. */
@@ -27,9 +28,13 @@ typedef struct {
     double nats, time;
 } Reported;
 
+/* Times of `room` events, then room + 1 sums, of which the i-th is that of all events before the i-th. */
 typedef struct {
-    double *times, *sums; /* sums[i]: of all events before the i-th */
+    double *far; /* NULL while they fit into `near` */
     int32_t count, room;
+    int32_t first[MOST_WINDOWS]; /* by window: the first event within it, as of the latest */
+    int32_t unordered; /* a time is no number: then the first event is searched */
+    double near[2 * NEAR_EVENTS + 1];
 } Events;
 
 typedef struct {
@@ -37,6 +42,11 @@ typedef struct {
     int usable;
     double own_scale, shared_scale, rarity;
     double begun[MOST_WINDOWS]; /* by window: the first event of the last sums, seconds; 0 where nothing is summed */
+    int32_t quiet; /* the number of the oldest subject, if its latest event is known ... */
+    double quiet_since; /* ... which was at this time */
+    uint64_t shared_kind; /* the kind that was compared last, and its counts; only while `is_shared_known` */
+    const double *shared_counts;
+    int is_shared_known;
     Table events, shared, highest, reported;
 } Counter;
 
@@ -44,26 +54,27 @@ typedef struct {
     double nats, total, count, window, usual, begun;
 } Seen;
 
+/* As fmax, which is a call. */
+static inline double larger(double a, double b)
+{
+    return a >= b || b != b ? a : b;
+}
+
 static int counter_start(Counter *counter, const CounterSettings *set, uint64_t seed)
 {
     counter->set = *set;
     counter->usable = set->windows;
     counter->own_scale = counter->shared_scale = 1;
+    counter->quiet = NONE;
     size_t counts = MOST_WINDOWS * sizeof(double);
     return table_start(&counter->events, sizeof(Events), seed) | table_start(&counter->shared, counts, seed)
            | table_start(&counter->highest, counts, seed) | table_start(&counter->reported, sizeof(Reported), seed);
 }
 
-static void events_end(Events *events)
-{
-    free(events->times);
-    free(events->sums);
-}
-
 static void counter_end(Counter *counter)
 {
     for (int32_t at = counter->events.oldest; at != NONE; at = head(&counter->events, at)->newer)
-        events_end(payload(&counter->events, at));
+        free(((Events *)payload(&counter->events, at))->far);
     table_end(&counter->events);
     table_end(&counter->shared);
     table_end(&counter->highest);
@@ -83,29 +94,33 @@ static int32_t first_not_before(const double *times, int32_t n, double time)
     return low;
 }
 
+static inline double *times_of(Events *events)
+{
+    return events->far ? events->far : events->near;
+}
+
 static int events_grow(Events *events)
 {
-    if (events->count < events->room)
-        return 0;
-    int32_t room = events->room ? events->room * 2 : 8;
-    double *times = realloc(events->times, (size_t)room * sizeof *times);
-    if (!times)
-        return -1;
-    events->times = times;
-    double *sums = realloc(events->sums, ((size_t)room + 1) * sizeof *sums);
-    if (!sums)
-        return -1;
-    if (!events->sums)
-        sums[0] = 0;
-    events->sums = sums;
+    int32_t room = events->room ? events->room < 8 ? 8 : events->room * 2 : NEAR_EVENTS;
+    if (events->room) {
+        double *former = times_of(events), *far = malloc((2 * (size_t)room + 1) * sizeof *far);
+        if (!far)
+            return -1;
+        memcpy(far, former, (size_t)events->count * sizeof *far);
+        memcpy(far + room, former + events->room, ((size_t)events->count + 1) * sizeof *far);
+        free(events->far);
+        events->far = far;
+    }
     events->room = room;
     return 0;
 }
 
-static void forget_oldest(Table *table)
+static void forget_oldest(Counter *counter)
 {
-    events_end(payload(table, table->oldest));
+    Table *table = &counter->events;
+    free(((Events *)payload(table, table->oldest))->far);
     table_drop(table, table->oldest);
+    counter->quiet = NONE;
 }
 
 /* Those that were quiet for longer than the longest window: their sums are 0, as are those of nobody. */
@@ -114,52 +129,84 @@ static void forget_quiet(Counter *counter, double time)
     Table *table = &counter->events;
     double since = time - counter->set.window[counter->set.windows - 1];
     for (int i = 0; i < FORGOTTEN_AT_A_TIME && table->oldest != NONE; i++) {
-        const Events *events = payload(table, table->oldest);
-        if (!events->count || events->times[events->count - 1] >= since)
+        if (counter->quiet != table->oldest) {
+            Events *events = payload(table, table->oldest);
+            counter->quiet = table->oldest;
+            counter->quiet_since = events->count ? times_of(events)[events->count - 1] : INFINITY;
+        }
+        if (counter->quiet_since >= since)
             return;
-        forget_oldest(table);
+        forget_oldest(counter);
     }
 }
 
-static Events *events_of(Counter *counter, const Subject *subject, int32_t most)
+static Events *events_of(Counter *counter, const Key *subject, int32_t most)
 {
     Table *table = &counter->events;
-    int32_t at = table_find(table, subject);
+    int32_t at = find_key(table, subject);
     if (at != NONE) {
+        if (at == counter->quiet)
+            counter->quiet = NONE;
         table_renew(table, at);
         return payload(table, at);
     }
     if (table->live >= most)
-        forget_oldest(table);
-    at = table_add(table, subject);
+        forget_oldest(counter);
+    at = add_key(table, subject);
     return at == NONE ? NULL : payload(table, at);
 }
 
+/* Moves on to the first events within the windows that end at `time`; times never go back. */
+static void find_firsts(const Counter *counter, Events *events, double time)
+{
+    const double *times = times_of(events);
+    for (int i = 0; i < counter->set.windows; i++) {
+        double since = time - counter->set.window[i];
+        int32_t first = events->first[i];
+        while (!events->unordered && first < events->count && times[first] < since)
+            first++;
+        events->first[i] = events->unordered ? first_not_before(times, events->count, since) : first;
+    }
+}
+
+/* Forgets the oldest events, but only many at a time. */
+static int drop_aged(const Counter *counter, Events *events)
+{
+    int32_t n = events->count, aged = events->first[counter->set.windows - 1];
+    if (n > MOST_EVENTS && aged < MOST_EVENTS / 4)
+        aged = MOST_EVENTS / 4;
+    if (aged <= n / 8)
+        return 0;
+    double *times = times_of(events), *sums = times + events->room;
+    n = events->count = n - aged;
+    memmove(times, times + aged, (size_t)n * sizeof *times);
+    memmove(sums, sums + aged, ((size_t)n + 1) * sizeof *sums);
+    for (int i = 0; i < counter->set.windows; i++)
+        events->first[i] = events->first[i] > aged ? events->first[i] - aged : 0;
+    return 1;
+}
+
 /* Adds an event; the sums within the windows go to `out`.  -1 when memory is short. */
-static int counter_add(Counter *counter, const Subject *subject, double time, double weight, int32_t most, double *out)
+static int counter_add(Counter *counter, const Key *subject, double time, double weight, int32_t most, double *out)
 {
     forget_quiet(counter, time);
     Events *events = events_of(counter, subject, most);
-    if (!events || events_grow(events))
+    if (!events || (events->count == events->room && events_grow(events)))
         return -1;
-    if (events->count && time < events->times[events->count - 1])
-        time = events->times[events->count - 1]; /* two ports may deliver in another order */
-    events->times[events->count] = time;
-    events->sums[events->count + 1] = events->sums[events->count] + weight;
-    events->count++;
+    double *times = times_of(events), *sums = times + events->room;
     int32_t n = events->count;
-    int32_t aged = first_not_before(events->times, n, time - counter->set.window[counter->set.windows - 1]);
-    if (n > MOST_EVENTS && aged < MOST_EVENTS / 4)
-        aged = MOST_EVENTS / 4;
-    if (aged > n / 8) {
-        n = events->count = n - aged;
-        memmove(events->times, events->times + aged, (size_t)n * sizeof *events->times);
-        memmove(events->sums, events->sums + aged, ((size_t)n + 1) * sizeof *events->sums);
-    }
-    for (int32_t i = 0; i < counter->set.windows; i++) {
-        int32_t first = first_not_before(events->times, n, time - counter->set.window[i]);
-        out[i] = events->sums[n] - events->sums[first];
-        counter->begun[i] = events->times[first];
+    if (n && time < times[n - 1])
+        time = times[n - 1]; /* two ports may deliver in another order */
+    events->unordered |= time != time;
+    times[n] = time;
+    sums[n + 1] = sums[n] + weight;
+    events->count++;
+    find_firsts(counter, events, time);
+    if (drop_aged(counter, events) && events->unordered)
+        find_firsts(counter, events, time);
+    for (int i = 0; i < counter->set.windows; i++) {
+        out[i] = sums[events->count] - sums[events->first[i]];
+        counter->begun[i] = times[events->first[i]];
     }
     return 0;
 }
@@ -172,10 +219,22 @@ static void weigh_more(const Counter *counter, int window, Seen *best, double na
     }
 }
 
-static const double *counts_of(const Table *table, const Subject *key)
+static const double *counts_of(const Table *table, const Key *key)
 {
-    int32_t at = table_find(table, key);
+    int32_t at = find_key(table, key);
     return at == NONE ? NULL : payload(table, at);
+}
+
+/* The highest counts of a kind; one packet is seldom of another kind than the one before. */
+static const double *shared_of(Counter *counter, uint64_t kind)
+{
+    if (!counter->is_shared_known || counter->shared_kind != kind) {
+        Key by_kind = keyed(&counter->shared, (Subject){{kind, 0, 0, 0, 0, 0}});
+        counter->shared_counts = counts_of(&counter->shared, &by_kind);
+        counter->shared_kind = kind;
+        counter->is_shared_known = 1;
+    }
+    return counter->shared_counts;
 }
 
 /* Nats of a count above everybody's highest, without its rarity. */
@@ -184,22 +243,21 @@ static double counter_excess(const Counter *counter, double count, double most)
     double least = counter->set.least_scale;
     if (counter->set.rates)
         return log((count + least) / (most + least)) / counter->shared_scale;
-    return (count - most) / fmax(least, counter->shared_scale * most);
+    return (count - most) / larger(least, counter->shared_scale * most);
 }
 
-static Seen counter_measure(const Counter *counter, const BehaviourLimits *limits, const Subject *whose, const double *sums, uint64_t kind)
+static Seen counter_measure(Counter *counter, const BehaviourLimits *limits, const Key *whose, const double *sums, uint64_t kind)
 {
-    Subject by_kind = {{kind, 0, 0, 0, 0, 0}};
-    const double *shared = counts_of(&counter->shared, &by_kind), *own = counts_of(&counter->highest, whose);
+    const double *shared = shared_of(counter, kind), *own = counts_of(&counter->highest, whose);
     Seen best = {0, 0, sums[0], counter->set.window[0], 0, counter->begun[0]};
     for (int i = 0; i < counter->usable; i++) {
         double count = sums[i], most = shared ? shared[i] : 0;
         if (count > most)
             weigh_more(counter, i, &best, counter->rarity + counter_excess(counter, count, most), count, most);
         if (own) {
-            double usual = fmax(own[i], limits->neighbours_share * most);
+            double usual = larger(own[i], limits->neighbours_share * most);
             if (count > usual) {
-                double scale = fmax(fmax(counter->set.least_scale, counter->own_scale * usual), limits->least_scale_share * most);
+                double scale = larger(larger(counter->set.least_scale, counter->own_scale * usual), limits->least_scale_share * most);
                 weigh_more(counter, i, &best, (count - usual) / scale, count, usual);
             }
         }
@@ -207,25 +265,36 @@ static Seen counter_measure(const Counter *counter, const BehaviourLimits *limit
     return best;
 }
 
+/* Whether too little is new, by a lower bound of what is left of the former nats: then no power need be computed. */
+static int is_told(const BehaviourLimits *limits, double nats, double former, double half_lives)
+{
+    double left = former * (1 - 0.6932 * half_lives) * (1 - 1e-12); /* 0.5^x >= 1 - x ln 2 */
+    double least = limits->least_share * larger(left, limits->deciding_nats);
+    return nats - left < (left > limits->deciding_nats || least < limits->least_step ? least : limits->least_step);
+}
+
 /* The part that is new, if it is worth a message; else 0. */
-static double found_added(Table *reported, const BehaviourLimits *limits, const Subject *subject, double nats, double time)
+static double found_added(Table *reported, const BehaviourLimits *limits, const Key *subject, double nats, double time)
 {
     if (nats < limits->least_nats)
         return 0;
-    int32_t at = table_find(reported, subject);
+    nats = nats < limits->most_nats ? nats : limits->most_nats;
+    int32_t at = find_key(reported, subject);
     double faded = 0;
     if (at != NONE) {
         const Reported *former = payload(reported, at);
-        faded = former->nats * pow(0.5, fmax(0.0, time - former->time) / limits->half_life_s);
+        double half_lives = fmax(0.0, time - former->time) / limits->half_life_s;
+        if (is_told(limits, nats, former->nats, half_lives))
+            return 0;
+        faded = former->nats * pow(0.5, half_lives);
     }
-    nats = nats < limits->most_nats ? nats : limits->most_nats;
     double least = faded > limits->deciding_nats ? limits->least_share * faded : limits->least_step;
     if (nats < limits->least_nats || nats - faded < least)
         return 0;
     if (at == NONE) {
         if (reported->live >= limits->kept)
             table_drop(reported, reported->oldest);
-        at = table_add(reported, subject);
+        at = add_key(reported, subject);
         if (at == NONE)
             return 0;
     }

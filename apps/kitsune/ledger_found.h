@@ -43,7 +43,28 @@ static Subject with_more(Subject sender, uint64_t more, Address target)
     return sender;
 }
 
+static inline Key keyed_by(const Behaviour *b, Subject subject)
+{
+    return keyed(&b->known, subject);
+}
+
 static const Address NOBODY = {0, 0, 0};
+
+static inline int is_login(const Behaviour *b, int64_t service)
+{
+    int64_t port = service - TCP;
+    return port >= 0 && port < 65536 && b->login_ports[port >> 3] >> (port & 7) & 1;
+}
+
+static inline Subject visit_of(Address source, Address host)
+{
+    return pair_of(is_six(host), 0, source, host);
+}
+
+static inline Subject login_of(Address source, Address target, int64_t service, int64_t reverse)
+{
+    return pair_of(join_ports((uint64_t)service, (uint64_t)reverse), is_six(source), source, target);
+}
 
 static void set_who(BehaviourEvent *event, const Subject *sender)
 {
@@ -92,7 +113,7 @@ static BehaviourEvent *found(Behaviour *b, int what, const Subject *sender, Addr
     return event;
 }
 
-static int count(Behaviour *b, int what, const Subject *subject, double time, double weight, double *sums)
+static int count(Behaviour *b, int what, const Key *subject, double time, double weight, double *sums)
 {
     if (counter_add(&b->counter[what], subject, time, weight, b->limits.most_subjects, sums))
         b->failed = 1;
@@ -100,7 +121,7 @@ static int count(Behaviour *b, int what, const Subject *subject, double time, do
 }
 
 /* Weighs sums of which the subject is also the name under which it is reported. */
-static int weighed(Behaviour *b, int what, const Subject *whose, const double *sums, uint64_t kind, double time, Seen *seen)
+static int weighed(Behaviour *b, int what, const Key *whose, const double *sums, uint64_t kind, double time, Seen *seen)
 {
     *seen = counter_measure(&b->counter[what], &b->limits, whose, sums, kind);
     seen->nats = found_added(&b->counter[what].reported, &b->limits, whose, seen->total, time);

@@ -1,4 +1,4 @@
-/* Packet columns as rows, with the meaning that `behaviour/rows.py` gives them; blocks in force; networks inside. */
+/* Packets as rows, with the meaning that `behaviour/rows.py` gives them, and what their keys are; blocks in force. */
 
 #ifndef LEDGER_ROWS_H
 #define LEDGER_ROWS_H
@@ -22,119 +22,77 @@
 #define ACK 0x10
 #define WELL_KNOWN 1024
 
-typedef struct {
-    const double *time;
-    const uint64_t *arrival;
-    const uint16_t *port;
-    const uint32_t *length;
-    const uint64_t *eth_src, *eth_dst;
-    const int32_t *arp_op;
-    const uint32_t *arp_src_ip, *arp_dst_ip;
-    const uint8_t *ip_version;
-    const uint64_t *ip_src_hi, *ip_src_lo, *ip_dst_hi, *ip_dst_lo;
-    const int32_t *tcp_sport, *tcp_dport, *udp_sport, *udp_dport;
-    const uint8_t *quoted, *tcp_flags;
-    const int32_t *icmp_type, *icmp6_type;
-} PacketRows;
-
 /* Of no version: hi and lo are 0. */
 typedef struct {
     uint64_t hi, lo;
     uint8_t version;
 } Address;
 
+/* Made of columns once for all ledgers, by `rows_read`. */
 typedef struct {
     double time;
     int64_t second;
     uint64_t arrival, mac, to_mac;
-    uint32_t length;
-    uint16_t port;
     Address source, target;
     int64_t service, reverse;
-    int32_t sport, dport, udp_sport;
-    uint8_t flags;
-    int is_arp, is_tcp, is_udp, is_ping, to_group, group, quoted, answer;
+    int32_t sport, dport, udp_sport, udp_dport;
+    uint32_t length;
+    uint16_t port;
+    uint8_t flags, is_arp, is_tcp, is_udp, is_ping, to_group, group, quoted, answer;
 } Row;
 
-static int is_six(Address address)
+static inline int is_six(Address address)
 {
     return address.version == 6;
 }
 
-static int is_some(Address address)
+static inline int is_some(Address address)
 {
     return is_six(address) || address.lo;
 }
 
-static int same_address(Address a, Address b)
+static inline int same_address(Address a, Address b)
 {
     return a.hi == b.hi && a.lo == b.lo && is_six(a) == is_six(b);
 }
 
-static Address address_of(uint8_t version, uint64_t hi, uint64_t lo)
+static inline Address address_of(uint8_t version, uint64_t hi, uint64_t lo)
 {
     Address found = {version == 6 ? hi : 0, version == 6 ? lo : version == 4 ? lo & 0xFFFFFFFFu : 0, version == 4 || version == 6 ? version : 0};
     return found;
 }
 
-static int64_t whole_second(double time)
-{
-    return time >= -9e18 && time <= 9e18 ? (int64_t)time : 0;
-}
-
-static void read_row(const PacketRows *c, long i, Row *row)
-{
-    row->time = c->time[i];
-    row->second = whole_second(row->time);
-    row->arrival = c->arrival[i];
-    row->mac = c->eth_src[i] & 0xFFFFFFFFFFFFu;
-    row->to_mac = c->eth_dst[i] & 0xFFFFFFFFFFFFu;
-    row->length = c->length[i];
-    row->port = c->port[i];
-    row->is_arp = c->arp_op[i] >= 0;
-    row->is_tcp = c->tcp_sport[i] >= 0;
-    row->is_udp = c->udp_sport[i] >= 0;
-    row->is_ping = c->icmp_type[i] == 8 || c->icmp6_type[i] == 128;
-    int is_pong = c->icmp_type[i] == 0 || c->icmp6_type[i] == 129;
-    if (row->is_arp) {
-        row->source = address_of(4, 0, c->arp_src_ip[i]);
-        row->target = address_of(4, 0, c->arp_dst_ip[i]);
-    } else {
-        row->source = address_of(c->ip_version[i], c->ip_src_hi[i], c->ip_src_lo[i]);
-        row->target = address_of(c->ip_version[i], c->ip_dst_hi[i], c->ip_dst_lo[i]);
-    }
-    row->sport = row->is_tcp ? c->tcp_sport[i] : c->udp_sport[i];
-    row->dport = row->is_tcp ? c->tcp_dport[i] : c->udp_dport[i];
-    int64_t base = row->is_arp ? ARP : row->is_tcp ? TCP : row->is_udp ? UDP : row->is_ping || is_pong ? ECHO : OTHER;
-    row->service = base + (row->is_tcp || row->is_udp ? row->dport : 0);
-    row->reverse = base + (row->is_tcp || row->is_udp ? row->sport : 0);
-    row->quoted = c->quoted[i] != 0;
-    row->udp_sport = row->quoted ? -1 : c->udp_sport[i];
-    row->flags = c->tcp_flags[i];
-    row->to_group = (c->eth_dst[i] & 1ULL << 40) != 0;
-    row->group = row->to_group && !(row->is_arp && c->arp_op[i] == 1);
-    row->answer = c->arp_op[i] == 2 || is_pong || (row->is_arp && c->arp_src_ip[i] == c->arp_dst_ip[i]) || base == OTHER;
-}
-
 /* A SYN-ACK or RST, which never begin a conversation. */
-static int is_tcp_reply(uint8_t flags)
+static inline int is_tcp_reply(uint8_t flags)
 {
     return flags & RST || (flags & (SYN | ACK)) == (SYN | ACK);
 }
 
-static uint64_t join_ports(uint64_t low, uint64_t high)
+static inline uint64_t join_ports(uint64_t low, uint64_t high)
 {
     return (low & 0xFFFFFFFFu) | high << 32;
 }
 
-static Subject pair_of(uint64_t first, uint64_t second, Address source, Address target)
+static inline Subject pair_of(uint64_t first, uint64_t second, Address source, Address target)
 {
     Subject key = {{first, second, source.hi, source.lo, target.hi, target.lo}};
     return key;
 }
 
+static inline int comes_first(Address a, Address b)
+{
+    return a.hi != b.hi ? a.hi < b.hi : a.lo <= b.lo;
+}
+
+/* Both hosts of a packet, whichever sent it. */
+static inline Subject hosts_of(const Row *row)
+{
+    int first = comes_first(row->source, row->target);
+    return pair_of(is_six(row->source), 0, first ? row->source : row->target, first ? row->target : row->source);
+}
+
 /* Switch, port, MAC and address of who sends; `more` goes into the upper half of the second word. */
-static Subject sender_of(uint16_t number, const Row *row, Address address, uint64_t more)
+static inline Subject sender_of(uint16_t number, const Row *row, Address address, uint64_t more)
 {
     Subject key = {{row->mac | (uint64_t)row->port << 48, number | (uint64_t)is_six(address) << 16 | more << 32, address.hi, address.lo, 0, 0}};
     return key;

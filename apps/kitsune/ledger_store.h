@@ -27,7 +27,7 @@ static int start_tables(Behaviour *b, const CounterSettings *settings, uint64_t 
         failed |= counter_start(&b->counter[what], &settings[what], seed);
     return failed | table_start(&b->failures, sizeof(Reported), seed) | table_start(&b->called, sizeof(Reported), seed)
            | table_start(&b->visits, sizeof(Visit), seed) | table_start(&b->pending, sizeof(Pending), seed)
-           | table_start(&b->known, sizeof(uint32_t), seed) | table_start(&b->vain, 0, seed) | table_start(&b->proven, 0, seed)
+           | table_start(&b->known, sizeof(Known), seed) | table_start(&b->vain, 0, seed) | table_start(&b->proven, 0, seed)
            | table_start(&b->senders, 0, seed) | table_start(&b->owners, sizeof(double), seed)
            | table_start(&b->owner_macs, sizeof(int32_t), seed) | table_start(&b->exchanges, sizeof(Exchanges), seed)
            | table_start(&b->asked, sizeof(double), seed) | table_start(&b->logins, sizeof(Login), seed)
@@ -73,7 +73,6 @@ const BehaviourEvent *behaviour_events(const Behaviour *b, long *count)
     return b->events;
 }
 
-/* How many of the last packets of training are known. */
 /* Whose events are counted, by each statistic. */
 long behaviour_subjects(const Behaviour *b)
 {
@@ -83,6 +82,7 @@ long behaviour_subjects(const Behaviour *b)
     return live;
 }
 
+/* How many of the last packets of training are known. */
 long behaviour_tail(const Behaviour *b)
 {
     return (long)b->tail_count;
@@ -107,6 +107,24 @@ void behaviour_outside(Behaviour *b, double silence, int32_t reached)
     b->outside_reached = reached;
 }
 
+/* The scores of the last packets of training; logs[i] is that of the i-th of the last n. */
+int behaviour_calibrate(Behaviour *b, const double *logs, long n, int32_t blocks)
+{
+    b->event_count = 0;
+    if (n > b->tail_count)
+        return -2;
+    long per_block = (n + blocks - 1) / blocks > 1 ? (n + blocks - 1) / blocks : 1;
+    for (long i = 0; i < n && !b->failed; i++) {
+        const Trained *each = &b->tail[(b->tail_from + b->tail_count - n + i) % b->limits.calibration];
+        double sums[MOST_WINDOWS];
+        Key sender = keyed_by(b, each->sender);
+        if (logs[i] > 0 && !count(b, SCORES, &sender, each->time, logs[i], sums))
+            taught(b, SCORES, (int)(i / per_block), &each->sender, NOBODY, NO_SERVICE, 0, sums);
+    }
+    b->tail_count = b->tail_from = 0;
+    return b->failed ? -1 : 0;
+}
+
 /* Seconds to wait for ARP replies from now on. */
 void behaviour_arp_grace(Behaviour *b, double seconds)
 {
@@ -118,7 +136,7 @@ void behaviour_arp_grace(Behaviour *b, double seconds)
 void behaviour_close_training(Behaviour *b)
 {
     for (int32_t at = b->known.oldest; at != NONE; at = head(&b->known, at)->newer)
-        *(uint32_t *)payload(&b->known, at) = FROM_TRAINING;
+        ((Known *)payload(&b->known, at))->generation = FROM_TRAINING;
     b->young = 0;
 }
 
@@ -141,6 +159,7 @@ int behaviour_baseline(Behaviour *b, int32_t what, int32_t own, const uint64_t *
     if (what < 0 || what >= STATISTICS)
         return -2;
     Table *table = own ? &b->counter[what].highest : &b->counter[what].shared;
+    b->counter[what].is_shared_known = 0;
     table_clear(table);
     for (long i = 0; i < n; i++)
         if (put_counts(table, keys + WORDS * i, counts + MOST_WINDOWS * i))
@@ -174,9 +193,9 @@ int behaviour_know(Behaviour *b, const uint64_t *senders, long n, const uint64_t
     }
     for (long i = 0; i < k; i++) {
         memcpy(&key, contacts + WORDS * i, sizeof key);
-        uint32_t *generation = table_find(&b->known, &key) == NONE ? added(b, &b->known, &key) : NULL;
-        if (generation)
-            *generation = FROM_TRAINING;
+        Key contact = keyed_by(b, key);
+        if (find_key(&b->known, &contact) == NONE)
+            know_contact(b, &contact, FROM_TRAINING);
     }
     return b->failed ? -1 : 0;
 }
@@ -186,11 +205,11 @@ long behaviour_contacts(const Behaviour *b, int32_t training, uint64_t *out, lon
 {
     long count = 0;
     for (int32_t at = b->known.oldest; at != NONE; at = head(&b->known, at)->newer) {
-        const Subject *contact = &head(&b->known, at)->key;
-        if (training ? *(uint32_t *)payload(&b->known, at) != FROM_TRAINING : !came_about(b, contact))
+        Key contact = {head(&b->known, at)->key, head(&b->known, at)->hash};
+        if (training ? ((const Known *)payload(&b->known, at))->generation != FROM_TRAINING : !came_about(b, &contact))
             continue;
         if (count < room)
-            memcpy(out + WORDS * count, contact, sizeof *contact);
+            memcpy(out + WORDS * count, &contact.subject, sizeof contact.subject);
         count++;
     }
     return count;

@@ -1,4 +1,8 @@
-/* Hash tables of the ledgers: keys of six words, entries in order of insertion, numbers that stay while they live. */
+/* Hash tables of the ledgers: keys of six words, entries in order of insertion, numbers that stay while they live.
+ *
+ * Slots are probed one after the other and hold the hash beside the number, so that who looks for a key that is not
+ * there reads no entry.  Tables of one ledger share a seed, so that a key is hashed once for all of them.
+ */
 
 #ifndef LEDGER_TABLE_H
 #define LEDGER_TABLE_H
@@ -15,16 +19,27 @@ typedef struct {
     uint64_t word[WORDS];
 } Subject;
 
+/* A subject and its hash. */
+typedef struct {
+    Subject subject;
+    uint32_t hash;
+} Key;
+
 typedef struct {
     Subject key;
     uint32_t hash;
-    int32_t next;
+    int32_t next; /* among the free entries */
     int32_t older, newer; /* older is VACANT in free entries */
 } Head;
 
 typedef struct {
+    uint32_t hash;
+    int32_t at; /* NONE: free */
+} Slot;
+
+typedef struct {
     char *entries;
-    int32_t *bucket;
+    Slot *slot;
     size_t stride;
     uint32_t mask;
     int32_t used, room, free, live;
@@ -32,19 +47,34 @@ typedef struct {
     uint64_t seed;
 } Table;
 
-static uint64_t fold(uint64_t a, uint64_t b)
+static inline uint64_t fold(uint64_t a, uint64_t b)
 {
     unsigned __int128 product = (unsigned __int128)a * b;
     return (uint64_t)product ^ (uint64_t)(product >> 64);
 }
 
-static uint32_t hash_of(const Table *table, const Subject *key)
+static inline uint32_t hash_of(uint64_t s, const Subject *subject)
 {
-    const uint64_t *w = key->word, s = table->seed;
+    const uint64_t *w = subject->word;
     uint64_t h = fold(w[0] ^ s, w[1] ^ 0x9E3779B97F4A7C15u) ^ fold(w[2] ^ s ^ 0xA0761D6478BD642Fu, w[3] ^ 0xE7037ED1A0B428DBu)
                  ^ fold(w[4] ^ s ^ 0x8EBC6AF09C88C6E3u, w[5] ^ 0x589965CC75374CC3u);
     h = fold(h ^ s, 0x1D8E4E27C47D124Fu);
     return (uint32_t)(h ^ h >> 32);
+}
+
+static inline Key keyed(const Table *any, Subject subject)
+{
+    Key key = {subject, hash_of(any->seed, &subject)};
+    return key;
+}
+
+static Slot *free_slots(uint32_t mask)
+{
+    size_t bytes = ((size_t)mask + 1) * sizeof(Slot);
+    Slot *slot = malloc(bytes);
+    if (slot)
+        memset(slot, 0xFF, bytes);
+    return slot;
 }
 
 static int table_start(Table *table, size_t payload, uint64_t seed)
@@ -54,30 +84,27 @@ static int table_start(Table *table, size_t payload, uint64_t seed)
     table->free = table->oldest = table->newest = NONE;
     table->seed = seed | 1;
     table->mask = 63;
-    table->bucket = malloc((table->mask + 1) * sizeof *table->bucket);
-    if (!table->bucket)
-        return -1;
-    memset(table->bucket, 0xFF, (table->mask + 1) * sizeof *table->bucket);
-    return 0;
+    table->slot = free_slots(table->mask);
+    return table->slot ? 0 : -1;
 }
 
 static void table_end(Table *table)
 {
     free(table->entries);
-    free(table->bucket);
+    free(table->slot);
 }
 
-static Head *head(const Table *table, int32_t at)
+static inline Head *head(const Table *table, int32_t at)
 {
     return (Head *)(table->entries + (size_t)at * table->stride);
 }
 
-static void *payload(const Table *table, int32_t at)
+static inline void *payload(const Table *table, int32_t at)
 {
     return table->entries + (size_t)at * table->stride + sizeof(Head);
 }
 
-static int same_subject(const Subject *a, const Subject *b)
+static inline int same_subject(const Subject *a, const Subject *b)
 {
     uint64_t difference = 0;
     for (int i = 0; i < WORDS; i++)
@@ -85,53 +112,60 @@ static int same_subject(const Subject *a, const Subject *b)
     return !difference;
 }
 
-static int32_t table_find(const Table *table, const Subject *key)
+static inline int32_t find_key(const Table *table, const Key *key)
 {
-    if (!table->live)
-        return NONE;
-    uint32_t hash = hash_of(table, key);
-    for (int32_t at = table->bucket[hash & table->mask]; at != NONE; at = head(table, at)->next) {
-        const Head *found = head(table, at);
-        if (found->hash == hash && same_subject(&found->key, key))
-            return at;
-    }
+    uint32_t i = key->hash & table->mask;
+    for (Slot slot; (slot = table->slot[i]).at != NONE; i = (i + 1) & table->mask)
+        if (slot.hash == key->hash && same_subject(&head(table, slot.at)->key, &key->subject))
+            return slot.at;
     return NONE;
 }
 
-/* What `table_find` will read, fetched early: first where a chain begins, then, a while later, its first entry. */
-static void table_fetch_chain(const Table *table, uint32_t hash)
+static int32_t table_find(const Table *table, const Subject *subject)
 {
-    __builtin_prefetch(&table->bucket[hash & table->mask]);
+    if (!table->live)
+        return NONE;
+    Key key = keyed(table, *subject);
+    return find_key(table, &key);
 }
 
-static void table_fetch_entry(const Table *table, uint32_t hash)
+/* What `find_key` will read, fetched early: first the slot, then, a while later, the entry. */
+static inline void fetch_slot(const Table *table, uint32_t hash)
 {
-    int32_t at = table->bucket[hash & table->mask];
-    if (at == NONE)
+    __builtin_prefetch(&table->slot[hash & table->mask]);
+}
+
+static inline void fetch_entry(const Table *table, const Key *key)
+{
+    Slot slot = table->slot[key->hash & table->mask];
+    if (slot.at == NONE || slot.hash != key->hash)
         return;
-    const char *entry = (const char *)head(table, at);
+    const char *entry = (const char *)head(table, slot.at);
     __builtin_prefetch(entry);
-    __builtin_prefetch(entry + sizeof(Head) - 1);
+    __builtin_prefetch(entry + sizeof(Head));
 }
 
-/* More buckets; 0 when memory is short: longer chains still work. */
+static void table_put(Table *table, uint32_t hash, int32_t at)
+{
+    uint32_t i = hash & table->mask;
+    while (table->slot[i].at != NONE)
+        i = (i + 1) & table->mask;
+    table->slot[i].hash = hash;
+    table->slot[i].at = at;
+}
+
+/* Twice as many slots; 0 when memory is short. */
 static int table_spread(Table *table)
 {
-    uint32_t mask = table->mask * 4 + 3;
-    int32_t *bucket = malloc(((size_t)mask + 1) * sizeof *bucket);
-    if (!bucket)
+    Slot *slot = table->mask < UINT32_MAX / 2 ? free_slots(table->mask * 2 + 1) : NULL;
+    if (!slot)
         return 0;
-    memset(bucket, 0xFF, ((size_t)mask + 1) * sizeof *bucket);
-    free(table->bucket);
-    table->bucket = bucket;
-    table->mask = mask;
-    for (int32_t at = 0; at < table->used; at++) {
-        Head *each = head(table, at);
-        if (each->older != VACANT) {
-            each->next = bucket[each->hash & mask];
-            bucket[each->hash & mask] = at;
-        }
-    }
+    free(table->slot);
+    table->slot = slot;
+    table->mask = table->mask * 2 + 1;
+    for (int32_t at = 0; at < table->used; at++)
+        if (head(table, at)->older != VACANT)
+            table_put(table, head(table, at)->hash, at);
     return 1;
 }
 
@@ -148,7 +182,7 @@ static int table_grow(Table *table)
     return 0;
 }
 
-static void table_append(Table *table, int32_t at)
+static inline void table_append(Table *table, int32_t at)
 {
     head(table, at)->older = table->newest;
     head(table, at)->newer = NONE;
@@ -156,7 +190,7 @@ static void table_append(Table *table, int32_t at)
     table->newest = at;
 }
 
-static void table_unlink(Table *table, int32_t at)
+static inline void table_unlink(Table *table, int32_t at)
 {
     const Head *each = head(table, at);
     *(each->older == NONE ? &table->oldest : &head(table, each->older)->newer) = each->newer;
@@ -164,8 +198,11 @@ static void table_unlink(Table *table, int32_t at)
 }
 
 /* A new entry, which the caller has not found; its payload is zero.  NONE when memory is short. */
-static int32_t table_add(Table *table, const Subject *key)
+static int32_t add_key(Table *table, const Key *key)
 {
+    uint32_t live = (uint32_t)table->live + 1;
+    if (live > table->mask / 2 && !table_spread(table) && live > table->mask - table->mask / 8)
+        return NONE;
     int32_t at = table->free;
     if (at != NONE)
         table->free = head(table, at)->next;
@@ -174,24 +211,39 @@ static int32_t table_add(Table *table, const Subject *key)
     else
         return NONE;
     Head *each = head(table, at);
-    memset(each, 0, table->stride);
-    each->key = *key;
-    each->hash = hash_of(table, key);
+    memset(payload(table, at), 0, table->stride - sizeof *each);
+    each->key = key->subject;
+    each->hash = key->hash;
     table_append(table, at);
-    if ((uint32_t)++table->live > table->mask && table_spread(table))
-        return at;
-    each->next = table->bucket[each->hash & table->mask];
-    table->bucket[each->hash & table->mask] = at;
+    table->live++;
+    table_put(table, key->hash, at);
     return at;
+}
+
+static int32_t table_add(Table *table, const Subject *subject)
+{
+    Key key = keyed(table, *subject);
+    return add_key(table, &key);
+}
+
+/* Frees a slot; what was pushed on by it moves back, so that no search ends too early. */
+static void table_take(Table *table, uint32_t hash, int32_t at)
+{
+    uint32_t mask = table->mask, i = hash & mask;
+    while (table->slot[i].at != at)
+        i = (i + 1) & mask;
+    for (uint32_t j = (i + 1) & mask; table->slot[j].at != NONE; j = (j + 1) & mask)
+        if (((j - table->slot[j].hash) & mask) >= ((j - i) & mask)) {
+            table->slot[i] = table->slot[j];
+            i = j;
+        }
+    table->slot[i].at = NONE;
 }
 
 static void table_drop(Table *table, int32_t at)
 {
     Head *each = head(table, at);
-    int32_t *link = &table->bucket[each->hash & table->mask];
-    while (*link != at)
-        link = &head(table, *link)->next;
-    *link = each->next;
+    table_take(table, each->hash, at);
     table_unlink(table, at);
     each->next = table->free;
     each->older = VACANT;
@@ -203,13 +255,13 @@ static void table_clear(Table *table)
 {
     if (!table->used)
         return;
-    memset(table->bucket, 0xFF, ((size_t)table->mask + 1) * sizeof *table->bucket);
+    memset(table->slot, 0xFF, ((size_t)table->mask + 1) * sizeof *table->slot);
     table->used = table->live = 0;
     table->free = table->oldest = table->newest = NONE;
 }
 
 /* The entry was used: now it is the newest. */
-static void table_renew(Table *table, int32_t at)
+static inline void table_renew(Table *table, int32_t at)
 {
     if (table->newest != at) {
         table_unlink(table, at);

@@ -48,6 +48,11 @@ typedef struct {
     int32_t dns, dhcp;
 } Speaker;
 
+/* Of one packet: who sends it, its conversation there and back; the latter two of packets with ports. */
+typedef struct {
+    Key identity, there, back;
+} Keys;
+
 typedef struct {
     int64_t most_senders;
     int32_t most_conversations, anomalous_packets, replies_per_packet;
@@ -92,12 +97,19 @@ static void name_event(Senders *s, int what, const Subject *key)
         memcpy(event->who, key->word, sizeof event->who);
 }
 
-static int32_t added(Senders *s, Table *table, const Subject *key)
+static int32_t added(Senders *s, Table *table, const Key *key)
 {
-    int32_t at = table_add(table, key);
+    int32_t at = add_key(table, key);
     if (at == NONE)
         s->failed = 1;
     return at;
+}
+
+/* Whether the subject is new; then it is added. */
+static int is_new(Senders *s, Table *table, Subject subject)
+{
+    Key key = keyed(table, subject);
+    return find_key(table, &key) == NONE && added(s, table, &key) != NONE;
 }
 
 /* As `sender_of` of the rows, with the version itself: what has no address is another than 0.0.0.0. */
@@ -118,9 +130,9 @@ static Address record_address(const Subject *key)
     return found;
 }
 
-static int32_t number_of(Senders *s, const Subject *identity)
+static int32_t number_of(Senders *s, const Key *identity)
 {
-    int32_t number = table_find(&s->records, identity);
+    int32_t number = find_key(&s->records, identity);
     if (number != NONE)
         return number;
     number = added(s, &s->records, identity);
@@ -129,7 +141,7 @@ static int32_t number_of(Senders *s, const Subject *identity)
     Record *record = payload(&s->records, number);
     record->last_second = s->has_second ? s->second : 0;
     record->serial = -1;
-    name_event(s, SEEN, identity);
+    name_event(s, SEEN, &identity->subject);
     return number;
 }
 
@@ -246,7 +258,7 @@ static void count_destination(Senders *s, Tally *tally, Address to)
     tally->has_destination = 1;
     tally->last_destination = to;
     Subject key = pair_of((uint32_t)tally->sender, to.version, to, (Address){0, 0, 0});
-    if (table_find(&s->destinations, &key) == NONE && added(s, &s->destinations, &key) != NONE)
+    if (is_new(s, &s->destinations, key))
         tally->destinations++;
 }
 
@@ -270,20 +282,20 @@ static Subject conversation_of(const Row *row, int back)
     return pair_of((uint64_t)row->is_tcp | (uint64_t)address.version << 8, sport | dport << 32, address, (Address){0, 0, 0});
 }
 
-static Conversation *begun(Senders *s, const Subject *key, double time)
+static Conversation *begun(Senders *s, const Key *key, double time)
 {
-    int32_t at = table_find(&s->young, key);
+    int32_t at = find_key(&s->young, key);
     Table *table = at != NONE ? &s->young : &s->old;
     if (at == NONE)
-        at = table_find(&s->old, key);
+        at = find_key(&s->old, key);
     if (at == NONE)
         return NULL;
     Conversation *found = payload(table, at);
-    double within = key->word[0] & 1 ? TCP_REPLY_S : UDP_REPLY_S;
+    double within = key->subject.word[0] & 1 ? TCP_REPLY_S : UDP_REPLY_S;
     return fabs(time - found->time) <= within ? found : NULL;
 }
 
-static void begin(Senders *s, const Subject *key, int32_t sender, double time)
+static void begin(Senders *s, const Key *key, int32_t sender, double time)
 {
     double passed = time - s->turned;
     if (!(passed >= 0 && passed <= TCP_REPLY_S) || s->young.live >= s->limits.most_conversations) {
@@ -293,7 +305,7 @@ static void begin(Senders *s, const Subject *key, int32_t sender, double time)
         table_clear(&s->young);
         s->turned = time;
     }
-    int32_t at = table_find(&s->young, key), each = s->limits.replies_per_packet;
+    int32_t at = find_key(&s->young, key), each = s->limits.replies_per_packet;
     if (at == NONE)
         at = added(s, &s->young, key);
     if (at == NONE)
@@ -314,25 +326,22 @@ static int32_t charge(Conversation *conversation, int32_t sender)
     return conversation->sender;
 }
 
-static int32_t responsible(Senders *s, const Row *row, int32_t sender)
+static int32_t responsible(Senders *s, const Row *row, const Keys *keys, int32_t sender)
 {
     if (row->sport < 0)
         return sender;
-    Subject back = conversation_of(row, 1), there;
     if (row->quoted) {
         /* the ports are those of the packet that the error quotes */
-        there = pair_of((uint64_t)row->is_tcp | (uint64_t)row->target.version << 8, join_ports((uint32_t)row->sport, (uint32_t)row->dport), row->target, (Address){0, 0, 0});
-        Conversation *quoted = begun(s, &there, row->time);
+        Key sent = keyed(&s->young, pair_of((uint64_t)row->is_tcp | (uint64_t)row->target.version << 8, join_ports((uint32_t)row->sport, (uint32_t)row->dport), row->target, (Address){0, 0, 0}));
+        Conversation *quoted = begun(s, &sent, row->time);
         return quoted ? charge(quoted, sender) : sender;
     }
     int is_reply = !row->is_tcp || is_tcp_reply(row->flags), is_syn = row->is_tcp && (row->flags & (SYN | ACK)) == SYN;
-    Conversation *found = is_syn ? NULL : begun(s, &back, row->time);
+    Conversation *found = is_syn ? NULL : begun(s, &keys->back, row->time);
     if (found)
         return is_reply ? charge(found, sender) : sender;
-    if (!(row->is_tcp && is_reply)) {
-        there = conversation_of(row, 0);
-        begin(s, &there, sender, row->time);
-    }
+    if (!(row->is_tcp && is_reply))
+        begin(s, &keys->there, sender, row->time);
     return sender;
 }
 
@@ -353,11 +362,11 @@ static void learn_roles(Senders *s, const Row *row)
         Subject key = {{row->to_mac, (uint64_t)row->target.version << 16, row->target.hi, row->target.lo, 0, 0}};
         if (s->towards.live >= 1 << 20)
             table_clear(&s->towards); /* Python keeps a set: telling twice does no harm */
-        if (table_find(&s->towards, &key) == NONE && added(s, &s->towards, &key) != NONE)
+        if (is_new(s, &s->towards, key))
             name_event(s, TOWARDS, &key);
     }
-    Subject key = pair_of(row->source.version, 0, row->source, (Address){0, 0, 0});
-    int32_t at = table_find(&s->speakers, &key);
+    Key key = keyed(&s->speakers, pair_of(row->source.version, 0, row->source, (Address){0, 0, 0}));
+    int32_t at = find_key(&s->speakers, &key);
     if (at == NONE)
         at = added(s, &s->speakers, &key);
     if (at == NONE)
@@ -378,15 +387,14 @@ static void end_training(Senders *s)
 
 /* ---- the interface */
 
-static void take_row(Senders *s, const Row *row, uint16_t number, int trains, double score, double threshold, long at)
+static void take_row(Senders *s, const Row *row, const Keys *keys, uint16_t number, int trains, double score, double threshold, long at)
 {
     if (!s->has_second || row->second != s->second)
         turn(s, row->second);
-    Subject identity = identity_of(number, row);
-    int32_t sender = number_of(s, &identity);
+    int32_t sender = number_of(s, &keys->identity);
     if (sender == NONE)
         return;
-    int32_t charged = responsible(s, row, sender);
+    int32_t charged = responsible(s, row, keys, sender);
     if (!record_of(s, charged))
         charged = sender; /* who began the conversation is forgotten */
     if (s->blocked.live && concerns_blocked(s, row, number, sender, charged))
@@ -407,17 +415,49 @@ static void take_row(Senders *s, const Row *row, uint16_t number, int trains, do
         mark(tally, score, row->arrival, at);
 }
 
+/* ---- rows ahead: what they will look up is fetched early; all tables hash with one seed */
+
+#define AHEAD 8
+
+static inline void look_ahead(const Senders *s, const Row *row, uint16_t number, Keys *keys)
+{
+    keys->identity = keyed(&s->records, identity_of(number, row));
+    fetch_slot(&s->records, keys->identity.hash);
+    if (row->sport < 0)
+        return;
+    keys->there = keyed(&s->young, conversation_of(row, 0));
+    keys->back = keyed(&s->young, conversation_of(row, 1));
+    fetch_slot(&s->young, keys->there.hash);
+    fetch_slot(&s->young, keys->back.hash);
+    fetch_slot(&s->old, keys->back.hash);
+}
+
+static inline void fetch_entries(const Senders *s, const Row *row, const Keys *keys)
+{
+    fetch_entry(&s->records, &keys->identity);
+    if (row->sport < 0)
+        return;
+    fetch_entry(&s->young, &keys->there);
+    fetch_entry(&s->young, &keys->back);
+    fetch_entry(&s->old, &keys->back);
+}
+
 /* n rows, of which the first `trained` were training.  The rows of peaks that are to be kept go to `peaks` (room for
  * n), their number to kept[0]; the number of this batch and of the oldest in which a peak is kept to kept[1] and [2].
  * -1 when memory is short. */
-int senders_add(Senders *s, const PacketRows *rows, long n, long trained, uint16_t number, const double *scores, double threshold, int32_t *peaks, long *kept)
+int senders_add(Senders *s, const Row *rows, long n, long trained, uint16_t number, const double *scores, double threshold, int32_t *peaks, long *kept)
 {
     s->event_count = 0;
     s->batch++;
+    Keys ahead[AHEAD];
+    for (long i = 0; i < n && i < AHEAD; i++)
+        look_ahead(s, &rows[i], number, &ahead[i]);
     for (long i = 0; i < n && !s->failed; i++) {
-        Row row;
-        read_row(rows, i, &row);
-        take_row(s, &row, number, i < trained, scores[i], threshold, i);
+        if (i + AHEAD / 2 < n)
+            fetch_entries(s, &rows[i + AHEAD / 2], &ahead[(i + AHEAD / 2) % AHEAD]);
+        take_row(s, &rows[i], &ahead[i % AHEAD], number, i < trained, scores[i], threshold, i);
+        if (i + AHEAD < n)
+            look_ahead(s, &rows[i + AHEAD], number, &ahead[i % AHEAD]);
     }
     kept[0] = 0;
     kept[1] = kept[2] = s->batch;
@@ -480,7 +520,7 @@ Senders *senders_new(const SenderLimits *limits, int32_t training, uint64_t seed
 
 int senders_know(Senders *s, const uint64_t *who, int64_t rate, int64_t destinations)
 {
-    Subject key = {{who[0], who[1], who[2], who[3], 0, 0}};
+    Key key = keyed(&s->records, (Subject){{who[0], who[1], who[2], who[3], 0, 0}});
     s->event_count = 0;
     int32_t number = number_of(s, &key);
     if (number == NONE)

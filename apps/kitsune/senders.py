@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -74,8 +74,7 @@ class Tally:
     evidence: Any = None
 
 
-@dataclass(frozen=True, slots=True)
-class AnomalousSecond:
+class AnomalousSecond(NamedTuple):
     """A sender's second in which too many packets scored at or above the threshold."""
 
     second: int
@@ -170,7 +169,7 @@ class Senders:
         peaks, kept = np.empty(rows.count, np.int32), np.zeros(3, np.int64)
         code = self._lib.senders_add(
             self._state,
-            rows.pointer,
+            rows.decoded,
             rows.count,
             trained,
             number,
@@ -231,9 +230,11 @@ class Senders:
         if not count[0]:
             return seconds
         events = np.frombuffer(self._kernel.ffi.buffer(pointer, count[0] * _EVENT.itemsize), _EVENT)
+        peaks = events["row"][(events["what"] == _ANOMALOUS) & (events["row"] >= 0)]
+        proofs = iter(evidence(peaks) if len(peaks) else ())
         for event in self._worth(events).tolist():
-            what, kept_in, kept_at, row, *rest = event
-            identity = self._identity(rest[:4])
+            what, kept_in, kept_at, row, ends, where, hi, lo, *numbers = event
+            identity = self._identity((ends, where, hi, lo))
             if what == _SEEN:
                 self._see(identity)
             elif what == _TOWARDS:
@@ -246,8 +247,8 @@ class Senders:
             elif what == _FORGOTTEN:
                 self._history.pop(identity, None)
             else:
-                proof = evidence(np.array([row], np.int32))[0] if row >= 0 else self._kept[kept_in][kept_at]
-                seconds.append(self._anomalous(identity, rest[4:], proof))
+                proof = next(proofs) if row >= 0 else self._kept[kept_in][kept_at]
+                seconds.append(self._anomalous(identity, numbers, proof))
         return seconds
 
     def _worth(self, events: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
@@ -284,7 +285,5 @@ class Senders:
         while history[0] <= second - HISTORY_S:
             history.popleft()
         record = SenderRecord(identity, rate, hosts, second, history)
-        tally = Tally(
-            packets=packets, over=over, peak=peak, first_over=first_over, hosts=destinations, evidence=proof
-        )
+        tally = Tally(packets, over, peak, first_over, destinations, proof)
         return AnomalousSecond(second, record, tally, len(history))

@@ -1,6 +1,116 @@
-/* What of each kind of flood comes to each host: `victims.py` in C. */
+/* Columns as rows, which all ledgers read; and what of each kind of flood comes to each host: `victims.py` in C. */
 
 #include "ledger_rows.h"
+
+/* In the order of `kernel.ROW_FIELDS`. */
+typedef struct {
+    const uint32_t *length;
+    const double *time;
+    const uint64_t *eth_src, *eth_dst;
+    const int32_t *arp_op;
+    const uint32_t *arp_src_ip, *arp_dst_ip;
+    const uint8_t *ip_version;
+    const uint64_t *ip_src_hi, *ip_src_lo, *ip_dst_hi, *ip_dst_lo;
+    const int32_t *tcp_sport, *tcp_dport, *udp_sport, *udp_dport, *icmp_type;
+    const uint64_t *arrival;
+    const uint16_t *port;
+    const uint8_t *quoted, *tcp_flags;
+    const int32_t *icmp6_type;
+} PacketRows;
+
+static int64_t whole_second(double time)
+{
+    return time >= -9e18 && time <= 9e18 ? (int64_t)time : 0;
+}
+
+static inline void read_row(const PacketRows *c, long i, Row *row)
+{
+    int32_t arp_op = c->arp_op[i], icmp = c->icmp_type[i], icmp6 = c->icmp6_type[i];
+    int32_t tcp_sport = c->tcp_sport[i], udp_sport = c->udp_sport[i], udp_dport = c->udp_dport[i];
+    int is_arp = arp_op >= 0, is_tcp = tcp_sport >= 0, is_udp = udp_sport >= 0, is_quoted = c->quoted[i] != 0;
+    int is_ping = icmp == 8 || icmp6 == 128, is_pong = icmp == 0 || icmp6 == 129;
+    int32_t sport = is_tcp ? tcp_sport : udp_sport, dport = is_tcp ? c->tcp_dport[i] : udp_dport;
+    int64_t base = is_arp ? ARP : is_tcp ? TCP : is_udp ? UDP : is_ping || is_pong ? ECHO : OTHER;
+    int to_group = c->eth_dst[i] >> 40 & 1;
+    uint8_t version = is_arp ? 4 : c->ip_version[i];
+    row->time = c->time[i];
+    row->second = whole_second(c->time[i]);
+    row->arrival = c->arrival[i];
+    row->mac = c->eth_src[i] & 0xFFFFFFFFFFFFu;
+    row->to_mac = c->eth_dst[i] & 0xFFFFFFFFFFFFu;
+    row->source = address_of(version, c->ip_src_hi[i], is_arp ? c->arp_src_ip[i] : c->ip_src_lo[i]);
+    row->target = address_of(version, c->ip_dst_hi[i], is_arp ? c->arp_dst_ip[i] : c->ip_dst_lo[i]);
+    row->service = base + (is_tcp || is_udp ? dport : 0);
+    row->reverse = base + (is_tcp || is_udp ? sport : 0);
+    row->sport = sport;
+    row->dport = dport;
+    row->udp_sport = is_quoted ? -1 : udp_sport;
+    row->udp_dport = udp_dport;
+    row->length = c->length[i];
+    row->port = c->port[i];
+    row->flags = c->tcp_flags[i];
+    row->is_arp = is_arp;
+    row->is_tcp = is_tcp;
+    row->is_udp = is_udp;
+    row->is_ping = is_ping;
+    row->to_group = to_group;
+    row->group = to_group && !(is_arp && arp_op == 1);
+    row->quoted = is_quoted;
+    row->answer = arp_op == 2 || is_pong || (is_arp && c->arp_src_ip[i] == c->arp_dst_ip[i]) || base == OTHER;
+}
+
+/* Bytes that `rows_read` needs for each row. */
+long row_bytes(void)
+{
+    return sizeof(Row);
+}
+
+void rows_read(const PacketRows *columns, long n, Row *rows)
+{
+    const PacketRows c = *columns; /* which no row can overwrite */
+    for (long i = 0; i < n; i++)
+        read_row(&c, i, &rows[i]);
+}
+
+static int is_among(const uint64_t *sorted, long n, uint64_t mac)
+{
+    long low = 0;
+    while (low < n) {
+        long middle = low + (n - low) / 2;
+        if (sorted[middle] == mac)
+            return 1;
+        if (sorted[middle] < mac)
+            low = middle + 1;
+        else
+            n = middle;
+    }
+    return 0;
+}
+
+/* Rows from `first` on that neither come from one of m MACs (ascending) nor go to one: how many score above the
+ * threshold, and the first and last time among them; returns how many there are. */
+long rows_benign(const Row *rows, long first, long last, const double *scores, double threshold, const uint64_t *macs, long m, double *out)
+{
+    long count = 0, above = 0;
+    double least = INFINITY, most = -INFINITY;
+    int known = 1;
+    for (long i = first; i < last; i++) {
+        if (is_among(macs, m, rows[i].mac) || is_among(macs, m, rows[i].to_mac))
+            continue;
+        double time = rows[i].time;
+        count++;
+        above += !(scores[i] <= threshold);
+        least = time < least ? time : least;
+        most = time > most ? time : most;
+        known &= time == time;
+    }
+    out[0] = (double)above;
+    out[1] = known ? least : NAN;
+    out[2] = known ? most : NAN;
+    return count;
+}
+
+/* ---- victims */
 
 typedef struct {
     int64_t highest, packets;
@@ -44,17 +154,17 @@ Victims *victims_new(const VictimLimits *limits, uint64_t seed)
     return v;
 }
 
-static int32_t entry_of(Victims *v, Table *table, const Subject *key, int may_add)
+static int32_t entry_of(Victims *v, Table *table, const Key *key, int may_add)
 {
-    int32_t at = table_find(table, key);
+    int32_t at = find_key(table, key);
     if (at == NONE && may_add) {
-        at = table_add(table, key);
+        at = add_key(table, key);
         v->failed |= at == NONE;
     }
     return at;
 }
 
-static void learn(Victims *v, const Subject *key, Address source, int64_t now)
+static void learn(Victims *v, const Key *key, Address source, int64_t now)
 {
     int32_t at = entry_of(v, &v->usual, key, v->usual.live < v->limits.most_kinds);
     if (at == NONE)
@@ -63,8 +173,9 @@ static void learn(Victims *v, const Subject *key, Address source, int64_t now)
     if (now > usual->highest)
         usual->highest = now;
     usual->packets++;
-    Subject by_source = {{key->word[0], key->word[1], key->word[2], key->word[3], source.hi, source.lo}};
-    int32_t found = table_find(&v->sources, &by_source);
+    const uint64_t *word = key->subject.word;
+    Key by_source = keyed(&v->sources, (Subject){{word[0], word[1], word[2], word[3], source.hi, source.lo}});
+    int32_t found = find_key(&v->sources, &by_source);
     if (found == NONE) {
         if (usual->sources >= v->limits.most_sources || v->named >= v->limits.most_sources_of_all)
             return;
@@ -79,7 +190,7 @@ static void learn(Victims *v, const Subject *key, Address source, int64_t now)
 
 static void count_kind(Victims *v, const Row *row, int64_t kind, int trains)
 {
-    Subject key = pair_of((uint32_t)kind, is_six(row->target), row->target, (Address){0, 0, 0});
+    Key key = keyed(&v->now, pair_of((uint32_t)kind, is_six(row->target), row->target, (Address){0, 0, 0}));
     int32_t at = entry_of(v, &v->now, &key, v->now.live < v->limits.most_kinds);
     int64_t now = at == NONE ? 0 : ++*(int64_t *)payload(&v->now, at);
     if (trains)
@@ -97,37 +208,34 @@ static void turn(Victims *v, int64_t second)
     table_clear(&v->now);
 }
 
-static int kinds_of(const PacketRows *rows, long i, const Row *row, int64_t *kinds)
+static int kinds_of(const Row *row, int64_t *kinds)
 {
     int count = 0;
     if (row->is_udp) {
-        int64_t sport = rows->udp_sport[i], dport = rows->udp_dport[i] & 0xFFFF;
+        int64_t sport = row->udp_sport, dport = row->udp_dport & 0xFFFF;
         kinds[count++] = sport < WELL_KNOWN ? FROM_UDP | sport : UDP | dport;
         kinds[count++] = ANY_UDP;
     }
     if (row->is_tcp && !(row->flags & SYN))
-        kinds[count++] = STRAY_TCP | (rows->tcp_dport[i] & 0xFFFF);
+        kinds[count++] = STRAY_TCP | (row->dport & 0xFFFF);
     if (row->is_ping && !row->is_tcp && !row->is_udp)
         kinds[count++] = ECHO;
     return count;
 }
 
 /* n rows, of which the first `trained` were training; -1 when memory is short. */
-int victims_add(Victims *v, const PacketRows *rows, long n, long trained)
+int victims_add(Victims *v, const Row *rows, long n, long trained)
 {
     for (long i = 0; i < n && !v->failed; i++) {
-        Row row;
-        if (rows->arp_op[i] >= 0)
-            continue;
-        read_row(rows, i, &row);
-        if (row.quoted || !row.target.version)
+        const Row *row = &rows[i];
+        if (row->is_arp || row->quoted || !row->target.version)
             continue;
         int64_t kinds[4];
-        int count = kinds_of(rows, i, &row, kinds);
+        int count = kinds_of(row, kinds);
         if (count)
-            turn(v, row.second);
+            turn(v, row->second);
         for (int kind = 0; kind < count; kind++)
-            count_kind(v, &row, kinds[kind], i < trained);
+            count_kind(v, row, kinds[kind], i < trained);
     }
     return v->failed ? -1 : 0;
 }

@@ -72,7 +72,7 @@ class VictimRates:
     def add(self, batch: Columns, trained: int) -> None:
         """Take a batch of which the first `trained` packets were training."""
         rows = rows_of(self._kernel, batch)
-        check(self._lib.victims_add(self._state, rows.pointer, rows.count, trained), _WHAT)
+        check(self._lib.victims_add(self._state, rows.decoded, rows.count, trained), _WHAT)
         self._has_learnt |= trained > 0
 
     def usual(self, victim: int, kind: int) -> UsualTraffic:

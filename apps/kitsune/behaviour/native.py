@@ -125,11 +125,11 @@ class NativeBehaviour(Behaviour):
             return []
         rows = rows_of(self._kernel, batch)
         number = self._switches.number(switch)
-        self._apply_blocks(blocked)
+        self._apply_blocks(blocked if blocked is not None else Blocked())
         if trained:
             null = self._kernel.ffi.NULL
             code = self._lib.behaviour_add(
-                self._state, rows.pointer, rows.count, 0, trained, number, null, null, 0.0
+                self._state, rows.decoded, rows.count, 0, trained, number, null, null, 0.0
             )
             check(code, _WHAT)
             self._learn()
@@ -141,7 +141,7 @@ class NativeBehaviour(Behaviour):
         logs = self._log_scores(scores)
         code = self._lib.behaviour_add(
             self._state,
-            rows.pointer,
+            rows.decoded,
             rows.count,
             trained,
             rows.count,
@@ -220,8 +220,8 @@ class NativeBehaviour(Behaviour):
     def _log_scores(self, scores: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return np.log(np.maximum(scores, twin.TINY) / self.usual_score)
 
-    def _apply_blocks(self, blocked: Blocked | None) -> None:
-        rows = self._switches.changed_blocks(blocked or Blocked())
+    def _apply_blocks(self, blocked: Blocked) -> None:
+        rows = self._switches.changed_blocks(blocked)
         if rows is not None:
             pointer = self._kernel.pointer("uint64_t", rows)
             check(self._lib.behaviour_blocks(self._state, pointer, len(rows)), _WHAT)

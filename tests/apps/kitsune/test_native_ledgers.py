@@ -9,10 +9,13 @@ from hypothesis import strategies as st
 
 from apps.kitsune import senders as senders_module
 from apps.kitsune import victims as victims_module
-from apps.kitsune.kernel import ColumnError
+from apps.kitsune.afterimage import AfterImage
+from apps.kitsune.kernel import ColumnError, load_kernel
+from apps.kitsune.ledger import KernelRows
 from apps.kitsune.senders import Senders
 from apps.kitsune.victims import VictimRates
 from apps.messages import Target
+from sdnator.testing.packet_rows import part
 from tests.apps.firewall.enforcement.test_eve import decision
 from tests.apps.kitsune.behaviour.test_native import plain
 from tests.apps.kitsune.random_traffic import scores_of, traffic
@@ -113,5 +116,17 @@ def test_columns_that_do_not_fit_are_refused():
     rates = VictimRates()
     with pytest.raises(ColumnError, match="tcp_flags"):
         rates.add({name: column for name, column in batch.items() if name != "tcp_flags"}, 0)
+    with pytest.raises(ColumnError, match="time_us"):
+        rates.add({name: column for name, column in batch.items() if name != "time_us"}, 0)
     with pytest.raises(ColumnError, match="equally long"):
         rates.add({**batch, "port": batch["port"][:5]}, 0)
+
+
+@pytest.mark.parametrize("mode", ["reference", "bounded"])
+def test_features_of_columns_that_were_checked_before_are_the_same(mode):
+    """A detector checks a batch once, for features and ledgers."""
+    batch, kernel = traffic(np.random.default_rng(3), 300, 0.0), load_kernel()
+    one, other = (AfterImage(mode, kernel=kernel) for _ in range(2))
+    for count in (300, 1, 0):
+        given_columns = part(batch, 0, count)
+        assert np.array_equal(one.update(given_columns), other.update(KernelRows(kernel, given_columns)))

@@ -74,3 +74,36 @@ def test_findings_and_what_is_learnt_are_equal(small, seed):
         for _ in range(3):
             feed(again, random, at, left=0)
         assert plain(again[0].to_state()) == plain(again[1].to_state())
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=4, deadline=None)
+def test_a_subject_of_many_events_is_counted_as_by_the_twin(seed):
+    """More events than are remembered of one subject, quiet hours between them, and a clock that is set back."""
+    random = np.random.default_rng(seed)
+    sides = [Behaviour(TRAINING), NativeBehaviour(TRAINING, load_kernel())]
+    left, at = TRAINING, 0.0
+    for step in range(5):
+        batch = traffic(random, 1_500, at, hosts=2)
+        scores = random.lognormal(2.0, 1.0, 1_500)
+        found = [side.add(batch, "s1", scores, left, lambda: np.full(50, 0.5), 1.5) for side in sides]
+        assert repr(found[0]) == repr(found[1])
+        assert sides[0].subjects == sides[1].subjects
+        left, at = 0, at + [5, 2_000, -900, 90, 0][step]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=8, deadline=None)
+def test_a_contact_that_is_forgotten_before_it_ends_ends_all_the_same(seed):
+    """With so little room contacts are forgotten while an answer is still awaited."""
+    random = np.random.default_rng(seed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contacts, "MOST_CONTACTS", 3)
+        sides = [Behaviour(TRAINING), NativeBehaviour(TRAINING, load_kernel())]
+        left, at = TRAINING, 0.0
+        for _ in range(10):
+            trained, _ = feed(sides, random, at, left=left)
+            left, at = left - trained, at + float(random.exponential(2))
+        assert plain(json.loads(json.dumps(sides[0].to_state()))) == plain(
+            json.loads(json.dumps(sides[1].to_state()))
+        )
