@@ -1,5 +1,6 @@
 """Kitsune without I/O: takes record batches, returns scores and alerts."""
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,19 +12,19 @@ import numpy.typing as npt
 
 from apps.evidence import Evidence
 from apps.kitsune.accused import LEAST_NATS, Accused
-from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode, seconds
+from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode
 from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS
 from apps.kitsune.behaviour.findings import Finding
 from apps.kitsune.behaviour.native import NativeBehaviour
 from apps.kitsune.behaviour.rows import parts_of
-from apps.kitsune.drift import TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
+from apps.kitsune.drift import BLOCK_S, TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
 from apps.kitsune.evidence import evidence_of
 from apps.kitsune.kernel import Columns, Kernel, load_kernel
 from apps.kitsune.kitnet import KitNet
-from apps.kitsune.ledger import KernelRows
+from apps.kitsune.ledger import KernelRows, RowRoom
 from apps.kitsune.model_file import Model, NotAModelError, save_model
 from apps.kitsune.names import ip_text, mac_text
-from apps.kitsune.reasons import Explanations, reason
+from apps.kitsune.reasons import Explanation, explanations, reason
 from apps.kitsune.senders import AnomalousSecond, Senders
 from apps.kitsune.threshold import Benign, Calibration
 from apps.kitsune.training_check import TrainingCheck
@@ -138,6 +139,7 @@ class Detector:
         self._check = TrainingCheck()
         self._trained_at_us = 0
         self._kernel = kernel
+        self._room = RowRoom()
         self.senders = Senders(kernel)
         self.behaviour = NativeBehaviour(settings.fm_grace + settings.ad_grace + 1, kernel)
         self.victims = VictimRates(kernel)
@@ -185,32 +187,32 @@ class Detector:
             switch: where they were seen.
             features: of each packet, where another detector has measured them; its statistics are then in use.
         """
-        batch = KernelRows(self._kernel, batch)
+        rows = KernelRows(self._kernel, batch, self._room)
         if features is None:
-            features = self.afterimage.update(batch)
+            features = self.afterimage.update(rows)
         before = self.model.trained
         scores, errors = self.model.process(features)
         trained = self.model.trained - before
         if trained:
-            self._check.see(batch, trained)
-            self._trained_at_us = int(batch["time_us"][trained - 1])
+            self._check.see(rows, trained)
+            self._trained_at_us = int(rows["time_us"][trained - 1])
             self._keep_tail(features[:trained])
             self._keep_sample(features[:trained], before)
         state = np.full(len(scores), SCORED, dtype=np.uint8)
         state[:trained] = TRAIN
         threshold = self.threshold
 
-        def explain(rows: npt.NDArray[np.int32]) -> Explanations:
-            return Explanations(features[rows], errors[rows - trained])
+        def explain(chosen: npt.NDArray[np.int32]) -> list[Explanation]:
+            return explanations(self.model.moved_most(features, errors, chosen, trained))
 
         anomalous = self.senders.add(
-            batch, switch, scores=scores, trained=trained, threshold=threshold, evidence=explain
+            rows, switch, scores=scores, trained=trained, threshold=threshold, evidence=explain
         )
-        self.victims.add(batch, trained)
+        self.victims.add(rows, trained)
         findings: list[Finding] = []
         if self._knows_behaviour:
             findings = self.behaviour.add(
-                batch,
+                rows,
                 switch,
                 scores,
                 trained,
@@ -219,11 +221,12 @@ class Detector:
                 self.senders.blocked,
             )
         self._evidence += [self._as_evidence(finding) for finding in findings]
-        self._follow_drift(batch, scores, trained, findings)
-        over = int(np.count_nonzero(~(scores[trained:] < threshold)))
+        self._follow_drift(rows, scores, trained, findings)
+        scored = scores[trained:]
+        over = int(np.count_nonzero(~(scored < threshold)))
         if trained and self.model.is_trained:
             self.training_warnings = self._check.warnings(self.senders.known())
-        if self.calibration.add(scores[trained:], seconds(batch)[trained:]):
+        if self.calibration.add(scored, rows.seconds[trained:]):
             self.threshold = self._threshold()
         return Scored(scores, state, features, over, threshold), [self._alert(second) for second in anomalous]
 
@@ -257,7 +260,7 @@ class Detector:
             self._sample.append(features[chosen].copy())
 
     def _follow_drift(
-        self, batch: Columns, scores: npt.NDArray[np.float64], trained: int, findings: list[Finding]
+        self, rows: KernelRows, scores: npt.NDArray[np.float64], trained: int, findings: list[Finding]
     ) -> None:
         """Benign scores only: those of senders without evidence against them."""
         for finding in findings:
@@ -265,10 +268,16 @@ class Detector:
                 self.accused.accuse(finding.sender[2], finding.time)
         if self.drift is None or trained == len(scores):
             return
-        times = seconds(batch)[trained:]
-        benign = self.accused.benign(batch, float(times[-1]))
-        chosen = slice(None) if benign is None else benign[trained:]
-        self.drift_changed |= self.drift.add(scores[trained:][chosen], times[chosen])
+        now = float(rows.seconds[-1])
+        count, above, first, last = rows.benign(trained, scores, self.drift.threshold, self.accused.macs(now))
+        if not count:
+            return
+        if first // BLOCK_S == last // BLOCK_S and math.isfinite(first):
+            self.drift_changed |= self.drift.count(int(first // BLOCK_S), count, above)
+            return
+        benign = self.accused.benign(rows, now)
+        chosen = slice(trained, None) if benign is None else benign & (np.arange(len(scores)) >= trained)
+        self.drift_changed |= self.drift.add(scores[chosen], rows.seconds[chosen])
 
     def _as_evidence(self, finding: Finding) -> Evidence:
         rate = training_rate = 0.0
@@ -367,5 +376,5 @@ class Detector:
             training_rate=float(second.record.training_rate),
             mac_addresses=self.senders.roles.addresses(mac),
             role=self.senders.roles.role(mac, address),
-            reason=reason(second, self.model, self.threshold),
+            reason=reason(second, self.threshold),
         )

@@ -92,6 +92,25 @@ class Drift:
         limit = max(_FACTOR * (1 - QUANTILE), _TRAINING_FACTOR * upper)
         return cls(float(np.quantile(scores, QUANTILE)), min(limit, _MOST_LIMIT))
 
+    def count(self, number: int, packets: int, above: int) -> bool:
+        """Count benign packets of one half hour: how many there are, and how many are above the threshold.
+
+        Args:
+            number: of the half hour, that of time 0 being 0.
+            packets: how many.
+            above: of them.
+
+        Returns:
+            Whether it has drifted, or no longer has, since the last call.
+        """
+        changed = False
+        if number not in self._blocks:
+            changed = self._close(number)
+            self._blocks[number] = [0, 0]
+        self._blocks[number][0] += packets
+        self._blocks[number][1] += above
+        return changed
+
     def add(self, scores: _Array, seconds: _Array) -> bool:
         """Take benign scores in order of time.
 
@@ -106,14 +125,9 @@ class Drift:
             return False
         numbers = (seconds // BLOCK_S).astype(np.int64)
         changed = False
-        least, most = int(numbers.min()), int(numbers.max())
-        for number in [least] if least == most else np.unique(numbers).tolist():
-            if number not in self._blocks:
-                changed |= self._close(number)
-                self._blocks[number] = [0, 0]
-            here = scores if least == most else scores[numbers == number]
-            self._blocks[number][0] += len(here)
-            self._blocks[number][1] += int(np.count_nonzero(~(here <= self.threshold)))
+        for number in np.unique(numbers).tolist():
+            here = scores[numbers == number]
+            changed |= self.count(number, len(here), int(np.count_nonzero(~(here <= self.threshold))))
         return changed
 
     def _close(self, number: int) -> bool:

@@ -1,7 +1,9 @@
 """A finding as a message: who, against whom, how strong, and in words."""
 
 import math
-from typing import Final
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 from apps.evidence import Evidence, Kind
 from apps.kitsune.behaviour.behaviour import CONTACTS
@@ -36,6 +38,7 @@ def address_text(address: int) -> str:
     return ip_text(*parts_of(address))
 
 
+@lru_cache(maxsize=4_096)
 def sender_of(sender: SenderId) -> Sender:
     """An identity of `behaviour.rows` as a message."""
     switch, port, mac, address = sender
@@ -96,33 +99,77 @@ def evidence_of(
     )
 
 
+_TRIED: Final = {"icmp": "pinged", "arp": "got no ARP reply from"}
+"""What a sender did to many hosts, by service; of others it is said that they were not reached."""
+
+
+class _Told(NamedTuple):
+    """A finding, and the names that its text needs."""
+
+    finding: Finding
+    who: str
+    victim: str
+
+    @property
+    def service(self) -> str:
+        return service_text(self.finding.service) if self.finding.service >= 0 else ""
+
+    @property
+    def within(self) -> str:
+        return f"within {self.finding.window_s:g} s"
+
+    @property
+    def usual(self) -> str:
+        return f"at most {self.finding.usual:,.0f} in training"
+
+    def counted(self, nouns: str, noun: str = "") -> str:
+        return _counted(math.ceil(self.finding.count), nouns, noun)
+
+
+def _sweep(told: _Told) -> str:
+    unanswered = told.finding.service == UNANSWERED
+    tried = "got no echo reply from" if unanswered else _TRIED.get(told.service)
+    tried = tried or f"failed to reach {told.service} at"
+    return f"{told.who} {tried} {told.counted('new hosts')} {told.within}; {told.usual}"
+
+
+_TEXTS: Final[dict[Statistic, Callable[[_Told], str]]] = {
+    "contacts": lambda told: (
+        f"{told.who} failed to reach {told.counted('new hosts or ports', 'new host or port')} {told.within}; {told.usual}"
+    ),
+    "ports": lambda told: (
+        f"{told.who} failed to reach {told.counted('new ports')} of {told.victim} {told.within}; {told.usual}"
+    ),
+    "targets": _sweep,
+    "logins": lambda told: (
+        f"{told.who} opened {told.counted('short connections')} to {told.service} of {told.victim} {told.within}; {told.usual}"
+    ),
+    "callbacks": lambda told: (
+        f"{told.victim} connected back to {told.who} {told.finding.window_s:.1f} s after its login to {told.service};"
+        f" {_counted(round(told.finding.usual), 'hosts')} did so in training"
+    ),
+    "one_way": lambda told: (
+        f"{told.who} sent {told.counted('packets')} a second to {told.victim}, which does not answer; {told.usual}"
+    ),
+    "claims": lambda told: (
+        f"{told.who} sent {told.counted('ARP replies', 'ARP reply')} that nobody had asked for {told.within}; {told.usual}"
+    ),
+    "thefts": lambda told: f"{told.who} claims the address of {told.victim}, which is present",
+    "strangers": lambda told: (
+        f"{told.counted('addresses', 'address')} unknown to training failed to reach {told.service} of {told.victim}"
+        f" {told.within}; {told.usual}"
+    ),
+    "scores": lambda told: (
+        f"the packets of {told.who} are unlike those of training ({told.finding.total:.0f} nats {told.within})"
+    ),
+    "threshold": lambda told: f"a packet of {told.who} scored {told.finding.count:.3g}",
+}
+
+
 def _words(finding: Finding, victim: str) -> str:
     sender = finding.sender
     who = "" if sender is None else (address_text(sender[3]) or mac_text(sender[2]))
-    count, usual = math.ceil(finding.count), f"at most {finding.usual:,.0f} in training"
-    within = f"within {finding.window_s:g} s"
-    service = service_text(finding.service) if finding.service >= 0 else ""
-    tried = "got no echo reply from" if finding.service == UNANSWERED else _TRIED.get(service)
-    texts: dict[Statistic, str] = {
-        "contacts": f"{who} failed to reach {_counted(count, 'new hosts or ports', 'new host or port')} {within}; {usual}",
-        "ports": f"{who} failed to reach {_counted(count, 'new ports')} of {victim} {within}; {usual}",
-        "targets": f"{who} {tried or f'failed to reach {service} at'}"
-        f" {_counted(count, 'new hosts')} {within}; {usual}",
-        "logins": f"{who} opened {_counted(count, 'short connections')} to {service} of {victim} {within}; {usual}",
-        "callbacks": f"{victim} connected back to {who} {finding.window_s:.1f} s after its login to {service};"
-        f" {_counted(round(finding.usual), 'hosts')} did so in training",
-        "one_way": f"{who} sent {_counted(count, 'packets')} a second to {victim}, which does not answer; {usual}",
-        "claims": f"{who} sent {_counted(count, 'ARP replies', 'ARP reply')} that nobody had asked for {within}; {usual}",
-        "thefts": f"{who} claims the address of {victim}, which is present",
-        "strangers": f"{_counted(count, 'addresses', 'address')} unknown to training failed to reach {service} of {victim} {within}; {usual}",
-        "scores": f"the packets of {who} are unlike those of training ({finding.total:.0f} nats {within})",
-        "threshold": f"a packet of {who} scored {finding.count:.3g}",
-    }
-    return texts[finding.statistic]
-
-
-_TRIED: Final = {"icmp": "pinged", "arp": "got no ARP reply from"}
-"""What a sender did to many hosts, by service; of others it is said that they were not reached."""
+    return _TEXTS[finding.statistic](_Told(finding, who, victim))
 
 
 def _counted(number: int, nouns: str, noun: str = "") -> str:

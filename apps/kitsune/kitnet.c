@@ -305,3 +305,58 @@ int kitnet_score(const Layer *ensemble, const Layer *output, const double *x, lo
     }
     return 0;
 }
+
+/* ---- which of it moved most */
+
+static int is_more(double a, double b)
+{
+    return a > b || (b != b && a == a);
+}
+
+/* The input that is farthest from the middle of its range; the first that is no number, if there is one. */
+static int32_t farthest_input(const Layer *layer, int a, const double *row)
+{
+    long first = (long)a * layer->visible;
+    int32_t found = -1;
+    double most = -1;
+    for (int v = 0; v < layer->visible_of[a]; v++) {
+        double low = layer->low[first + v], x = row[layer->input[first + v]];
+        double moved = fabs((x - low) / (layer->high[first + v] - low + 1e-16) - 0.5);
+        if (moved != moved)
+            return layer->input[first + v];
+        if (moved > most) {
+            most = moved;
+            found = layer->input[first + v];
+        }
+    }
+    return found;
+}
+
+/* For n rows of x: the two autoencoders with the highest errors, compared with those of training, and the input of each
+ * that moved most; -1 where there is no second.  Errors are those of the rows from `first` on.  -2 as in `kitnet_train`. */
+int kitnet_moved(const Layer *ensemble, const Layer *output, const double *x, long width, const double *errors, long first,
+                 const int32_t *rows, long n, int32_t *out)
+{
+    if (!are_sound(ensemble, output, n, width) || output->visible < ensemble->count)
+        return -2;
+    for (long i = 0; i < n; i++, out += 4) {
+        const double *row = x + rows[i] * width, *error = errors + (rows[i] - first) * ensemble->count;
+        double excess[2] = {NAN, NAN};
+        out[0] = out[1] = out[2] = out[3] = -1;
+        for (int32_t a = 0; a < ensemble->count; a++) {
+            double more = (error[a] - output->low[a]) / (output->high[a] - output->low[a] + 1e-16);
+            if (out[0] < 0 || is_more(more, excess[0])) {
+                excess[1] = excess[0];
+                out[1] = out[0];
+                excess[0] = more;
+                out[0] = a;
+            } else if (out[1] < 0 || is_more(more, excess[1])) {
+                excess[1] = more;
+                out[1] = a;
+            }
+        }
+        for (int which = 0; which < 2 && out[which] >= 0; which++)
+            out[2 + which] = farthest_input(ensemble, out[which], row);
+    }
+    return 0;
+}

@@ -106,6 +106,7 @@ class KitNet:
         self.feature_map: list[list[int]] = []
         self.ensemble: Layer | None = None
         self.output: Layer | None = None
+        self._in_c: tuple[Layer, Layer, list[Any], list[Any]] | None = None
         if feature_map is not None:
             self._build(feature_map)
 
@@ -125,6 +126,8 @@ class KitNet:
         array without rows until the first packet is scored).
         """
         taught = min(len(features), self.training_packets - self.trained)
+        if not taught:
+            return self.score(features)
         self.learn(features[:taught])
         scores, errors = self.score(features[taught:])
         return np.concatenate([np.zeros(taught), scores]), errors
@@ -153,6 +156,40 @@ class KitNet:
         if not len(features):
             return np.zeros(0), np.zeros((0, len(self.feature_map)))
         return self._score(contiguous(features, "f8"))
+
+    def moved_most(
+        self, features: _Array, errors: _Array, rows: npt.NDArray[np.int32], first: int = 0
+    ) -> list[list[int]]:
+        """For each of some rows: two autoencoders, and of each the feature that moved most.
+
+        Args:
+            features: rows that were scored, and rows before them.
+            errors: of each autoencoder, of the rows that were scored.
+            rows: numbers of rows that were scored.
+            first: number of the first row that was scored.
+
+        Returns:
+            The autoencoders with the highest errors, compared with those of training, and of each the feature that is
+            farthest from the middle of its range; -1 where there is no second.
+        """
+        found = np.empty((len(rows), 4), np.int32)
+        x, rmse = (
+            self._kernel.pointer("double", contiguous(features, "f8")),
+            self._kernel.pointer("double", errors),
+        )
+        given = self._kernel.pointer("int32_t", rows), len(rows), self._kernel.pointer("int32_t", found)
+        if self._kernel.lib.kitnet_moved(*self._c_layers(), x, self.width, rmse, first, *given):
+            raise ValueError(_UNSOUND)
+        moved: list[list[int]] = found.tolist()
+        return moved
+
+    def _c_layers(self) -> list[Any]:
+        """The layers in C, made once: training changes their numbers in place."""
+        layers = self._layers()
+        if self._in_c is None or self._in_c[0] is not layers[0] or self._in_c[1] is not layers[1]:
+            pinned = [dict(vars(layer)) for layer in layers]  # C points into their arrays
+            self._in_c = *layers, [_c_layer(self._kernel, layer) for layer in layers], pinned
+        return self._in_c[2]
 
     def _check_width(self, features: _Array) -> None:
         if features.ndim != 2 or features.shape[1] != self.width:

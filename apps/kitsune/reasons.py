@@ -1,14 +1,10 @@
 """The reason of an alert as text."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, overload
-
-import numpy as np
-import numpy.typing as npt
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 from apps.kitsune.kernel import LAMBDAS
-from apps.kitsune.kitnet import KitNet
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.senders import AnomalousSecond
 
@@ -32,36 +28,17 @@ _NOTABLE: Final = 2.0
 """A rate or fan-out of at least this many times its training maximum is mentioned."""
 
 
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """The packet with the highest score of a second, as the autoencoders saw it."""
+class Explanation(NamedTuple):
+    """What moved most in the packet with the highest score of a second."""
 
-    features: npt.NDArray[np.float64]
-    errors: npt.NDArray[np.float64]
+    autoencoders: tuple[int, ...]
+    features: tuple[int, ...]
+    """Of each of them one."""
 
 
-class Explanations(Sequence[Explanation]):
-    """Explanations of several packets of one batch.
-
-    Args:
-        features: their features, row by row.
-        errors: RMSE of each autoencoder.
-    """
-
-    def __init__(self, features: npt.NDArray[np.float64], errors: npt.NDArray[np.float64]) -> None:
-        self._features, self._errors = features, errors
-
-    def __len__(self) -> int:
-        return len(self._features)
-
-    @overload
-    def __getitem__(self, row: int) -> Explanation: ...
-    @overload
-    def __getitem__(self, row: slice) -> "Explanations": ...
-    def __getitem__(self, row: int | slice) -> "Explanation | Explanations":
-        if isinstance(row, slice):
-            return Explanations(self._features[row], self._errors[row])
-        return Explanation(self._features[row], self._errors[row])
+def explanations(moved: Iterable[Sequence[int]]) -> list[Explanation]:
+    """What `KitNet.moved_most` has found, by packet."""
+    return [Explanation((a, b), (x, y)) if b >= 0 else Explanation((a,), (x,)) for a, b, x, y in moved]
 
 
 def feature_words(feature: int) -> str:
@@ -72,7 +49,7 @@ def feature_words(feature: int) -> str:
     return f"{names[statistic]} of {group} over {round(1 / LAMBDAS[scale], 1):g} s"
 
 
-def reason(second: AnomalousSecond, model: KitNet, threshold: float) -> str:
+def reason(second: AnomalousSecond, threshold: float) -> str:
     """What the sender did, and the autoencoders and features with the highest errors."""
     tally, record = second.tally, second.record
     _, _, mac, address = record.identity
@@ -82,7 +59,7 @@ def reason(second: AnomalousSecond, model: KitNet, threshold: float) -> str:
         f"{tally.over} of {tally.packets} packets scored over {threshold:.3g}, the highest {tally.peak:.3g}"
     )
     if isinstance(tally.evidence, Explanation):
-        parts.append(_autoencoders(tally.evidence, model))
+        parts.append(_moved(tally.evidence))
     return "; ".join(parts)
 
 
@@ -98,19 +75,7 @@ def _comparisons(who: str, packets: int, trained_packets: int, hosts: int, train
     return parts or [f"{who} sends no more than in training, but differently"]
 
 
-def _autoencoders(evidence: Explanation, model: KitNet) -> str:
-    ensemble, output = model.ensemble, model.output
-    if ensemble is None or output is None:
-        return "no model"
-    excess = (evidence.errors - output.low[0]) / (output.high[0] - output.low[0] + 1e-16)
-    worst = np.argsort(-excess)[:2].tolist()
-    words = [feature_words(_most_moved(evidence.features, model, autoencoder)) for autoencoder in worst]
-    return f"autoencoders {' and '.join(map(str, worst))} moved most: " + ", ".join(dict.fromkeys(words))
-
-
-def _most_moved(features: npt.NDArray[np.float64], model: KitNet, autoencoder: int) -> int:
-    ensemble: Any = model.ensemble
-    group = np.array(model.feature_map[autoencoder])
-    low, high = ensemble.low[autoencoder, : len(group)], ensemble.high[autoencoder, : len(group)]
-    scaled = (features[group] - low) / (high - low + 1e-16)
-    return int(group[np.argmax(np.abs(scaled - 0.5))])
+@lru_cache(maxsize=4_096)
+def _moved(explanation: Explanation) -> str:
+    which, words = explanation.autoencoders, map(feature_words, explanation.features)
+    return f"autoencoders {' and '.join(map(str, which))} moved most: " + ", ".join(dict.fromkeys(words))

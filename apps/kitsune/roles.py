@@ -4,6 +4,7 @@ Roles are learnt from the training traffic only, so that an attacker cannot acqu
 """
 
 import ipaddress
+from functools import lru_cache
 from typing import Any, Final
 
 from apps.messages import Role
@@ -15,6 +16,8 @@ _ROUTED: Final = 3
 """A MAC with traffic from or to this many addresses outside the local network is a gateway."""
 _DNS, _DHCP = 53, 67
 _FEW: Final = 4
+_KEPT: Final = 65_536
+"""Addresses of which it is known whether they are inside."""
 _BORROWED: Final = 4
 """Most addresses of a host that lends itself others' names; a MAC with more may be a new router."""
 
@@ -31,6 +34,8 @@ class Roles:
         self._multicast: dict[Address, list[int]] = {}
         self._gateways: set[int] = set()
         self._gateway_addresses: set[Address] = set()
+        self._counted: dict[int, tuple[int, int]] = {}
+        """By MAC: how many addresses there were, and what `addresses` said."""
 
     def see(self, mac: int, address: Address) -> None:
         """A frame came from this MAC and address (once per sender is enough)."""
@@ -88,8 +93,12 @@ class Roles:
     def addresses(self, mac: int) -> int:
         """Number of addresses of one family seen behind a MAC, without link-local ones."""
         behind = self._behind.get(mac, set())
-        fourth = sum(address[0] == 4 for address in behind)
-        return max(fourth, len(behind) - fourth)
+        count, most = self._counted.get(mac, (0, 0))
+        if count != len(behind):  # addresses are never forgotten
+            fourth = sum(address[0] == 4 for address in behind)
+            most = max(fourth, len(behind) - fourth)
+            self._counted[mac] = len(behind), most
+        return most
 
     def is_borrowed(self, mac: int, address: Address) -> bool:
         """Whether a local host uses an outside address beside its own: training has such addresses behind gateways only."""
@@ -145,12 +154,14 @@ def _parsed(address: Address) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     return ipaddress.IPv4Address(lo) if version == 4 else ipaddress.IPv6Address(hi << 64 | lo)
 
 
+@lru_cache(maxsize=_KEPT)
 def is_link_local(address: Address) -> bool:
     """Whether an address is link-local or unspecified; every host has one besides its own."""
     parsed = _parsed(address)
     return parsed.is_unspecified or (address[0] == 6 and parsed.is_link_local)
 
 
+@lru_cache(maxsize=_KEPT)
 def is_inside(address: Address) -> bool:
     """Whether an address is private or link-local, and so of the local network."""
     return _parsed(address).is_private

@@ -17,9 +17,10 @@ added since the last one about the same subject.
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Self
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -340,7 +341,7 @@ class Behaviour:
         if best is None:
             return []
         added = self._failures.added(sender, best.total, time)
-        return [replace(best, nats=added)] if added else []
+        return [msgspec.structs.replace(best, nats=added)] if added else []
 
     def _strange(self, ended: EndedContact, block: int) -> list[Finding]:
         """Unknown sources towards a victim: by what they send, and datagrams to a port each of all ports."""

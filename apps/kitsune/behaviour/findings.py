@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -42,8 +43,7 @@ LONGEST_SHARE: Final = 1 / 3
 KEPT: Final = 65_536
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(msgspec.Struct, frozen=True):
     """More than training saw; `nats` is what has been added since the last finding about the same subject."""
 
     statistic: Statistic

@@ -101,3 +101,14 @@ def test_state_goes_through_plain_values():
     again = Roles.from_state(roles.to_state())
     assert again.role(ROUTER_MAC, ROUTER) == "gateway"
     assert again.addresses(ROUTER_MAC) == 1
+
+
+def test_addresses_are_counted_again_when_there_are_more():
+    roles = Roles()
+    assert roles.addresses(HOST_MAC) == 0
+    for number in range(3):
+        roles.see(HOST_MAC, outside(number))
+        roles.see(HOST_MAC, (6, 0x20010DB8 << 32, number + 1))
+        assert roles.addresses(HOST_MAC) == number + 1
+    roles.see(HOST_MAC, HOST)
+    assert roles.addresses(HOST_MAC) == 4
