@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from apps.kitsune import senders as senders_module
 from apps.kitsune import victims as victims_module
+from apps.kitsune.accused import Accused
 from apps.kitsune.afterimage import AfterImage
 from apps.kitsune.kernel import ColumnError, load_kernel
-from apps.kitsune.ledger import KernelRows
+from apps.kitsune.ledger import KernelRows, RowRoom
 from apps.kitsune.senders import Senders
 from apps.kitsune.victims import VictimRates
 from apps.messages import Target
@@ -130,3 +131,22 @@ def test_features_of_columns_that_were_checked_before_are_the_same(mode):
     for count in (300, 1, 0):
         given_columns = part(batch, 0, count)
         assert np.array_equal(one.update(given_columns), other.update(KernelRows(kernel, given_columns)))
+
+
+@pytest.mark.parametrize("accused", [[], [2], [1, 5, 8, 77]])
+def test_benign_packets_are_counted_as_the_accused_are_left_out(accused):
+    """By C for drift, by numpy for the model that trains beside the one in use; memory of the batch before is reused."""
+    random, kernel, known, room = np.random.default_rng(5), load_kernel(), Accused(), RowRoom()
+    for mac in accused:
+        known.accuse(mac, 0.0)
+    for count in (300, 40):
+        batch, scores = traffic(random, count, 0.0), scores_of(random, count)
+        rows = KernelRows(kernel, batch, room)
+        benign = known.benign(batch, 0.0)
+        left = np.arange(count) >= 7
+        left &= True if benign is None else benign
+        found = rows.benign(7, scores, 0.5, known.macs(0.0))
+        above, times = int(np.count_nonzero(~(scores[left] <= 0.5))), rows.seconds[left]
+        assert found == (int(left.sum()), above, times.min(), times.max())
+    assert len(known.macs(3_600.0)) == 0
+    assert KernelRows(kernel, batch, room).benign(40, scores, 0.5, known.macs(0.0))[0] == 0
