@@ -17,7 +17,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of one engine; all have defaults."""
 
     updates: str = ""
-    """Data Updates URL: redis://, rediss://, unix://, kafka://; empty: $DUE_UPDATES, else an embedded server."""
+    """Data Updates URL: redis://, rediss://, redis+sentinel://, unix://, kafka://; empty: $DUE_UPDATES, else an embedded server."""
     observable: tuple[str, ...] = ()
     """Key patterns that this app's user of Data Updates may observe; empty: the server restricts nothing."""
     archive: str = ""

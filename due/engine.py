@@ -115,7 +115,7 @@ class Engine:
         """Choose the Data Updates server; call it before `init`.
 
         Args:
-            url: redis://, rediss://, unix://, kafka:// or memory://.
+            url: redis://, rediss://, redis+sentinel://, unix://, kafka:// or memory://.
 
         Raises:
             InvalidOption: the engine is already initialised.

@@ -189,7 +189,9 @@ def _read(path: str) -> bytes:
 def _parser(app_id: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=app_id, description=f"Run the app {app_id}.")
     parser.add_argument(
-        "--updates", default="", help="Data Updates URL: redis://, rediss://, unix:// or kafka://"
+        "--updates",
+        default="",
+        help="Data Updates URL: redis://, rediss://, redis+sentinel://, unix:// or kafka://",
     )
     parser.add_argument("--archive", default="", help="Data Archives URL: sqlite:///file.db or mongodb://")
     parser.add_argument("--settings", default="", help="JSON file with the app's settings")

@@ -145,7 +145,10 @@ class Publisher(Protocol):
         ...
 
     def settle(self, timeout: float | None = None) -> None:
-        """Return when the server has acknowledged everything sent so far; raises `Timeout`."""
+        """Return when the server has acknowledged everything sent so far; raises `Timeout`.
+
+        Where the URL names sentinels: when enough replicas have it, too.
+        """
         ...
 
     def poll(self) -> float:

@@ -146,7 +146,7 @@ class EmbeddedServer:
         log = self.log.open("ab")
         with log:
             self._process = subprocess.Popen(
-                _ending_with_us([server_program(), *self._arguments()]),
+                ending_with_us([server_program(), *self._arguments()]),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -233,7 +233,7 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _ending_with_us(command: list[str]) -> list[str]:
+def ending_with_us(command: list[str]) -> list[str]:
     """The command with a wrapper that lets the kernel end it together with this process.
 
     Not a `preexec_fn`: that forks, and in a process with gRPC in it the child then dies of gRPC's fork

@@ -4,6 +4,8 @@ publish ──PUBLISH due:<path>──►                 pipelined: replies are
 append  ──XADD due:stream:<path>──►             pipelined, kept until readers have acknowledged
 
 A stream is announced after its first entry, by its producer's app: so an announced path has a stream.
+Behind sentinels every connection goes to the primary of that moment; an entry counts once enough replicas have it
+(`redis_replicas`), and what the next primary lacks is appended to it again.
 """
 
 import logging
@@ -16,9 +18,11 @@ from typing import Any
 
 import hiredis
 
-from due.backoff import Backoff
+from due.drivers.redis_primary import backoff_for, watch_for
 from due.drivers.redis_progress import Question
 from due.drivers.redis_receiver import RedisReceiver, channel_name
+from due.drivers.redis_replicas import Confirmations, ReplicaQuestion
+from due.drivers.redis_sentinel import least_replicas
 from due.drivers.redis_streams import (
     CARE_SECONDS,
     LEAST_PAUSE,
@@ -57,12 +61,12 @@ _MESSAGE = "message"
 """A best-effort message whose reply is pending; lost with the connection."""
 _COMMAND = "command"
 """A command of our own whose reply is pending."""
-_Awaited = StreamEntry | StreamLedger | Question | str | int
+_Awaited = StreamEntry | StreamLedger | Question | ReplicaQuestion | str | int
 """What a reply belongs to: a number is the `now` of a probe, a ledger awaits how many heard of its stream."""
 
 
 class RedisUpdates:
-    """The driver behind redis://, rediss:// and unix:// URLs."""
+    """The driver behind redis://, rediss://, unix:// and redis+sentinel:// URLs."""
 
     def __init__(
         self,
@@ -109,8 +113,10 @@ class RedisPublisher:
         self._outstanding: deque[_Awaited] = deque()
         self._ledgers: dict[str, StreamLedger] = {}
         self._channels: dict[str, bytes] = {}
-        self._run_id = b""
-        self._backoff = Backoff()
+        self._life = b""
+        self._backoff = backoff_for(url)
+        self._watch = watch_for(url)
+        self._replicas = Confirmations(least_replicas(url), self._place)
         self._collect_at = 0
         """Number of outstanding replies from which to collect them."""
         self._care_at = 0.0
@@ -120,14 +126,8 @@ class RedisPublisher:
         self._probing = False
         self._connecting = False
         self._denied: set[str] = set()
-        self._counts = {
-            "refused": 0,
-            "denied": 0,
-            "lost_disconnected": 0,
-            "reconnects": 0,
-            "held_back": 0,
-            "resent": 0,
-        }
+        counted = ("refused", "denied", "lost_disconnected", "reconnects", "held_back", "resent")
+        self._counts = dict.fromkeys(counted, 0)
         self._connect()
 
     def publish(self, path: str, *payloads: bytes) -> None:
@@ -165,20 +165,35 @@ class RedisPublisher:
     def settle(self, timeout: float | None = None) -> None:
         """See `Publisher.settle`."""
         deadline = None if timeout is None else time.monotonic() + timeout
-        while True:
+        while not self._settled():
+            if deadline is not None and time.monotonic() > deadline:
+                replicas = self._wire is not None and self._replicas.missing
+                raise Timeout(
+                    f"no min_replicas={self._replicas.least} replicas of {self._place} confirmed within {timeout} s"
+                    if replicas
+                    else f"{self._place} did not acknowledge within {timeout} s"
+                )
             with self._lock:
-                if self._wire is not None and not self._outstanding:
-                    return
                 if self._wire is not None:
                     self._guarded_wait(0.05)
                     continue
             self.poll()
-            if deadline is not None and time.monotonic() > deadline:
-                raise Timeout(f"{self._place} did not acknowledge within {timeout} s")
             time.sleep(0.01)
+
+    def _settled(self) -> bool:
+        """Whether nothing is awaited; asks the replicas where only they are."""
+        with self._lock:
+            if self._wire is None or self._outstanding:
+                return False
+            try:
+                self._ask_replicas()
+            except UpdatesUnavailable as error:
+                self._lose(error)
+            return self._wire is not None and not self._replicas.missing
 
     def poll(self) -> float:
         """See `Publisher.poll`."""
+        self._leave_old_primary()
         with self._lock:
             away = self._wire is None
             connecting, self._connecting = self._connecting, self._connecting or away
@@ -223,11 +238,13 @@ class RedisPublisher:
         """Counters, and bytes kept for readers that have not acknowledged."""
         with self._lock:
             connected = int(self._wire is not None)
+            confirmed = {"unconfirmed": self._replicas.missing} if self._replicas.least else {}
             return {
                 **self._counts,
                 "connected": connected,
                 "kept_bytes": sum(x.kept_bytes for x in self._ledgers.values()),
                 "streams": len(self._ledgers),
+                **confirmed,
             }
 
     def close(self) -> None:
@@ -237,6 +254,8 @@ class RedisPublisher:
             if self._wire is not None:
                 self._wire.close()
                 self._wire = None
+        if self._watch is not None:
+            self._watch.close()
 
     def _channel(self, path: str) -> bytes:
         if len(self._channels) >= _CHANNELS:
@@ -299,8 +318,7 @@ class RedisPublisher:
         if self._wire is None:
             return
         try:
-            self._wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
-            self._outstanding.append(entry)
+            self._send_kept(self._wire, entry)
             self._collect()
         except UpdatesUnavailable as error:
             self._lose(error)
@@ -370,6 +388,7 @@ class RedisPublisher:
                 return
             question = Question(ledger)
             try:
+                self._ask_replicas()  # first, so that the answer to the question may count
                 self._wire.send_packed(question.command())
             except UpdatesUnavailable as error:
                 self._lose(error)
@@ -377,13 +396,19 @@ class RedisPublisher:
             ledger.asking(time.monotonic())
             self._outstanding.extend([question] * question.size)
 
+    def _ask_replicas(self) -> None:
+        """Raises `UpdatesUnavailable`."""
+        question = self._replicas.question()
+        if question is not None:
+            self._command(*self._replicas.command(), awaited=question)
+
     def _acknowledged(self, question: Question) -> None:
         """Forget what the readers have acknowledged, here and on the server."""
         ledger = question.ledger
         ledger.asked = False
         up_to = question.answer()
         early = up_to == NOBODY and ledger.awaits_readers(time.monotonic())
-        ledger.acknowledged(NOTHING if early else up_to)
+        ledger.acknowledged(NOTHING if early else up_to, self._replicas.confirmed)
         for group in question.placed & ledger.places:
             ledger.places.discard(group)
             self._command(b"XGROUP", b"DESTROY", stream_name(ledger.path), group)
@@ -427,6 +452,8 @@ class RedisPublisher:
                     self._acknowledged(awaited)
             elif isinstance(awaited, int):
                 self.answered, self._probing = awaited, False
+            elif isinstance(awaited, ReplicaQuestion):
+                self._replicas.answered(awaited, reply)
             elif isinstance(reply, hiredis.ReplyError):
                 self._refused(reply, awaited)
             elif isinstance(awaited, StreamEntry):
@@ -441,6 +468,8 @@ class RedisPublisher:
             return
         if self._counts["refused"] == self._counts["denied"] + 1:
             log.error("Data Updates refused a message: %s", reply)
+        if str(reply).startswith("READONLY"):
+            raise UpdatesUnavailable(f"the server is a replica now: {reply}")
         if isinstance(awaited, StreamEntry):  # kept, and sent again on the next connection
             raise UpdatesUnavailable(f"the server refused an entry of {awaited.path}: {reply}")
 
@@ -464,53 +493,69 @@ class RedisPublisher:
         self._counts["lost_disconnected"] += self._outstanding.count(_MESSAGE)
         self._outstanding.clear()
         self._probing = False
+        self._replicas.lost()
         for ledger in self._ledgers.values():
             ledger.asked = False
         delay = self._backoff.failed(time.monotonic())
         log.warning("lost Data Updates at %s: %s; retrying in %.2f s", self._place, error, delay)
 
+    def _leave_old_primary(self) -> None:
+        """Without the lock: whoever holds it may be waiting for the old one."""
+        wire = self._wire
+        if self._watch is None or wire is None:
+            return
+        successor = self._watch.successor([wire.primary])
+        if successor and successor != wire.primary:
+            wire.interrupt()
+            with self._lock:
+                if self._wire is wire:
+                    self._lose(UpdatesUnavailable(f"{successor} is the primary now"))
+
     def _connect(self) -> None:
         """Without the lock until the server has answered: nobody waits for one that does not."""
         try:
             wire = Wire(self._url)
-            run_id = _run_id(wire)
+            life = wire.life()
         except UpdatesUnavailable as error:
             delay = self._backoff.failed(time.monotonic())
             log.warning("%s; retrying in %.2f s", error, delay)
             return
         with self._lock:
-            self._take_up(wire, run_id)
+            self._take_up(wire, life)
 
-    def _take_up(self, wire: Wire, run_id: bytes) -> None:
+    def _take_up(self, wire: Wire, life: bytes) -> None:
         if self._closed:
             wire.close()
             return
         self._backoff.succeeded()
         self._wire = wire
-        if self._run_id:
+        if self._life:
             self._counts["reconnects"] += 1
             log.warning("reconnected to Data Updates at %s", self._place)
         try:
             for ledger in self._ledgers.values():
-                self._restore(wire, ledger, restarted=run_id != self._run_id)
-            self._run_id = run_id
+                self._restore(wire, ledger, restarted=life != self._life)
+            self._life = life
         except UpdatesUnavailable as error:
             self._lose(error)
 
     def _restore(self, wire: Wire, ledger: StreamLedger, *, restarted: bool) -> None:
-        """Resend what the server may not have; readers recognise repeats."""
+        """Resend what the server may not have; readers recognise repeats.
+
+        A replica that has become the primary may lack the youngest entries: it gets all that somebody still has to
+        read. Those that all have read are missed by nobody, unless the stream is gone.
+        """
         self._guarded_settle(wire)
         wire.make_room()
         ledger.lasting = False
         if restarted:
-            unread = ledger.unread()
-            ledger.forget_ids()
-            empty = not self._called(wire, "EXISTS", stream_name(ledger.path))
-            retained = list(ledger.retained) if empty else []
-            done = max(0, len(retained) - unread)
-            self._resend(wire, retained[:done])
+            ledger.forget_ids(time.monotonic())
+            there = self._called(wire, "EXISTS", stream_name(ledger.path))
+            done = 0
+            if not there:
+                done = len(ledger.retained)
+                self._resend(wire, list(ledger.retained))
             self._restore_groups(wire, ledger, done)
-            self._resend(wire, retained[done:])
         self._resend(wire, [entry for entry in ledger.kept if entry.id is None])
         if ledger.kept or ledger.retained:
             self._put_off(ledger)
@@ -534,9 +579,14 @@ class RedisPublisher:
     def _resend(self, wire: Wire, entries: Iterable[StreamEntry]) -> None:
         for entry in entries:
             self._counts["resent"] += 1
-            wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
-            self._outstanding.append(entry)
+            self._send_kept(wire, entry)
             self._collect()
+
+    def _send_kept(self, wire: Wire, entry: StreamEntry) -> None:
+        """Send an entry of a ledger; its id and its replicas are told later."""
+        wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
+        entry.number = self._replicas.number()
+        self._outstanding.append(entry)
 
     def _called(self, wire: Wire, *command: bytes | str) -> Any:
         """The reply, after all replies to what was sent before; an error of the server is one, too."""
@@ -546,9 +596,3 @@ class RedisPublisher:
     def _guarded_settle(self, wire: Wire) -> None:
         while self._outstanding:
             self._take(wire.wait())
-
-
-def _run_id(wire: Wire) -> bytes:
-    info = wire.call("INFO", "server")
-    text = info if isinstance(info, bytes) else b""
-    return next((line for line in text.splitlines() if line.startswith(b"run_id:")), b"run_id:unknown")

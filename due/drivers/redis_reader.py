@@ -19,10 +19,11 @@ from typing import Any
 import hiredis
 import redis
 
-from due.backoff import Backoff
 from due.drivers.base import Delivery
+from due.drivers.redis_acks import Acknowledgements
 from due.drivers.redis_aside import Aside
 from due.drivers.redis_leases import LEFT, LeaseValue, LeaseWatch, lease_name
+from due.drivers.redis_primary import backoff_for
 from due.drivers.redis_streams import stream_name, wake_name, work_name
 from due.drivers.redis_upkeep import Upkeep
 from due.drivers.redis_wire import Wire, pack, understood
@@ -33,8 +34,6 @@ from due.drivers.redis_work import (
     ReadRound,
     ServerTime,
     WorkLists,
-    announced_paths,
-    packed_done,
     packed_ids,
     packed_payload,
     put_before,
@@ -56,9 +55,6 @@ _MOST_PATHS = 4096
 _TRIES = 3
 """Immediate attempts to make a list, in case the connection was just lost."""
 _STREAM, _WORK = stream_name(""), "due:work:"
-_SKIP_REPLY = pack((b"CLIENT", b"REPLY", b"SKIP"))
-
-
 _MOST_CLAIMED = 1000
 _Expected = tuple[str, str, str]
 """Kind of an answer, path, id."""
@@ -88,8 +84,7 @@ class StreamReader:
         self._woken = "0-0"
         self._listless = False
         """A work list is gone."""
-        self._acks: deque[tuple[str, str]] = deque()
-        self._acks_sent: deque[tuple[str, str]] = deque()
+        self._acks = Acknowledgements(group)
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
@@ -106,21 +101,14 @@ class StreamReader:
         self._quiet = False
         """Whether the server can suppress the reply to an XACK."""
         self._claimed: deque[Delivery] = deque()
-        self._backoff = Backoff()
+        self._backoff = backoff_for(url)
+        self._life = b""
         self._active = True
         self._take_over = False
         self._stale = False
-        self._connected_before = False
         self._denied: set[str] = set()
         """Paths without a right to read them."""
         self._counts = {"claimed": 0, "vanished": 0, "paths_refused": 0, "paths_denied": 0}
-
-    def known(self) -> list[str]:
-        """Paths of all streams that producers announced."""
-        try:
-            return announced_paths(self._commands)
-        except (redis.RedisError, OSError) as error:
-            raise UpdatesUnavailable(str(error)) from None
 
     def add(self, path: str, start: str, *, reset: bool = False) -> None:
         """Read this stream too; `start` counts if the group has no work list of it, or `reset`."""
@@ -171,6 +159,15 @@ class StreamReader:
         """For select; -1 while there is nothing to wait for."""
         return self._wire.fileno() if self._wire is not None else -1
 
+    @property
+    def primary(self) -> str:
+        return self._wire.primary if self._wire is not None else ""
+
+    def move(self, successor: str) -> None:
+        """Another server is the primary now."""
+        if self.primary not in ("", successor):
+            self._lose(UpdatesUnavailable(f"{successor} is the primary now"))
+
     def patience(self) -> float:
         """How long `receive` may wait at most, seconds."""
         if self._claimed:
@@ -214,7 +211,7 @@ class StreamReader:
 
     def acknowledge(self, delivery: Delivery) -> None:
         """Remember to acknowledge; sent with the next request."""
-        self._acks.append((delivery.path, delivery.token))
+        self._acks.done(delivery)
 
     def set_aside(self, path: str, payload: bytes, reason: str) -> None:
         """Set a payload aside."""
@@ -286,11 +283,11 @@ class StreamReader:
             try:
                 begin = self._server_time.start(since) if start == "$" and since is not None else start
                 self._lists.make(path, begin, reset=reset)
-            except (redis.ConnectionError, redis.TimeoutError, OSError) as error:
-                failed = error
-                continue
             except redis.exceptions.NoPermissionError as error:
                 self._deny(path, error)
+            except (redis.RedisError, OSError) as error:
+                failed = error
+                continue
             self._unmade.pop(path, None)
             self._at.pop(path, None)
             return
@@ -314,6 +311,7 @@ class StreamReader:
 
     def _connect(self) -> None:
         wire = Wire(self._url)
+        life = wire.life()
         with understood("TIME"):
             now = seconds_of(wire.call("TIME"))
             self._server_time.note(now)
@@ -325,11 +323,22 @@ class StreamReader:
         self._read_ahead = ReadAhead()
         self._found = ReadRound()
         self._at.clear()
-        self._acks.extendleft(reversed(self._acks_sent))
-        self._acks_sent.clear()
+        self._acks.lost()
         with self._lock:
-            self._catch_up = set(self._paths) if self._connected_before else set()
-        self._connected_before = True
+            paths = list(self._paths)
+            self._catch_up = set(paths if self._life else ())
+        before, self._life = self._life, life
+        if before not in (b"", life):
+            self._begin_elsewhere(paths)
+
+    def _begin_elsewhere(self, paths: Sequence[str]) -> None:
+        """The server may know less of this group than we have done, or nothing: producers have to hear that it reads."""
+        self._acks.forget()
+        self._commands.connection_pool.disconnect(inuse_connections=False)  # they lead to the old one
+        for path in paths:
+            self._upkeep.added(path)
+        self.renew()
+        self._register(paths)
 
     def _lose(self, error: Exception) -> None:
         if self._wire is not None:
@@ -375,19 +384,8 @@ class StreamReader:
 
     def _packed_acks(self, *, quietly: bool = False) -> bytes:
         """`quietly`: a read follows, so replies of their own would only cause wake-ups."""
-        command = b""
-        while self._acks:
-            path = self._acks[0][0]
-            tokens = []
-            while self._acks and self._acks[0][0] == path:
-                self._acks_sent.append(self._acks[0])
-                tokens.append(self._acks.popleft()[1])
-            for one in packed_done(self._group, path, tokens):
-                if quietly:
-                    command += _SKIP_REPLY
-                else:
-                    self._expected.append(_ACK)
-                command += one
+        command, replies = self._acks.packed(quietly=quietly)
+        self._expected.extend([_ACK] * replies)
         return command
 
     def _flush_acks(self) -> None:
@@ -406,7 +404,7 @@ class StreamReader:
             with understood("a request for entries"):
                 self._answered(reply, expected)
         if _ACK not in self._expected:
-            self._acks_sent.clear()
+            self._acks.answered()
         if self._expected and list(self._expected) != [_AHEAD]:
             return []
         if self._listless and not self._expected:
@@ -495,7 +493,7 @@ class StreamReader:
                 if fields:
                     self._found.ours.append((path, token.decode()))
                 else:
-                    self._acks.append((path, token.decode()))  # somebody took it off the list
+                    self._acks.add(path, token.decode())  # somebody took it off the list
             if len(entries) >= MOST_GIVEN:
                 self._at.pop(path, None)  # there may be more
         if again:
@@ -518,7 +516,7 @@ class StreamReader:
         if self._shared and found.ours:
             self._at.clear()  # others have put more on the lists while we process
         return [
-            Delivery(path, found.payloads[path, token], token)
+            Delivery(path, found.payloads[path, token], self._acks.token(token))
             for path, token in found.ours
             if (path, token) in found.payloads
         ]
@@ -526,7 +524,7 @@ class StreamReader:
     def _vanished(self, path: str, token: str) -> None:
         """Its producer has deleted it, which waited for the group as long as it was told to."""
         self._counts["vanished"] += 1
-        self._acks.append((path, token))
+        self._acks.add(path, token)
 
     def _refused(self, error: Exception, expected: _Expected) -> None:
         text = str(error)
@@ -545,6 +543,9 @@ class StreamReader:
             paths = list(self._paths)
         for path in paths:
             self._make_list(path, "0")
+        with self._lock:
+            self._held.update(self._unmade)  # a new primary may take no writes yet
+            self._look_at = 0.0
         self.renew()
         self._register(paths)
         self._catch_up.clear()
@@ -617,7 +618,8 @@ class StreamReader:
                     self._vanished(path, token)
                     continue
                 self._counts["claimed"] += 1
-                self._claimed.append(Delivery(path, payload, token, tries.get(token.encode(), 2)))
+                named = self._acks.token(token)
+                self._claimed.append(Delivery(path, payload, named, tries.get(token.encode(), 2)))
             low = "(" + pending[-1]["message_id"].decode()
 
 

@@ -12,12 +12,15 @@ import time
 from collections import deque
 from typing import Any
 
-from due.backoff import Backoff
+import redis
+
 from due.drivers.base import Delivery
+from due.drivers.redis_primary import LOOK_SECONDS, backoff_for, watch_for
 from due.drivers.redis_reader import StreamReader
 from due.drivers.redis_rights import channel_globs, granted_for
 from due.drivers.redis_streams import announced_name
 from due.drivers.redis_wire import Wire, client
+from due.drivers.redis_work import announced_paths
 from due.errors import InvalidKey, UpdatesUnavailable
 from due.keys import Key
 from due.logs import without_passwords
@@ -28,6 +31,8 @@ _PREFIX = b"due:"
 _ANNOUNCED = announced_name("").encode()
 _ANNOUNCEMENTS = announced_name("*").encode()
 _CONFIRM_SECONDS = 5.0
+_LIST_SECONDS = 1.0
+"""Between two attempts to list the streams that are there."""
 _REFUSED = b"refused"
 """The kind of an answer that is an error."""
 
@@ -58,7 +63,8 @@ class RedisReceiver:
         self._channels: dict[bytes, int] = {}
         """Channels and patterns of channels, with the number of their users here."""
         self._bus: Wire | None = None
-        self._backoff = Backoff()
+        self._backoff = backoff_for(url)
+        self._watch = watch_for(url)
         self._backlog: deque[Delivery] = deque()
         self._backlog_bytes = 0
         self._dropped = 0
@@ -69,6 +75,9 @@ class RedisReceiver:
         self._client = client(url)
         self._reader = StreamReader(url, self._client, group, consumer, shared=shared)
         self._followed: dict[str, str] = {}
+        self._unlisted: set[str] = set()
+        """Patterns of which streams may have been announced while there was no connection."""
+        self._list_at = 0.0
 
     def subscribe(self, pattern: str) -> None:
         """See `Receiver.subscribe`; on return the server has confirmed it."""
@@ -173,6 +182,8 @@ class RedisReceiver:
             os.close(self._wake_read)
             os.close(self._wake_write)
         self._client.close()
+        if self._watch is not None:
+            self._watch.close()
 
     def _channels_of(self, pattern: str) -> list[bytes]:
         globs = (glob for one in granted_for(pattern, self._observable) for glob in channel_globs(one))
@@ -183,15 +194,19 @@ class RedisReceiver:
             self._channels[channel] = self._channels.get(channel, 0) + 1
         self._change(b"SUBSCRIBE", [channel for channel in channels if self._channels[channel] == 1])
 
-    def _adopt(self, pattern: str, start: str, *, reset: bool = False) -> None:
-        """Read the streams that exist now and match."""
+    def _adopt(self, pattern: str, start: str, *, reset: bool = False) -> bool:
+        """Read the streams that exist now and match; False if trying again may help."""
         key = Key.parse(pattern)
         try:
-            for path in self._reader.known():
+            for path in announced_paths(self._client):
                 if key.matches_path(path) and _is_path(path):
                     self._reader.add(path, start, reset=reset)
-        except UpdatesUnavailable as error:
+        except redis.exceptions.NoPermissionError as error:
+            log.warning("streams of %s may not be listed: %s", pattern, error)
+        except (UpdatesUnavailable, redis.RedisError, OSError) as error:
             log.warning("streams of %s cannot be listed now: %s", pattern, error)
+            return False
+        return True
 
     def _announced(self, path: str) -> None:
         if any(Key.parse(p).matches_path(path) for p in self._followed) and _is_path(path):
@@ -227,6 +242,8 @@ class RedisReceiver:
             self._lose(error)
             return False
         self._backoff.succeeded()
+        self._unlisted.update(self._followed)
+        self._list_at = 0.0
         self._bus = bus
         return True
 
@@ -241,14 +258,39 @@ class RedisReceiver:
 
     def _care(self) -> None:
         """Reconnect lost connections, and look for streams announced meanwhile."""
+        self._leave_old_primary()
         if self._bus is None and self._channels and not self._closed:
             with self._lock:
                 opened = self._bus is None and self._open()
-            if opened:
-                log.warning("resubscribed at %s", self._place) if self._reconnects else None
-                for pattern in list(self._followed):
-                    self._adopt(pattern, "0")
+            if opened and self._reconnects:
+                log.warning("resubscribed at %s", self._place)
+        if self._unlisted and time.monotonic() >= self._list_at:
+            self._list_streams()
         self._reader.care()
+
+    def _list_streams(self) -> None:
+        """After a reconnect; again where the server did not answer that."""
+        self._list_at = time.monotonic() + _LIST_SECONDS
+        with self._lock:
+            patterns, self._unlisted = self._unlisted & self._followed.keys(), set()
+        self._client.connection_pool.disconnect(inuse_connections=False)  # they may lead to an old primary
+        failed = {pattern for pattern in patterns if not self._adopt(pattern, "0")}
+        with self._lock:
+            self._unlisted |= failed
+
+    def _leave_old_primary(self) -> None:
+        bus = self._bus
+        present = [one for one in (bus.primary if bus is not None else "", self._reader.primary) if one]
+        if self._watch is None or not present:
+            return
+        successor = self._watch.successor(present)
+        if not successor:
+            return
+        if bus is not None and bus.primary != successor:
+            with self._lock:
+                if self._bus is bus:
+                    self._lose(UpdatesUnavailable(f"{successor} is the primary now"))
+        self._reader.move(successor)
 
     def _wait(self, timeout: float) -> set[int]:
         poll = select.poll()
@@ -258,6 +300,10 @@ class RedisReceiver:
             poll.register(bus.fileno(), select.POLLIN)
         elif self._channels:
             timeout = min(timeout, 0.05)
+        if self._watch is not None:
+            timeout = min(timeout, LOOK_SECONDS)
+        if self._unlisted:
+            timeout = min(timeout, _LIST_SECONDS)
         timeout = min(timeout, self._reader.patience())
         stream = self._reader.fileno()
         if stream >= 0:

@@ -32,6 +32,7 @@ _CONNECTION = [
     "+ping",
     "+time",
     "+info",
+    "+wait",
     "+select",
     "+multi",
     "+exec",

@@ -3,9 +3,11 @@
     XADD ──reply──► kept (unacknowledged by readers) ──all live groups acknowledged──► retained (for replay)
 
 A payload stays in `kept` until every live group of readers has acknowledged it; `kept` is bounded by
-the window, and that bound is the back-pressure.  A group lives while one of its instances renews its
+the window, and that bound is the back-pressure.  Behind sentinels it also stays until enough replicas have it
+(`redis_replicas`).  A group lives while one of its instances renews its
 lease: until this producer has watched all of them unchanged for `group_timeout` (see `redis_leases`).
-If the server comes back empty, retained and kept payloads are sent again; readers recognise repeats.  The groups
+If the server comes back empty, retained and kept payloads are sent again; if another server takes its place, which
+may lack the youngest entries, what has not been read by all.  Readers recognise repeats.  The groups
 that lived are made again between the two: a member that died, too, is followed by one that has never read.
 A stream without writer and reader for `LIFETIME_S` expires, with its groups and leases.
 """
@@ -61,12 +63,14 @@ def announced_name(app: str) -> str:
 class StreamEntry:
     """A sent payload; its id is known once the server has answered."""
 
-    __slots__ = ("id", "path", "payload")
+    __slots__ = ("id", "number", "path", "payload")
 
     def __init__(self, path: str, payload: bytes) -> None:
         self.path = path
         self.payload = payload
         self.id: tuple[int, int] | None = None
+        self.number = 0
+        """See `redis_replicas.Confirmations`."""
 
     @property
     def size(self) -> int:
@@ -167,26 +171,35 @@ class StreamLedger:
         """Groups that lived when the readers were last asked about."""
         return {group_of(field) for field in self._leases.living(self._group_timeout)}
 
-    def acknowledged(self, up_to: tuple[int, int]) -> None:
-        """All live groups have acknowledged the ids up to this one; `NOTHING`: there are groups, not known how far."""
+    def acknowledged(self, up_to: tuple[int, int], confirmed: int = 0) -> None:
+        """All live groups have acknowledged the ids up to this one; `NOTHING`: there are groups, not known how far.
+
+        `confirmed`: number of the last entry that enough replicas have.
+        """
         if up_to != NOTHING or self._read_to == NOBODY:
             self._read_to = up_to
-        while self.kept and (at := self.kept[0].id) is not None and at <= up_to:
+        while self.kept and _is_done(self.kept[0], up_to, confirmed):
             entry = self.kept.popleft()
             self.kept_bytes -= entry.size
             self.retained.append(entry)
             self._retained_bytes += entry.size
 
     def unread(self) -> int:
-        """How many of the retained payloads a group may still read, which came when nobody seemed to.
+        """How many of the retained payloads a group still reads, which came when nobody seemed to."""
+        return sum(entry.id is not None and entry.id > self._read_to for entry in self.retained)
 
-        All of them after a restart of the server whose repair a second one cut short: repeats do no harm.
+    def forget_ids(self, now: float) -> None:
+        """The server was restarted or replaced: earlier ids mean nothing, and its clock may be behind them.
+
+        Readers that this producer has not met yet have to find their way again, too.  `now`: s, monotonic.
         """
-        return sum(entry.id is None or entry.id > self._read_to for entry in self.retained)
-
-    def forget_ids(self) -> None:
-        """The server was restarted: earlier ids mean nothing, and its clock may be behind them."""
+        for _ in range(self.unread()):
+            entry = self.retained.pop()
+            self._retained_bytes -= entry.size
+            self.kept.appendleft(entry)
+            self.kept_bytes += entry.size
         self._read_to = NOTHING
+        self._heard_at = now
         for entry in (*self.retained, *self.kept):
             entry.id = None
 
@@ -200,6 +213,10 @@ class StreamLedger:
             self._retained_bytes -= self.retained.popleft().size
             trimmed = True
         return self.retained[0].id if trimmed else None
+
+
+def _is_done(entry: StreamEntry, up_to: tuple[int, int], confirmed: int) -> bool:
+    return entry.id is not None and entry.id <= up_to and entry.number <= confirmed
 
 
 def next_pause(waited: float, freed: int, missing: int, longest: float) -> float:

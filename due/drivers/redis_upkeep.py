@@ -27,6 +27,7 @@ _GONE_SECONDS = 30.0
 """A member without a renewed lease for this long does not keep its group alive."""
 _FORGET_SECONDS = 120.0
 """A lease unchanged for this long is removed; a member that returns writes it again."""
+_AGAIN_SECONDS = 5.0
 _ATTEMPTS = 5
 """Of a transaction whose keys others change meanwhile."""
 
@@ -68,6 +69,7 @@ class Upkeep:
                 self._tidy(paths)
         except (redis.RedisError, OSError) as error:
             log.debug("housekeeping for the streams of %s failed: %s", self._group, error)
+            self._care_at = min(self._care_at, now + _AGAIN_SECONDS)
 
     def _drop_group(self, path: str, watch: LeaseWatch) -> bool:
         """Delete a list; True if it is gone or another living member keeps it."""

@@ -1,20 +1,22 @@
 """One connection to a Redis-protocol server: commands out, replies in, no waiting in between.
 
-redis-py opens the connection (URL, TLS, AUTH, database); afterwards we speak RESP2 ourselves, because a
+redis-py opens the connection (URL, sentinels, TLS, AUTH, database); afterwards we speak RESP2 ourselves, because a
 pipelined, selectable connection is what the engine needs and redis-py's pub/sub costs several times the
 parsing (RESP3, its default, formats each push into a log line).
 """
 
 import socket
 import ssl
+import struct
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, cast
 
 import hiredis
 import redis
 
+from due.drivers.redis_sentinel import is_sentinel, parse_sentinel_url, primary_client, primary_pool
 from due.errors import InvalidOption, UpdatesUnavailable
 from due.logs import without_passwords
 
@@ -25,6 +27,8 @@ _SEND_ROOM = 1 << 20
 """The default buffer of a Unix socket holds two frames, so a writer would wait at every third."""
 _JOIN_BELOW = 1 << 14
 _ANSWER_SECONDS = 5.0
+_SOON_SECONDS = 2.0
+"""Of a client behind sentinels: another server may answer."""
 _RECORD = 1 << 14
 """Most bytes of a TLS record."""
 _MOST_PARTS = 512
@@ -32,9 +36,15 @@ _MOST_PARTS = 512
 
 
 def client(url: str) -> redis.Redis:
-    """A plain redis-py client for commands off the hot path; raises `InvalidOption` for a wrong URL."""
+    """A plain redis-py client for commands off the hot path; raises `InvalidOption` for a wrong URL.
+
+    Behind sentinels each connection that it opens goes to the primary of that moment.
+    """
+    limits: dict[str, Any] = {"protocol": 2, "socket_timeout": 10, "socket_connect_timeout": 5}
+    if is_sentinel(url):
+        return primary_client(url, **limits | {"socket_timeout": _SOON_SECONDS})
     try:
-        return redis.Redis.from_url(_redis_url(url), protocol=2, socket_timeout=10, socket_connect_timeout=5)
+        return redis.Redis.from_url(_redis_url(url), **limits)
     except ValueError as error:
         raise InvalidOption(f"Data Updates URL {without_passwords(url)!r}: {error}") from None
 
@@ -46,14 +56,15 @@ def _redis_url(url: str) -> str:
     if url.startswith(("redis://", "rediss://")):
         return url
     raise InvalidOption(
-        f"Data Updates URL {without_passwords(url)!r}: use redis://host:port/0, rediss://… or unix:///path.sock"
+        f"Data Updates URL {without_passwords(url)!r}: use redis://host:port/0, rediss://…, "
+        "redis+sentinel://host:port,host:port/service or unix:///path.sock"
     )
 
 
 def as_user(url: str, name: str, password: str) -> str:
     """The URL of a server with this user and password; both have URL-safe characters only."""
-    kafka = url.startswith(("kafka://", "kafkas://"))
-    scheme, _, rest = (url if kafka else _redis_url(url)).partition("://")
+    cluster = url.startswith(("kafka://", "kafkas://")) or is_sentinel(url)
+    scheme, _, rest = (url if cluster else _redis_url(url)).partition("://")
     head, slash, tail = rest.partition("/")
     return f"{scheme}://{name}:{password}@{head.rpartition('@')[2]}{slash}{tail}"
 
@@ -68,20 +79,22 @@ def understood(what: str) -> Iterator[None]:
 
 
 class Wire:
-    """A connected socket with a reply parser.  Every failure is an `UpdatesUnavailable`."""
+    """A connected socket with a reply parser.  Every failure is an `UpdatesUnavailable`.
+
+    Behind sentinels it is connected to the primary, and gives up a server that is silent for 5 s while an answer is
+    awaited: another one may be the primary by now.
+    """
 
     def __init__(self, url: str) -> None:
-        pool = redis.ConnectionPool.from_url(
-            _redis_url(url),
-            protocol=2,
-            socket_timeout=_ANSWER_SECONDS,
-            socket_connect_timeout=_ANSWER_SECONDS,
-            retry=None,
-        )
-        self._connection = cast("Any", pool.make_connection())
+        self.primary = ""
+        """HOST:PORT to which the sentinels of the URL led; empty for a URL without."""
+        self.replicas = 0
+        """How many it had when the connection was opened; 0 for a URL without."""
+        self._longest: float | None = None
+        self._history = b""
         try:
-            self._connection.connect()
-        except (redis.RedisError, OSError) as error:
+            self._connection = self._connect(url)
+        except (redis.RedisError, OSError, UnicodeError) as error:
             raise UpdatesUnavailable(
                 f"Data Updates at {without_passwords(url)} cannot be reached: {error}"
             ) from None
@@ -92,6 +105,53 @@ class Wire:
         self._reader.setmaxbuf(_PARSER_KEEPS)
         # reused: the allocator would map and unmap a new one for each read
         self._buffer = bytearray(_READ)
+        if self.primary:
+            self._check_role()
+
+    def _connect(self, url: str) -> Any:
+        """An open connection of redis-py; raises redis.RedisError, OSError."""
+        limits: dict[str, Any] = {
+            "protocol": 2,
+            "socket_timeout": _ANSWER_SECONDS,
+            "socket_connect_timeout": _ANSWER_SECONDS,
+            "retry": None,
+        }
+        if is_sentinel(url):
+            pool, self.primary = primary_pool(parse_sentinel_url(url), **limits)
+        else:
+            pool = redis.ConnectionPool.from_url(_redis_url(url), **limits)
+        connection = cast("Any", pool.make_connection())
+        connection.connect()
+        return connection
+
+    def _check_role(self) -> None:
+        """A sentinel may be behind the others: raises `UpdatesUnavailable` for a server that is no primary."""
+        self._longest = _ANSWER_SECONDS
+        limit = struct.pack("ll", int(_ANSWER_SECONDS), 0)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+        try:
+            told = _lines(self.call("INFO", "replication"))
+        except UpdatesUnavailable:
+            self.close()
+            raise
+        if b"role:master" not in told:
+            self.close()
+            raise UpdatesUnavailable(f"{self.primary}, to which the sentinels lead, is not the primary")
+        self._history = _starting(told, b"master_replid:")
+        found = _starting(told, b"connected_slaves:").partition(b":")[2]
+        self.replicas = int(found) if found.isdigit() else 0
+
+    def life(self) -> bytes:
+        """Names the server and its present life: with another name its data may be older, and ids mean others.
+
+        A server that was a replica in between has the same process, but another replication id.
+        """
+        return _starting(_lines(self.call("INFO", "server")), b"run_id:") + self._history
+
+    def interrupt(self) -> None:
+        """Make every other thread that waits here fail; the connection is lost."""
+        with suppress(OSError):
+            socket.socket.shutdown(self._socket, socket.SHUT_RDWR)
 
     def make_room(self) -> None:
         """Enlarge the socket's send buffer; only for senders that are throttled otherwise.
@@ -155,10 +215,12 @@ class Wire:
     def wait(self, timeout: float | None = None) -> Iterator[Any]:
         """Like `replies`, but waits for the first bytes, at most `timeout` seconds."""
         try:
-            self._socket.settimeout(timeout)
+            self._socket.settimeout(self._longest if timeout is None else timeout)
             size = self._socket.recv_into(self._buffer)
         except TimeoutError:
-            return
+            if timeout is not None:
+                return
+            raise UpdatesUnavailable(f"no answer within {self._longest} s") from None
         except OSError as error:
             raise UpdatesUnavailable(f"connection lost: {error}") from None
         finally:
@@ -220,6 +282,14 @@ class Wire:
                     break
                 size += found
         return size
+
+
+def _lines(answer: Any) -> list[bytes]:
+    return answer.splitlines() if isinstance(answer, bytes) else []
+
+
+def _starting(lines: list[bytes], name: bytes) -> bytes:
+    return next((line for line in lines if line.startswith(name)), name + b"unknown")
 
 
 def _parts(arguments: tuple[bytes | str | int, ...]) -> list[bytes]:

@@ -286,12 +286,20 @@ def check_pipeline() -> Check:
 
 def check_updates(url: str) -> Check:
     """A given Data Updates server."""
+    from due.drivers.redis_sentinel import least_replicas
     from due.drivers.redis_wire import Wire
+    from due.errors import UpdatesUnavailable
+
+    def ask() -> None:
+        wire = Wire(url)
+        wire.close()
+        if wire.replicas < (least := least_replicas(url)):
+            raise UpdatesUnavailable(f"{wire.primary}: min_replicas={least}, connected are {wire.replicas}")
 
     return _reached(
         "--updates",
         url,
-        lambda: Wire(url).close(),
+        ask,
         "start it, or correct address, password or firewall rules",
     )
 

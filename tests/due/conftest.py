@@ -9,6 +9,7 @@ import pytest
 from due import CONSUMER, PRODUCER, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.testing.kafka_servers import KafkaMissing, KafkaServers
+from sdnator.testing.sentinel_servers import SentinelServers
 from tests.requirements import missing
 
 
@@ -17,6 +18,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedServer]
     """One server for all tests of a session; tests use keys of their own."""
     with EmbeddedServer(tmp_path_factory.mktemp("updates")) as running:
         yield running
+
+
+@pytest.fixture(scope="session")
+def sentinel_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SentinelServers]:
+    """A primary, two replicas and three sentinels for all tests of a session that do not break them."""
+    with SentinelServers(tmp_path_factory.mktemp("sentinel")) as servers:
+        yield servers
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,17 @@
 """Lost connections come back by themselves, and what was lost meanwhile is counted, never silent."""
 
+import os
+import signal
 from typing import Any
+
+import pytest
 
 from due import PUB_ONLY, Capability
 from due.drivers.embedded_redis import EmbeddedServer
+from due.drivers.redis import RedisUpdates
 from due.drivers.redis_streams import work_name
 from due.drivers.redis_wire import Wire
+from due.errors import Timeout
 from tests.due.conftest import wait_for
 
 
@@ -120,3 +126,16 @@ def _lists(url: str) -> int:
     lists = wire.call("EXISTS", work_name("consumer", "r.gone"))
     wire.close()
     return int(lists)
+
+
+def test_flush_ends_in_time_on_a_server_that_hangs(tmp_path):
+    """Its connection is open, and nothing comes."""
+    with EmbeddedServer(tmp_path / "u") as server:
+        publisher = RedisUpdates(server.url).publisher("writer")
+        os.kill(server.pid, signal.SIGSTOP)
+        publisher.append("r.hung", b"1")
+        with pytest.raises(Timeout, match="did not acknowledge within"):
+            publisher.settle(0.2)
+        os.kill(server.pid, signal.SIGCONT)
+        publisher.settle(60)
+        publisher.close()

@@ -7,6 +7,7 @@ import pytest
 import redis
 
 from due.drivers.base import Delivery
+from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_leases import lease_name
 from due.drivers.redis_reader import StreamReader
 from due.drivers.redis_streams import stream_name, work_name
@@ -151,3 +152,33 @@ def test_a_list_that_another_member_moves_is_read_from_there(server, monkeypatch
     assert again == wanted
     reader.close()
     commands.close()
+
+
+def test_an_acknowledgement_is_for_the_life_of_the_server_that_it_is_of(tmp_path):
+    """Where the clock was put back, another entry may have the same id after a restart."""
+    with EmbeddedServer(tmp_path / "u") as server:
+        commands = client(server.url)
+        reader = StreamReader(server.url, commands, "group", "one", shared=False)
+        reader.add("r.lives", "0")
+        entry = commands.xadd(stream_name("r.lives"), {"f": "early"})
+        (early,) = _read(reader)
+        server.kill()
+        server.start()
+        again = client(server.url)
+        again.xadd(stream_name("r.lives"), {"f": "late"}, id=entry)
+        found: list[Delivery] = []
+
+        def comes() -> list[Delivery]:
+            reader.care()
+            if reader.fileno() >= 0:
+                ready, _, _ = select.select([reader.fileno()], [], [], 0.05)
+                found.extend(reader.read(set(ready)))
+            return found
+
+        wait_for(comes)
+        assert [delivery.payload for delivery in found] == [b"late"]
+        reader.acknowledge(early)
+        reader.close()
+        assert again.xpending(work_name("group", "r.lives"), "group")["pending"] == 1
+        for each in (commands, again):
+            each.close()

@@ -56,8 +56,12 @@ def test_what_a_late_group_has_not_read_is_not_behind_it_after_a_restart():
     assert ledger.unread() == 3
     ledger.acknowledged(NOTHING)
     assert ledger.unread() == 3, "an answer that says nothing changes nothing"
-    ledger.forget_ids()
-    assert ledger.unread() == 5, "the server restarts, and restarts again before it has been told everything"
+    ledger.forget_ids(100.0)
+    assert (len(ledger.retained), len(ledger.kept)) == (2, 3)
+    ledger.forget_ids(100.0)
+    assert len(ledger.kept) == 3, "the server restarts again before it has been told everything"
+    assert ledger.awaits_readers(102.0), "others may have begun to read as well"
+    assert not ledger.awaits_readers(104.0)
 
 
 def test_what_the_server_has_not_answered_is_never_forgotten():
@@ -88,7 +92,7 @@ def test_ids_of_an_earlier_life_of_the_server_trim_nothing():
     ledger = _ledger()
     _add(ledger, 8)
     ledger.acknowledged((8, 0))
-    ledger.forget_ids()
+    ledger.forget_ids(0.0)
     assert ledger.trim_point() is None
     ledger.acknowledged((2**63, 0))
     assert not ledger.kept

@@ -31,13 +31,17 @@ def empty_place(kind: str, request: pytest.FixtureRequest) -> Iterator[str]:
         require_program("redis-server")
         with TlsRedis(folder) as encrypted:
             yield encrypted.url
+    elif kind == "sentinel":
+        servers = request.getfixturevalue("sentinel_servers")
+        servers.empty()
+        yield servers.url
     elif kind == "kafka":
         yield f"{request.getfixturevalue('kafka_server').url}/{name}"
     else:
         yield f"memory://{name}"
 
 
-@pytest.fixture(params=["redis", "rediss", "memory", "kafka"])
+@pytest.fixture(params=["redis", "rediss", "sentinel", "memory", "kafka"])
 def open_driver(request: pytest.FixtureRequest) -> Iterator[Open]:
     """Opens drivers of one empty place."""
     opened: list[UpdatesDriver] = []
