@@ -33,7 +33,7 @@ _SECRETS = (
 )
 _SECONDS = 5.0
 _UNIX = "unix:"
-_ELSEWHERE = ("redis://", "mongodb://", "kafka://")
+_ELSEWHERE = ("redis://", "redis+sentinel://", "mongodb://", "kafka://")
 
 
 def security_checks() -> Iterator[Check]:
@@ -150,18 +150,22 @@ def check_urls(config: config_file.Config, found: running.Running | None) -> Che
     bare = sorted(
         redacted(url)
         for url in urls
-        if url.startswith(_ELSEWHERE)
-        and not _is_local(urlsplit(url).hostname or "")
-        and "tls=true" not in url
+        if url.startswith(_ELSEWHERE) and not all(map(_is_local, _hosts(url))) and "tls=true" not in url
     )
     if bare:
         return Check(
             "backends",
             "exposed",
             f"{', '.join(bare)}: without TLS",
-            "use rediss://, kafkas:// or mongodb://…?tls=true",
+            "use rediss://, rediss+sentinel://, kafkas:// or mongodb://…?tls=true",
         )
     return Check("backends", "ok", "no password crosses the network without TLS")
+
+
+def _hosts(url: str) -> list[str]:
+    """Of a URL, which may name several."""
+    places = url.partition("://")[2].partition("/")[0].rpartition("@")[2].split(",")
+    return [urlsplit(f"//{place}").hostname or "" for place in places]
 
 
 def check_commanding(state: Path) -> Check:

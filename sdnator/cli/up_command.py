@@ -72,7 +72,10 @@ def up(
     device_id: Annotated[int | None, typer.Option(help="P4Runtime device id of the switch.", min=1)] = None,
     updates: Annotated[
         str,
-        typer.Option(help="Data Updates, redis:// or unix://; default: an embedded server.", metavar="URL"),
+        typer.Option(
+            help="Data Updates, redis://, redis+sentinel:// or unix://; default: an embedded server.",
+            metavar="URL",
+        ),
     ] = "",
     archive: Annotated[
         str, typer.Option(help="Data Archives, mongodb:// or sqlite:///; default: a file.", metavar="URL")

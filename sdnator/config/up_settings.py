@@ -9,7 +9,7 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Where the pipeline keeps and shares its data."""
 
     updates: str = ""
-    """Data Updates, redis://, rediss://, unix:// or kafka://; empty: an embedded server."""
+    """Data Updates, redis://, rediss://, redis+sentinel://, unix:// or kafka://; empty: an embedded server."""
     archive: str = ""
     """Data Archives, mongodb:// or sqlite:///; empty: a file in the data folder."""
     quota: float = 10.0

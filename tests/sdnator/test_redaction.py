@@ -11,6 +11,7 @@ from sdnator.redaction import redacted, redacted_values
         ("redis://:secret@10.0.0.5:6379/0", "redis://…@10.0.0.5:6379/0"),
         ("rediss://me:s@e'c:ret@h/0", "rediss://…@h/0"),
         ("unix://:secret@/run/v.sock", "unix://…@/run/v.sock"),
+        ("redis+sentinel://u:secret@a:1,b:2/due", "redis+sentinel://…@a:1,b:2/due"),
         ("at 'mongodb://me:secret@a,b/db?x=1': refused", "at 'mongodb://…@a,b/db?x=1': refused"),
         ("sqlite:////home/a@b/archive.db", "sqlite:////home/a@b/archive.db"),
         ("http://127.0.0.1:1/ and mail to a@b", "http://127.0.0.1:1/ and mail to a@b"),

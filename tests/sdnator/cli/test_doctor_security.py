@@ -123,7 +123,14 @@ def test_a_page_without_users_is_told(state, tmp_path):
 
 @pytest.mark.parametrize(
     ("url", "state"),
-    [("redis://:secret@10.0.0.1:6379", "exposed"), ("rediss://10.0.0.1", "ok"), ("redis://127.0.0.1", "ok")],
+    [
+        ("redis://:secret@10.0.0.1:6379", "exposed"),
+        ("rediss://10.0.0.1", "ok"),
+        ("redis://127.0.0.1", "ok"),
+        ("redis+sentinel://:secret@127.0.0.1:1,10.0.0.1:1/due", "exposed"),
+        ("redis+sentinel://127.0.0.1:1,[::1]:2/due", "ok"),
+        ("rediss+sentinel://10.0.0.1:1/due", "ok"),
+    ],
 )
 def test_passwords_without_tls_are_found_and_not_shown(tmp_path, url, state):
     path = tmp_path / "sdnator.toml"
