@@ -84,8 +84,11 @@ class Question:
         ledger = self.ledger
         ledger.groups = tuple(sorted(live))
         ledger.known = tuple(dict.fromkeys((*ledger.groups, *names)))[:_MOST_GROUPS]
-        crowded = len(names) >= _CROWD
-        ledger.strangers = tuple(name for name in names if crowded and leases.get(name) == {})
+        # what is left of a crowd goes, too, however few they are
+        ledger.crowded = len(names) >= _CROWD or (
+            ledger.crowded and any(not leases.get(name) for name in names)
+        )
+        ledger.strangers = tuple(name for name in names if ledger.crowded and leases.get(name) == {})
         # of a crowd each answer names others
         fresh = set() if len(names) >= _MOST_GROUPS else set(ledger.known) - set(self._known)
         self.surprised = bool(fresh or live - set(self._groups))

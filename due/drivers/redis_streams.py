@@ -101,6 +101,8 @@ class StreamLedger:
         """Live groups of readers, as of the last answer."""
         self.known: tuple[bytes, ...] = ()
         """Groups whose leases are asked for: those that say they read the stream, and those that lived."""
+        self.crowded = False
+        """There are more names of readers than apps, or there were and some of them are left."""
         self.strangers: tuple[bytes, ...] = ()
         """Names among them that have no lease, where there are more names than apps."""
         self.places: set[bytes] = set()
