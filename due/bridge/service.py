@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import msgspec
@@ -34,16 +34,13 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Key patterns of the far site that may cross to the near site."""
 
 
-class BridgedSite:
-    """One end: where frames are read and written, and the Coordinator is told.
+class BridgedSite(NamedTuple):
+    """One end: where frames are read and written, and the Coordinator is told."""
 
-    Args:
-        engine: joined to the site, with the bridge's app id.
-        driver: of the site's Data Updates.
-    """
-
-    def __init__(self, engine: Engine, driver: UpdatesDriver) -> None:
-        self.engine, self.driver = engine, driver
+    engine: Engine
+    """Joined to the site, with the bridge's app id."""
+    driver: UpdatesDriver
+    """Of the site's Data Updates."""
 
 
 class BridgeDirection:

@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import hiredis
@@ -22,7 +23,8 @@ import redis
 from due.drivers.base import Delivery
 from due.drivers.redis_acks import Acknowledgements
 from due.drivers.redis_aside import Aside
-from due.drivers.redis_leases import LEFT, LeaseValue, LeaseWatch, lease_name
+from due.drivers.redis_dead_members import SILENT_SECONDS, DeadMembers
+from due.drivers.redis_leases import LEFT, LeaseValue, lease_name
 from due.drivers.redis_primary import backoff_for
 from due.drivers.redis_streams import stream_name, wake_name, work_name
 from due.drivers.redis_upkeep import Upkeep
@@ -34,6 +36,7 @@ from due.drivers.redis_work import (
     ReadRound,
     ServerTime,
     WorkLists,
+    last_id,
     packed_ids,
     packed_payload,
     put_before,
@@ -45,8 +48,6 @@ from due.logs import without_passwords
 log = logging.getLogger("due.updates")
 
 _BLOCK_MS = 1000
-_SILENT_SECONDS = 3.0
-"""A member whose lease has not changed for this long counts as dead."""
 _LOOK_SECONDS = 1.0
 """Seconds between two checks of the other members; a single member checks less often."""
 _HOLD_SECONDS = 0.2
@@ -55,7 +56,6 @@ _MOST_PATHS = 4096
 _TRIES = 3
 """Immediate attempts to make a list, in case the connection was just lost."""
 _STREAM, _WORK = stream_name(""), "due:work:"
-_MOST_CLAIMED = 1000
 _Expected = tuple[str, str, str]
 """Kind of an answer, path, id."""
 _ACK, _NEW, _AHEAD = ("ack", "", ""), ("new", "", ""), ("ahead", "", "")
@@ -91,8 +91,8 @@ class StreamReader:
         self._unmade: dict[str, tuple[str, bool, float]] = {}
         """Work lists that could not be made: start, and since when; their streams are not read before that."""
         self._lease = LeaseValue()
-        self._watches: dict[str, LeaseWatch] = {}
         self._lists = WorkLists(commands, group)
+        self._dead = DeadMembers(commands, group, consumer)
         self._upkeep = Upkeep(commands, group, consumer)
         self._aside = Aside(commands, group)
         self._server_time = ServerTime(commands)
@@ -137,7 +137,7 @@ class StreamReader:
                 self._at.pop(path, None)
                 self._held.discard(path)
                 self._unmade.pop(path, None)
-                self._watches.pop(path, None)
+                self._dead.forget(path)
             self._stale = bool(gone)
             self._upkeep.withdrawn(gone, time.monotonic())
         with self._leases:
@@ -161,6 +161,7 @@ class StreamReader:
 
     @property
     def primary(self) -> str:
+        """HOST:PORT of the server that the streams are read from; empty: none."""
         return self._wire.primary if self._wire is not None else ""
 
     def move(self, successor: str) -> None:
@@ -183,7 +184,7 @@ class StreamReader:
             return
         now = time.monotonic()
         if now >= self._look_at:
-            usual = _SILENT_SECONDS if self._alone else _LOOK_SECONDS
+            usual = SILENT_SECONDS if self._alone else _LOOK_SECONDS
             self._look_at = now + (_HOLD_SECONDS if self._held else usual)
             self._look_after_the_dead()
         try:
@@ -468,7 +469,7 @@ class StreamReader:
     def _still_next(self, path: str, reply: Any) -> None:
         """Whether a list still ends where a stream was read ahead from; with the last answer what does is put on it."""
         before = self._read_ahead.places.get(path, "")
-        if path in self._paths and _last_id(reply) == before:
+        if path in self._paths and last_id(reply) == before:
             self._at[path] = before
         else:
             self._at.pop(path, None)
@@ -506,7 +507,7 @@ class StreamReader:
     def _placed(self, path: str, reply: Any) -> None:
         """What is not on the work list comes behind the last id that was."""
         if path in self._paths:
-            self._at[path] = _last_id(reply)
+            self._at[path] = last_id(reply)
 
     def _handed_out(self) -> list[Delivery]:
         """What is ours, in order; called when nothing is expected any more."""
@@ -583,47 +584,14 @@ class StreamReader:
 
     def _claim(self, path: str) -> bool:
         """Take the pending entries of dead members; returns whether a live one has some."""
-        work = work_name(self._group, path)
-        consumers: list[dict[str, Any]] = self._commands.xinfo_consumers(work, self._group)
-        others = [c for c in consumers if c["name"] != self._consumer.encode()]
-        self._alone = self._alone and not others
-        others = [c for c in others if c["pending"]]
-        if not others:
-            return False
-        names = [c["name"] for c in others]
-        watch = self._watches.setdefault(path, LeaseWatch(_SILENT_SECONDS))
-        asked = time.monotonic()
-        leases = self._commands.hgetall(lease_name(self._group, path))
-        # a missing lease is treated like an unchanged one
-        watch.look({name: leases.get(name, b"") for name in names}, asked, time.monotonic())
-        waits = False
-        for name in names:
-            if not self._take_over and watch.silent(name) < _SILENT_SECONDS:
-                waits = True
-            else:
-                self._claim_from(path, name)
+        found = partial(self._take_claimed, path)
+        alone, waits = self._dead.claim(path, found, even_the_living=self._take_over)
+        self._alone = self._alone and alone
         return waits
 
-    def _claim_from(self, path: str, consumer: bytes) -> None:
-        low = "-"
-        while True:
-            pending: list[dict[str, Any]] = self._commands.xpending_range(
-                work_name(self._group, path), self._group, low, "+", _MOST_CLAIMED, consumername=consumer
-            )
-            if not pending:
-                return
-            tries = {p["message_id"]: p["times_delivered"] + 1 for p in pending}
-            for token, payload in self._lists.take(path, self._consumer, tries):
-                if payload is None:
-                    self._vanished(path, token)
-                    continue
-                self._counts["claimed"] += 1
-                named = self._acks.token(token)
-                self._claimed.append(Delivery(path, payload, named, tries.get(token.encode(), 2)))
-            low = "(" + pending[-1]["message_id"].decode()
-
-
-def _last_id(reply: Any) -> str:
-    """The last id of a list, from `XINFO STREAM`."""
-    last: bytes = dict(zip(reply[::2], reply[1::2], strict=True))[b"last-generated-id"]
-    return last.decode()
+    def _take_claimed(self, path: str, token: str, payload: bytes | None, tries: int) -> None:
+        if payload is None:
+            self._vanished(path, token)
+            return
+        self._counts["claimed"] += 1
+        self._claimed.append(Delivery(path, payload, self._acks.token(token), tries))

@@ -75,6 +75,12 @@ def put_before(error: Exception) -> bool:
     return _REPEATED in str(error)
 
 
+def last_id(reply: Any) -> str:
+    """The last id of a list, from `XINFO STREAM`."""
+    last: bytes = dict(zip(reply[::2], reply[1::2], strict=True))[b"last-generated-id"]
+    return last.decode()
+
+
 class ReadRound:
     """What one round of requests has brought so far, by path and id."""
 

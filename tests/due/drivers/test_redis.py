@@ -77,7 +77,7 @@ def test_foreign_and_newer_payloads_are_counted_and_skipped(make_engine, server,
 
 def test_instances_of_a_shared_app_divide_a_stream(make_engine, monkeypatch):
     # or one that gets no core for seconds is taken for dead, and its part given to the other too
-    monkeypatch.setattr("due.drivers.redis_reader._SILENT_SECONDS", 600.0)
+    monkeypatch.setattr("due.drivers.redis_dead_members.SILENT_SECONDS", 600.0)
     init = {"capabilities": [Capability("r.shared", delivery="reliable")]}
     producer = make_engine("divider", init=init, frame_bytes=50)
     got: dict[str, list[Any]] = {name: [] for name in "ab"}

@@ -18,14 +18,19 @@ def servers(tmp_path) -> Iterator[SentinelServers]:
         yield started
 
 
+def _pair(programs, servers, count, size, *, delay_ms=0):
+    """A reader that is ready, and a producer of so many items of so many bytes."""
+    consumer = programs("consume", servers.url, "reader", count, delay_ms)
+    consumer.wait_for("ready")
+    return consumer, programs("produce", servers.url, "reliable", count, size)
+
+
 @pytest.mark.parametrize("to_write", [0, 1])
 def test_a_killed_primary_loses_nothing(programs, tmp_path, to_write):
     """Also where the next one takes no writes before it has a replica."""
     count = 200_000
     with SentinelServers(tmp_path / "servers", to_write=to_write) as servers:
-        consumer = programs("consume", servers.url, "reader", count, 0)
-        consumer.wait_for("ready")
-        producer = programs("produce", servers.url, "reliable", count, 50)
+        consumer, producer = _pair(programs, servers, count, 50)
         producer.wait_for("50000")
         servers.kill(servers.primary)
         producer.wait_for("flushed")
@@ -36,9 +41,7 @@ def test_a_killed_primary_loses_nothing(programs, tmp_path, to_write):
 def test_a_primary_that_is_made_a_replica_loses_nothing(programs, servers):
     """By hand; what is still written to the old one is discarded there."""
     count = 200_000
-    consumer = programs("consume", servers.url, "reader", count, 0)
-    consumer.wait_for("ready")
-    producer = programs("produce", servers.url, "reliable", count, 50)
+    consumer, producer = _pair(programs, servers, count, 50)
     producer.wait_for("50000")
     old = servers.primary
     servers.hand_over()
@@ -55,9 +58,7 @@ def test_what_the_new_primary_lacks_is_written_again(programs, servers, behind):
         servers.cut_off(servers.replicas)
     else:
         servers.freeze(servers.replicas)
-    consumer = programs("consume", servers.url, "reader", COUNT, 0)
-    consumer.wait_for("ready")
-    producer = programs("produce", servers.url, "reliable", COUNT, 200)
+    consumer, producer = _pair(programs, servers, COUNT, 200)
     _until(lambda: len(consumer.numbers()) >= 5000)
     old, others = servers.primary, servers.replicas
     servers.kill(old)
@@ -72,9 +73,7 @@ def test_what_the_new_primary_lacks_is_written_again(programs, servers, behind):
 def test_what_was_flushed_outlives_its_producer_and_the_primary(programs, servers):
     """Each item has a frame of its own, so that the reader has not fetched the last ones."""
     count = 2000
-    consumer = programs("consume", servers.url, "reader", count, 1)
-    consumer.wait_for("ready")
-    producer = programs("produce", servers.url, "reliable", count, 5000)
+    consumer, producer = _pair(programs, servers, count, 5000, delay_ms=1)
     producer.wait_for("flushed")
     producer.process.send_signal(signal.SIGKILL)
     servers.kill(servers.primary)
