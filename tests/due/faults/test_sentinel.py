@@ -1,12 +1,12 @@
 """kill -9 of the primary under load: the next one, however far behind it was, carries on without a loss."""
 
 import signal
-import time
 from collections.abc import Iterator
 
 import pytest
 
 from sdnator.testing.sentinel_servers import SentinelServers
+from tests.due.faults.test_kill import _until
 
 COUNT = 30_000
 
@@ -114,11 +114,3 @@ def test_two_primaries_in_a_row(programs, servers):
     producer.kill()
     got = consumer.numbers()
     assert got == list(range(len(got)))
-
-
-def _until(condition):
-    """As `wait_for`, less often: each look reads all that was said."""
-    deadline = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)

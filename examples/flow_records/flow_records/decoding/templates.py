@@ -91,12 +91,7 @@ class TemplateCache:
 
 def netflow9_templates(body: bytes) -> Iterator[FlowTemplate]:
     """The templates of a template flow set; raises FlowDecodeError."""
-    at = 0
-    while len(body) - at >= _PAIR.size:
-        number, count = _PAIR.unpack_from(body, at)
-        if _is_padding(number, body, at):
-            return
-        fields, at = _fields(body, at + _PAIR.size, count, enterprises=False)
+    for number, _, fields in _plain_templates(body, enterprises=False):
         yield _template(number, fields, options=False)
 
 
@@ -119,14 +114,22 @@ def netflow9_options(body: bytes) -> Iterator[FlowTemplate]:
 
 def ipfix_templates(body: bytes) -> Iterator[FlowTemplate]:
     """The templates of a template set; withdrawals are void over UDP (RFC 7011, 8.4).  Raises FlowDecodeError."""
+    for number, count, fields in _plain_templates(body, enterprises=True):
+        if count:
+            yield _template(number, fields, options=False)
+
+
+def _plain_templates(
+    body: bytes, *, enterprises: bool
+) -> Iterator[tuple[int, int, tuple[TemplateField, ...]]]:
+    """Number, number of fields, and fields of each template that has no scopes."""
     at = 0
     while len(body) - at >= _PAIR.size:
         number, count = _PAIR.unpack_from(body, at)
         if _is_padding(number, body, at):
             return
-        fields, at = _fields(body, at + _PAIR.size, count, enterprises=True)
-        if count:
-            yield _template(number, fields, options=False)
+        fields, at = _fields(body, at + _PAIR.size, count, enterprises=enterprises)
+        yield number, count, fields
 
 
 def ipfix_options(body: bytes) -> Iterator[FlowTemplate]:
