@@ -60,6 +60,8 @@ _TEXTS = (
 _WORDS = b"0123456789.,:;=()[]{}<>\"'\\/*|&!-+_ \t\n\r#%$@^~?xeE\x00\xff"
 _KINDS = ("f8", "u1", "i8", "u8", "M8[ns]", "S3", "?", "c16", ">i4", "U2", "V4")
 _MOST_CHANGES = 4
+_MOST_PARTS = 200_000
+"""Of a mutated tree."""
 _DEPTH = 4
 
 
@@ -168,6 +170,8 @@ def mutate_json(chance: random.Random, seeds: Sequence[bytes]) -> bytes:
     tree = json.loads(chance.choice(seeds))
     for _ in range(chance.randint(1, _MOST_CHANGES)):
         tree = changed(chance, tree, _json_atom)
+    if _grown(tree):
+        return mutate_bytes(chance, seeds)
     return json.dumps(tree).encode("utf-8", "surrogatepass")[: _limit(seeds)]
 
 
@@ -179,9 +183,22 @@ def mutate_value(chance: random.Random, seeds: Sequence[bytes]) -> bytes:
     try:
         for _ in range(chance.randint(1, _MOST_CHANGES)):
             value = changed(chance, value, _due_atom)
+        if _grown(value):
+            return mutate_bytes(chance, seeds)
         return encode_value(value)
     except (UnsupportedValue, DecodeError, OverflowError, ValueError, TypeError):
         return mutate_bytes(chance, seeds)  # not every tree is a value
+
+
+def _grown(tree: Any) -> bool:
+    """Whether repeated doubling has made more of a tree than any decoder would be sent: encoding it takes minutes."""
+    left, waiting = _MOST_PARTS, [tree]
+    while waiting and left > 0:
+        part = waiting.pop()
+        if isinstance(part, dict | list):
+            left -= len(part)
+            waiting.extend(part.values() if isinstance(part, dict) else part)
+    return left <= 0
 
 
 def changed(chance: random.Random, tree: Any, atom: Callable[[random.Random], Any]) -> Any:
