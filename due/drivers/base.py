@@ -223,6 +223,30 @@ class Receiver(Protocol):
         """Start or stop reading streams.  `take_over`: the group's other members are known to have ended."""
         ...
 
+    def share(self, shards: frozenset[str] | None) -> None:
+        """Read only these shards; None: all that is followed.
+
+        A shard is what one member reads while the others leave it alone: a stream, or on Kafka a partition.  Of a shard
+        that is taken away nothing new is fetched; what has been fetched is still delivered.
+        """
+        ...
+
+    def offered(self) -> tuple[str, ...]:
+        """The shards of what is followed, known so far."""
+        ...
+
+    def held(self) -> tuple[str, ...]:
+        """Shards that are this member's, or of which it has fetched entries that are not acknowledged."""
+        ...
+
+    def shard_of(self, delivery: Delivery) -> str:
+        """The shard of a delivery from a stream."""
+        ...
+
+    def abandon(self, shard: str) -> None:
+        """Leave the fetched entries of a shard, which another member may have by now, to whoever reads it."""
+        ...
+
     def wake(self) -> None:
         """Make `receive` return soon."""
         ...

@@ -80,6 +80,7 @@ class KafkaReceiver:
         self._joined: set[str] = set()
         """Reliable topics of which the group has a position in each partition."""
         self._active, self._take_over, self._closed = True, False, False
+        self._share: frozenset[str] | None = None
         self._woken = threading.Event()
         self._changed = threading.Event()
         self._since = -1
@@ -155,6 +156,38 @@ class KafkaReceiver:
             self._active, self._take_over = active, take_over
         self._changed.set()
         self.wake()
+
+    def share(self, shards: frozenset[str] | None) -> None:
+        """See `Receiver.share`."""
+        with self._lock:
+            self._share = shards
+        self._changed.set()
+        self.wake()
+
+    def offered(self) -> tuple[str, ...]:
+        """See `Receiver.offered`."""
+        with self._lock:
+            return tuple(sorted(map(_shard, self._places())))
+
+    def held(self) -> tuple[str, ...]:
+        """See `Receiver.held`."""
+        with self._lock:
+            mine = {place for place in self._places() if self._share is None or _shard(place) in self._share}
+            return tuple(sorted(map(_shard, {*mine, *self._progress, *self._leaving, *self._claiming})))
+
+    def shard_of(self, delivery: Delivery) -> str:
+        """See `Receiver.shard_of`."""
+        return delivery.token.rpartition("/")[0]
+
+    def abandon(self, shard: str) -> None:
+        """See `Receiver.abandon`."""
+        with self._lock:
+            for held in (self._progress, self._leaving):
+                for place in [place for place in held if _shard(place) == shard]:
+                    del held[place]
+                    if held is self._progress:
+                        self._drop([place])
+        self._changed.set()
 
     @property
     def connected(self) -> bool:
@@ -333,7 +366,9 @@ class KafkaReceiver:
     def _mine(self, now: float) -> set[Partition]:
         if not self._active:
             return set()
-        places = [(topic, number) for topic in self._joined for number in self._control.partitions(topic)]
+        places = self._places()
+        if self._share is not None:
+            return {place for place in places if _shard(place) in self._share}
         members = self._control.members(self._group)
         self._since = next(
             (seen.since for seen in members if seen.record.member == self._member), self._since
@@ -347,6 +382,9 @@ class KafkaReceiver:
             return set(places) if working[0] == self._member else set()
         rank = working.index(self._member)
         return {place for at, place in enumerate(sorted(places)) if at % len(working) == rank}
+
+    def _places(self) -> list[Partition]:
+        return [(topic, number) for topic in self._joined for number in self._control.partitions(topic)]
 
     def _listen(self, topics: Iterable[str], *, late: bool) -> None:
         """Read best-effort topics, from their beginning if they came after the subscription."""
@@ -522,6 +560,10 @@ class KafkaReceiver:
         tries = progress.deliver(offset)
         self._counts["claimed"] += tries > 1
         return [Delivery(path, payload, f"{topic}/{number}/{offset}", tries)]
+
+
+def _shard(place: Partition) -> str:
+    return f"{place[0]}/{place[1]}"
 
 
 def _text(header: str | bytes | None) -> str:

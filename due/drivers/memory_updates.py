@@ -177,6 +177,7 @@ class MemoryReceiver:
         self._counts = {"dropped_slow": 0, "reconnects": 0, "claimed": 0, "set_aside": 0}
         self._active = True
         self._take_over = False
+        self._share: frozenset[str] | None = None
         self._woken = False
         self._closed = False
         self.connected = True
@@ -216,6 +217,36 @@ class MemoryReceiver:
         with self._space.lock:
             self._active, self._take_over = active, take_over
         self.wake()
+
+    def share(self, shards: frozenset[str] | None) -> None:
+        """See `Receiver.share`."""
+        with self._space.lock:
+            self._share = shards
+        self.wake()
+
+    def offered(self) -> tuple[str, ...]:
+        """See `Receiver.offered`."""
+        with self._space.lock:
+            return tuple(sorted(self._paths))
+
+    def held(self) -> tuple[str, ...]:
+        """See `Receiver.held`."""
+        with self._space.lock:
+            return tuple(path for path in sorted(self._paths) if self._reads(path) or self._works_on(path))
+
+    def shard_of(self, delivery: Delivery) -> str:
+        """See `Receiver.shard_of`."""
+        return delivery.path
+
+    def abandon(self, shard: str) -> None:
+        """See `Receiver.abandon`."""
+        with self._space.lock:
+            stream = self._space.streams.get(shard)
+            group = stream.groups.get(self._group) if stream is not None else None
+            for pending in group.pending.values() if group is not None else ():
+                if pending.member == self._consumer:
+                    pending.member = ""
+            self._wake_members(shard)
 
     def offer(self, path: str, payloads: Iterable[bytes]) -> None:
         """Best-effort payloads of a path, from a publisher that holds the space's lock."""
@@ -306,6 +337,13 @@ class MemoryReceiver:
     def _follows(self, path: str) -> bool:
         return any(Key.parse(pattern).matches_path(path) for pattern in self._followed)
 
+    def _reads(self, path: str) -> bool:
+        return self._active and (self._share is None or path in self._share)
+
+    def _works_on(self, path: str) -> bool:
+        group = self._space.streams[path].groups[self._group]
+        return any(pending.member == self._consumer for pending in group.pending.values())
+
     def _join(self, path: str, start: str, *, reset: bool) -> None:
         self._space.streams[path].join(self._group, self._consumer, start, reset=reset)
         self._paths.add(path)
@@ -330,7 +368,7 @@ class MemoryReceiver:
         self._backlog_bytes = 0
         if not self._active:
             return found
-        for path in self._paths:
+        for path in filter(self._reads, self._paths):
             stream = self._space.streams[path]
             group = stream.groups[self._group]
             given = group.next_entries(

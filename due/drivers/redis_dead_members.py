@@ -14,6 +14,8 @@ from due.drivers.redis_work import WorkLists
 SILENT_SECONDS = 3.0
 """A member whose lease has not changed for this long counts as dead."""
 _MOST_CLAIMED = 1000
+_NOBODY = "nobody"
+"""A consumer that never has a lease: what is given to it is claimed like what a dead member had."""
 
 Claimed = Callable[[str, bytes | None, int], None]
 """Id, payload (None: its producer has it no more), and how often it was delivered, this time included."""
@@ -62,6 +64,18 @@ class DeadMembers:
             else:
                 self._claim_from(path, name, found)
         return False, waits
+
+    def release(self, path: str) -> None:
+        """Give up this member's pending entries, so that another one need not wait for its end."""
+        work = work_name(self._group, path)
+        while True:
+            pending: list[dict[str, Any]] = self._commands.xpending_range(
+                work, self._group, "-", "+", _MOST_CLAIMED, consumername=self._consumer
+            )
+            if not pending:
+                return
+            tokens = [one["message_id"] for one in pending]
+            self._commands.xclaim(work, self._group, _NOBODY, 0, tokens, justid=True)
 
     def _claim_from(self, path: str, consumer: bytes, found: Claimed) -> None:
         low = "-"

@@ -9,8 +9,15 @@ server or the network was stopped, all members get their full time to renew. See
 counts as renewed; a watcher that starts therefore waits once in full for a member that died before.
 """
 
+import logging
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import redis
+
+log = logging.getLogger("due.updates")
 
 LEFT = b"0"
 """The value of a lease that its member gave up."""
@@ -46,6 +53,37 @@ class LeaseValue:
         """The value of the next renewal."""
         self._last = max(self._last + 1, int(time.time() * 1000))
         return b"%d" % self._last
+
+
+class MemberLeases:
+    """One member's leases.  Thread-safe: none is renewed after it was given up."""
+
+    def __init__(self, commands: Any, group: str, consumer: str) -> None:
+        self._commands = commands  # Any: redis-py types an answer by options it cannot see
+        self._group, self._consumer = group, consumer
+        self._value = LeaseValue()
+        self._lock = threading.Lock()
+
+    def renew(self, paths: Callable[[], list[str]]) -> None:
+        """Renew those of all paths that are read now."""
+        with self._lock:
+            self._write(paths(), self._value.next())
+
+    def give_up(self, paths: list[str]) -> None:
+        """These streams are read no more."""
+        with self._lock:
+            self._write(paths, LEFT)
+
+    def _write(self, paths: list[str], value: bytes) -> None:
+        if not paths:
+            return
+        try:
+            pipe = self._commands.pipeline(transaction=False)
+            for path in paths:
+                pipe.hset(lease_name(self._group, path), self._consumer, value)
+            pipe.execute()
+        except (redis.RedisError, OSError) as error:
+            log.debug("leases could not be written: %s", error)
 
 
 class LeaseWatch:

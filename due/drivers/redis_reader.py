@@ -24,8 +24,9 @@ from due.drivers.base import Delivery
 from due.drivers.redis_acks import Acknowledgements
 from due.drivers.redis_aside import Aside
 from due.drivers.redis_dead_members import SILENT_SECONDS, DeadMembers
-from due.drivers.redis_leases import LEFT, LeaseValue, lease_name
+from due.drivers.redis_leases import MemberLeases
 from due.drivers.redis_primary import backoff_for
+from due.drivers.redis_share import StreamShare
 from due.drivers.redis_streams import stream_name, wake_name, work_name
 from due.drivers.redis_upkeep import Upkeep
 from due.drivers.redis_wire import Wire, pack, understood
@@ -72,8 +73,6 @@ class StreamReader:
         self._consumer = consumer
         self._shared = shared
         self._lock = threading.Lock()
-        self._leases = threading.Lock()
-        """Held while leases are written; otherwise one could be renewed after it was given up."""
         self._paths: dict[str, str] = {}
         self._wire: Wire | None = None
         self._expected: deque[_Expected] = deque()
@@ -90,11 +89,12 @@ class StreamReader:
         self._held: set[str] = set()
         self._unmade: dict[str, tuple[str, bool, float]] = {}
         """Work lists that could not be made: start, and since when; their streams are not read before that."""
-        self._lease = LeaseValue()
+        self._leases = MemberLeases(commands, group, consumer)
+        self._share = StreamShare()
         self._lists = WorkLists(commands, group)
         self._dead = DeadMembers(commands, group, consumer)
         self._upkeep = Upkeep(commands, group, consumer)
-        self._aside = Aside(commands, group)
+        self.aside = Aside(commands, group)
         self._server_time = ServerTime(commands)
         self._look_at = 0.0
         self._alone = False
@@ -140,8 +140,7 @@ class StreamReader:
                 self._dead.forget(path)
             self._stale = bool(gone)
             self._upkeep.withdrawn(gone, time.monotonic())
-        with self._leases:
-            self._write_leases(gone, LEFT)
+        self._leases.give_up(gone)
         self._interrupt()
 
     def activate(self, active: bool, *, take_over: bool) -> None:
@@ -154,6 +153,32 @@ class StreamReader:
             self._take_over = take_over
             self._stale = True
         self._interrupt()
+
+    def share(self, shards: frozenset[str] | None) -> None:
+        """See `Receiver.share`."""
+        with self._lock:
+            gained = self._share.change(shards, self._paths)
+            self._held.update(gained)
+            self._look_at = 0.0 if gained else self._look_at
+            self._stale = True
+        self._interrupt()
+
+    def offered(self) -> tuple[str, ...]:
+        """See `Receiver.offered`."""
+        with self._lock:
+            return tuple(sorted(self._paths))
+
+    def held(self) -> tuple[str, ...]:
+        """See `Receiver.held`."""
+        return self._share.held(self.offered() if self._active else ())
+
+    def abandon(self, path: str) -> None:
+        """See `Receiver.abandon`."""
+        self._share.abandon(path)
+        try:
+            self._dead.release(path)
+        except (redis.RedisError, OSError) as error:
+            log.warning("entries of %s stay with this member until it ends: %s", path, error)
 
     def fileno(self) -> int:
         """For select; -1 while there is nothing to wait for."""
@@ -175,7 +200,7 @@ class StreamReader:
             return 0.0
         if not self._paths or not self._active:
             return 60.0
-        return 0.05 if self._wire is None else _HOLD_SECONDS if self._held else _LOOK_SECONDS
+        return 0.05 if self._wire is None else _HOLD_SECONDS if self._waits() else _LOOK_SECONDS
 
     def care(self) -> None:
         """Take over from dead members, reconnect, and request more; called before each wait."""
@@ -185,7 +210,7 @@ class StreamReader:
         now = time.monotonic()
         if now >= self._look_at:
             usual = SILENT_SECONDS if self._alone else _LOOK_SECONDS
-            self._look_at = now + (_HOLD_SECONDS if self._held else usual)
+            self._look_at = now + (_HOLD_SECONDS if self._waits() else usual)
             self._look_after_the_dead()
         try:
             if self._wire is None and self._backoff.due(now):
@@ -213,36 +238,31 @@ class StreamReader:
     def acknowledge(self, delivery: Delivery) -> None:
         """Remember to acknowledge; sent with the next request."""
         self._acks.done(delivery)
-
-    def set_aside(self, path: str, payload: bytes, reason: str) -> None:
-        """Set a payload aside."""
-        self._aside.put(path, payload, reason)
-
-    def aside(self) -> list[tuple[bytes, str]]:
-        """What was set aside for the group, with reasons; raises `UpdatesUnavailable`."""
-        return self._aside.all()
+        self._share.done(delivery)
 
     def renew(self) -> None:
         """Renew the leases; a standby instance keeps the group's position, too."""
-        with self._leases:
-            self._write_leases(list(self._paths), self._lease.next())
+        self._leases.renew(lambda: list(self._paths))
         self._upkeep.tick(list(self._paths), time.monotonic())
 
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
         sizes = {"held_paths": len(self._held), "read_paths": len(self._paths)}
-        return {**self._counts, **sizes, **self._aside.counts, **self._upkeep.counts}
+        return {**self._counts, **sizes, **self.aside.counts, **self._upkeep.counts}
 
     def close(self) -> None:
         """Acknowledge what is done, give up the leases for good, close."""
         self._flush_acks()
         with self._lock:
             paths, self._paths = list(self._paths), {}
-        with self._leases:
-            self._write_leases(paths, LEFT)
+        self._leases.give_up(paths)
         if self._wire is not None:
             self._wire.close()
             self._wire = None
+
+    def _waits(self) -> bool:
+        with self._lock:
+            return any(map(self._share.reads, self._held))
 
     def _refuse(self, path: str) -> None:
         self._counts["paths_refused"] += 1
@@ -265,17 +285,6 @@ class StreamReader:
         self._counts["paths_denied"] += 1
         told = "%s has no right to read %s: %s; grant its key in [grants.%s]"
         log.error(told, self._group, path, error, self._group)
-
-    def _write_leases(self, paths: list[str], value: bytes) -> None:
-        if not paths:
-            return
-        try:
-            pipe = self._commands.pipeline(transaction=False)
-            for path in paths:
-                pipe.hset(lease_name(self._group, path), self._consumer, value)
-            pipe.execute()
-        except (redis.RedisError, OSError) as error:
-            log.debug("leases could not be written: %s", error)
 
     def _make_list(self, path: str, start: str, *, reset: bool = False, since: float | None = None) -> None:
         """`since`: when a list was first requested that could not be made then (s, monotonic)."""
@@ -325,6 +334,7 @@ class StreamReader:
         self._found = ReadRound()
         self._at.clear()
         self._acks.lost()
+        self._share.answered()
         with self._lock:
             paths = list(self._paths)
             self._catch_up = set(paths if self._life else ())
@@ -353,9 +363,10 @@ class StreamReader:
             self._stale = False
             self._catch_up &= self._paths.keys()
             history = tuple(self._catch_up)
-            paths = history or tuple(p for p in self._paths if p not in self._held)
             if not self._active:  # became a standby a moment ago
-                history = paths = ()
+                history = ()
+            readable = self._paths if self._active else ()
+            paths = history or tuple(p for p in readable if p not in self._held and self._share.ask(p))
         command = self._packed_acks(quietly=self._quiet and bool(paths))
         self._requested = paths
         at = {path: self._at.get(path, "") for path in paths}  # other threads forget places
@@ -437,7 +448,8 @@ class StreamReader:
                 self._at.clear()  # a list may have been moved
                 return
             path = name.decode()[len(_STREAM) :]
-            if path not in self._at or path in self._held or not self._active:
+            unread = path not in self._at or path in self._held or not self._active
+            if unread or not self._share.ask(path):
                 self._at.pop(path, None)
                 continue
             found[path] = [token.decode() for token, _ in entries]
@@ -516,11 +528,14 @@ class StreamReader:
             self._vanished(path, token)
         if self._shared and found.ours:
             self._at.clear()  # others have put more on the lists while we process
-        return [
+        deliveries = [
             Delivery(path, found.payloads[path, token], self._acks.token(token))
             for path, token in found.ours
             if (path, token) in found.payloads
         ]
+        self._share.given(deliveries)
+        self._share.answered()
+        return deliveries
 
     def _vanished(self, path: str, token: str) -> None:
         """Its producer has deleted it, which waited for the group as long as it was told to."""
@@ -571,6 +586,8 @@ class StreamReader:
             unmade = self._unmade.get(path)
             if unmade is not None:
                 self._make_list(path, unmade[0], reset=unmade[1], since=unmade[2])
+            if not self._share.reads(path):
+                continue
             try:
                 waits = self._claim(path)
             except (redis.RedisError, OSError) as error:
@@ -595,3 +612,4 @@ class StreamReader:
             return
         self._counts["claimed"] += 1
         self._claimed.append(Delivery(path, payload, self._acks.token(token), tries))
+        self._share.given([self._claimed[-1]])

@@ -117,6 +117,28 @@ class RedisReceiver:
         self._reader.activate(active, take_over=take_over)
         self.wake()
 
+    def share(self, shards: frozenset[str] | None) -> None:
+        """See `Receiver.share`."""
+        self._reader.share(shards)
+        self.wake()
+
+    def offered(self) -> tuple[str, ...]:
+        """See `Receiver.offered`."""
+        return self._reader.offered()
+
+    def held(self) -> tuple[str, ...]:
+        """See `Receiver.held`."""
+        return self._reader.held()
+
+    def shard_of(self, delivery: Delivery) -> str:
+        """See `Receiver.shard_of`."""
+        return delivery.path
+
+    def abandon(self, shard: str) -> None:
+        """See `Receiver.abandon`."""
+        self._reader.abandon(shard)
+        self.wake()
+
     @property
     def connected(self) -> bool:
         """See `Receiver.connected`."""
@@ -138,11 +160,11 @@ class RedisReceiver:
 
     def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
         """See `Receiver.set_aside`."""
-        self._reader.set_aside(delivery.path, payload, reason)
+        self._reader.aside.put(delivery.path, payload, reason)
 
     def aside(self) -> list[tuple[bytes, str]]:
         """See `Receiver.aside`."""
-        return self._reader.aside()
+        return self._reader.aside.all()
 
     def drain(self) -> bool:
         """See `Receiver.drain`."""

@@ -10,7 +10,7 @@ import pytest
 
 from due.backends import open_updates
 from due.config import Options
-from due.drivers.base import Delivery, Receiver, UpdatesDriver
+from due.drivers.base import Delivery, Publisher, Receiver, UpdatesDriver
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.testing.tls_redis import TlsRedis
 from tests.due.conftest import wait_for
@@ -253,3 +253,108 @@ def test_wake_ends_a_wait(open_driver: Open) -> None:
     waiting.join(60)
     assert not waiting.is_alive()
     receiver.close()
+
+
+_PATHS = [f"r.x.y.{number}" for number in range(8)]
+
+
+def _numbered(publisher: Publisher, numbers: range) -> None:
+    for number in numbers:
+        for path in _PATHS:
+            publisher.append(path, b"%d" % number)
+    publisher.settle(30)
+
+
+def _sharing(driver: UpdatesDriver, publisher: Publisher) -> tuple[Receiver, Receiver, frozenset[str]]:
+    """Two members that know the same shards, of which none is theirs, and five entries on each path."""
+    members = driver.receiver("group", "a"), driver.receiver("group", "b")
+    for member in members:
+        member.share(frozenset())
+        member.follow("r.x.**")
+    _numbered(publisher, range(5))
+
+    def known() -> bool:
+        assert not [delivery for member in members for delivery in member.receive(0.05)]
+        offered = [set(member.offered()) for member in members]
+        return len(offered[0]) >= least and offered[0] == offered[1]
+
+    # on Kafka a shard is a partition, and all of a topic are offered at once
+    least = 2 if driver.url.startswith("kafka") else len(_PATHS)
+    wait_for(known)
+    return *members, frozenset(members[0].offered())
+
+
+def _by_path(deliveries: list[Delivery]) -> dict[str, list[int]]:
+    found: dict[str, list[int]] = {}
+    for delivery in deliveries:
+        found.setdefault(delivery.path, []).append(int(delivery.payload))
+    return found
+
+
+def test_each_shard_is_read_whole_and_in_order_by_the_member_that_has_it(open_driver: Open) -> None:
+    driver = open_driver()
+    publisher = driver.publisher("writer")
+    a, b, shards = _sharing(driver, publisher)
+    part = frozenset(sorted(shards)[: len(shards) // 2])
+    a.share(part)
+    b.share(shards - part)
+    found: dict[Receiver, list[Delivery]] = {a: [], b: []}
+
+    def read() -> bool:
+        for member, deliveries in found.items():
+            member.renew()
+            for delivery in member.receive(0.05):
+                member.acknowledge(delivery)
+                deliveries.append(delivery)
+        return sum(map(len, found.values())) >= 5 * len(_PATHS)
+
+    wait_for(read)
+    assert {a.shard_of(delivery) for delivery in found[a]} <= part
+    assert {b.shard_of(delivery) for delivery in found[b]} <= shards - part
+    together = _by_path(found[a]) | _by_path(found[b])
+    assert together == {path: list(range(5)) for path in _PATHS}
+    for half in (a, b, publisher):
+        half.close()
+
+
+@pytest.mark.parametrize("how", ["acknowledged", "abandoned"])
+def test_a_shard_that_moves_waits_for_what_the_other_member_has_of_it(open_driver: Open, how: str) -> None:
+    driver = open_driver()
+    publisher = driver.publisher("writer")
+    a, b, shards = _sharing(driver, publisher)
+    a.share(shards)
+    first = received(a, 5 * len(_PATHS))
+    a.share(frozenset())
+    b.share(shards)
+    assert set(a.held()) >= {a.shard_of(delivery) for delivery in first}
+    _numbered(publisher, range(5, 10))
+    for _ in range(10):
+        a.renew()
+        b.renew()
+        assert a.receive(0.02) == []
+        assert b.receive(0.02) == []
+    if how == "acknowledged":
+        for delivery in first:
+            a.acknowledge(delivery)
+    else:
+        for shard in shards:
+            a.abandon(shard)
+    later: list[Delivery] = []
+    expected = range(5, 10) if how == "acknowledged" else range(10)
+
+    def read() -> bool:
+        a.renew()
+        b.renew()
+        assert a.receive(0.02) == []
+        came = b.receive(0.05)
+        for delivery in came:
+            b.acknowledge(delivery)
+        later.extend(came)
+        return len(later) >= len(expected) * len(_PATHS)
+
+    wait_for(read)
+    assert _by_path(later) == {path: list(expected) for path in _PATHS}
+    assert all((delivery.tries > 1) == (int(delivery.payload) < 5) for delivery in later)
+    wait_for(lambda: not a.held())
+    for half in (a, b, publisher):
+        half.close()
