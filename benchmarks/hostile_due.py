@@ -13,7 +13,7 @@ from benchmarks.hostile_target import DecoderTarget
 from due.codec import Frame, decode_frame, decode_value, encode_frame, encode_single, encode_value, unpack
 from due.errors import DecodeError, InvalidKey, RefusedFrame
 from due.keys import Key
-from due.membership import Assignments, Heartbeat, Incompatible, Registration
+from due.membership import Assignments, Heartbeat, Incompatible, Registration, ShardGrant
 from due.messages import Assignment, Capability, Interest, RecordBatch
 from due.routes import Routes
 from due.tracker import Tracker
@@ -66,10 +66,13 @@ _ASSIGNMENTS = Assignments(
     epoch=1,
     active="i",
     revisions={"i": 1},
+    shards={"a.b": ShardGrant("i", 7)},
     assignments=(Assignment("a.b.app.**", 2.5),),
     incompatible=(Incompatible(key="a.b", reason="too fast"),),
 )
-_HEARTBEAT = Heartbeat(app_id="app", instance_id="i", revision=1, written=3)
+_HEARTBEAT = Heartbeat(
+    app_id="app", instance_id="i", revision=1, written=3, offered=("a.b", "a.c"), held={"a.b": 7}
+)
 
 
 def _received(data: bytes) -> bool:

@@ -27,6 +27,7 @@ EPOCH_STEP = 1 << 28
 have been wrong by years (this is eight and a half)."""
 _HEARTBEAT_S = (0.01, 3600.0)
 _MOST_TEXT = 256
+_MOST_SHARD_TEXT = 1 << 20
 _APP = re.compile(r"[A-Za-z0-9_-]{1,128}")
 _TOLD = 20
 
@@ -85,6 +86,8 @@ class Admission:
         yield from _names(message, said_by)
         if not self._plausible(message.app_id, message.epoch):
             yield f"epoch {message.epoch} is far beyond any that was given"
+        if sum(map(len, (*message.offered, *message.held))) > _MOST_SHARD_TEXT:
+            yield f"its shards have names of more than {_MOST_SHARD_TEXT} characters together"
         if message.written < 0 or message.received < 0 or message.version < 0:
             yield "a counter is negative"
         yield from self._crowded(message.app_id, message.instance_id)

@@ -18,12 +18,15 @@ import msgspec
 
 from coordinator.matching import Declarations, Matched, match
 from coordinator.selection import Strategy, at_random
+from coordinator.sharding import ShardTable
 from due.membership import Assignments, Heartbeat, Registration
 
 _SILENCE = 3.0
 _MOST_EPOCHS = 4096
 """Apps whose epochs are remembered after they have ended; the oldest is forgotten first."""
 _MOST_EVENTS = 10_000
+_MOST_CLAIMED = 2**53
+"""Versions beyond are not believed, so that there is always room to count on."""
 
 
 class InstanceState(Enum):
@@ -90,6 +93,9 @@ class _App:
         self.active = ""
         self.epoch = epoch
         self.sent: Assignments | None = None
+        self.shards = ShardTable()
+        self.unsettled = False
+        """Heartbeats or instances have changed since the shards were settled."""
 
     @property
     def alive(self) -> list[Instance]:
@@ -98,6 +104,10 @@ class _App:
     @property
     def standby(self) -> bool:
         return any(one.registration.instances == "standby" for one in self.alive)
+
+    @property
+    def sharded(self) -> bool:
+        return any(one.registration.instances == "sharded" for one in self.alive)
 
     def declarations(self) -> Declarations:
         """The union of what live instances declare, each once."""
@@ -157,6 +167,7 @@ class Registry:
         self._version = version
         self._heard: float | None = None
         self._looked: float | None = None
+        self._led_since: float | None = None
         self._dirty = False
         self._answers: dict[str, None] = {}
         self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
@@ -204,6 +215,10 @@ class Registry:
             self._note("returned", message.app_id, message.instance_id)
             self._dirty = True
         known.seen, known.beat, known.gone = now, message, None
+        # those of an earlier Coordinator, whose clock was ahead of this one's
+        claims = (number for number in (message.version, *message.held.values()) if number <= _MOST_CLAIMED)
+        self._version = max(self._version, *claims, 0)
+        app.unsettled = True
         if self.leading and (app.sent is None or app.sent.version != message.version):
             self._answer(message.app_id)
 
@@ -238,6 +253,8 @@ class Registry:
             if not app.instances and name not in self._answers:
                 self._remember_epoch(name, app.epoch)
                 del self._apps[name]
+        if self.leading and self._led_since is None:
+            self._led_since = now
 
     def lead(self) -> None:
         """This Coordinator leads from now on; active instances stay active."""
@@ -252,11 +269,17 @@ class Registry:
     def follow(self) -> None:
         """Another Coordinator leads: only listen."""
         self.leading = False
+        self._led_since = None
+        for app in self._apps.values():
+            app.shards = ShardTable()
 
     # --- what goes out -------------------------------------------------------------------------
 
     def outgoing(self) -> list[Assignments]:
         """Assignments to send now: answers, and changes since the last call."""
+        for app in self._apps.values() if self.leading else ():
+            # before anything is said: what an instance has and is not told of, it takes for withdrawn
+            self._settle_shards(app)
         if self._dirty and self.leading:
             self._dirty = False
             self.changes += 1
@@ -362,7 +385,7 @@ class Registry:
 
     def _lost(self, name: str, instance: Instance, state: InstanceState) -> None:
         instance.gone = state
-        self._dirty = True
+        self._dirty = self._apps[name].unsettled = True
         self._note(state.value, name, instance.registration.instance_id)
 
     def _state(self, app: _App, instance: Instance) -> InstanceState:
@@ -389,6 +412,18 @@ class Registry:
                 self.failovers += 1
             self._note("activated", name, app.active, f"epoch {app.epoch}")
 
+    def _settle_shards(self, app: _App) -> None:
+        """Divide the shards of a sharded app among its instances."""
+        if not app.unsettled or not app.sharded:
+            return
+        now, since = self._looked, self._led_since
+        leading_s = now - since if now is not None and since is not None else 0.0
+        members = {one.registration.instance_id: one.beat for one in app.alive if one.beat is not None}
+        unheard = len(members) < len(app.alive) or leading_s < max(map(self._timeout, app.alive))
+        app.unsettled = unheard
+        if app.shards.settle(members, self._version + 1, unknown=unheard):
+            self._dirty = True
+
     def _former(self, name: str, app: _App) -> str:
         """The active instance of the checkpoint, if it is alive."""
         known = app.instances.get(self._preferred.pop(name, ""))
@@ -409,6 +444,7 @@ class Registry:
                 self._version += 1
                 self._note_incompatible(name, app.sent, message)
                 app.sent = msgspec.structs.replace(message, version=self._version)
+                app.shards.told(self._version)
                 self._answer(name)
 
     def _message(self, name: str, app: _App) -> Assignments:
@@ -418,7 +454,13 @@ class Registry:
             version=self._version,
             epoch=app.epoch,
             active=app.active,
-            revisions={one.registration.instance_id: one.registration.revision for one in app.alive},
+            shards=dict(app.shards.given) if app.sharded else {},
+            revisions={
+                one.registration.instance_id: one.registration.revision
+                for one in app.alive
+                # one that has not said yet what it works on would take it that it has lost everything
+                if one.beat is not None or one.registration.instances != "sharded"
+            },
             assignments=tuple(
                 msgspec.structs.replace(assignment, epoch=app.epoch)
                 for assignment in self.matched.assignments.get(name, ())
@@ -446,4 +488,11 @@ class Registry:
 
 
 def _content(message: Assignments) -> tuple[Any, ...]:
-    return message.epoch, message.active, message.revisions, message.assignments, message.incompatible
+    return (
+        message.epoch,
+        message.active,
+        message.shards,
+        message.revisions,
+        message.assignments,
+        message.incompatible,
+    )

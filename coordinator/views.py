@@ -15,7 +15,8 @@ from due.messages import Item
 
 
 def instances(registry: Registry, now: float) -> list[dict[str, Any]]:
-    """Every instance with its state; `silent_s`: seconds since its last heartbeat."""
+    """Every instance with its state; `silent_s`: seconds since its last heartbeat; `shards`: those given to it."""
+    given = _given(registry)
     return [
         {
             "app_id": known.registration.app_id,
@@ -29,9 +30,19 @@ def instances(registry: Registry, now: float) -> list[dict[str, Any]]:
             "pid": known.registration.pid,
             "written": known.beat.written if known.beat else 0,
             "received": known.beat.received if known.beat else 0,
+            "shards": given.get((known.registration.app_id, known.registration.instance_id), []),
         }
         for known, state in registry.instances()
     ]
+
+
+def _given(registry: Registry) -> dict[tuple[str, str], list[str]]:
+    """The shards of each instance, by app and instance."""
+    given: dict[tuple[str, str], list[str]] = {}
+    for app, message in registry.assignments().items():
+        for shard, grant in sorted(message.shards.items()):
+            given.setdefault((app, grant.instance), []).append(shard)
+    return given
 
 
 def apps(registry: Registry, now: float) -> list[dict[str, Any]]:

@@ -21,12 +21,14 @@ from due.logs import LogLimit
 from due.membership import (
     ASSIGNMENT,
     HEARTBEAT,
+    MOST_SHARDS,
     REGISTRATION,
     Assignments,
     Heartbeat,
     Member,
     Phase,
     Registration,
+    Standing,
 )
 from due.threads import Failed, LoudThread
 
@@ -120,7 +122,7 @@ class HeartbeatThread:
         self.alive_until = awake_ns() + int(self._pause * 1e9)
         me = self.member.registration
         self._control.subscribe(f"{ASSIGNMENT}.{me.app_id}")
-        if me.instances == "standby" and self.member.announced:
+        if me.instances != "shared" and self.member.announced:
             self._control.subscribe(f"{HEARTBEAT}.{me.app_id}")
         self._turn()
         self._thread.start()
@@ -148,6 +150,22 @@ class HeartbeatThread:
                     late,
                 )
         self.changed()
+
+    def standing(self, shard: str, grant: int) -> Standing:
+        """See `Member.standing`; a suspension until this moment counts."""
+        self.check_pause()
+        with self.lock:
+            return self.member.standing(shard, grant)
+
+    def grant(self, shard: str) -> int:
+        """See `Member.grant`."""
+        with self.lock:
+            return self.member.grant(shard)
+
+    def let_go(self, shard: str) -> None:
+        """See `Member.let_go`."""
+        with self.lock:
+            self.member.let_go(shard)
 
     def close(self) -> None:
         """Send the offline heartbeat and stop."""
@@ -227,8 +245,9 @@ class HeartbeatThread:
         now = time.monotonic()
         with self.lock:
             worked = self.member.active
-            messages = self.member.tick(now, written=self.written(), received=self._dispatcher.received)
+            messages = self.member.tick(now, self._beat)
             changes, active, reading = self.member.changes, self.member.active, self.member.reading
+            shards = self.member.shards
             self.superseded += worked and not active
         probed = awake_ns()
         for message in messages:
@@ -237,8 +256,11 @@ class HeartbeatThread:
             self._probed, self._unanswered = probed, True
             self._publisher.probe(probed)
         if changes != self._seen:
-            take_over = self.member.phase is Phase.COORDINATED
+            # the other instances of a sharded app go on working
+            alone = self.member.registration.instances != "sharded"
+            take_over = alone and self.member.phase is Phase.COORDINATED
             self._seen = changes
+            self._dispatcher.share(shards)
             self._dispatcher.activate(active, reading=reading, take_over=take_over)
             self.changed()
         if now >= self._renew_at:
@@ -247,6 +269,17 @@ class HeartbeatThread:
         busy = self._dispatcher.busy_since
         if busy is not None and now - busy > _SLOW_CALLBACK:
             self._rhythm.drained(some=self._dispatcher.receiver.drain())
+
+    def _beat(self) -> Heartbeat:
+        """A heartbeat with what this instance has done, and with its shards."""
+        receiver = self._dispatcher.receiver
+        sharded = self.member.registration.instances == "sharded"
+        return self.member.beat(
+            written=self.written(),
+            received=self._dispatcher.received,
+            offered=receiver.offered()[:MOST_SHARDS] if sharded else (),
+            held=receiver.held()[:MOST_SHARDS] if sharded else (),
+        )
 
     def _send(self, message: Registration | Heartbeat) -> None:
         path = REGISTRATION if isinstance(message, Registration) else HEARTBEAT

@@ -14,14 +14,18 @@ Rules for the Coordinator:
    was active, within two heartbeats);
  - `epoch` grows with each change of the active instance and never falls: a new Coordinator starts above
    the highest `epoch` in the heartbeats; Assignments with a lower epoch than seen are ignored;
- - `active` is "" for shared apps (every instance works) and while no instance is chosen for a standby app
-   that has only consumers' duties it is the instance that reads.
-While no Coordinator answers, the instances of a standby app settle it among themselves by their heartbeats: see `Peers`.
+ - `active` is "" for shared and sharded apps (every instance works) and while no instance is chosen for a standby app
+   that has only consumers' duties it is the instance that reads;
+ - each shard of a sharded app is given to one instance. It is given to another one only when the heartbeats of the
+   first, of the version that took it away or a later one, do not list it as `held` any more, or have ended.
+While no Coordinator answers, the instances of a standby app settle it among themselves by their heartbeats: see `Peers`;
+so do those of a sharded app, of which then one works on everything.
 
 `Member` holds the decisions.  Pure: no socket, no clock, no thread; time is an argument (seconds, monotonic).
 """
 
 import enum
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, Self
 
 import msgspec
@@ -40,6 +44,8 @@ APP_ID = r"[A-Za-z0-9_-]{1,64}"
 """Grammar of app ids and instance ids."""
 MOST_DECLARED = 16_384
 """Capabilities, interests, assignments or instances in one message."""
+MOST_SHARDS = 4096
+"""Shards of one app; those beyond, in alphabetical order, are given to nobody."""
 _MOST_TEXT = 2048
 _MOST_PEERS = 1024
 _MISSED = 4.0
@@ -55,6 +61,7 @@ _Host = Annotated[str, msgspec.Meta(max_length=255)]
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=_MOST_COUNT)]
 _Seconds = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_HEARTBEAT)]
 _Many = msgspec.Meta(max_length=MOST_DECLARED)
+_Shards = msgspec.Meta(max_length=MOST_SHARDS)
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True):
@@ -117,6 +124,10 @@ class Heartbeat(_Message, frozen=True, kw_only=True):
     """Items written since its start."""
     received: _Count = 0
     """Items received since its start."""
+    offered: Annotated[tuple[_Text, ...], _Shards] = ()
+    """Shards that an instance of a sharded app could work on: those of the reliable keys that it observes."""
+    held: Annotated[dict[_Text, _Count], _Shards] = {}
+    """Shards that it works on, or of which it has not finished everything, and the grants by which it has them."""
 
 
 class Incompatible(_Message, frozen=True, kw_only=True):
@@ -125,6 +136,14 @@ class Incompatible(_Message, frozen=True, kw_only=True):
     key: _Text
     """The interest's key."""
     reason: _Text
+
+
+class ShardGrant(msgspec.Struct, frozen=True, array_like=True):
+    """A shard that was given to an instance."""
+
+    instance: _Id
+    number: _Count
+    """Grows with each grant of the shard; 0: as the instance has it already."""
 
 
 class Assignments(_Message, frozen=True, kw_only=True):
@@ -138,6 +157,8 @@ class Assignments(_Message, frozen=True, kw_only=True):
     epoch: Annotated[int, msgspec.Meta(ge=0, le=MAX_EPOCH)]
     active: _NoId = ""
     """The instance that works; "" = every instance does."""
+    shards: Annotated[dict[_Text, ShardGrant], _Shards] = {}
+    """Of a sharded app: the instance that works on each shard; one that is not listed rests."""
     revisions: Annotated[dict[_Id, _Count], _Many]
     """The registrations it knows: instance id to revision."""
     assignments: Annotated[tuple[Assignment, ...], _Many] = ()
@@ -166,6 +187,18 @@ class Verdict(enum.Enum):
     """This instance is not the active one, or was fenced off."""
 
 
+class Standing(enum.Enum):
+    """What an instance of a sharded app may do with a shard that it works on."""
+
+    MINE = "mine"
+    LEAVING = "leaving"
+    """It is asked to hand it over: save, acknowledge, and let go."""
+    LOST = "lost"
+    """Another instance may work on it already: let go, and neither save nor acknowledge."""
+    ASKING = "asking"
+    """Not known at the moment."""
+
+
 class Permission(msgspec.Struct, frozen=True):
     """How to treat the items of one concrete key, until `Member.changes` moves on."""
 
@@ -176,7 +209,7 @@ class Permission(msgspec.Struct, frozen=True):
 
 
 class Peers:
-    """The other instances of a standby app, by their heartbeats; who works while no Coordinator answers.
+    """The other instances of an app of which one works, by their heartbeats; which one while no Coordinator answers.
 
     One that works goes on, one that a Coordinator named before all others. Where none works, the one with the smallest
     id begins; and where two do, which were cut off from each other, it goes on.
@@ -184,7 +217,7 @@ class Peers:
 
     def __init__(self, registration: Registration) -> None:
         self._me = registration.instance_id
-        self._standby = registration.instances == "standby"
+        self._alone = registration.instances != "shared"
         self._beats: dict[str, tuple[float, Heartbeat]] = {}
         self.patience = _MISSED * registration.heartbeat
         """A peer silent for this many seconds has ended, or will ask before it writes again."""
@@ -194,7 +227,7 @@ class Peers:
     def heard(self, message: Heartbeat, now: float) -> bool:
         """Note a heartbeat; returns whether its instance was not known."""
         name = message.instance_id
-        if name == self._me or not self._standby:
+        if name == self._me or not self._alone:
             return False
         if message.state == "offline":
             self._beats.pop(name, None)
@@ -227,6 +260,10 @@ class Peers:
         return [beat for _, beat in self._beats.values()]
 
 
+Beat = Callable[[], Heartbeat]
+"""Makes a heartbeat as of now."""
+
+
 class Member:
     """One instance's view of its membership."""
 
@@ -256,6 +293,10 @@ class Member:
         self._peers = Peers(registration)
         self._yields = False
         """No Coordinator answers, and another instance works."""
+        self._grants: dict[str, int] = {}
+        """Of the shards that this instance has."""
+        self._lost: set[str] = set()
+        """Shards that another instance may have got while this one was suspended."""
 
     @property
     def active(self) -> bool:
@@ -273,6 +314,41 @@ class Member:
     def reading(self) -> bool:
         """Whether it may read streams: a standby instance first waits to hear whether it is the active one."""
         return self.active and (self.phase is not Phase.WAITING or self.registration.instances == "shared")
+
+    @property
+    def shards(self) -> frozenset[str] | None:
+        """The shards that are this instance's; None: it reads every stream."""
+        if self.registration.instances != "sharded" or self.phase is Phase.ALONE:
+            return None
+        return frozenset(self._mine()) if self.active else frozenset()
+
+    def _mine(self) -> dict[str, int]:
+        if self.current is None:
+            return {}
+        me = self.registration.instance_id
+        return {shard: grant.number for shard, grant in self.current.shards.items() if grant.instance == me}
+
+    def grant(self, shard: str) -> int:
+        """The number of the grant by which this instance has a shard; 0: none."""
+        return self._grants.get(shard, 0)
+
+    def standing(self, shard: str, grant: int) -> Standing:
+        """What it may do with a shard that it got by the grant of this number; 0: without one."""
+        if self.registration.instances != "sharded" or self.phase is Phase.ALONE:
+            return Standing.MINE
+        if self._fenced or self.phase is Phase.WAITING or self.current is None:
+            return Standing.ASKING
+        now = self.current.shards.get(shard)
+        if shard in self._lost:
+            return Standing.LOST
+        if now is None:
+            return Standing.LEAVING
+        mine = now.instance == self.registration.instance_id and (not grant or now.number in (0, grant))
+        return Standing.MINE if mine else Standing.LOST
+
+    def let_go(self, shard: str) -> None:
+        """Nothing of a lost shard is left here."""
+        self._lost.discard(shard)
 
     @property
     def announced(self) -> bool:
@@ -302,8 +378,8 @@ class Member:
         self._register_at = now
         self.changes += 1
 
-    def tick(self, now: float, *, written: int = 0, received: int = 0) -> list[Registration | Heartbeat]:
-        """What to send now.  Call at least once per heartbeat."""
+    def tick(self, now: float, beat: Beat | None = None) -> list[Registration | Heartbeat]:
+        """What to send now; `beat` makes heartbeats.  Call at least once per heartbeat."""
         self._settle(now)
         if self._fenced and now >= self._fenced_until:
             if self._peers.active(now):
@@ -319,7 +395,7 @@ class Member:
             messages.append(self.registration)
         if now >= self._beat_at:
             self._beat_at = max(self._beat_at + self.registration.heartbeat, now)
-            messages.append(self.beat(written=written, received=received))
+            messages.append((beat or self.beat)())
         return messages
 
     def _settle(self, now: float) -> None:
@@ -347,9 +423,17 @@ class Member:
         return min(self._register_at, self._beat_at)
 
     def beat(
-        self, state: Literal["online", "offline"] = "online", *, written: int = 0, received: int = 0
+        self,
+        state: Literal["online", "offline"] = "online",
+        *,
+        written: int = 0,
+        received: int = 0,
+        offered: tuple[str, ...] = (),
+        held: tuple[str, ...] = (),
     ) -> Heartbeat:
         """A heartbeat as of now."""
+        kept = self._mine().keys() | held
+        self._grants = {shard: number for shard, number in self._grants.items() if shard in kept}
         return Heartbeat(
             app_id=self.registration.app_id,
             instance_id=self.registration.instance_id,
@@ -360,6 +444,8 @@ class Member:
             active=self.reading,
             written=written,
             received=received,
+            offered=offered,
+            held={shard: self._grants.get(shard, 0) for shard in held},
         )
 
     def assigned(self, message: Assignments, now: float) -> bool:
@@ -372,28 +458,40 @@ class Member:
             if me not in message.revisions:
                 self._beat_at = now  # tell a new Coordinator at once whether this instance is active
                 return False
-        before = (self.phase, self.active, self.assignments, self.epoch)
+        before = (self.phase, self.active, self.assignments, self.epoch, self.shards)
         self.current = message
         self.epoch = message.epoch
         self.phase = Phase.COORDINATED
+        self._grant(fenced=self._fenced)
         self._fenced = self._yields = False
-        changed = before != (self.phase, self.active, self.assignments, self.epoch)
+        changed = before != (self.phase, self.active, self.assignments, self.epoch, self.shards)
         self.changes += changed
         return changed
+
+    def _grant(self, *, fenced: bool) -> None:
+        """Note the grants of `current`; what was not left here over a suspension is lost."""
+        mine = self._mine()
+        if fenced:
+            self._lost |= {
+                shard for shard, number in self._grants.items() if mine.get(shard) not in (0, number)
+            }
+        self._grants |= {s: number or self._grants.get(s, 0) for s, number in mine.items()}
 
     def paused(self, now: float) -> bool:
         """This process was suspended or cut off for longer than a Coordinator waits: another may be active by now.
 
         Writes are buffered until the Coordinator says who is active, or stays silent for the handshake
-        time-out.  Returns whether this applies (only the active instance of a standby app).
+        time-out.  Returns whether this applies (only the active instance of a standby app, and those of a sharded one).
         """
         if self.phase is Phase.ALONE and self._peers.known:
             # one of them may work by now: their heartbeats tell
             self.phase, self._deadline, self._beat_at = Phase.WAITING, now + self._peers.patience, now
             self.changes += 1
             return True
-        standby = self.current is not None and self.current.active != ""
-        if not standby or not self.active:
+        replaceable = self.current is not None and (
+            self.current.active != "" or self.registration.instances == "sharded"
+        )
+        if not replaceable or not self.active:
             return False
         self._fenced = True
         self._fenced_until = now + self._handshake_timeout

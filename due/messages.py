@@ -14,7 +14,7 @@ from due.keys import Key
 Delivery = Literal["best_effort", "reliable"]
 Archive = Literal["on_demand", "always"]
 Pacing = Literal["latest", "queue"]
-Instances = Literal["standby", "shared"]
+Instances = Literal["standby", "shared", "sharded"]
 Frequency = float | tuple[float, float] | None
 """Hz.  A capability's number is the most it can make; an interest's number the least it wants; a pair is
 (minimum, maximum); None: every item."""

@@ -74,6 +74,13 @@ def test_what_is_not_plausible_is_refused(fields: dict[str, Any], reason: str) -
     assert door.registry.app_count() == 0
 
 
+def test_names_of_shards_are_limited() -> None:
+    door = Door()
+    assert door.join(instances="sharded")
+    assert door.beat(offered=("a.b",), held={"a.b": 1})
+    assert not door.beat(offered=tuple(f"{number}.{'x' * 1000}" for number in range(1100)))
+
+
 def test_apps_instances_and_keys_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(admission, "MOST_APPS", 2)
     monkeypatch.setattr(admission, "MOST_INSTANCES", 2)

@@ -134,6 +134,25 @@ def test_shared_instances_all_work() -> None:
     assert set(world.states().values()) == {"active"}
 
 
+def test_paths_of_a_sharded_app_go_to_its_living_instances_only() -> None:
+    world = World()
+    world.run(1.0, [])
+    for name in ("i1", "i2"):
+        world.join("app", name, instances="sharded")
+    for _ in range(3):
+        for name in ("i1", "i2"):
+            told = world.told["app"].shards
+            mine = {shard: grant.number for shard, grant in told.items() if grant.instance == name}
+            world.beat("app", name, active=True, offered=("a.b", "a.c"), held=mine)
+    assert world.told["app"].active == ""
+    assert {grant.instance for grant in world.told["app"].shards.values()} == {"i1", "i2"}
+    for _ in range(10):
+        world.now += 0.1
+        world.beat("app", "i2", active=True, offered=("a.b", "a.c"))
+    assert {grant.instance for grant in world.told["app"].shards.values()} == {"i2"}
+    assert set(world.told["app"].shards) == {"a.b", "a.c"}
+
+
 def test_every_epoch_is_above_the_last() -> None:
     world = World()
     epochs = []
