@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from due.codec import Frame, decode_frame, encode_frame, freeze
 from due.drivers.base import Delivery, Receiver
@@ -14,6 +14,7 @@ from due.logs import LogLimit
 from due.messages import Item
 from due.observation import Callback, Observation, deliver
 from due.routes import Routes
+from due.shards import ShardWork
 from due.threads import Failed, LoudThread
 from due.tracker import Tracker
 
@@ -52,6 +53,8 @@ class Dispatcher:
         self._reading = True
         self._counts = dict.fromkeys((*_REFUSALS, "callback_errors", "set_aside"), 0)
         self._reliable: Delivery | None = None
+        self.shards: ShardWork | None = None
+        """Of a sharded app; set by the session."""
         self._thread = LoudThread("due-dispatcher", self._run, failed)
 
     def start(self) -> None:
@@ -102,28 +105,41 @@ class Dispatcher:
                 self.post(self.tracker.rested)
             self.receiver.activate(reading, take_over=take_over)
 
+    def share(self, shards: frozenset[str] | None) -> None:
+        """The shards of a sharded app that are this instance's."""
+        if self.shards is not None:
+            self.receiver.share(shards)
+            self.shards.changed()
+            self.receiver.wake()
+
     def statistics(self) -> dict[str, int]:
         """Counters for `health`."""
+        sharded = self.shards.counts if self.shards is not None else {}
         tracked = {name: getattr(self.tracker, name) for name in ("gaps", "repeats", "fenced", "refuted")}
-        return {"received": self.received, **tracked, **self._counts, **self.receiver.statistics()}
+        return {"received": self.received, **tracked, **self._counts, **sharded, **self.receiver.statistics()}
 
     def halt(self) -> None:
         """Callbacks cannot work any more: stop, and leave undelivered items to the next process."""
         self._halted = self._closed = True
         self.receiver.wake()
 
-    def close(self) -> None:
-        """Stop after the running callback."""
+    def finish(self) -> None:
+        """Stop after the running callback; a sharded app saves its state."""
         self._closed = True
         self.receiver.wake()
         if not self.inside() and self._thread.is_alive():
             self._thread.join(10)
+
+    def close(self) -> None:
+        """Stop, and disconnect."""
+        self.finish()
         self.receiver.close()
 
     def _run(self) -> None:
         while not self._closing():
             try:
-                deliveries = self.receiver.receive(_REST)
+                rest = _REST if self.shards is None else min(_REST, self.shards.next_turn())
+                deliveries = self.receiver.receive(rest)
             except DueError as error:
                 self._errors.error("receiving failed", error=error)
                 time.sleep(0.1)
@@ -133,12 +149,19 @@ class Dispatcher:
             # first: a key that is forgotten here may be observed again by these tasks
             while self._tasks and not self._closing():
                 self._run_task(self._tasks.popleft())
-            for delivery in deliveries:
-                self._dispatch(delivery)
-                self.answered = self._asked
-                if self._closing():
-                    break
+            self._dispatch_all(deliveries)
+            if self.shards is not None and not self._closing():
+                self._dispatch_all(self.shards.turn())
             self.busy_since = None
+        if self.shards is not None and not self._halted:
+            self.shards.close()
+
+    def _dispatch_all(self, deliveries: Sequence[Delivery]) -> None:
+        for delivery in deliveries:
+            self._dispatch(delivery)
+            self.answered = self._asked
+            if self._closing():
+                break
 
     def _closing(self) -> bool:
         return self._closed
@@ -151,10 +174,8 @@ class Dispatcher:
             self._errors.error("a callback failed", error=error)
 
     def _dispatch(self, delivery: Delivery) -> None:
-        if not delivery.token:
-            self.best_effort += 1
-            if not self._active:
-                return
+        if not self._begun(delivery):
+            return
         try:
             frame = decode_frame(delivery.payload)
             route = self._routes.known.get(frame.key)
@@ -172,8 +193,19 @@ class Dispatcher:
         else:
             if new:
                 self._deliver(delivery, frame, observations)
-        if delivery.token and not self._halted:
+        if not delivery.token or self._halted:
+            return
+        if self.shards is not None:
+            self.shards.end(delivery)
+        else:
             self.receiver.acknowledge(delivery)
+
+    def _begun(self, delivery: Delivery) -> bool:
+        """Whether to look at a delivery now."""
+        if delivery.token:
+            return self.shards is None or self.shards.begin(delivery)
+        self.best_effort += 1
+        return self._active
 
     def _deliver(self, delivery: Delivery, frame: Frame, observations: tuple[Observation, ...]) -> None:
         if delivery.tries > self._tries + 1:

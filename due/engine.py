@@ -19,7 +19,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, get_args
 from uuid import uuid4
 
 import msgspec
@@ -45,11 +45,13 @@ from due.messages import (
 )
 from due.observation import Observation
 from due.session import Session
+from due.shards import ShardState
 
 _MODES = (BOTH, PUBLISH, ARCHIVE, 0, BOTH, PUBLISH, ARCHIVE, 0)
 """By flag bits: PUB_ONLY = 1, DB_ONLY = 2, NO_WAIT = 4."""
 _NO_WAIT = 4
 _FLUSH_SECONDS = 30.0
+_LONGEST_EVERY = 3600.0
 
 
 class Engine:
@@ -151,7 +153,9 @@ class Engine:
             role: PRODUCER, CONSUMER, or both.
             interests: the keys this app wants; `observe` adds more.
             capabilities: the keys this app can write; other keys may be written as well.
-            instances: "standby": one instance is active, the others are standbys; "shared": all of them are active.
+            instances: "standby": one instance is active, the others are standbys; "shared": all of them are active and
+                divide the items of reliable keys; "sharded": all of them are active, and each reliable path is read,
+                in order, by one of them, as the Coordinator divides the paths.
 
         Raises:
             InvalidKey: a key breaks the grammar.
@@ -161,8 +165,8 @@ class Engine:
         self._before_init("init")
         if not isinstance(app_id, str) or not re.fullmatch(APP_ID, app_id):
             raise InvalidOption(f"app id {app_id!r}: 1 to {MAX_ID} characters of A-Z a-z 0-9 _ -")
-        if instances not in ("standby", "shared"):
-            raise InvalidOption(f"instances {instances!r}: 'standby' or 'shared'")
+        if instances not in get_args(Instances):
+            raise InvalidOption(f"instances {instances!r}: 'standby', 'shared' or 'sharded'")
         self._start(
             _checked_registration(
                 app_id=app_id,
@@ -333,6 +337,23 @@ class Engine:
             None if capabilities is None else tuple(capabilities),
         )
 
+    def keep_state(self, state: ShardState, *, every: float = 5.0) -> None:
+        """Keep the state of a sharded app by path, so that a path can move to another instance with its state.
+
+        Items are then acknowledged when the state that contains them is saved. Call it before the first subscription.
+
+        Args:
+            state: loads and saves; called in the dispatcher thread.
+            every: seconds between two times that a path's state is saved.
+
+        Raises:
+            InvalidOption: the app is not sharded, subscribes already, or `every` is not above zero.
+            NotInitialised: called before `init` or after `close`.
+        """
+        if not 0 < every <= _LONGEST_EVERY:
+            raise InvalidOption(f"keep_state(every={every}): above 0, at most {_LONGEST_EVERY:g} seconds")
+        self._require().keep_state(state, every)
+
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back whenever this app's assignments change, and once immediately.
 
@@ -387,6 +408,9 @@ class Engine:
 
     def close(self) -> None:
         """Send what is still queued, sign off from the Coordinator and disconnect.  Safe to call twice."""
+        session = self._session
+        if session is not None and session.dispatcher.shards is not None:
+            session.dispatcher.finish()  # what it saves is written by this engine
         with self._lock:
             session = self._session or self._broken
             self._session = self._broken = self._registration = None

@@ -26,7 +26,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, get_args, runtime_checkable
 
 import msgspec
 
@@ -115,7 +115,7 @@ def run(
         interests: declared to the Coordinator.
         capabilities: declared to the Coordinator.
         argv: command line without the program's name; None takes that of the process.
-        instances: "standby" or "shared", unless --instances says otherwise.
+        instances: "standby", "shared" or "sharded", unless --instances says otherwise.
 
     Returns:
         The exit code: 0, 1 or 2 as above.
@@ -197,7 +197,7 @@ def _parser(app_id: str) -> argparse.ArgumentParser:
     parser.add_argument("--settings", default="", help="JSON file with the app's settings")
     parser.add_argument("--engine", default="", help="JSON file with options of the DUE engine")
     parser.add_argument("--directory", default="", help="folder for spool and embedded defaults")
-    parser.add_argument("--instances", default="", choices=("", "standby", "shared"))
+    parser.add_argument("--instances", default="", choices=("", *get_args(Instances)))
     parser.add_argument("--log", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument("--log-format", default="console", choices=("console", "json"))
     parser.add_argument(

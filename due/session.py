@@ -34,6 +34,7 @@ from due.membership import MOST_DECLARED, Member, Registration
 from due.messages import Assignment, AssignmentCallback, Capability, Interest
 from due.observation import Observation
 from due.sender import BatchSender
+from due.shards import ShardState, ShardWork
 from due.threads import Failed
 from due.write_admission import WriteAdmission
 
@@ -80,6 +81,8 @@ class Session:
         self.keeper = HeartbeatThread(
             member, control, self.publisher, self.dispatcher, pause=pause, failed=self._died
         )
+        if registration.instances == "sharded":
+            self.dispatcher.shards = ShardWork(receiver, self.dispatcher.tracker, self.keeper)
         self.keeper.say, self.keeper.changed = self._say, self._changed
         self.keeper.written = self._written
         self.gate = WriteAdmission(self.keeper, self.publisher, options.handshake_bytes)
@@ -264,6 +267,15 @@ class Session:
                 self._declared = interests
             self._declare_interests()
         self.keeper.wake()
+
+    def keep_state(self, state: ShardState, every: float) -> None:
+        """See `Engine.keep_state`."""
+        self.check()
+        if self.dispatcher.shards is None:
+            raise InvalidOption('keep_state is for apps with instances="sharded"')
+        if self._observed:
+            raise InvalidOption("keep_state comes before the first subscription")
+        self.dispatcher.shards.keep(state, every)
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """See `Engine.on_assignments`."""

@@ -22,7 +22,7 @@ can write to the server and imitates an instance's numbers exactly can still rep
 import logging
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from due.codec import Frame
@@ -128,6 +128,24 @@ class Tracker:
             del self._expected[name]
             self._left_off.pop(name, None)
 
+    def place(self, path: str) -> dict[tuple[str, str], int]:
+        """The number that comes next of each (instance, key) under a path."""
+        return {name: number for name, number in self._expected.items() if _path_of(name[1]) == path}
+
+    def resume(self, path: str, place: Mapping[tuple[str, str], int]) -> None:
+        """Go on from a place: frames before it are repeats."""
+        self.leave(path)
+        for name, number in place.items():
+            self._make_space(self._expected)
+            self._expected[name] = number
+
+    def leave(self, path: str) -> None:
+        """Forget what was seen under a path: another instance reads it."""
+        for name in [name for name in self._expected if _path_of(name[1]) == path]:
+            del self._expected[name]
+            self._left_off.pop(name, None)
+            self._rested.discard(name)
+
     def rested(self) -> None:
         """This instance did not read for a while; another one of its app may have."""
         self._rested = set(self._expected)
@@ -172,7 +190,7 @@ class Tracker:
             del self._left_off[name]
 
     def _current(self, frame: Frame) -> bool:
-        path = (frame.app_id, frame.key.partition(":")[0])
+        path = (frame.app_id, _path_of(frame.key))
         known = self._epochs.get(path)
         if known is None:
             self._make_space(self._epochs)
@@ -205,3 +223,7 @@ class Tracker:
     def _make_space(self, table: OrderedDict[Any, Any]) -> None:
         if len(table) >= self._remember:
             table.popitem(last=False)
+
+
+def _path_of(key: str) -> str:
+    return key.partition(":")[0]

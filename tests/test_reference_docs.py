@@ -168,6 +168,12 @@ def test_onboarding_shows_the_examples(example, mark):
     assert len(lines) <= 10
 
 
+def test_onboarding_shows_the_example_with_state():
+    source = (ROOT / "examples" / "sharded_totals.py").read_text(encoding="utf-8")
+    code = source.split("# [totals]\n")[1].split("# [/totals]")[0].strip()
+    assert code in (DOCS / "onboarding.md").read_text(encoding="utf-8")
+
+
 def test_documentation_builds_without_a_warning_and_works_offline(tmp_path):
     """`mkdocs build --strict` is content, and no page loads anything from elsewhere."""
     if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("material") is None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from due import NO_WAIT, PUB_ONLY, RecordBatch
+from due import NO_WAIT, PUB_ONLY, Capability, RecordBatch
 from tests.due.conftest import wait_for
 from tests.requirements import require_program
 
@@ -69,6 +69,25 @@ def test_the_analyser_sees_alerts(server, make_engine, tmp_path):
         wait_for(lambda: received.count(3) >= 2)
         said, _ = process.communicate("\n", timeout=30)
     assert said.strip() == "[('10.0.0.1', 2), ('10.0.0.2', 1)]"
+
+
+def test_totals_go_on_in_the_next_process(server, make_engine, tmp_path):
+    climate = [Capability("house.climate.**", delivery="reliable")]
+    thermometer = make_engine("thermometer", init={"capabilities": climate})
+    reader = make_engine("reader", archive=f"sqlite://{tmp_path / 'a.db'}")
+
+    def total() -> object:
+        found = reader.get("house.total.counter.**", limit=1)
+        return found[-1].value["state"] if found else 0
+
+    for rounds in (1, 2):
+        with _start("sharded_totals.py", server, tmp_path) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("Enter")
+            for _ in range(10):
+                thermometer.write("house.climate.thermometer.attic", 21.5, [PUB_ONLY])
+            wait_for(lambda rounds=rounds: total() == 10 * rounds)
+            process.communicate("\n", timeout=30)
 
 
 def test_the_foreign_detector_scores(server, make_engine, tmp_path):

@@ -3,15 +3,20 @@
 import os
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
-from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Options
+from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Item, Options
+from due.shard_archive import ArchivedStates
+from due.shards import Place
 
 KEY = "fault.stream"
 SPEECH = "fault.speech.speaker"
+LINKS = "fault.link"
+CHAINS = "fault.chain"
 OPTIONS = Options(coordinated=False, window_bytes=4 << 20, backlog_bytes=4 << 20)
 
 
@@ -104,6 +109,48 @@ def listen(url: str) -> None:
     sys.stdin.readline()
 
 
+class Chain:
+    """A state that tells whether every item counted once, and in order."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._saved = ArchivedStates(engine, CHAINS)
+        self._chains: dict[str, list[int]] = {}
+
+    def load(self, path: str) -> Place | None:
+        found = self._saved.load(path)
+        self._chains[path] = found[0] if found else [0, 0]
+        print("loaded", path, self._chains[path][0], flush=True)
+        return found[1] if found else None
+
+    def save(self, path: str, place: Place) -> None:
+        self._saved.save(path, list(self._chains[path]), place)
+
+    def drop(self, path: str) -> None:
+        del self._chains[path]
+
+    def take(self, item: Item) -> None:
+        chain = self._chains[item.key]
+        self._chains[item.key] = [chain[0] + 1, linked(chain[1], item.value)]
+
+
+def linked(chain: int, number: int) -> int:
+    """The chain with one more number."""
+    return zlib.crc32(b"%d %d" % (chain, number))
+
+
+def chain(url: str, folder: str) -> None:
+    """One of several instances of a sharded app."""
+    engine = Engine(Options(heartbeat=0.2, directory=folder, archive=f"sqlite:///{folder}/archive.db"))
+    engine.set_pubsub(url)
+    engine.init("chainer", instances="sharded")
+    state = Chain(engine)
+    engine.keep_state(state, every=0.5)
+    engine.observe(f"{LINKS}.*").subscribe(state.take)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    engine.close()
+
+
 def shift_clock(file: Path) -> None:
     """From now on this process' wall clock is off by as many seconds as the file says at the moment."""
     real = time.time_ns
@@ -119,5 +166,6 @@ if __name__ == "__main__":
         "consume": consume,
         "speak": speak,
         "listen": listen,
+        "chain": chain,
     }
     programs[sys.argv[1]](*sys.argv[2:])
