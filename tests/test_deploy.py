@@ -25,9 +25,11 @@ from due import Engine
 from due import metrics as due_metrics
 from due import service as due_service
 from sdnator import __version__
+from sdnator.cli.main import COMMANDS
 from sdnator.p4_program import find
 from sdnator.supervisor.metrics import part_metrics
-from tests.requirements import optional_program
+from sdnator.up import metrics_targets
+from tests.requirements import require_program
 
 yaml = pytest.importorskip("yaml", reason="PyYAML, which comes with mkdocs, is not installed")
 
@@ -197,10 +199,25 @@ def expressions():
     for panel in dashboard["panels"]:
         for target in panel.get("targets", []):
             yield panel["title"], target["expr"]
-    rules = yaml.safe_load((DEPLOY / "alerts.yml").read_text(encoding="utf-8"))
-    for group in rules["groups"]:
-        for rule in group["rules"]:
+    for rule in alerting_rules():
+        if not rule["expr"].startswith("up{"):  # Prometheus' own
             yield rule["alert"], rule["expr"]
+
+
+def alerting_rules():
+    """The rules of alerts.yml."""
+    read = yaml.safe_load((DEPLOY / "alerts.yml").read_text(encoding="utf-8"))
+    return [rule for group in read["groups"] for rule in group["rules"]]
+
+
+def panel_targets():
+    """(PromQL, legend) of every curve and figure of the Grafana dashboard."""
+    dashboard = json.loads((DEPLOY / "grafana/dashboards/sdnator.json").read_text(encoding="utf-8"))
+    return [
+        (target["expr"], target.get("legendFormat", ""))
+        for panel in dashboard["panels"]
+        for target in panel.get("targets", [])
+    ]
 
 
 @pytest.mark.parametrize(("where", "expression"), list(expressions()), ids=lambda value: str(value)[:60])
@@ -209,6 +226,44 @@ def test_metrics_of_dashboard_and_alerts_exist(exported, where, expression):
     named = re.findall(rf"\b(?:{PREFIXES})_\w+", re.sub(r'"[^"]*"', "", expression))
     assert named
     assert set(named) <= exported
+
+
+def promtool(*words):
+    """What the tool of Prometheus says of our files; it must find them good."""
+    done = subprocess.run(
+        [require_program("promtool"), *words],
+        cwd=DEPLOY,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_prometheus_takes_configuration_and_rules():
+    """With the rules that the configuration names."""
+    assert f"{len(alerting_rules())} rules found" in promtool("check", "config", "prometheus.yml")
+
+
+def test_alerting_rules_fire_when_they_should():
+    """Each of them is tried, in a case in which it fires with its text and in one in which it does not."""
+    assert "SUCCESS" in promtool("test", "rules", "alerts.test.yml")
+    tried = yaml.safe_load((DEPLOY / "alerts.test.yml").read_text(encoding="utf-8"))["tests"]
+    fired = {
+        case["alertname"] for test in tried for case in test.get("alert_rule_test", ()) if case["exp_alerts"]
+    }
+    assert fired == {rule["alert"] for rule in alerting_rules()}
+
+
+def test_alerts_know_the_jobs_that_are_scraped():
+    """`MetricsAway` looks at the jobs of prometheus.yml and at that of the file which `up` writes."""
+    read = yaml.safe_load((DEPLOY / "prometheus.yml").read_text(encoding="utf-8"))
+    jobs = {job["job_name"] for job in read["scrape_configs"]}
+    jobs |= {group["labels"]["job"] for group in metrics_targets.targets({"kitsune": "127.0.0.1:9472"})}
+    (looked,) = (rule["expr"] for rule in alerting_rules() if rule["alert"] == "MetricsAway")
+    assert set(re.findall(r'=~"([^"]+)"', looked)[0].split("|")) == jobs
 
 
 def test_dashboard_uses_the_provisioned_data_source():
@@ -268,6 +323,7 @@ def test_nftables_has_the_right_that_it_needs_and_no_other_app_has_it():
 
 def test_the_bill_of_materials_is_about_this_release(tmp_path, monkeypatch):
     """Its main component has the version, which the project's file does not hold."""
+    monkeypatch.syspath_prepend(DEPLOY)
     loaded = spec_from_file_location("make_dist", DEPLOY / "make_dist.py")
     make_dist = module_from_spec(loaded)
     loaded.loader.exec_module(make_dist)
@@ -284,7 +340,7 @@ def test_the_bill_of_materials_is_about_this_release(tmp_path, monkeypatch):
 
 def test_units_are_what_systemd_understands(tmp_path):
     """`systemd-analyze verify` finds nothing to say, with our programs where they are here."""
-    analyze = optional_program("systemd-analyze")
+    analyze = require_program("systemd-analyze")
     programs = str(Path(sys.executable).parent)
     for unit in UNITS:
         text = unit.read_text(encoding="utf-8").replace("/opt/sdnator/bin/start-", f"{DEPLOY}/start-")
@@ -295,3 +351,17 @@ def test_units_are_what_systemd_understands(tmp_path):
     )
     ours = [line for line in done.stderr.splitlines() if "sdnator" in line]
     assert not ours
+
+
+def test_the_man_page_is_one():
+    """mandoc misses nothing but a date, which a page made from the code has not, and shows every command."""
+    said = {}
+    for form in ("lint", "ascii"):
+        done = subprocess.run(
+            [require_program("mandoc"), "-T", form, "-W", "warning", "sdnator.1"],
+            cwd=ROOT / "docs" / "reference", capture_output=True, text=True, check=False, timeout=60,
+        )  # fmt: skip
+        said[form] = done.stdout
+    assert [line for line in said["lint"].splitlines() if "missing date" not in line] == []
+    shown = re.sub(".\b", "", said["ascii"])
+    assert [name for name in COMMANDS if f"sdnator {name}" not in shown] == []
