@@ -1,7 +1,8 @@
 """Builds what a release consists of, in `dist/`, and tries it: `make dist`.
 
     tracked files ─► sdist ─► wheel of this machine ─► empty environment ─► `sdnator demo`, bill of materials
-                          └─► wheel for aarch64, where its compiler is installed
+                          │                         └─► `uv tool install` and `pipx install` into empty homes
+                          └─► wheel for aarch64, where its compiler is installed ─► tried under qemu, where that is
     all of them ─► SHA256SUMS
 
 Wheels are built from the sdist, so that a file which the sdist lacks is noticed here.
@@ -21,6 +22,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+# a script beside this one: its folder is where Python looks first
+from try_aarch64 import TrialFailed, missing, try_aarch64
+
 from sdnator import __version__
 
 ROOT: Final = Path(__file__).resolve().parent.parent
@@ -28,6 +32,8 @@ KERNEL: Final = "apps/kitsune/_kernel.so"
 MACHINES: Final = {"x86_64": 62, "aarch64": 183}
 """Names of processors and their numbers in the header of an ELF file."""
 CROSS_COMPILER: Final = "aarch64-linux-gnu-gcc"
+INSTALLERS: Final = {"uv": ("uv", "tool", "install"), "pipx": ("pipx", "install")}
+"""What the documentation names besides pip; both come with the extra `release`."""
 
 
 class DistError(Exception):
@@ -82,11 +88,58 @@ def wheel_for(machine: str, sdist: Path, out: Path) -> Path:
         return Path(shutil.copy(named, out))
 
 
+def compiles(compiler: str) -> bool:
+    """Whether there is such a compiler, with the headers of a C library."""
+    if shutil.which(compiler) is None:
+        return False
+    command = (compiler, "-fsyntax-only", "-x", "c", "-include", "math.h", os.devnull)
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+def wheel_for_others(sdist: Path, out: Path) -> Path | None:
+    """A wheel for aarch64, where it is another processor and there is a compiler for it.  Raises DistError."""
+    if os.uname().machine == "aarch64":
+        return None
+    if not compiles(CROSS_COMPILER):
+        lacks = "Debian: gcc-aarch64-linux-gnu and libc6-dev-arm64-cross"
+        print(f"==> no wheel for aarch64: {CROSS_COMPILER} or its headers are not installed ({lacks})")
+        return None
+    return wheel_for("aarch64", sdist, out)
+
+
+def try_foreign(wheel: Path, here: Path, base: Path) -> None:
+    """Run a wheel for aarch64 as far as this machine can.  Raises DistError."""
+    if lacking := missing():
+        print(f"==> {wheel.name} was not tried: no {', no '.join(lacking)}")
+        return
+    folder = base / "aarch64"
+    folder.mkdir()
+    try:
+        try_aarch64(wheel, here, folder)
+    except TrialFailed as error:
+        raise DistError(f"{wheel.name}: {error}") from None
+    print(f"==> {wheel.name} finds under qemu what the wheel of this machine finds")
+
+
 def empty_environment(base: Path, wheel: Path) -> Path:
     """The scripts' folder of an environment that holds the wheel and what it needs."""
     venv.create(base, with_pip=True)
     run(base / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel)
     return base / "bin"
+
+
+def try_installers(wheel: Path, base: Path) -> None:
+    """Install the wheel into empty homes as people do, and run what was installed.  Raises DistError."""
+    for name, words in INSTALLERS.items():
+        home = base / name
+        home.mkdir()
+        places = {"HOME": home, "XDG_DATA_HOME": home / ".local/share", "XDG_BIN_HOME": home / ".local/bin"}
+        places |= {"PIPX_HOME": home / "pipx", "PIPX_BIN_DIR": home / ".local/bin"}
+        more = {variable: str(place) for variable, place in places.items()} | {"UV_PYTHON_DOWNLOADS": "never"}
+        run(*words, wheel, folder=home, more=more)
+        for asked in (("--version",), ("queries", "list")):
+            run(home / ".local/bin/sdnator", *asked, folder=home, more=more)
+        print(f"==> {' '.join(words)} works")
 
 
 def bill_of(python: Path, bill: Path) -> None:
@@ -115,14 +168,14 @@ def make(out: Path, *, demo: bool) -> None:
         run(sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", out, base / "source")
         (sdist,) = out.glob("*.tar.gz")
         here = wheel_for(os.uname().machine, sdist, out)
-        if os.uname().machine == "aarch64" or shutil.which(CROSS_COMPILER) is None:
-            print(f"==> no wheel for another processor: {CROSS_COMPILER} is not installed")
-        else:
-            wheel_for("aarch64", sdist, out)
+        foreign = wheel_for_others(sdist, out)
         scripts = empty_environment(base / "environment", here)
         bill = out / f"{sdist.name.removesuffix('.tar.gz')}.cdx.json"
         bill_of(scripts / "python", bill)
         run(scripts / "sdnator", "--version", folder=base)
+        try_installers(here, base)
+        if foreign is not None:
+            try_foreign(foreign, scripts / "python", base)
         if demo:
             run(scripts / "sdnator", "demo", folder=base)
     check_sums([path for path in out.iterdir() if path.is_file()], out)

@@ -321,12 +321,62 @@ def test_nftables_has_the_right_that_it_needs_and_no_other_app_has_it():
         assert find_spec(f"apps.enforcers.{enforcer}.service")
 
 
+def script(name, monkeypatch):
+    """A program of `deploy/` as a module, which finds its neighbours as when it runs."""
+    monkeypatch.syspath_prepend(DEPLOY)
+    loaded = spec_from_file_location(name, DEPLOY / f"{name}.py")
+    module = module_from_spec(loaded)
+    loaded.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("score", "differs"),
+    [
+        ("0.25", ""),
+        ("0.25000000000000006", ""),
+        ("0.2500000001", "scores.csv"),
+        ("0.25", "features.npy"),
+        ("0.25", "alerts.csv"),
+    ],
+)
+def test_a_foreign_wheel_must_find_what_ours_finds(tmp_path, monkeypatch, score, differs):
+    """Whichever of the files that are compared differs, the wheel is refused with its name; a score's last bit may."""
+    trial = script("try_aarch64", monkeypatch)
+
+    def run(_, program, *words, **__):
+        if trial.SCORES in words:
+            out, foreign = Path(words[-1]), program == "qemu-aarch64-static"
+            out.mkdir()
+            for name in trial.EQUAL:
+                (out / name).write_text(f"{foreign and name == differs}")
+            (out / trial.SCORES_FILE).write_text(f"index,score\n0,{score if foreign else 0.25}\n")
+        return "aarch64 3.11.2\n"
+
+    monkeypatch.setattr(trial, "_run", run)
+    monkeypatch.setattr(trial, "_foreign_root", lambda folder: folder / "usr/bin/python3.11")
+    arguments = (tmp_path / "a.whl", Path("here"), tmp_path)
+    if not differs:
+        trial.try_aarch64(*arguments)
+        return
+    with pytest.raises(trial.TrialFailed, match=f"{differs} of aarch64 differs"):
+        trial.try_aarch64(*arguments)
+
+
+def test_a_compiler_without_headers_is_none(tmp_path, monkeypatch):
+    """Debian's cross compiler comes without those of the C library, which are a package of their own."""
+    make_dist = script("make_dist", monkeypatch)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for code, works in ((0, True), (1, False)):
+        (tmp_path / "some-gcc").write_text(f"#!/bin/sh\nexit {code}\n", encoding="utf-8")
+        (tmp_path / "some-gcc").chmod(0o755)
+        assert make_dist.compiles("some-gcc") is works
+    assert make_dist.compiles("no-such-gcc") is False
+
+
 def test_the_bill_of_materials_is_about_this_release(tmp_path, monkeypatch):
     """Its main component has the version, which the project's file does not hold."""
-    monkeypatch.syspath_prepend(DEPLOY)
-    loaded = spec_from_file_location("make_dist", DEPLOY / "make_dist.py")
-    make_dist = module_from_spec(loaded)
-    loaded.loader.exec_module(make_dist)
+    make_dist = script("make_dist", monkeypatch)
 
     def written(*words):
         told = {"metadata": {"component": {"name": "sdnator"}}, "components": []}
@@ -336,6 +386,27 @@ def test_the_bill_of_materials_is_about_this_release(tmp_path, monkeypatch):
     make_dist.bill_of(Path(sys.executable), tmp_path / "bill.json")
     told = json.loads((tmp_path / "bill.json").read_text(encoding="utf-8"))
     assert told["metadata"]["component"] == {"name": "sdnator", "version": __version__}
+
+
+def test_units_of_the_documents_exist_with_what_they_read():
+    """Each unit that an operator is told to enable is there, its settings too, and its files are in the table."""
+    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    told = {
+        unit
+        for line in re.findall(r"^# systemctl enable --now (.*)$", page, re.MULTILINE)
+        for unit in line.split()
+    }
+    files = {unit.name.partition(".service")[0]: unit.read_text(encoding="utf-8") for unit in UNITS}
+    assert {unit.partition("@")[0] + "@" * ("@" in unit) for unit in told} == files.keys() - {"sdnator"}
+    for unit in told:
+        name, _, instance = unit.partition("@")
+        text = files[name + "@" * bool(instance)].replace("%i", instance)
+        for file in re.findall(r"^EnvironmentFile=-?/etc/sdnator/(\S+)$", text, re.MULTILINE):
+            assert f"`{file}`" in page, file
+        for file in re.findall(r"--settings /etc/sdnator/(\S+)", text):
+            assert (DEPLOY / "settings" / file).is_file()
+        for module in re.findall(r"python -m (\S+)", text):
+            assert find_spec(module), module
 
 
 def test_units_are_what_systemd_understands(tmp_path):
