@@ -66,7 +66,7 @@ def threshold(value: float | None) -> dict[str, Any]:
         "silent": True,
         "symbol": "none",
         "lineStyle": {"color": AMBER, "type": "dashed", "width": 1.5},
-        "label": {"formatter": "threshold\n{c}", "position": "end", "color": AMBER},
+        "label": {"formatter": "threshold\n{c}", "position": "end", "color": AMBER, "lineHeight": 15},
         "data": [] if value is None else [{"yAxis": value}],
     }
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _SHOWN = 50
 _PAGE = 8
 """Rows of a list that are on show at once."""
+_LONG = 4
+"""The same for alerts, each of which is a paragraph."""
 _LISTS_SECONDS = 1.0
 """Lists change no more often: people read them, and press buttons in them."""
 _ENTRY = """
@@ -81,12 +83,12 @@ def _table(name: str, *labels: str) -> ui.table:
     return table
 
 
-def _fill(table: ui.table, rows: list[dict[str, Any]]) -> None:
+def _fill(table: ui.table, rows: list[dict[str, Any]], page: int = _PAGE) -> None:
     """Show these rows, and a way to turn pages only where there are some."""
     if table.rows == rows:
         return
     table.rows = rows
-    if len(rows) > _PAGE:
+    if len(rows) > page:
         table.props(remove="hide-pagination")
     else:
         table.props("hide-pagination")
@@ -123,43 +125,52 @@ class OverviewPanel:
             with _panel("Anomaly scores; a gap is silence", wide=True):
                 chart = ui.echart(score_chart(), renderer="svg").style("height: 260px; width: 100%")
                 self._chart = chart.classes("scores")
-            self._lists_of_decisions()
-            with _panel("Traffic by port"):
-                self._ports = _table("ports", "port", "forwarded/s", "bits/s", "dropped/s", "dropped in all")
-                self._ports.add_slot(
-                    "no-data", '<div class="nothing">no switch forwards or drops by an entry yet</div>'
-                )
-            with _panel("Top talkers"):
-                self._talkers = _table("talkers", "sender", "from", "bits/s", "packets/s", "share")
-                self._talkers.add_slot(
-                    "no-data", '<div class="nothing">no packet has been counted for ten seconds</div>'
-                )
-            with _panel("Requests to the switches"):
-                self._asked = self._feed("asked", "", "no switch has reported yet")
-            with _panel("Training"):
-                self._progress = ui.linear_progress(0.0, show_value=False).props('aria-label="training"')
-                self._model = ui.label("").classes("quiet model").style("white-space: pre-line")
+            with ui.element("div").classes("stack"):
+                self._decisions = self._list_of_decisions()
+                with _panel("Traffic by port"):
+                    names = ("port", "forwarded/s", "bits/s", "dropped/s", "dropped in all")
+                    self._ports = _table("ports", *names)
+                    self._ports.add_slot(
+                        "no-data", '<div class="nothing">no switch forwards or drops by an entry yet</div>'
+                    )
+                with _panel("Requests to the switches"):
+                    self._asked = self._feed("asked", "", "no switch has reported yet")
+                with _panel("Training"):
+                    self._progress = ui.linear_progress(0.0, show_value=False)
+                    self._progress.props('aria-label="training"')
+                    self._model = ui.label("").classes("quiet model").style("white-space: pre-line")
+            with ui.element("div").classes("stack"):
+                with _panel("Alerts"):
+                    self._alerts = self._feed("alerts", "", "no alerts", _LONG)
+                with _panel("Top talkers"):
+                    self._talkers = _table("talkers", "sender", "from", "bits/s", "packets/s", "share")
+                    self._talkers.add_slot(
+                        "no-data", '<div class="nothing">no packet has been counted for ten seconds</div>'
+                    )
 
-    def _lists_of_decisions(self) -> None:
+    def _list_of_decisions(self) -> ui.table:
         with _panel("Blocks and guards"):
             undo = _button("undo", ':label="props.row.undo"', "undo", 'v-if="props.row.undo"')
             buttons = undo + _button("allow", 'label="Allow"', "verified_user", 'v-if="props.row.allow"')
             wrong = 'v-if="props.row.false_alarm"'
             buttons += _button("false_alarm", 'label="False alarm"', "school", wrong)
-            self._decisions = self._feed("decisions", buttons, "nothing is blocked, guarded or limited")
-            self._decisions.on("undo", self._undo)
-            self._decisions.on("allow", self._allow)
-            self._decisions.on("false_alarm", self._false_alarm)
-        with _panel("Alerts"):
-            self._alerts = self._feed("alerts", "", "no alerts")
+            decisions = self._feed("decisions", buttons, "nothing is blocked, guarded or limited")
+            decisions.on("undo", self._undo)
+            decisions.on("allow", self._allow)
+            decisions.on("false_alarm", self._false_alarm)
+        return decisions
 
     def _spoken(self, figure: str) -> str:
         """The name of a figure, with the time that it is about where it is no state of now."""
-        return f"{figure}, {self._history_s:.0f} s" if figure == "above the threshold" else figure
+        return (
+            f"{figure}, {self._history_s:.0f}\N{NO-BREAK SPACE}s"
+            if figure == "at or above the threshold"
+            else figure
+        )
 
-    def _feed(self, name: str, buttons: str, nothing: str) -> ui.table:
+    def _feed(self, name: str, buttons: str, nothing: str, page: int = _PAGE) -> ui.table:
         columns = [{"name": "target", "label": "", "field": "target", "align": "left"}]
-        table = ui.table(rows=[], columns=columns, row_key="id", pagination=_PAGE)
+        table = ui.table(rows=[], columns=columns, row_key="id", pagination=page)
         table.classes(f"feed {name}").props("flat dense hide-header hide-pagination rows-per-page-label=rows")
         table.add_slot("no-data", f'<div class="nothing">{nothing}</div>')
         table.add_slot("body", _ENTRY.replace("BUTTONS", buttons if self._acting.allowed else ""))
@@ -195,7 +206,7 @@ class OverviewPanel:
             self._drawn = now
             self._draw(points, limit, now)
         for name, found in rows.items():
-            _fill(self._tables()[name], found)
+            _fill(self._tables()[name], found, _LONG if name == "alerts" else _PAGE)
         for name, text in figures.items():
             if self._numbers[name].text != text:
                 self._numbers[name].set_text(text)

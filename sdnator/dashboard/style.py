@@ -9,10 +9,13 @@ body { font-variant-numeric: tabular-nums; }
 .nicegui-content { padding: 12px; gap: 12px; max-width: 1500px; margin: 0 auto; width: 100%; }
 .board { display: grid; gap: 12px; width: 100%; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); }
 .board > .wide { grid-column: 1 / -1; }
+.board > .stack { display: grid; gap: 12px; align-content: start; min-width: 0; }
 .health { border-radius: 8px; padding: 10px 14px; font-size: 1.05rem; font-weight: 500; width: 100%; color: #fff; }
 .health.well { background: #1b6e3a; } .health.notice { background: #8a5200; } .health.trouble { background: #b71c1c; }
 .scores svg text, .flow svg text { fill: currentColor !important; stroke: none !important; }
-.body--dark .text-primary { color: #8dbdf0 !important; }
+.flow svg text { paint-order: stroke; stroke: #fff !important; stroke-width: 3px !important; }
+.body--dark .flow svg text { stroke: #121212 !important; }
+.body--dark .text-primary { --q-primary: #8dbdf0; }
 summary { cursor: pointer; list-style: none; text-decoration: underline; }
 :focus-visible { outline: 2px solid #2f6fb3; outline-offset: 1px; }
 .body--dark :focus-visible { outline-color: #8dbdf0; }
@@ -46,12 +49,20 @@ summary { cursor: pointer; list-style: none; text-decoration: underline; }
 .form { display: flex; gap: 8px; flex-wrap: wrap; align-items: center; width: 100%; }
 @media (max-width: 900px) {
   .board { grid-template-columns: minmax(0, 1fr); }
+  .board > .stack { display: contents; } .stack > :nth-child(2) { order: 1; } .stack > :nth-child(n + 3) { order: 2; }
   .figures { grid-template-columns: repeat(3, minmax(0, 1fr)); }
   .nicegui-content { padding: 8px; gap: 8px; }
+  .flow svg text[style*="font-size: 10px"] { display: none; }
   .q-tab__icon { display: none; } .q-tab { padding: 0 7px; min-width: 0; } .q-tab__label { font-size: .8rem; }
   .bar .q-btn__content .block { display: none; } .bar { gap: 4px; padding: 2px 8px; flex-wrap: nowrap; }
   .bar .who { overflow: hidden; text-overflow: ellipsis; white-space: nowrap; min-width: 0; }
   .plain td, .plain th { padding: 4px 5px !important; } .plain th { white-space: normal !important; }
+  .plain th:not(.sorted) .q-table__sort-icon { display: none; }
+  .queries td, .operators td, .counters td, .found td { overflow-wrap: anywhere !important; min-width: 48px; }
+  .queries td:first-child, .operators td:first-child { white-space: normal !important; min-width: 120px; }
+  .found thead { display: none; } .found tr, .found td { display: block; width: 100%; height: auto !important; }
+  .found td { border: 0 !important; padding: 1px 5px !important; } .found tr { padding: 5px 0; border-bottom: 1px solid #8884; }
+  .instances :is(td, th):is(:nth-child(3), :nth-child(4), :nth-child(5)), .counters :is(td, th):nth-child(4) { display: none; }
   .entry { flex-wrap: wrap; } .entry .text { flex-basis: 70%; }
   .entry .side { margin-left: 14px; }
 }

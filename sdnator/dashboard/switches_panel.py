@@ -13,8 +13,16 @@ if TYPE_CHECKING:
 
 
 def _columns(*named: tuple[str, str]) -> list[dict[str, Any]]:
+    """Numbers are aligned right, and grouped by thousands as everywhere else."""
     return [
-        {"name": name, "label": name, "field": name, "align": align, "sortable": True}
+        {
+            "name": name,
+            "label": name,
+            "field": name,
+            "align": align,
+            "sortable": True,
+            **({":format": "(value) => value.toLocaleString('en')"} if align == "right" else {}),
+        }
         for name, align in named
     ]
 
