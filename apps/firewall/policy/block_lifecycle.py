@@ -94,13 +94,44 @@ class BlockLifecycle:
     _recent: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_RECENT))
     _said: dict[str, int] = field(default_factory=dict)
     _ids: deque[str] = field(default_factory=lambda: deque(maxlen=_NEW_IDS))
+    _held: int = 0
+    _by_address: dict[str, dict[str, int]] = field(default_factory=dict)
+    """MAC or address to the ids of its blocks, each with its place in the order of blocking."""
+    _prefixes: dict[str, int] = field(default_factory=dict)
+    """The same for blocks of prefixes."""
 
     def covering(self, sender: Sender) -> Block | None:
-        """The block in force that already stops this sender."""
-        for block in self.blocks.values():
-            if block.decision.switch in (sender.switch, "*") and _stops(block.decision.target, sender):
+        """The block in force that already stops this sender, the oldest of several."""
+        found = [
+            place for each in {sender.mac, sender.ip} for place in self._by_address.get(each, {}).items()
+        ]
+        for name, _ in sorted([*found, *self._prefixes.items()], key=lambda place: place[1]):
+            block = self.blocks.get(name)
+            if block is None or block.decision.switch not in (sender.switch, "*"):
+                continue
+            if _stops(block.decision.target, sender):
                 return block
         return None
+
+    def _hold(self, block: Block) -> None:
+        decision = block.decision
+        self.blocks[decision.id] = block
+        self._held += 1
+        self._places(decision).setdefault(decision.id, self._held)
+
+    def _release(self, decision_id: str) -> Block | None:
+        block = self.blocks.pop(decision_id, None)
+        if block is not None:
+            decision = block.decision
+            places = self._places(decision)
+            places.pop(decision_id, None)
+            if not places:
+                self._by_address.pop(decision.target.address, None)
+        return block
+
+    def _places(self, decision: Decision) -> dict[str, int]:
+        address = decision.target.address
+        return self._prefixes if "/" in address else self._by_address.setdefault(address, {})
 
     def on_probation(self, sender: Sender, now: int) -> bool:
         """True if a block of this sender was lifted less than ten minutes ago."""
@@ -168,7 +199,7 @@ class BlockLifecycle:
             first_packet=first_packet,
         )
         block = Block(decision, training_rate, deque([(now, 0)]), host=host or target.address)
-        self.blocks[decision.id] = block
+        self._hold(block)
         self._recent.append(now)
         return decision
 
@@ -190,7 +221,7 @@ class BlockLifecycle:
             if decision.action == "block":
                 readings = deque([(decision.event_time, 0)])
                 block = Block(decision, 0.0, readings, "restored", decision.target.address)
-                self.blocks[decision.id] = block
+                self._hold(block)
 
     def matching(self, subject: str) -> list[Decision]:
         """Blocks in force with this id or address."""
@@ -199,7 +230,7 @@ class BlockLifecycle:
 
     def lift(self, decision_id: str, now: int, reason: str) -> Decision | None:
         """End a block early, without probation; None if there is none."""
-        block = self.blocks.pop(decision_id, None)
+        block = self._release(decision_id)
         if block is None:
             return None
         return _changed(block.decision, now, action="unblock", reason=reason)
@@ -211,7 +242,7 @@ class BlockLifecycle:
             return
         block.state = confirmation.state
         if confirmation.state in {"failed", "removed", "expired"}:
-            del self.blocks[confirmation.id]
+            self._release(confirmation.id)
 
     def count_drops(self, decision_id: str, packets: int, now: int) -> None:
         """Record a value of a block's drop counter."""
@@ -231,7 +262,7 @@ class BlockLifecycle:
     def _end(self, block: Block, now: int) -> Decision:
         old = block.decision
         if block.is_asked_for:
-            del self.blocks[old.id]
+            self._release(old.id)
             return _changed(old, now, action="unblock", reason="the time that was asked for is over")
         floor = max(block.training_rate * STILL_GOING_RATIO, STILL_GOING_FLOOR)
         if block.drop_rate > floor and not old.dry_run:
@@ -243,7 +274,7 @@ class BlockLifecycle:
             )
             block.decision = extended
             return extended
-        del self.blocks[old.id]
+        self._release(old.id)
         key = (old.switch, old.target.kind, old.target.address)
         self.probation = {each: until for each, until in self.probation.items() if until > now}
         self.probation[key] = now + PROBATION_S * SECOND

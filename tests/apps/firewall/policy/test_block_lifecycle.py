@@ -1,5 +1,8 @@
 """The life of a block: expiry, extension, probation, escalation, caps."""
 
+import ipaddress
+from random import Random
+
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.rules import Rules
 from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
@@ -55,6 +58,57 @@ def test_block_covers_its_station_and_nobody_else():
     assert ledger.covering(CAMERA) is not None
     assert ledger.covering(Sender(switch="s1", port=2, mac=CAMERA.mac, ip=CAMERA.ip)) is None
     assert ledger.covering(Sender(switch="s2", port=1, mac=CAMERA.mac, ip=CAMERA.ip)) is None
+
+
+def covering_by_a_look_at_each(ledger: BlockLifecycle, sender: Sender) -> str | None:
+    for block in ledger.blocks.values():
+        target = block.decision.target
+        covered = sender.ip != "" and (
+            ipaddress.ip_address(sender.ip) in ipaddress.ip_network(target.address)
+            if "/" in target.address
+            else target.address == sender.ip
+        )
+        if target.kind == "mac":
+            covered = target.address == sender.mac and target.port in (None, sender.port)
+        if covered and block.decision.switch in (sender.switch, "*"):
+            return block.decision.id
+    return None
+
+
+def test_the_oldest_of_several_blocks_covers():
+    """As a look at each block in force would find it, however they come and go."""
+    random = Random(7)
+    targets = [
+        *(
+            Target(kind="mac", address=f"02:00:00:00:00:0{n}", port=port)
+            for n in (1, 2)
+            for port in (None, 1)
+        ),
+        *(Target(kind="ip", address=each) for each in ("10.0.0.1", "10.0.0.2", "fd00::1", "10.0.0.0/31")),
+    ]
+    senders = [
+        Sender(switch=switch, port=port, mac=f"02:00:00:00:00:0{n}", ip=ip)
+        for switch in ("s1", "s2")
+        for port in (1, 2)
+        for n in (1, 3)
+        for ip in ("", "10.0.0.1", "10.0.0.3", "fd00::1")
+    ]
+    ledger = BlockLifecycle(Rules())
+    kinds = set()
+    for at in range(300):
+        step = random.random()
+        if step < 0.5:
+            ledger.open(random.choice(["s1", "s2", "*"]), random.choice(targets), "", (), at * SECOND)
+        elif ledger.blocks and step < 0.9:
+            ledger.lift(random.choice([*ledger.blocks]), at * SECOND, "by hand")
+        elif ledger.blocks:
+            (decision, *_) = (block.decision for block in ledger.blocks.values())
+            ledger.confirm(confirmation(decision, "failed"))
+        for sender in senders:
+            found = ledger.covering(sender)
+            assert (found and found.decision.id) == covering_by_a_look_at_each(ledger, sender)
+            kinds.add(found is not None)
+    assert kinds == {True, False}
 
 
 def test_quiet_block_runs_out_into_probation():
