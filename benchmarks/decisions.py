@@ -13,6 +13,8 @@ of the paper (block at the first score over the threshold) and the rule of secon
     false_blocks_per_day, …_upper95   blocks a day of benign traffic, and the upper end of its 95 % interval
     captured                  how many captured attacks there are, held back or not; or why none
     real_benign               the benign part of the real capture: packets behind training, blocks
+    ceiling                   share of the attacks that are within reach (`benchmarks.decision_reach`)
+    unreachable, missed       attacks beyond it, and those within that were not mitigated in time, each with the reason
     by_attack                 with the packets dropped and challenged, and the packets and hosts of others that were hit;
                               `peak_score` and `over_1` are Kitsune's scores of the attack's packets, those dropped
                               apart: where none is over 1, the two other rules cannot block
@@ -23,39 +25,39 @@ Attacks are stopped under each rule for itself.  In days, novelty and the real c
 detector says and nothing is stopped, which is the same where a rule blocks nobody, and spares two thirds of the time.
 
 Attacks whose number is between 101 and 200 are held back: `--held-back` runs those instead, and captured ones that
-are.  Not part of it: switch, meters, queries as evidence.
+are.  Not part of it: the switch, which counts SYNs itself and has floods of them guarded, and queries: whose results
+are evidence, the setting `evidence_queries` says, and by default it names none.
 """
 
 import ipaddress
 import json
 import math
-import os
-import pickle
-import select
+import resource
 import statistics
 import sys
-import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
 from apps.firewall.policy.rules import Rules
 from benchmarks import measure
 from benchmarks.data_folder import add_data_option
+from benchmarks.decision_jobs import Jobs
+from benchmarks.decision_reach import SOON_S, missed, unreachable
+from benchmarks.decision_rows import row_of
 from benchmarks.decision_traffic.attacks import ATTACKS
 from benchmarks.decision_traffic.network import Network
 from benchmarks.decision_traffic.networks import NETWORKS
 from benchmarks.decision_traffic.novelty import NOVELTIES
 from benchmarks.decision_traffic.real import real_attacks, real_network
 from benchmarks.decision_traffic.traffic import BASE_US, SECOND, Traffic, merge, renumbered
-from benchmarks.decision_traffic.truth import AttackSpec, AttackTruth
-from benchmarks.decisions_core import DecidedAction, DecisionRun, detector_for, watch
+from benchmarks.decision_traffic.truth import AttackSpec
+from benchmarks.decisions_core import DecisionRun, detector_for, feed_apart, watch
 from benchmarks.decisions_fastnetmon import bans, missing, settings, thresholds_of
 
 RULES: Final = {"sequential": "", "paper": "paper_rule", "seconds": "seconds_rule"}
@@ -74,7 +76,7 @@ FLOOD_S: Final = 12.0
 WAITING: Final = 6
 """FastNetMon takes the captures' own time, so that several hardly need more than one."""
 Figures = dict[str, Any]
-SOON_S: Final = 5.0
+ByRule = dict[str, list[Figures]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--no-fastnetmon", action="store_true", help="leave FastNetMon out, which needs root")
     add_data_option(parser)
     chosen = parser.parse_args(argv)
-    begun = monotonic()
+    begun, jobs = monotonic(), Jobs()
     figures: Figures = {
         "machine": measure.machine(),
         "settings": {
@@ -102,28 +104,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures["captured"] = len(captured) if captured else f"not run: no data in {chosen.data}"
     if not captured:
         print(f"captured attacks: {figures['captured']}", flush=True)
-    rows: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
-    novelty: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
-    for name in chosen.networks:
-        attacks, novelties = _network(name, chosen)
-        for rule in chosen.rules:
-            rows[rule] += attacks[rule]
-            novelty[rule] += novelties[rule]
-            _print_attacks(rule, attacks[rule])
-        print(f"{name}: done after {monotonic() - begun:.0f} s", flush=True)
-    days = _days(chosen)
+    # the longest first; networks become many short pieces of work, which end at the same time
+    days = [partial(_day, chosen.rules, *each) for each in _seeds_of_days(chosen)]
+    networks = [partial(_network, name, chosen, jobs) for name in chosen.networks]
+    done = jobs.all([*days, *networks, partial(_real_benign, chosen)])
+    of_days, of_networks, real = done[: len(days)], done[len(days) : -1], done[-1]
+    print(f"days, networks and the real capture: done after {monotonic() - begun:.0f} s", flush=True)
     figures["fastnetmon"] = "not asked for" if chosen.no_fastnetmon else _fastnetmon(chosen)
-    real = _real_benign(chosen)
     for rule, field in RULES.items():
         if rule in chosen.rules:
-            its_days = [day["shared"] | day[rule] for day in days]
-            found = _summary(rows[rule], novelty[rule], its_days) | {"real_benign": real[rule]}
+            rows = [row for attacks, _ in of_networks for row in attacks[rule]]
+            novelty = [row for _, novelties in of_networks for row in novelties[rule]]
+            its_days = [day["shared"] | day[rule] for day in of_days]
+            _print_attacks(rule, rows)
+            found = _summary(rows, novelty, its_days) | {"real_benign": real[rule]}
             figures |= {field: found} if field else found
             _print(rule, found)
     figures["seconds"] = round(monotonic() - begun)
-    print(f"took {figures['seconds']} s")
+    figures["cpu_seconds"] = round(_cpu_seconds())
+    print(f"took {figures['seconds']} s, and {figures['cpu_seconds']} s of processors")
     measure.write_json(chosen.json, figures)
     return 0
+
+
+def _cpu_seconds() -> float:
+    """Of this process and all its copies."""
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in spent)
 
 
 def _print_attacks(rule: str, rows: list[Figures]) -> None:
@@ -143,8 +150,11 @@ def _print_attacks(rule: str, rows: list[Figures]) -> None:
 
 
 def _print(rule: str, found: Figures) -> None:
-    short = {key: value for key, value in found.items() if not key.startswith("by_")}
-    print(json.dumps({"rule": rule} | short))
+    lists = ("by_attack", "by_novelty", "by_day", "unreachable", "missed")
+    print(json.dumps({"rule": rule} | {key: value for key, value in found.items() if key not in lists}))
+    for field in ("unreachable", "missed"):
+        for row in found[field]:
+            print(f"   {field}: {row['network']}, {row['attack']}, seed {row['seed']}: {row['reason']}")
     for row in (*found["by_novelty"], *found["by_day"]):
         if row["blocks"]:
             print("  ", row)
@@ -152,7 +162,7 @@ def _print(rule: str, found: Figures) -> None:
 
 
 def _summary(rows: list[Figures], novelty: list[Figures], days: list[Figures]) -> Figures:
-    blocks = sum(day["blocks"] for day in days)
+    blocks, beyond = sum(day["blocks"] for day in days), unreachable(rows)
     seconds = [row["s_to_decision"] for row in rows]
     upper = float(chi2.ppf(0.95, 2 * (blocks + 1))) / 2
     return {
@@ -166,6 +176,9 @@ def _summary(rows: list[Figures], novelty: list[Figures], days: list[Figures]) -
         "benign_days": len(days),
         "false_blocks_per_day": blocks / len(days) if days else None,
         "false_blocks_per_day_upper95": upper / len(days) if days else None,
+        "ceiling": (len(rows) - len(beyond)) / len(rows) if rows else None,
+        "unreachable": beyond,
+        "missed": missed(rows),
         "by_attack": rows,
         "by_novelty": novelty,
         "by_day": days,
@@ -176,8 +189,8 @@ def _rules(rule: str) -> Rules:
     return Rules(rule=rule)  # type: ignore[arg-type]
 
 
-def _network(name: str, chosen: Any) -> tuple[dict[str, list[Figures]], dict[str, list[Figures]]]:
-    """Train once, and run every attack under each rule, and every novelty, from there."""
+def _network(name: str, chosen: Any, jobs: Jobs) -> tuple[ByRule, ByRule]:
+    """Train once, and run every attack and every novelty from there, under all rules."""
     network = NETWORKS[name](1)
     known = [*ATTACKS, *_captured(chosen.data)]
     specs = [each for each in known if each.held_back == chosen.held_back and each.fits(network)]
@@ -186,27 +199,23 @@ def _network(name: str, chosen: Any) -> tuple[dict[str, list[Figures]], dict[str
     novelties = [each for each in NOVELTIES if chosen.only in each]
     novelties = novelties[: max(1, round(len(novelties) * chosen.scale))]
     if not specs and not novelties:
-        nothing: dict[str, list[Figures]] = {rule: [] for rule in chosen.rules}
+        nothing: ByRule = {rule: [] for rule in chosen.rules}
         return nothing, nothing
     benign = merge(*network.chunks(0, BENIGN_S + NOVELTY_S + 60))
-    run = DecisionRun(len(benign.between(0, TRAINING_S)), _rules(chosen.rules[0]))
-    run.feed(benign.between(0, TRAINING_S))
+    trained = DecisionRun(len(benign.between(0, TRAINING_S)), _rules(chosen.rules[0]))
+    trained.feed(benign.between(0, TRAINING_S))
+    runs = [DecisionRun(trained.training_packets, _rules(rule), trained.detector) for rule in chosen.rules]
     seeds = range(1, chosen.seeds + 1)
-    attacks = {
-        rule: [
-            {"network": name} | row
-            for row in _apart(partial(_under_rule, rule, run, network, benign, specs, seeds))
+    attacks, found = jobs.all(
+        [
+            partial(_attacks, runs, network, benign, specs, seeds, jobs),
+            partial(_novelties, runs, network, benign, novelties, seeds, jobs),
         ]
-        for rule in chosen.rules
-    }
-    runs = [DecisionRun(run.training_packets, _rules(rule), run.detector) for rule in chosen.rules]
-    watch(runs, _from(benign, TRAINING_S, BENIGN_S))
-    found = _all_apart(
-        [partial(_novelty, runs, network, benign, which, seed) for which in novelties for seed in seeds]
     )
-    return attacks, {
-        rule: [{"network": name} | each["shared"] | each[rule] for each in found] for rule in chosen.rules
-    }
+    return (
+        {rule: [{"network": name} | row for row in attacks[rule]] for rule in chosen.rules},
+        {rule: [{"network": name} | each["shared"] | each[rule] for each in found] for rule in chosen.rules},
+    )
 
 
 def _captured(data: Path) -> Sequence[AttackSpec]:
@@ -220,147 +229,64 @@ def _from(benign: Traffic, start_s: float, end_s: float, *more: Traffic) -> Traf
     return renumbered(merge(*parts), len(benign.between(0, start_s)))
 
 
-def _under_rule(
-    rule: str,
-    run: DecisionRun,
+def _attacks(
+    runs: Sequence[DecisionRun],
     network: Network,
     benign: Traffic,
     specs: Sequence[AttackSpec],
     seeds: Sequence[int],
+    jobs: Jobs,
+) -> ByRule:
+    """Each attack with each of its seeds, behind the same benign traffic."""
+    chosen = [
+        (spec, seed) for spec in specs for seed in seeds if seed in spec.seeds or spec.seeds == (1, 2, 3)
+    ]
+
+    def attack(together: Sequence[DecisionRun]) -> ByRule:
+        for run in together:
+            run.decided.clear()
+            run.refused.clear()
+        rows = jobs.all([partial(_attack, together, network, benign, *each, jobs) for each in chosen])
+        return {run.rules.rule: [row[run.rules.rule] for row in rows] for run in together}
+
+    return feed_apart(runs, _from(benign, TRAINING_S, BENIGN_S), jobs, attack)
+
+
+def _novelties(
+    runs: Sequence[DecisionRun],
+    network: Network,
+    benign: Traffic,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    jobs: Jobs,
 ) -> list[Figures]:
-    run.decide_by(_rules(rule))
-    run.feed(_from(benign, TRAINING_S, BENIGN_S))
-    run.decided.clear()
-    run.refused.clear()
-    return _all_apart(
-        [
-            partial(_attack, run, network, benign, spec, seed)
-            for spec in specs
-            for seed in seeds
-            if seed in spec.seeds or spec.seeds == (1, 2, 3)
-        ]
+    """Each benign novelty with each seed, behind the same benign traffic."""
+    watch(runs, _from(benign, TRAINING_S, BENIGN_S))
+    return jobs.all(
+        [partial(_novelty, runs, network, benign, name, seed) for name in names for seed in seeds]
     )
 
 
-def _apart(work: Callable[[], Any]) -> Any:
-    """Do it in a copy of this process, which alone can copy the detector's state."""
-    return _all_apart([work])[0]
-
-
-def _all_apart(works: Sequence[Callable[[], Any]], most: int = os.cpu_count() or 1) -> list[Any]:
-    """Do each in a copy of this process, `most` at a time."""
-    found: dict[int, Any] = {}
-    going: dict[int, tuple[int, int]] = {}
-    waiting = list(enumerate(works))[::-1]
-    while waiting or going:
-        while waiting and len(going) < most:
-            number, work = waiting.pop()
-            child, pipe = _copied(work)
-            going[pipe] = (number, child)
-        for pipe in select.select(list(going), [], [])[0]:
-            number, child = going.pop(pipe)
-            with os.fdopen(pipe, "rb") as reader:
-                data = reader.read()
-            if os.waitpid(child, 0)[1]:
-                raise SystemExit("benchmarks.decisions: a run failed, see above")
-            found[number] = pickle.loads(data)  # noqa: S301 - our own child's
-    return [found[number] for number in range(len(works))]
-
-
-def _copied(work: Callable[[], Any]) -> tuple[int, int]:
-    """Start a copy of this process; returns its id, and the pipe that its result comes from."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if not child:
-        os.close(reader)
-        code = 1
-        try:
-            result = pickle.dumps(work())
-            with os.fdopen(writer, "wb") as pipe:
-                pipe.write(result)
-            code = 0
-        except BaseException:  # noqa: BLE001 - the copy must not go on as if it were this process
-            traceback.print_exc()
-        os._exit(code)
-    os.close(writer)
-    return child, reader
-
-
-def _attack(run: DecisionRun, network: Network, benign: Traffic, spec: AttackSpec, seed: int) -> Figures:
+def _attack(
+    runs: Sequence[DecisionRun],
+    network: Network,
+    benign: Traffic,
+    spec: AttackSpec,
+    seed: int,
+    jobs: Jobs,
+) -> dict[str, Figures]:
     sent, truth = spec.traffic(network, seed, ATTACK_S)
     end = min(truth.last_us / 1e6 - BASE_US / 1e6, ATTACK_S + LONGEST_S) + 1
     traffic = _from(benign, BENIGN_S, end, sent)
-    stopped = run.feed(traffic)
-    mine = traffic.attack == truth.id
-    first_ns = truth.first_us * 1_000
-    good = [each for each in run.decided if _helps(each, truth)]
-    wrong = [each for each in run.decided if not _helps(each, truth)]
-    others = stopped & ~mine & ~_sent_by(traffic, truth, network.gateway.mac)
-    hit = [traffic.columns[name][others & ~run.limited].tolist() for name in ("port", "eth_src", "ip_src_lo")]
-    return {
-        "attack": spec.name,
-        "number": spec.number,
-        "seed": seed,
-        "s_to_decision": min(((each.time_ns - first_ns) / 1e9 for each in good), default=math.inf),
-        "packets": int(mine.sum()),
-        "peak_score": float(run.scores[mine].max(initial=0.0)),
-        "over_1": int((run.scores[mine] >= 1).sum()),
-        "stopped_share": float(stopped[mine].mean()) if mine.any() else 0.0,
-        "dropped": int((stopped & ~run.challenges & ~run.limited)[mine].sum()),
-        "challenged": int(run.challenges[mine].sum()),
-        "limited": int(run.limited[mine].sum()),
-        "innocent_packets": int((others & ~run.limited).sum()),
-        "innocent_limited": int((others & run.limited).sum()),
-        "innocent_hosts": len(set(zip(*hit, strict=True))),
-        "remedy": _remedy(good[0]) if good else "none",
-        "wrong": len(wrong),
-        "decisions": [each.reason for each in (*good[:2], *wrong[:3])],
-        "refused": run.refused[:2],
-    }
 
+    def told(together: Sequence[DecisionRun]) -> dict[str, Figures]:
+        return {
+            run.rules.rule: row_of(run, traffic, truth, network, TRAINING_S)
+            | {"number": spec.number, "seed": seed}
+            for run in together
+        }
 
-def _sent_by(traffic: Traffic, truth: AttackTruth, router: int) -> npt.NDArray[np.bool_]:
-    """Which packets attackers have sent under their own address, as part of the attack or not."""
-    found = np.zeros(len(traffic), bool)
-    columns = traffic.columns
-    for attacker in truth.attackers:
-        if attacker.ip:
-            mine = (columns["port"] == attacker.port) & (columns["eth_src"] == attacker.mac)
-            found |= mine if attacker.mac != router else mine & (columns["ip_src_lo"] == attacker.ip)
-    return found
-
-
-def _helps(decided: DecidedAction, truth: AttackTruth) -> bool:
-    """Whether a decision stops the attacker, and nobody else."""
-    if decided.service is not None:
-        victims = {str(ipaddress.IPv4Address(victim)) for victim in truth.victims}
-        return "guard" in truth.remedies and decided.service.address in victims
-    if decided.limited:
-        victims = {str(ipaddress.IPv4Address(victim)) for victim in truth.victims}
-        return "meter" in truth.remedies and decided.limited in victims
-    target = decided.target
-    if target is None:
-        return False
-    for attacker in truth.attackers:
-        mac = attacker.mac.to_bytes(6, "big").hex(":")
-        if target.kind == "mac" and target.address == mac and target.port in (None, attacker.port):
-            return "block_sender" in truth.remedies
-        if target.kind == "ip" and attacker.ip and target.address == str(ipaddress.IPv4Address(attacker.ip)):
-            return "block_address" in truth.remedies
-    return False
-
-
-def _remedy(decided: DecidedAction) -> str:
-    """What was decided, in a word or two."""
-    if decided.service is not None:
-        return "guard"
-    if decided.limited:
-        return "rate limit"
-    return (
-        "block of an address"
-        if decided.target is not None and decided.target.kind == "ip"
-        else "block of a MAC"
-    )
+    return feed_apart(runs, traffic, jobs, told)
 
 
 def _novelty(runs: Sequence[DecisionRun], network: Network, benign: Traffic, name: str, seed: int) -> Figures:
@@ -383,24 +309,20 @@ def _blocks(runs: Sequence[DecisionRun]) -> Figures:
     }
 
 
-def _days(chosen: Any) -> list[Figures]:
-    """Days of benign traffic after an hour of training: each of another network or seed."""
-    names = [chosen.networks[number % len(chosen.networks)] for number in range(chosen.days)]
-    return _all_apart(
-        [
-            partial(_day, chosen.rules, name, 11 + number // len(chosen.networks))
-            for number, name in enumerate(names)
-        ]
-    )
+def _seeds_of_days(chosen: Any) -> list[tuple[str, int]]:
+    """Each day is of another network or seed."""
+    networks = chosen.networks
+    return [(networks[day % len(networks)], 11 + day // len(networks)) for day in range(chosen.days)]
 
 
 def _day(rules: Sequence[str], name: str, seed: int) -> Figures:
-    network = NETWORKS[name](seed)
-    packets = sum(len(part) for part in network.chunks(0, TRAINING_S))
-    detector = detector_for(packets)
-    runs = [DecisionRun(packets, _rules(rule), detector) for rule in rules]
+    """A day of benign traffic after an hour of training."""
+    parts = NETWORKS[name](seed).chunks(0, TRAINING_S + 86_400)
+    first = next(parts)  # training, an hour
+    detector = detector_for(len(first))
+    runs = [DecisionRun(len(first), _rules(rule), detector) for rule in rules]
     benign = 0
-    for part in network.chunks(0, TRAINING_S + 86_400):
+    for part in chain([first], parts):
         watch(runs, part)
         benign += len(part)
     found = _blocks(runs)
@@ -417,7 +339,7 @@ def _fastnetmon(chosen: Any) -> Figures | str:
     reason = missing()
     if reason:
         return reason
-    rows: list[Figures] = []
+    works = []
     thresholds = {}
     for name in chosen.networks:
         network = NETWORKS[name](1)
@@ -427,9 +349,8 @@ def _fastnetmon(chosen: Any) -> Figures | str:
         known = [*ATTACKS, *_captured(chosen.data)]
         floods = [each for each in known if each.kind == "flood" and chosen.only in each.name]
         floods = [each for each in floods if each.held_back == chosen.held_back and each.fits(network)]
-        rows += _all_apart(
-            [partial(_banned, network, benign, spec, thresholds[name]) for spec in floods], WAITING
-        )
+        works += [partial(_banned, network, benign, spec, thresholds[name]) for spec in floods]
+    rows = Jobs(WAITING).all(works)
     _print_banned(rows)
     return {"settings": settings({}) | {"thresholds": thresholds}, "by_attack": rows}
 

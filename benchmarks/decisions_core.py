@@ -7,9 +7,10 @@ A decision is in force for the next rows; within a batch it comes too late, as i
 """
 
 import ipaddress
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,9 @@ from apps.firewall.policy.rules import AllowList, Rules
 from apps.firewall.syn.services import TcpService
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import load_kernel
-from apps.messages import Alert, Decision, Target
+from apps.messages import Alert, Decision, Sender, Target
+from benchmarks.decision_blocks import ModelledBlocks
+from benchmarks.decision_jobs import Jobs
 from benchmarks.decision_limits import ModelledLimits
 from benchmarks.decision_traffic.traffic import Traffic
 from due import RecordBatch
@@ -33,6 +36,9 @@ ROWS: Final = 128
 """Packets between two looks at decisions."""
 MANY_ROWS: Final = 4_096
 """The same where no decision can stop anything: in training, and where several runs watch one detector."""
+
+Then = Callable[[Sequence["DecisionRun"]], dict[str, Any]]
+"""What follows when runs were fed: figures by rule."""
 
 
 @dataclass(frozen=True)
@@ -47,23 +53,34 @@ class DecidedAction:
     """Whose packets are limited."""
 
 
-@dataclass
+class EvidenceHeard(NamedTuple):
+    """Whom a piece of evidence was about, and the sum that it made."""
+
+    time_ns: int
+    sender: Sender | None
+    victims: tuple[str, ...]
+    nats: float
+
+
+@dataclass(eq=False)
 class DecisionRun:
     """One network under one rule; `feed` it in order of time.
 
     Args:
         training_packets: packets of training.
         rules: the firewall's options.
-        watched: a detector that several runs share; then decisions are made, but nothing is stopped.
+        shared: a detector that several runs listen to (`watch`, `feed_apart`).
     """
 
     training_packets: int
     rules: Rules
-    watched: Detector | None = None
+    shared: Detector | None = None
     decided: list[DecidedAction] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
-    dropped: int = 0
-    challenged: int = 0
+    heard: list[EvidenceHeard] = field(default_factory=list)
+    """Of the last `feed`."""
+    stopped: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """Which packets of the last `feed` were dropped, or are SYNs that were challenged."""
     challenges: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     """Which packets of the last `feed` were challenged; they are among the stopped."""
     limited: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
@@ -72,52 +89,51 @@ class DecisionRun:
     """Kitsune's scores of the packets of the last `feed`; 0 for those that were dropped."""
 
     def __post_init__(self) -> None:
-        self.detector = self.watched or detector_for(self.training_packets)
-        self.decide_by(self.rules)
-
-    def decide_by(self, rules: Rules) -> None:
-        """Go on with other rules, as if they had been there from the start of training."""
-        self.rules = rules
+        self.detector = self.shared or detector_for(self.training_packets)
         self._ledger = BlockLifecycle(self.rules)
         # capture times of generated traffic: ARP claims are weighed by the detector
         bindings = ArpBindings(training_s=0, settle_s=3_600, contest_s=60)
         self.decider = Decider(self.rules, self._ledger, bindings, (), AllowList)
         self._told = False
+        self._untold: list[Decision] = []
+        """Decisions that the detector does not know of."""
+        self._blocks = ModelledBlocks()
         self._guarded: set[TcpService] = set()
         self._limits, self._meters = RateLimits(self.rules), ModelledLimits()
 
     def feed(self, traffic: Traffic) -> npt.NDArray[np.bool_]:
         """Take traffic; returns which of its packets were stopped (dropped, or SYNs that were challenged)."""
-        stopped = np.zeros(len(traffic), bool)
-        self.challenges = np.zeros(len(traffic), bool)
-        self.limited = np.zeros(len(traffic), bool)
-        self.scores = np.zeros(len(traffic))
+        self.begin(len(traffic))
         start = 0
         while start < len(traffic):
-            learning = self.training_packets - self.detector.trained
-            part = slice(start, start + (min(MANY_ROWS, learning) if learning > 0 else ROWS))
-            start = part.stop
-            columns = {name: column[part] for name, column in traffic.columns.items()}
-            drops = self._drops(columns)
-            over = self._meters.over(columns, drops)
-            self.limited[part] = over
-            drops |= over
-            challenges = self._challenges(columns) & ~drops
-            stopped[part] = drops | challenges
-            self.challenges[part] = challenges
-            self.dropped += int(drops.sum())
-            self.challenged += int(challenges.sum())
-            left = ~drops
-            if left.any():
-                rows = columns if left.all() else {name: column[left] for name, column in columns.items()}
-                self.scores[part][left] = self._look(rows)
-        return stopped
+            start = _step([self], traffic, start)
+        return self.stopped
 
-    def _look(self, columns: Mapping[str, Any]) -> npt.NDArray[np.float64]:
-        """Take rows; returns their scores."""
-        scored, alerts = self.detector.process(RecordBatch(dict(columns)), SWITCH)
-        self.judge(alerts, self.detector.take_evidence(), int(columns["time_us"][-1]) * 1_000)
-        return scored.scores
+    @property
+    def drops(self) -> bool:
+        """Whether packets are dropped now, so that the detector sees what other runs do not have it see."""
+        return bool(self._ledger.blocks or self._limits.standing)
+
+    def begin(self, packets: int) -> None:
+        """So many packets are going to come."""
+        self.stopped, self.challenges, self.limited = (np.zeros(packets, bool) for _ in range(3))
+        self.scores = np.zeros(packets)
+        self.heard = []
+
+    def pass_on(self, columns: Mapping[str, Any], part: slice) -> npt.NDArray[np.bool_]:
+        """Which of the next packets come through; `part` is their place in the traffic."""
+        drops = self._blocks.drops(columns)
+        over = self._meters.over(columns, drops)
+        drops |= over
+        challenges = self._challenges(columns) & ~drops
+        self.limited[part], self.challenges[part], self.stopped[part] = over, challenges, drops | challenges
+        return ~drops
+
+    def enforce(self) -> None:
+        """Tell the detector, which is this run's alone, what was decided."""
+        for decision in self._untold:
+            self.detector.senders.blocked.decide(decision)
+        self._untold.clear()
 
     def judge(self, alerts: Sequence[Alert], heard: Sequence[Evidence], now: int) -> None:
         """Decide about what the detector has said until a capture time, ns."""
@@ -135,7 +151,7 @@ class DecisionRun:
                 )
             )
         for decision in self._ledger.due(now):
-            self._tell(decision)
+            self._carry_out(decision)
         for name, packets in self._meters.counters().items():
             self._limits.count_drops(name, packets, now)
         self._meters.decide(self._limits.due(now))
@@ -147,12 +163,14 @@ class DecisionRun:
         for evidence in heard:
             self._hear(evidence)
 
-    def _tell(self, decision: Decision) -> None:
-        if self.watched is None:
-            self.detector.senders.blocked.decide(decision)
+    def _carry_out(self, decision: Decision) -> None:
+        self._blocks.decide(decision)
+        self._untold.append(decision)
 
     def _hear(self, evidence: Evidence) -> None:
         proposal = self.decider.evidence(evidence, "kitsune", lambda _: 0)
+        nats, _ = self.decider.sum_of(evidence)
+        self.heard.append(EvidenceHeard(evidence.event_time, evidence.sender, evidence.victims, nats))
         if proposal is None:
             return
         if proposal.service is not None:
@@ -179,21 +197,8 @@ class DecisionRun:
         decision = self._ledger.open(
             SWITCH, target, reason, (), cause.event_time, training_rate=cause.training_rate, host=host
         )
-        self._tell(decision)
+        self._carry_out(decision)
         self.decided.append(DecidedAction(cause.event_time, reason, target=target))
-
-    def _drops(self, columns: Mapping[str, Any]) -> npt.NDArray[np.bool_]:
-        drops = np.zeros(len(columns["port"]), bool)
-        for block in self._ledger.blocks.values():
-            target = block.decision.target
-            if target.kind == "mac":
-                mine = columns["eth_src"] == int(target.address.replace(":", ""), 16)
-                drops |= mine if target.port is None else mine & (columns["port"] == target.port)
-            else:
-                address = ipaddress.ip_address(target.address)
-                if address.version == 4:
-                    drops |= (columns["ip_version"] == 4) & (columns["ip_src_lo"] == int(address))
-        return drops
 
     def _challenges(self, columns: Mapping[str, Any]) -> npt.NDArray[np.bool_]:
         challenges = np.zeros(len(columns["port"]), bool)
@@ -223,4 +228,57 @@ def watch(runs: Sequence[DecisionRun], traffic: Traffic) -> None:
         _, alerts = detector.process(RecordBatch(columns), SWITCH)
         heard = detector.take_evidence()
         for run in runs:
+            run.begin(0)
             run.judge(alerts, heard, int(columns["time_us"][-1]) * 1_000)
+
+
+def feed_apart(
+    runs: Sequence[DecisionRun], traffic: Traffic, jobs: Jobs, then: Then, start: int = 0
+) -> dict[str, Any]:
+    """Feed runs that share a detector, each as if it were alone: who drops packets goes on in a copy of this process.
+
+    Args:
+        runs: one for each rule.
+        traffic: what they are fed.
+        jobs: for copies.
+        then: called at the end, in this process or a copy, for the runs that still share a detector there.
+        start: packets of the traffic that they have had.
+
+    Returns:
+        What `then` returned, of all.
+    """
+    together, apart = list(runs), []
+    if not start:
+        for run in together:
+            run.begin(len(traffic))
+    while start < len(traffic):
+        for run in [each for each in together if each.drops]:
+            if len(together) > 1:
+                together.remove(run)
+                apart.append(jobs.start(partial(feed_apart, [run], traffic, jobs, then, start)))
+        start = _step(together, traffic, start)
+    found = then(together)
+    for more in jobs.collect(apart):
+        found |= more
+    return found
+
+
+def _step(runs: Sequence[DecisionRun], traffic: Traffic, start: int) -> int:
+    """Feed the next packets; returns how many have been fed then."""
+    first = runs[0]
+    detector = first.detector
+    learning = first.training_packets - detector.trained
+    part = slice(start, min(len(traffic), start + (min(MANY_ROWS, learning) if learning > 0 else ROWS)))
+    columns = {name: column[part] for name, column in traffic.columns.items()}
+    if len(runs) == 1:
+        first.enforce()
+    left = np.logical_and.reduce([run.pass_on(columns, part) for run in runs])
+    if not left.any():
+        return part.stop
+    rows = columns if left.all() else {name: column[left] for name, column in columns.items()}
+    scored, alerts = detector.process(RecordBatch(rows), SWITCH)
+    heard = detector.take_evidence()
+    for run in runs:
+        run.scores[part][left] = scored.scores
+        run.judge(alerts, heard, int(rows["time_us"][-1]) * 1_000)
+    return part.stop
