@@ -20,6 +20,7 @@ of the paper (block at the first score over the threshold) and the rule of secon
                               apart: where none is over 1, the two other rules cannot block
     paper_rule, seconds_rule  the same under these rules
     fastnetmon                Debian's FastNetMon on the floods (seed 1), with its settings, or why it was not run
+    seconds, cpu_seconds      what all of this took, on the clock and of all processors
 
 Attacks are stopped under each rule for itself.  In days, novelty and the real capture all rules judge what one
 detector says and nothing is stopped, which is the same where a rule blocks nobody, and spares two thirds of the time.
