@@ -3,6 +3,9 @@
 Every run is a process of its own that writes 200-byte messages under one key through the embedded Data
 Updates server; runs with and without the archive alternate, and medians are given.  "Batch" is the number
 of messages per frame and per archive transaction.
+
+`--items N` fills an archive with so many items instead and asks for some of them (`benchmarks.archives_large`);
+docs/scaling.md gives figures of 10,000,000.
 """
 
 import argparse
@@ -19,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import measure
+from benchmarks import archives_large, measure
 from due import PUB_ONLY, Engine, Item, Options, RecordBatch
 from due.codec import pack
 from due.drivers.embedded_redis import EmbeddedServer
@@ -39,7 +42,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run all, print a table and bars, write the figures."""
     parser = measure.arguments("archives", __doc__, rounds=2)
     parser.add_argument("--worker", help=argparse.SUPPRESS)
+    parser.add_argument("--items", type=int, help="fill an archive with so many items instead")
+    parser.add_argument(
+        "--folder", type=Path, help="for that archive; default: the folder of temporary files"
+    )
     chosen = parser.parse_args(argv)
+    if chosen.items is not None:
+        if chosen.items < archives_large.LEAST:
+            parser.error(f"--items {chosen.items}: at least {archives_large.LEAST:,}")
+        if chosen.folder is not None and not chosen.folder.is_dir():
+            parser.error(f"--folder {chosen.folder}: there is no such folder")
+        large = archives_large.figures_of(chosen.items, chosen.folder)
+        archives_large.show(large)
+        measure.write_json(chosen.json, {"machine": measure.machine(), "large": large})
+        return 0
     if chosen.worker:
         print(json.dumps(publish(**json.loads(chosen.worker))))
         return 0

@@ -88,6 +88,10 @@ COMMANDS = {
     "logs": ("sdnator.cli.logs_command:logs", "Show the logs of the pipeline's parts."),
     "model": ("sdnator.cli.model_commands:model", "Kitsune's model: show it, retrain it."),
     "observe": ("sdnator.cli.due_commands:observe", "Show items as they arrive."),
+    "plan": (
+        "sdnator.cli.plan_command:plan_command",
+        "Calculate what a pipeline takes: processes, cores, memory, archive, and what limits it.",
+    ),
     "program": (
         "sdnator.cli.program_commands:program",
         "Manage the programs that embedded switches may load.",
@@ -130,7 +134,7 @@ GROUPS = {
     ),
     "Decide": ("blocks", "allow", "model"),
     "Data": ("dataset", "backup", "restore"),
-    "Maintain": ("config", "doctor", "program", "shell"),
+    "Maintain": ("config", "doctor", "plan", "program", "shell"),
 }  # fmt: skip
 """In which order `sdnator --help` shows commands; what stands nowhere is maintenance."""
 _MOST_COLUMNS = 100
