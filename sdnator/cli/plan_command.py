@@ -18,7 +18,7 @@ from sdnator.plurals import counted
 
 if TYPE_CHECKING:
     from sdnator.plan.costs import Costs
-    from sdnator.plan.demand import Demand
+    from sdnator.plan.demand import PipelineDemand
     from sdnator.plan.model import Plan
 
 _COSTS = Path("sdnator-costs.json")
@@ -67,12 +67,12 @@ def plan_command(
 
     Example: sdnator plan --switches 200 --pps 20000 --queries 5
     """
-    from sdnator.plan.demand import Demand
+    from sdnator.plan.demand import PipelineDemand
     from sdnator.plan.model import plan
 
     if pps is None and not measure:
         raise BadInput("--pps: say how many packets a second the pipeline has to carry")
-    demand = None if pps is None else Demand(
+    demand = None if pps is None else PipelineDemand(
         switches=switches, pps=pps, queries=queries, consumers=consumers, archive_days=archive_days,
         blocks=blocks,
     )  # fmt: skip
@@ -110,7 +110,7 @@ def _measured(path: Path) -> "Costs":
     return found
 
 
-def shown(made: "Plan", demand: "Demand", costs: "Costs") -> Iterator[str]:
+def shown(made: "Plan", demand: "PipelineDemand", costs: "Costs") -> Iterator[str]:
     """The lines for people."""
     rate = demand.pps / demand.switches
     more = [
@@ -177,7 +177,7 @@ def _rounded(value: float) -> str:
     return f"{float(f'{value:.3g}'):,.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _as_json(made: "Plan | None", costs: "Costs", demand: "Demand | None") -> dict[str, object]:
+def _as_json(made: "Plan | None", costs: "Costs", demand: "PipelineDemand | None") -> dict[str, object]:
     import msgspec
 
     found = {} if made is None else asdict(made)

@@ -11,7 +11,7 @@ _MOST_DAYS = 36_500.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demand:
+class PipelineDemand:
     """What a pipeline has to carry.
 
     Raises:

@@ -23,7 +23,7 @@ from due.codec import pack
 from due.drivers.sqlite import SqliteArchive
 from sdnator.errors import PipelineError
 from sdnator.plan.costs import Costs, ProcessCost
-from sdnator.plan.measured_pipeline import MeasuredPipeline, Phase
+from sdnator.plan.measured_pipeline import LoadPhase, MeasuredPipeline
 from sdnator.report.flow_picture import SERVICES
 
 PER_SWITCH = ("switch", "spare")
@@ -89,7 +89,7 @@ def one_switch(pipeline: MeasuredPipeline, schedule: Schedule, train: int, tell:
     idle = pipeline.idle(schedule.seconds)
     tell(f"training on {train:,} packets")
     pipeline.loaded(schedule.rates[-1], TRAIN_S)
-    carried: list[Phase] = []
+    carried: list[LoadPhase] = []
     for rate in schedule.rates:
         tell(f"{schedule.seconds:g} s at {rate:,.0f} packets a second")
         phase = pipeline.loaded(rate, schedule.seconds)
@@ -105,7 +105,7 @@ def one_switch(pipeline: MeasuredPipeline, schedule: Schedule, train: int, tell:
     return _with_more(costs, idle, carried, pipeline, schedule, tell) if schedule.more else costs
 
 
-def _costs(idle: Phase, phases: Sequence[Phase], pipeline: MeasuredPipeline) -> Costs:
+def _costs(idle: LoadPhase, phases: Sequence[LoadPhase], pipeline: MeasuredPipeline) -> Costs:
     mib = pipeline.mib()
     processes = {
         name: ProcessCost(
@@ -132,20 +132,20 @@ def _costs(idle: Phase, phases: Sequence[Phase], pipeline: MeasuredPipeline) -> 
     )
 
 
-def over_idle(phase: Phase, idle: Phase, name: str) -> float:
+def over_idle(phase: LoadPhase, idle: LoadPhase, name: str) -> float:
     """CPU seconds of a phase that its packets have caused."""
     return max(0.0, phase.cpu_s.get(name, 0.0) - idle.cpu_s.get(name, 0.0) / idle.elapsed_s * phase.elapsed_s)
 
 
-def _per_packet(phases: Sequence[Phase], idle: Phase, what: str) -> tuple[float, ...]:
+def _per_packet(phases: Sequence[LoadPhase], idle: LoadPhase, what: str) -> tuple[float, ...]:
     rest = getattr(idle, what) / idle.elapsed_s
     return tuple(max(0.0, (getattr(each, what) - rest * each.elapsed_s) / each.sent) for each in phases)
 
 
 def _with_more(
     costs: Costs,
-    idle: Phase,
-    phases: Sequence[Phase],
+    idle: LoadPhase,
+    phases: Sequence[LoadPhase],
     pipeline: MeasuredPipeline,
     schedule: Schedule,
     tell: Tell,
@@ -177,13 +177,13 @@ def _with_more(
     )
 
 
-def _more_cpu(phase: Phase, before: Phase, idle: Phase, name: str) -> float:
+def _more_cpu(phase: LoadPhase, before: LoadPhase, idle: LoadPhase, name: str) -> float:
     """Seconds a packet."""
     more = over_idle(phase, idle, name) / phase.sent - over_idle(before, idle, name) / before.sent
     return max(0.0, more)
 
 
-def _more_bytes(phase: Phase, before: Phase, what: str) -> float:
+def _more_bytes(phase: LoadPhase, before: LoadPhase, what: str) -> float:
     more: float = getattr(phase, what) / phase.sent - getattr(before, what) / before.sent
     return max(0.0, more)
 

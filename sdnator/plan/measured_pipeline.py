@@ -35,7 +35,7 @@ _LATE = 1.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Phase:
+class LoadPhase:
     """What was used in some time."""
 
     elapsed_s: float
@@ -146,13 +146,13 @@ class MeasuredPipeline:
     def _said(self) -> str:
         return (self.folder / "up.log").read_text(encoding="utf-8", errors="replace")[-2000:].strip()
 
-    def idle(self, seconds: float) -> Phase:
+    def idle(self, seconds: float) -> LoadPhase:
         """What is used without packets."""
         before = self._moment()
         time.sleep(seconds)
         return self._phase(before)
 
-    def loaded(self, pps: float, seconds: float) -> Phase:
+    def loaded(self, pps: float, seconds: float) -> LoadPhase:
         """What is used for so many packets a second at each switch, until they are scored."""
         before, sent, scored = self._moment(), self._load.sent, self._scored()
         took = self._load.send(pps, seconds)
@@ -187,12 +187,12 @@ class MeasuredPipeline:
             archive_bytes(self.folder / "data" / "sdnator" / "archive.db"),
         )
 
-    def _phase(self, before: _Moment, **more: Any) -> Phase:
+    def _phase(self, before: _Moment, **more: Any) -> LoadPhase:
         after = self._moment()
         none = Usage()
         cpu = {name: each.cpu_s - before.used.get(name, none).cpu_s for name, each in after.used.items()}
         server, earlier = after.used.get(UPDATES, none), before.used.get(UPDATES, none)
-        return Phase(
+        return LoadPhase(
             elapsed_s=after.at - before.at,
             cpu_s={name: max(0.0, each) for name, each in cpu.items()},
             archived=after.archive - before.archive,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from sdnator.plan.costs import Costs, ProcessCost
-from sdnator.plan.demand import Demand
+from sdnator.plan.demand import PipelineDemand
 
 ARCHIVE = "archive (SQLite)"
 FULL = 0.7
@@ -34,7 +34,7 @@ _STEPS = 100
 
 
 @dataclass(frozen=True)
-class Row:
+class PartRow:
     """The processes of one name."""
 
     name: str
@@ -62,7 +62,7 @@ class Bottleneck:
 class Plan:
     """What a pipeline takes."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[PartRow, ...]
     processes: int
     cores: float
     """Used on average."""
@@ -83,7 +83,7 @@ class Plan:
     notes: tuple[str, ...]
 
 
-def plan(demand: Demand, costs: Costs) -> Plan:
+def plan(demand: PipelineDemand, costs: Costs) -> Plan:
     """What `demand` takes where parts cost what `costs` say."""
     rows = tuple(_row(name, cost, demand, costs.rates) for name, cost in costs.processes.items())
     cores = sum(row.cores for row in rows)
@@ -122,7 +122,7 @@ def at_rate(rates: Sequence[float], per_packet: Sequence[float], rate: float) ->
     return rate * per_packet[-1]
 
 
-def bottleneck(demand: Demand, costs: Costs) -> Bottleneck:
+def bottleneck(demand: PipelineDemand, costs: Costs) -> Bottleneck:
     """The process, or the archive, that uses the largest share of its limit."""
     found = {name: _each(cost, demand, costs.rates, demand.pps) for name, cost in costs.processes.items()}
     if costs.sqlite_bytes_per_s:
@@ -131,14 +131,14 @@ def bottleneck(demand: Demand, costs: Costs) -> Bottleneck:
     return Bottleneck(name, found[name], _full_at(name, demand, costs))
 
 
-def _row(name: str, cost: ProcessCost, demand: Demand, rates: Sequence[float]) -> Row:
+def _row(name: str, cost: ProcessCost, demand: PipelineDemand, rates: Sequence[float]) -> PartRow:
     each = _each(cost, demand, rates, demand.pps)
     number = demand.switches if cost.per_switch else 1
     further = 0.0 if cost.per_switch else (demand.switches - 1) * cost.switch_mib
-    return Row(name, number, each, number * each, number * cost.mib + further, tuple(_grows_with(cost)))
+    return PartRow(name, number, each, number * each, number * cost.mib + further, tuple(_grows_with(cost)))
 
 
-def _each(cost: ProcessCost, demand: Demand, rates: Sequence[float], pps: float) -> float:
+def _each(cost: ProcessCost, demand: PipelineDemand, rates: Sequence[float], pps: float) -> float:
     """Cores of one process."""
     switches = 1 if cost.per_switch else demand.switches
     rate = _rate(demand, pps)
@@ -147,23 +147,23 @@ def _each(cost: ProcessCost, demand: Demand, rates: Sequence[float], pps: float)
     return cost.idle_cores + (switches - 1) * cost.switch_cores + switches * load / 1e6
 
 
-def _archived(demand: Demand, costs: Costs, pps: float) -> float:
+def _archived(demand: PipelineDemand, costs: Costs, pps: float) -> float:
     """Bytes a second."""
     packets = demand.switches * at_rate(costs.rates, costs.archive, _rate(demand, pps))
     return packets + pps * demand.queries * costs.query_archive + demand.switches * costs.archive_idle
 
 
-def _rate(demand: Demand, pps: float) -> float:
+def _rate(demand: PipelineDemand, pps: float) -> float:
     return pps / demand.switches
 
 
-def _share(name: str, demand: Demand, costs: Costs, pps: float) -> float:
+def _share(name: str, demand: PipelineDemand, costs: Costs, pps: float) -> float:
     if name == ARCHIVE:
         return _archived(demand, costs, pps) / costs.sqlite_bytes_per_s
     return _each(costs.processes[name], demand, costs.rates, pps)
 
 
-def _full_at(name: str, demand: Demand, costs: Costs) -> float:
+def _full_at(name: str, demand: PipelineDemand, costs: Costs) -> float:
     """Packets a second at which a share is 1, by bisection; it never falls with the rate."""
     if _share(name, demand, costs, 0.0) >= 1:
         return math.inf
@@ -191,7 +191,7 @@ def _grows_with(cost: ProcessCost) -> Iterator[str]:
         yield "consumers"
 
 
-def _notes(demand: Demand, costs: Costs, cores: float, gb_per_day: float) -> Iterator[str]:
+def _notes(demand: PipelineDemand, costs: Costs, cores: float, gb_per_day: float) -> Iterator[str]:
     """What the figures do not say."""
     rate = _rate(demand, demand.pps)
     low, high = costs.rates[0], costs.rates[-1]
@@ -225,7 +225,7 @@ def _notes(demand: Demand, costs: Costs, cores: float, gb_per_day: float) -> Ite
         )
 
 
-def _not_measured(demand: Demand, costs: Costs) -> Iterator[str]:
+def _not_measured(demand: PipelineDemand, costs: Costs) -> Iterator[str]:
     """What the demand has and the costs have not."""
     processes = costs.processes.values()
     if demand.queries and not any(each.us_per_query for each in processes):

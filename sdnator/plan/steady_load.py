@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from sdnator.capture.interfaces import WireFeed
 from sdnator.datasets.mirai_like import MiraiLikeOptions, generate
 
+SLICE_S = 0.02
+"""Each interface gets its frames in bursts, one in each slice; those of several interfaces take turns within it."""
 _SECONDS = 600
 _FRAMES = 10_000
-_SLICE_S = 0.005
 
 
 class SteadyLoad:
@@ -25,8 +26,8 @@ class SteadyLoad:
     def __init__(self, interfaces: Sequence[str]) -> None:
         options = MiraiLikeOptions(benign_seconds=_SECONDS, attack_seconds=0)
         made = itertools.islice(generate(options), _FRAMES)
-        self._frames = itertools.cycle([(frame.length, frame.data) for frame in made])
-        self._feeds = [WireFeed(each) for each in interfaces]
+        frames = [(frame.length, frame.data) for frame in made]
+        self._feeds = [(WireFeed(each), itertools.cycle(frames)) for each in interfaces]
         self.sent = 0
         """Frames, at all interfaces together."""
 
@@ -35,18 +36,22 @@ class SteadyLoad:
 
         What is late is sent as soon as possible, so that the number of frames is right.
         """
-        began = time.monotonic()
-        for number in range(round(pps * seconds)):
-            due = began + number / pps
-            while (early := due - time.monotonic()) > 0:
-                time.sleep(max(early, _SLICE_S))
-            length, data = next(self._frames)
-            for feed in self._feeds:
+        began, slices, number = time.monotonic(), max(1, round(seconds / SLICE_S)), len(self._feeds)
+        sent = [0] * number
+        for turn in range(slices * number):
+            done, place = divmod(turn, number)
+            early = began + turn * SLICE_S / number - time.monotonic()
+            if early > 0:
+                time.sleep(early)
+            wanted = round(pps * seconds * (done + 1) / slices)
+            feed, frames = self._feeds[place]
+            for length, data in itertools.islice(frames, wanted - sent[place]):
                 feed.send((), (length,), (data,))
-                self.sent += 1
-        return time.monotonic() - began
+            self.sent += wanted - sent[place]
+            sent[place] = wanted
+        return max(seconds, time.monotonic() - began)
 
     def close(self) -> None:
         """Close the sockets."""
-        for feed in self._feeds:
+        for feed, _ in self._feeds:
             feed.close()

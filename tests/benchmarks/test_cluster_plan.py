@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks.cluster_plan import compared
 from sdnator.plan.costs import Costs, ProcessCost
-from sdnator.plan.measured_pipeline import Phase
+from sdnator.plan.measured_pipeline import LoadPhase
 
 COSTS = Costs(
     machine="some processor",
@@ -18,13 +18,13 @@ COSTS = Costs(
     archive=(400.0,),
 )
 NOTHING = {"updates_in": 0, "updates_out": 0}
-IDLE = Phase(elapsed_s=10, cpu_s={"kitsune": 0.1, "switch": 0.4}, archived=0, **NOTHING)
+IDLE = LoadPhase(elapsed_s=10, cpu_s={"kitsune": 0.1, "switch": 0.4}, archived=0, **NOTHING)
 
 
 def busy(kitsune, switch, archived):
     """Ten seconds of load at two switches, and two until all was scored."""
     used = {"kitsune": kitsune + 0.12, "switch": switch + 0.48}
-    return Phase(elapsed_s=12, load_s=10, sent=10_000, cpu_s=used, archived=archived, **NOTHING)
+    return LoadPhase(elapsed_s=12, load_s=10, sent=10_000, cpu_s=used, archived=archived, **NOTHING)
 
 
 def test_what_is_as_predicted_has_no_error():

@@ -10,7 +10,7 @@ import pytest
 
 from sdnator.errors import PipelineError
 from sdnator.plan.measure import Schedule, one_switch, over_idle, processor
-from sdnator.plan.measured_pipeline import Phase, archive_bytes, configuration
+from sdnator.plan.measured_pipeline import LoadPhase, archive_bytes, configuration
 from sdnator.plan.processes import usages
 
 BUSY = """
@@ -66,8 +66,8 @@ def test_switches_get_ids_and_ports():
 
 
 def test_what_is_idle_is_no_cost_of_packets():
-    idle = Phase(elapsed_s=10, cpu_s={"kitsune": 1.0}, archived=0, updates_in=0, updates_out=0)
-    busy = Phase(
+    idle = LoadPhase(elapsed_s=10, cpu_s={"kitsune": 1.0}, archived=0, updates_in=0, updates_out=0)
+    busy = LoadPhase(
         elapsed_s=20, load_s=15, sent=100, cpu_s={"kitsune": 5.0, "switch": 0.5},
         archived=0, updates_in=0, updates_out=0,
     )  # fmt: skip
@@ -85,14 +85,14 @@ class FakePipeline:
     """Each packet costs 50 µs and 400 bytes; more than 1,000 a second are too many."""
 
     def idle(self, seconds):
-        return Phase(
+        return LoadPhase(
             elapsed_s=seconds, cpu_s={"kitsune": 0.1 * seconds, "spare": 0.0},
             archived=0, updates_in=0, updates_out=0,
         )  # fmt: skip
 
     def loaded(self, pps, seconds):
         sent = round(pps * seconds)
-        return Phase(
+        return LoadPhase(
             elapsed_s=seconds + 2, load_s=seconds, sent=sent, carried=pps <= 1000,
             cpu_s={"kitsune": 0.1 * (seconds + 2) + sent * 50e-6, "spare": 0.0},
             archived=400 * sent, updates_in=500 * sent, updates_out=0,

@@ -13,7 +13,7 @@ from sdnator.config.up_settings import UpSettings
 from sdnator.errors import BadInput
 from sdnator.plan import model
 from sdnator.plan.costs import Costs, ProcessCost
-from sdnator.plan.demand import Demand
+from sdnator.plan.demand import PipelineDemand
 from sdnator.plan.model import ARCHIVE, at_rate, plan
 
 SWITCH = ProcessCost(
@@ -49,7 +49,7 @@ def row(found, name):
 
 def test_one_switch_takes_what_was_measured():
     """At a measured rate the costs themselves come out."""
-    found = plan(Demand(pps=1000), COSTS)
+    found = plan(PipelineDemand(pps=1000), COSTS)
     assert row(found, "switch").cores == pytest.approx(0.01 + 0.05)
     assert row(found, "kitsune").cores == pytest.approx(0.02 + 0.1)
     assert found.cores == pytest.approx(0.06 + 0.12 + 0.01)
@@ -62,7 +62,7 @@ def test_one_switch_takes_what_was_measured():
 
 def test_many_switches_multiply_what_one_of_them_brings():
     """Processes of a switch become more; those of the pipeline have more to do, at the rate of one switch."""
-    found = plan(Demand(switches=10, pps=1000), COSTS)
+    found = plan(PipelineDemand(switches=10, pps=1000), COSTS)
     switch, detector = row(found, "switch"), row(found, "kitsune")
     assert (switch.processes, switch.mib) == (10, 600)
     assert switch.each == pytest.approx(0.01 + 100 * 100e-6)
@@ -74,8 +74,8 @@ def test_many_switches_multiply_what_one_of_them_brings():
 
 
 def test_queries_and_consumers_add_to_each_packet():
-    alone = plan(Demand(pps=1000, archive_days=3), COSTS)
-    found = plan(Demand(pps=1000, queries=4, consumers=2, archive_days=3), COSTS)
+    alone = plan(PipelineDemand(pps=1000, archive_days=3), COSTS)
+    found = plan(PipelineDemand(pps=1000, queries=4, consumers=2, archive_days=3), COSTS)
     assert row(found, "switch").cores - row(alone, "switch").cores == pytest.approx(1000 * 4e-6)
     assert row(found, "updates").cores - row(alone, "updates").cores == pytest.approx(1000 * 10e-6)
     assert row(found, "kitsune").cores == row(alone, "kitsune").cores
@@ -107,31 +107,31 @@ def test_between_rates_cores_are_interpolated(rate, wanted):
 
 def test_bottleneck_is_the_process_that_needs_most_of_a_core():
     """And the rate at which it is full is the one at which it needs a whole one."""
-    found = plan(Demand(pps=5000), COSTS).bottleneck
+    found = plan(PipelineDemand(pps=5000), COSTS).bottleneck
     assert (found.name, found.share) == ("kitsune", pytest.approx(0.52))
     assert found.pps == pytest.approx(9800, rel=1e-6)
-    full = plan(Demand(pps=found.pps), COSTS)
+    full = plan(PipelineDemand(pps=found.pps), COSTS)
     assert row(full, "kitsune").each == pytest.approx(1)
-    over = plan(Demand(pps=50_000), COSTS).bottleneck
+    over = plan(PipelineDemand(pps=50_000), COSTS).bottleneck
     assert (over.share, over.pps) == (pytest.approx(5.02), pytest.approx(9800, rel=1e-6))
 
 
 def test_switches_alone_can_be_too_many():
     """Then no rate is low enough."""
-    found = plan(Demand(switches=2000, pps=1), COSTS).bottleneck
+    found = plan(PipelineDemand(switches=2000, pps=1), COSTS).bottleneck
     assert (found.name, found.pps) == ("kitsune", math.inf)
 
 
 def test_what_costs_nothing_is_never_full():
     costs = msgspec.structs.replace(COSTS, processes={"idle": ProcessCost(idle_cores=0.1)})
-    found = plan(Demand(pps=1000), costs)
+    found = plan(PipelineDemand(pps=1000), costs)
     assert found.bottleneck.pps == math.inf
     assert row(found, "idle").grows_with == ()
 
 
 def test_the_archive_can_be_the_bottleneck():
     costs = msgspec.structs.replace(COSTS, sqlite_bytes_per_s=200_010.0)
-    found = plan(Demand(pps=1000), costs).bottleneck
+    found = plan(PipelineDemand(pps=1000), costs).bottleneck
     assert (found.name, found.share) == (ARCHIVE, pytest.approx(400_010 / 200_010))
     # 60,000 bytes a second at 100 packets a second, 400,000 at 1,000
     assert found.pps == pytest.approx(100 + 900 * 140 / 340)
@@ -140,15 +140,15 @@ def test_the_archive_can_be_the_bottleneck():
 @pytest.mark.parametrize(
     ("demand", "word"),
     [
-        (Demand(pps=10), "less than was measured"),
-        (Demand(pps=2000), "more than was measured"),
-        (Demand(pps=20_000), "a machine with 2 cores"),
-        (Demand(switches=300, pps=30_000), "256 switches at most"),
-        (Demand(pps=1000, queries=300), "256 requests"),
-        (Demand(switches=4, pps=400, blocks=100), "400 table entries"),
-        (Demand(pps=1000, blocks=5000), "4,096 blocks at most"),
-        (Demand(pps=1000), "keeps 7.5 hours"),
-        (Demand(pps=100, archive_days=30), "keeps 2.1 days"),
+        (PipelineDemand(pps=10), "less than was measured"),
+        (PipelineDemand(pps=2000), "more than was measured"),
+        (PipelineDemand(pps=20_000), "a machine with 2 cores"),
+        (PipelineDemand(switches=300, pps=30_000), "256 switches at most"),
+        (PipelineDemand(pps=1000, queries=300), "256 requests"),
+        (PipelineDemand(switches=4, pps=400, blocks=100), "400 table entries"),
+        (PipelineDemand(pps=1000, blocks=5000), "4,096 blocks at most"),
+        (PipelineDemand(pps=1000), "keeps 7.5 hours"),
+        (PipelineDemand(pps=100, archive_days=30), "keeps 2.1 days"),
     ],
 )
 def test_what_the_figures_do_not_say_is_noted(demand, word):
@@ -158,9 +158,9 @@ def test_what_the_figures_do_not_say_is_noted(demand, word):
 @pytest.mark.parametrize(
     ("demand", "word"),
     [
-        (Demand(pps=500, queries=1), "further query"),
-        (Demand(pps=500, consumers=1), "further consumer"),
-        (Demand(switches=2, pps=500), "further switch"),
+        (PipelineDemand(pps=500, queries=1), "further query"),
+        (PipelineDemand(pps=500, consumers=1), "further consumer"),
+        (PipelineDemand(switches=2, pps=500), "further switch"),
     ],
 )
 def test_what_was_not_measured_is_said(demand, word):
@@ -171,7 +171,7 @@ def test_what_was_not_measured_is_said(demand, word):
 
 
 def test_a_demand_within_all_limits_has_no_notes():
-    assert plan(Demand(pps=500, archive_days=0.1), COSTS).notes == ()
+    assert plan(PipelineDemand(pps=500, archive_days=0.1), COSTS).notes == ()
 
 
 def test_limits_are_those_of_the_product():
@@ -200,4 +200,4 @@ def test_limits_are_those_of_the_product():
 )
 def test_impossible_demands_are_named(options, word):
     with pytest.raises(BadInput, match=word):
-        Demand(**{"pps": 100.0, **options})
+        PipelineDemand(**{"pps": 100.0, **options})
