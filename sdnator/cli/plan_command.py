@@ -131,11 +131,13 @@ def shown(made: "Plan", demand: "PipelineDemand", costs: "Costs") -> Iterator[st
     yield f"cores to provide  {made.cores_to_provide:,}, so that bursts find room"
     yield (
         f"archive           {_rounded(made.archive_gb_per_day)} GB a day, {_rounded(made.archive_gb)} GB for "
-        f"{demand.archive_days:g} days"
+        f"{demand.archive_days:g} day{'' if demand.archive_days == 1 else 's'}"
     )
     yield f"Data Updates      {_rounded(made.updates_in / 1e6)} MB/s in, {_rounded(made.updates_out / 1e6)} MB/s out"
+    if made.keys:
+        yield f"                  {made.keys:,} streams and channels"
     if made.partitions:
-        yield f"                  {made.keys:,} streams and channels; on Kafka {made.partitions:,} partitions"
+        yield f"                  on Kafka {made.partitions:,} partitions"
     yield ""
     yield fitted(bottleneck_sentence(made))
     for note in (*made.notes, basis(costs)):

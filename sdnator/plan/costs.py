@@ -69,7 +69,7 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     sqlite_bytes_per_s: float = 0.0
     """What SQLite takes, by itself; 0: not measured."""
     keys: int = 0
-    """Keys with a writer, that is, channels and streams on Data Updates, at one switch."""
+    """Paths with a writer, that is, channels and streams on Data Updates, at one switch."""
     switch_keys: int = 0
     """What each further switch adds."""
     topics: tuple[int, int] = (0, 0)

@@ -12,7 +12,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from due.codec import pack
 from due.drivers.sqlite import SqliteArchive
 from sdnator.errors import PipelineError
 from sdnator.plan.costs import Costs, ProcessCost
-from sdnator.plan.measured_pipeline import LoadPhase, MeasuredPipeline
+from sdnator.plan.measured_pipeline import FIRST_SWITCH, LoadPhase, MeasuredPipeline
 from sdnator.report.flow_picture import SERVICES
 
 PER_SWITCH = ("switch", "spare")
@@ -38,6 +37,8 @@ _CONSUMERS = 4
 _SERVED_S = 5.0
 """Until new queries are in force."""
 _ROWS, _ROW_BYTES, _BATCH = 2_000, 16_384, 20
+_NOISE_S, _NOISE = 0.03, 0.05
+"""Of CPU: three ticks of the kernel's clock, or a share of it."""
 _DAY = "%Y-%m-%d"
 
 Tell = Callable[[str], None]
@@ -72,6 +73,7 @@ def measured(schedule: Schedule, tell: Tell) -> Costs:
         tell("starting a pipeline with one switch")
         train = round(schedule.rates[-1] * TRAIN_S)
         with MeasuredPipeline(folder / "1", 1, train) as pipeline:
+            pipeline.idle(schedule.seconds)  # as long as where its memory is compared
             begun = pipeline.mib()
             costs = one_switch(pipeline, schedule, train, tell)
         if schedule.more:
@@ -116,7 +118,7 @@ def _costs(idle: LoadPhase, phases: Sequence[LoadPhase], pipeline: MeasuredPipel
         )
         for name in sorted(idle.cpu_s)
     }
-    health = pipeline.health()
+    paths = _paths(pipeline.health())
     return Costs(
         machine=processor(),
         cores=os.cpu_count() or 1,
@@ -127,7 +129,8 @@ def _costs(idle: LoadPhase, phases: Sequence[LoadPhase], pipeline: MeasuredPipel
         updates_out=_per_packet(phases, idle, "updates_out"),
         archive=_per_packet(phases, idle, "archived"),
         archive_idle=max(0.0, idle.archived / idle.elapsed_s),
-        keys=sum(_outlets(health).values()),
+        keys=len(paths),
+        switch_keys=sum(FIRST_SWITCH in path.split(".") for path in paths),
         topics=_topics(),
     )
 
@@ -178,9 +181,9 @@ def _with_more(
 
 
 def _more_cpu(phase: LoadPhase, before: LoadPhase, idle: LoadPhase, name: str) -> float:
-    """Seconds a packet."""
-    more = over_idle(phase, idle, name) / phase.sent - over_idle(before, idle, name) / before.sent
-    return max(0.0, more)
+    """Seconds a packet; none where the difference is what repeating a phase makes, too."""
+    now, then = over_idle(phase, idle, name), over_idle(before, idle, name) * phase.sent / before.sent
+    return (now - then) / phase.sent if now - then > max(_NOISE_S, _NOISE * then) else 0.0
 
 
 def _more_bytes(phase: LoadPhase, before: LoadPhase, what: str) -> float:
@@ -215,7 +218,7 @@ def _with_switches(
     costs: Costs, begun: Mapping[str, float], pipeline: MeasuredPipeline, schedule: Schedule
 ) -> Costs:
     """What further switches cost that forward nothing; `begun` is the memory of one with one switch, when it began."""
-    mib, idle, further = pipeline.mib(), pipeline.idle(schedule.seconds), pipeline.switches - 1
+    idle, mib, further = pipeline.idle(schedule.seconds), pipeline.mib(), pipeline.switches - 1
 
     def more(name: str, cost: ProcessCost) -> ProcessCost:
         if cost.per_switch:
@@ -224,16 +227,15 @@ def _with_switches(
         memory = mib.get(name, 0.0) - begun.get(name, 0.0)
         return replace(cost, switch_cores=max(0.0, cores / further), switch_mib=max(0.0, memory / further))
 
-    keys = sum(_outlets(pipeline.health()).values())
-    return replace(
-        costs,
-        processes={name: more(name, cost) for name, cost in costs.processes.items()},
-        switch_keys=max(0, round((keys - costs.keys) / further)),
-    )
+    return replace(costs, processes={name: more(name, cost) for name, cost in costs.processes.items()})
 
 
-def _outlets(health: Mapping[str, Any]) -> dict[str, int]:
-    return {name: told.get("health", {}).get("engine", {}).get("outlets", 0) for name, told in health.items()}
+def _paths(health: Mapping[str, Any]) -> set[str]:
+    """Paths that apps have written to; each has a stream or a channel of its own."""
+    found: set[str] = set()
+    for told in health.values():
+        found |= set(told.get("health", {}).get("engine", {}).get("keys", {}))
+    return found
 
 
 def _topics() -> tuple[int, int]:
@@ -248,19 +250,17 @@ def _topics() -> tuple[int, int]:
 
 
 def _sqlite_bytes_per_s(folder: Path) -> float:
-    """How many bytes of frames an archive takes a second: the median of batches."""
+    """How many bytes of frames an archive takes a second."""
     values = np.random.default_rng(1).bytes(_ROW_BYTES)
     frames = [pack([Item("plan.archive", values, n, n, "plan", "i", n)]) for n in range(_ROWS)]
     archive = SqliteArchive(f"sqlite://{folder}/filled.db")
-    times = []
+    began = time.perf_counter()
     try:
         for start in range(0, _ROWS, _BATCH):
-            began = time.perf_counter()
             archive.insert_frames(frames[start : start + _BATCH])
-            times.append(time.perf_counter() - began)
     finally:
         archive.close()
-    return _BATCH * _ROW_BYTES / median(times)
+    return _ROWS * _ROW_BYTES / (time.perf_counter() - began)
 
 
 def processor() -> str:

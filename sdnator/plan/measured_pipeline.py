@@ -24,6 +24,7 @@ from sdnator.plan.steady_load import SteadyLoad
 from sdnator.up import running
 
 UPDATES = "updates"
+FIRST_SWITCH = "s1"
 MOST_SWITCHES = 13
 """An interface's name has a letter for each pair of interfaces."""
 _START_S = 300.0

@@ -1,10 +1,11 @@
 """From demand and costs to processes, cores, memory, bytes and the bottleneck.  Pure.
 
-    cores of a process = idle + switches x (what a packet costs at the rate of one switch) x that rate
+    cores = idle + packets x cost of one in a long list + batches x cost of a batch x (1 - cores)
 
-A packet costs less where more come at once, since batches are larger; a batch belongs to one switch.  So what is
-measured at one switch holds for each of many with the same rate.  Between two measured rates cores are interpolated;
-beyond the highest, a packet costs what it costs there.
+A packet costs less where more come at once, since batches are larger.  A batch belongs to one switch, so what batches
+cost is measured at one switch, at the rate of one.  What comes while a process is busy waits, and is taken with what
+comes after it: the last factor.  So a busy process needs less for a packet, and is full when packets alone fill it.
+Between two measured rates cores are interpolated; beyond the highest, a packet costs what it costs there.
 """
 
 import math
@@ -76,7 +77,7 @@ class Plan:
     archive_gb: float
     """For as many days as it keeps."""
     keys: int
-    """Channels and streams on Data Updates."""
+    """Channels and streams on Data Updates; 0: not measured."""
     partitions: int
     """Of all topics, if Data Updates is Kafka."""
     bottleneck: Bottleneck
@@ -104,7 +105,7 @@ def plan(demand: PipelineDemand, costs: Costs) -> Plan:
         + demand.pps * (queries * costs.query_updates_out + consumers * costs.consumer_updates_out),
         archive_gb_per_day=gb_per_day,
         archive_gb=gb_per_day * demand.archive_days,
-        keys=costs.keys + (demand.switches - 1) * costs.switch_keys + queries,
+        keys=costs.keys + (demand.switches - 1) * costs.switch_keys + queries if costs.keys else 0,
         partitions=reliable * PARTITIONS + best_effort,
         bottleneck=bottleneck(demand, costs),
         notes=tuple(_notes(demand, costs, cores, gb_per_day)),
@@ -142,9 +143,15 @@ def _each(cost: ProcessCost, demand: PipelineDemand, rates: Sequence[float], pps
     """Cores of one process."""
     switches = 1 if cost.per_switch else demand.switches
     rate = _rate(demand, pps)
+    one = at_rate(rates, cost.us_per_packet, rate) / 1e6
+    packets = min(one, rate * min(cost.us_per_packet, default=0.0) / 1e6)
+    busy = cost.idle_cores + one
+    # of those batches that find the process idle; measured were those that did
+    batches = (one - packets) / (1 - busy) if busy < 1 else 0.0
     more = demand.queries * cost.us_per_query + demand.consumers * cost.us_per_consumer
-    load = at_rate(rates, cost.us_per_packet, rate) + rate * more
-    return cost.idle_cores + (switches - 1) * cost.switch_cores + switches * load / 1e6
+    fixed = cost.idle_cores + (switches - 1) * cost.switch_cores + switches * rate * more / 1e6
+    least = fixed + switches * (packets if busy < 1 else one)
+    return max(least, (least + switches * batches) / (1 + switches * batches))
 
 
 def _archived(demand: PipelineDemand, costs: Costs, pps: float) -> float:

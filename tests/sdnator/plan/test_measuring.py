@@ -9,7 +9,7 @@ import tomllib
 import pytest
 
 from sdnator.errors import PipelineError
-from sdnator.plan.measure import Schedule, one_switch, over_idle, processor
+from sdnator.plan.measure import Schedule, _more_cpu, one_switch, over_idle, processor
 from sdnator.plan.measured_pipeline import LoadPhase, archive_bytes, configuration
 from sdnator.plan.processes import usages
 
@@ -102,7 +102,8 @@ class FakePipeline:
         return {"kitsune": 100.0, "spare": 40.0}
 
     def health(self):
-        return {"kitsune": {"health": {"engine": {"outlets": 7}}}}
+        keys = {"network.switch.app.s1": 3, "network.anomaly.app.score": 9}
+        return {"kitsune": {"health": {"engine": {"keys": keys}}}, "firewall": {}}
 
 
 def test_costs_are_those_of_the_rates_that_were_carried():
@@ -117,7 +118,7 @@ def test_costs_are_those_of_the_rates_that_were_carried():
     assert (kitsune.idle_cores, kitsune.mib, kitsune.per_switch) == (pytest.approx(0.1), 100, False)
     assert (spare.us_per_packet, spare.per_switch) == ((0, 0), True)
     assert (costs.archive, costs.updates_in) == (pytest.approx((400, 400)), pytest.approx((500, 500)))
-    assert costs.keys == 7
+    assert (costs.keys, costs.switch_keys) == (2, 1)
     assert min(costs.topics) > 0
     assert "training on 80,000 packets" in told
 
@@ -125,3 +126,19 @@ def test_costs_are_those_of_the_rates_that_were_carried():
 def test_a_machine_that_carries_nothing_is_told():
     with pytest.raises(PipelineError, match="cannot carry 4,000"):
         one_switch(FakePipeline(), Schedule(rates=(4000.0,), more=False), 80_000, lambda _: None)
+
+
+def test_small_differences_are_no_cost():
+    """Repeating a phase differs by as much."""
+    idle = LoadPhase(elapsed_s=10, cpu_s={}, archived=0, updates_in=0, updates_out=0)
+
+    def used(seconds):
+        return LoadPhase(
+            elapsed_s=10, load_s=10, sent=1000, cpu_s={"updates": seconds},
+            archived=0, updates_in=0, updates_out=0,
+        )  # fmt: skip
+
+    assert _more_cpu(used(1.04), used(1.0), idle, "updates") == 0
+    assert _more_cpu(used(0.9), used(1.0), idle, "updates") == 0
+    assert _more_cpu(used(1.1), used(1.0), idle, "updates") == pytest.approx(0.0001)
+    assert _more_cpu(used(0.02), used(0.0), idle, "updates") == 0

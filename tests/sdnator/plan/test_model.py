@@ -68,7 +68,9 @@ def test_many_switches_multiply_what_one_of_them_brings():
     assert switch.each == pytest.approx(0.01 + 100 * 100e-6)
     assert switch.cores == pytest.approx(10 * switch.each)
     assert (detector.processes, detector.mib) == (1, 150 + 9 * 2)
-    assert detector.cores == pytest.approx(0.02 + 9 * 0.001 + 1000 * 200e-6)
+    # at one switch: 0.01 for packets, 0.01 for batches while 0.96 of the time was left for them
+    least, batches = 0.029 + 10 * 0.01, 10 * 0.01 / 0.96
+    assert detector.cores == pytest.approx((least + batches) / (1 + batches))
     assert found.keys == 30 + 9 * 7
     assert found.partitions == 85
 
@@ -114,6 +116,16 @@ def test_bottleneck_is_the_process_that_needs_most_of_a_core():
     assert row(full, "kitsune").each == pytest.approx(1)
     over = plan(PipelineDemand(pps=50_000), COSTS).bottleneck
     assert (over.share, over.pps) == (pytest.approx(5.02), pytest.approx(9800, rel=1e-6))
+
+
+def test_a_busy_process_takes_what_waits_together():
+    """It is full where packets alone fill it, however small the batches of each switch are."""
+    demand = PipelineDemand(switches=100, pps=5000)
+    found = plan(demand, COSTS)
+    detector = row(found, "kitsune").each
+    linear = 0.02 + 99 * 0.001 + 5000 * 200e-6
+    assert 0.02 + 99 * 0.001 + 5000 * 100e-6 < detector < 1 < linear
+    assert found.bottleneck.pps == pytest.approx((1 - 0.02 - 99 * 0.001) / 100e-6, rel=1e-6)
 
 
 def test_switches_alone_can_be_too_many():
