@@ -25,7 +25,7 @@ _COSTS = Path("sdnator-costs.json")
 _REMEDIES = {
     "archive (SQLite)": "use MongoDB (--archive), or ask for fewer packets",
     "switch": "use more switches, or one in hardware",
-    "spare": "it should be idle",
+    "dashboard": "do without it (--no-dashboard)",
 }
 _OTHERWISE = "copy fewer packets to the controller, or divide the switches between several pipelines"
 _ROOM = 0.7

@@ -21,7 +21,8 @@ TEXT = """\
    "idle_cores": 0.0074, "switch_cores": 0.0025, "us_per_packet": [713.0, 221.0, 41.6], "mib": 80, "switch_mib": 1.7
   },
   "sonata_adapter": {
-   "idle_cores": 0.0025, "switch_cores": 0.0013, "us_per_packet": [113.0, 61.0, 26.0], "mib": 105
+   "idle_cores": 0.0025, "switch_cores": 0.0013, "us_per_packet": [113.0, 61.0, 26.0], "us_per_query": 15.3,
+   "mib": 105, "switch_mib": 16
   },
   "spare": {"per_switch": true, "mib": 46},
   "supervisor": {"idle_cores": 0.0024, "mib": 58},
@@ -31,7 +32,13 @@ TEXT = """\
  "updates_in": [1889.0, 907.0, 595.0],
  "updates_out": [1157.0, 585.0, 474.0],
  "archive": [983.0, 563.0, 472.0],
+ "query_updates_in": 60.0,
+ "query_updates_out": 40.0,
+ "query_archive": 30.0,
+ "consumer_updates_out": 100.0,
  "sqlite_bytes_per_s": 52000000.0,
+ "keys": 33,
+ "switch_keys": 7,
  "topics": [35, 4]
 }
 """

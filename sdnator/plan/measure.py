@@ -73,7 +73,6 @@ def measured(schedule: Schedule, tell: Tell) -> Costs:
         tell("starting a pipeline with one switch")
         train = round(schedule.rates[-1] * TRAIN_S)
         with MeasuredPipeline(folder / "1", 1, train) as pipeline:
-            pipeline.idle(schedule.seconds)  # as long as where its memory is compared
             begun = pipeline.mib()
             costs = one_switch(pipeline, schedule, train, tell)
         if schedule.more:
@@ -218,7 +217,7 @@ def _with_switches(
     costs: Costs, begun: Mapping[str, float], pipeline: MeasuredPipeline, schedule: Schedule
 ) -> Costs:
     """What further switches cost that forward nothing; `begun` is the memory of one with one switch, when it began."""
-    idle, mib, further = pipeline.idle(schedule.seconds), pipeline.mib(), pipeline.switches - 1
+    mib, idle, further = pipeline.mib(), pipeline.idle(schedule.seconds), pipeline.switches - 1
 
     def more(name: str, cost: ProcessCost) -> ProcessCost:
         if cost.per_switch:
