@@ -209,31 +209,37 @@ class KitNet:
         self.output = Layer.fresh([range(len(self.feature_map))])
 
     def _train(self, features: _Array) -> None:
-        ensemble, output = self._layers()
         kernel = self._kernel
         scratch = self._scratch()
-        layers = [_c_layer(kernel, layer) for layer in (ensemble, output)]
+        layers = self._c_layers()
         rows = kernel.pointer("double", features)
         work = kernel.pointer("double", scratch)
         if kernel.lib.kitnet_train(*layers, rows, len(features), self.width, self.learning_rate, work):
             raise ValueError(_UNSOUND)
 
     def _score(self, features: _Array) -> tuple[_Array, _Array]:
-        kernel = self._kernel
-        layers = [_c_layer(kernel, layer) for layer in self._layers()]
         count = len(features)
-        spare = -count % _LANES
-        if spare:
-            features = np.concatenate([features, np.zeros((spare, self.width))])
-        errors = np.empty((len(features), len(self.feature_map)))
-        scores = np.empty(len(features))
+        whole = count - count % _LANES
+        room = whole if whole == count else whole + _LANES
+        errors, scores = np.empty((room, len(self.feature_map))), np.empty(room)
         scratch = self._scratch()
+        if whole:
+            self._score_lanes(features[:whole], scratch, errors, scores)
+        if whole < count:
+            last = np.zeros((_LANES, self.width))
+            last[: count - whole] = features[whole:]
+            self._score_lanes(last, scratch, errors[whole:], scores[whole:])
+        return scores[:count], errors[:count]
+
+    def _score_lanes(self, features: _Array, scratch: _Array, errors: _Array, scores: _Array) -> None:
+        """Rows of which there are a multiple of `_LANES`."""
+        kernel = self._kernel
         rows, work, rmse, out = (
             kernel.pointer("double", array) for array in (features, scratch, errors, scores)
         )
-        if kernel.lib.kitnet_score(*layers, rows, len(features), self.width, self.clip, work, rmse, out):
+        given = rows, len(features), self.width, self.clip, work, rmse, out
+        if kernel.lib.kitnet_score(*self._c_layers(), *given):
             raise ValueError(_UNSOUND)
-        return scores[:count], errors[:count]
 
     def _scratch(self) -> _Array:
         units = sum(sum(layer.weights.shape) for layer in self._layers())

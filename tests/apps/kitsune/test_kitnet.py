@@ -59,6 +59,16 @@ def test_kernel_equals_twin_and_naive_on_random_features(width, most, seed):
     assert np.allclose(kernel.process(rows)[0], wanted, rtol=1e-10, atol=0)
 
 
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 47])
+def test_scores_do_not_depend_on_how_many_rows_come_at_a_time(count):
+    """The kernel takes sixteen at a time, whatever else is asked."""
+    rows = np.random.default_rng(4).random((100, 6))
+    network = KitNet(6, fm_grace=5, ad_grace=30, max_ae=3)
+    network.learn(rows[:36])
+    for found, wanted in zip(network.score(rows[36 : 36 + count]), network.score(rows[36:]), strict=True):
+        assert np.array_equal(found, wanted[:count])
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_given_map_trains_on_all_training_packets(name):
     rows = np.random.default_rng(5).random((40, 4))
