@@ -2,12 +2,15 @@
 
 import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
 
 from sdnator.errors import BadInput, PipelineError
 
 if TYPE_CHECKING:
     from due import Item
+    from due.drivers.base import ArchiveDriver
 
 _SECONDS = 5.0
 _WINDOWS_NS = (60 * 10**9, 3_600 * 10**9, 86_400 * 10**9)
@@ -49,6 +52,21 @@ def without_user(url: str) -> str:
     """A URL without user and password, for people."""
     scheme, _, rest = url.partition("://")
     return f"{scheme}://{rest.rpartition('@')[2]}"
+
+
+def open_existing(url: str) -> "ArchiveDriver":
+    """An archive to read from.
+
+    Raises:
+        BadInput: its file is not there; opening would make an empty one.
+    """
+    from due.backends import open_archive
+
+    if url.startswith("sqlite:") and not Path(unquote(urlsplit(url).path)).exists():
+        raise BadInput(
+            f"there is no archive at {url} yet: start a pipeline with `sdnator up`, or give --archive"
+        )
+    return open_archive(url)
 
 
 def latest(

@@ -1,7 +1,7 @@
 """Blocks, guards and rate limits in Data Archives, read and written without a running pipeline."""
 
-import os
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
@@ -20,21 +20,13 @@ INSTRUCTION: Final = "network.instruction.operator.firewall"
 _LIFTS: Final = {"block": "unblock", "protect": "unprotect", "meter": "unmeter"}
 
 
-def archive_url(given: str) -> str:
-    """The archive that was named, in $DUE_ARCHIVE, too, or the one of `sdnator up`."""
-    if given or os.environ.get("DUE_ARCHIVE"):
-        return given or os.environ["DUE_ARCHIVE"]
-    found = running.find()
-    return found.archive if found is not None else running.default_archive()
-
-
 def readable(archive: str) -> str:
     """URL of the archive to read; empty: there is no default archive yet.
 
     Raises:
         BadInput: the named file does not exist; the driver would create it, and show no blocks.
     """
-    url = archive_url(archive)
+    url = running.archive_url(archive)
     parts = urlsplit(url)
     if parts.scheme != "sqlite" or not parts.path or Path(unquote(parts.path)).is_file():
         return url
@@ -52,11 +44,8 @@ def find(archive: str, query: str | dict[str, Any]) -> list[Item]:
     if not url:
         return []
     try:
-        driver = open_archive(url)
-        try:
+        with closing(open_archive(url)) as driver:
             return driver.find({"dataKey": query} if isinstance(query, str) else query)
-        finally:
-            driver.close()
     except DueError as error:
         raise BadInput(f"{url}: {error}") from error
 
@@ -96,11 +85,8 @@ def lift_in_archive(archive: str) -> list[Decision]:
     if not url:
         return []
     try:
-        driver = open_archive(url)
-        try:
+        with closing(open_archive(url)) as driver:
             driver.insert(items)
-        finally:
-            driver.close()
     except DueError as error:
         raise BadInput(f"{url}: {error}") from error
     return standing

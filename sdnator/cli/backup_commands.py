@@ -227,11 +227,8 @@ def _check_archive(path: Path) -> None:
     from due.errors import DueError
 
     try:
-        driver = open_archive(f"sqlite://{path}")
-        try:
+        with closing(open_archive(f"sqlite://{path}")) as driver:
             driver.find({"dataKey": "sdnator.restore"})
-        finally:
-            driver.close()
     except DueError as error:
         raise BadInput(f"the archive in the backup cannot be used: {error}") from None
 

@@ -25,7 +25,7 @@ from apps.messages import Decision, Instruction
 from apps.standing_decisions import in_force
 from due import DueError
 from sdnator.app_requests import AppRequest, ask
-from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, archive_url, find, lift_in_archive
+from sdnator.blocks.blocks_archive import INSTRUCTION, all_decisions, find, lift_in_archive
 from sdnator.blocks.blocks_direct import lift_in_switch
 from sdnator.blocks.blocks_nft import nft_sets
 from sdnator.blocks.blocks_places import PlaceAnswer, answers_of
@@ -298,7 +298,7 @@ def _instruct(
         expires=time.time_ns() + round(patience * 1e9),
     )
     question = AppRequest("firewall", INSTRUCTION, _ANSWER, instruction.id, instruction.to_value())
-    typer.echo(ask(question, updates, archive_url(archive), patience))
+    typer.echo(ask(question, updates, running.archive_url(archive), patience))
 
 
 def _check_subject(verb: Verb, subject: str) -> None:

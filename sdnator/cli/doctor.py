@@ -7,7 +7,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -309,11 +309,8 @@ def check_archive(url: str) -> Check:
     from due.backends import open_archive
 
     def ask() -> None:
-        driver = open_archive(url)
-        try:
+        with closing(open_archive(url)) as driver:
             driver.find({"dataKey": "doctor"})
-        finally:
-            driver.close()
 
     return _reached("--archive", url, ask, "start it, or correct address, password or file permissions")
 
@@ -366,4 +363,6 @@ def _show(checks: list[Check], *, well: bool) -> None:
     if any(check.state == "exposed" for check in checks):
         print("something is EXPOSED; see above what to do")
     else:
-        print("everything is as it should be" if well else "a required part is MISSING; see above what to do")
+        print(
+            "everything is as it should be" if well else "a required part is MISSING; see above what to do"
+        )

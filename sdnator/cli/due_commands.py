@@ -7,11 +7,9 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-from urllib.parse import unquote, urlsplit
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,7 +17,7 @@ from sdnator.cli.item_rates import SECONDS, Rates, headline
 from sdnator.cli.live_items import live_items
 from sdnator.cli.plan_question import is_asked_of_adapter
 from sdnator.errors import BadInput, PipelineError
-from sdnator.northbound import latest
+from sdnator.northbound import latest, open_existing
 from sdnator.notation import brief, duration_ns, instant_ns, local_time, typed_key
 from sdnator.plurals import counted
 from sdnator.up import running
@@ -191,7 +189,8 @@ def get(
     start = instant_ns(since, now, "--since") if since else 0
     end = instant_ns(until, now, "--until") if until else now + 1
     try:
-        items, more = _from_archive(archive or known_archive(), wanted, start, end, limit)
+        with closing(open_existing(running.archive_url(archive))) as driver:
+            items, more = latest(driver.find, wanted, start, end, limit)
     except (InvalidOption, InvalidQuery) as error:
         raise BadInput(str(error)) from None
     except DueError as error:
@@ -202,29 +201,6 @@ def get(
         print(f"sdnator: there are older items; raise --limit {limit} to see them", file=sys.stderr)
     elif not items:
         print(f"sdnator: no items under {wanted['dataKey']} in that time", file=sys.stderr)
-
-
-def known_archive() -> str:
-    """Data Archives of the running pipeline, or the file of the last one."""
-    found = running.find()
-    return found.archive if found is not None else running.default_archive()
-
-
-def _from_archive(
-    url: str, query: Mapping[str, Any], start: int, end: int, limit: int
-) -> "tuple[list[Item], bool]":
-    from due.backends import open_archive
-
-    # opening would create the file
-    if url.startswith("sqlite:") and not Path(unquote(urlsplit(url).path)).exists():
-        raise BadInput(
-            f"there is no archive at {url} yet: start a pipeline with `sdnator up`, or give --archive"
-        )
-    driver = open_archive(url)
-    try:
-        return latest(driver.find, query, start, end, limit)
-    finally:
-        driver.close()
 
 
 def _json_line(item: "Item") -> str:

@@ -6,6 +6,7 @@ wanted ─► Coordinator ─► adapter: plan ─► switch: entries, counters 
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from typing import Annotated, Any, Final
 
 import typer
@@ -165,11 +166,8 @@ def _archived(url: str, key: str) -> Section:
     from sdnator.redaction import redacted
 
     try:
-        driver = open_archive(url)
-        try:
+        with closing(open_archive(url)) as driver:
             items, _ = latest(driver.find, {"dataKey": key}, 0, time.time_ns() + 1, 1)
-        finally:
-            driver.close()
     except DueError as error:
         return {"where": redacted(url), "key": key, "last": None, "error": str(error)}
     last = {"at": items[-1].event_time, "value": _plain(items[-1].value)} if items else None

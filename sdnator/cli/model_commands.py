@@ -13,7 +13,6 @@ from apps.kitsune.kept_model import models_aside, set_aside
 from apps.kitsune.model_file import ModelFileError, load_model
 from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder
 from sdnator.app_requests import AppRequest, ask
-from sdnator.blocks.blocks_archive import archive_url
 from sdnator.errors import BadInput, PipelineError
 from sdnator.model_words import model_lines, model_of
 from sdnator.up import running
@@ -96,7 +95,7 @@ def retrain(
         expires=time.time_ns() + round(_ANSWER_SECONDS * 1e9),
     )
     question = AppRequest("detector", ORDERS, ANSWER, order.id, order.to_value())
-    typer.echo(ask(question, "", archive_url(""), _ANSWER_SECONDS))
+    typer.echo(ask(question, "", running.archive_url(""), _ANSWER_SECONDS))
 
 
 def _live(found: running.Running) -> dict[str, Any] | None:

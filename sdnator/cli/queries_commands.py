@@ -28,7 +28,7 @@ from apps.sonata_adapter.query.templates import QueryFolder, own_queries
 from apps.sonata_adapter.query.text import parse_queries
 from due import DueError
 from sdnator.capture.captures import CaptureError
-from sdnator.cli.due_commands import Updates, known_archive
+from sdnator.cli.due_commands import Updates
 from sdnator.cli.plain_table import plain_table
 from sdnator.cli.plan_question import ask_plan
 from sdnator.cli.queries_run import PastPackets, archived, as_line, as_text, captured, engine_of
@@ -250,7 +250,7 @@ def run_query(
         raise BadInput("give either --capture FILE or --since 1h")
     try:
         past = PastPackets(request, engine_of(engine, master))
-        streams = captured(capture) if capture else archived(archive or known_archive(), since)
+        streams = captured(capture) if capture else archived(running.archive_url(archive), since)
         for output in past.run(streams):
             typer.echo(json.dumps(as_line(output)) if as_json else as_text(output))
     except (CaptureError, DueError, SonataError) as error:

@@ -8,11 +8,11 @@ the archive the value that the controller wrote to `network.switch.p4runtime_ctr
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from apps.sonata_adapter.host.engine import HostEngine, WindowEngine
 from apps.sonata_adapter.keys import QueryRequest
 from apps.sonata_adapter.results import Captured, QueryResult
 from due import Item, RecordBatch
-from due.backends import open_archive
 from due.drivers.base import ArchiveDriver
 from sdnator.capture.captures import Capture
 from sdnator.errors import BadInput
+from sdnator.northbound import open_existing
 from sdnator.notation import duration_ns
 from sdnator.plurals import counted
 
@@ -127,20 +127,13 @@ def _batch(times_us: list[int], lengths: list[int], frames: list[bytes], first: 
 def archived(url: str, since: str) -> Iterator[Piece]:
     """Packets in the archive that were written within the last `since` (`30s`, `1h`)."""
     begin = time.time_ns() - duration_ns(since, "--since")
-    if url.startswith("sqlite:") and not Path(unquote(urlsplit(url).path)).exists():
-        raise BadInput(
-            f"there is no archive at {url} yet: start a pipeline with `sdnator up`, or give --archive"
-        )
-    archive = open_archive(url)
-    try:
+    with closing(open_existing(url)) as archive:
         bases: dict[str, int] = {}
         for item in _slices(archive, begin, time.time_ns()):
             switch = item.key.split(".")[3]
             if switch not in bases:
                 bases[switch] = _base_us(archive, switch)
             yield Piece(switch, bases[switch], item.value, whole=False)
-    finally:
-        archive.close()
 
 
 def _slices(archive: ArchiveDriver, begin: int, end: int) -> Iterator[Item]:

@@ -4,7 +4,6 @@ p4runtime-shell pins protobuf 3.20, which is slow with today's Python and confli
 has its own environment in the cache folder, created on first use.
 """
 
-import os
 import shutil
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import typer
 
 from sdnator.cli.switch_place import DeviceId, Insecure, SwitchAddress, SwitchArgument, place_of
 from sdnator.errors import BadInput, PipelineError
+from sdnator.user_folders import user_folder
 
 PACKAGE = "p4runtime-shell==0.0.6"
 _MADE = "made"
@@ -61,9 +61,8 @@ def _command(python: Path, place: SwitchAddress) -> list[str]:
 
 def folder() -> Path:
     """Folder of the shell's environment."""
-    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    base = named if named.is_absolute() else Path.home() / ".cache"
-    return base / "sdnator" / f"p4runtime-shell-{sys.version_info.major}.{sys.version_info.minor}"
+    name = f"p4runtime-shell-{sys.version_info.major}.{sys.version_info.minor}"
+    return user_folder("XDG_CACHE_HOME", ".cache") / name
 
 
 def environment(*, again: bool = False) -> Path:

@@ -12,8 +12,9 @@ from typing import Any, get_origin, get_type_hints
 import msgspec
 
 from sdnator.config import config_lines
-from sdnator.config.config_lines import line_at, lines_of
+from sdnator.config.config_lines import lines_of
 from sdnator.errors import BadInput
+from sdnator.user_folders import user_folder
 
 NAME = "sdnator.toml"
 PREFIX = "SDNATOR_"
@@ -97,8 +98,7 @@ def find() -> Path | None:
 
 def configuration_folder() -> Path:
     """The folder of the user's configuration."""
-    named = Path(os.environ.get("XDG_CONFIG_HOME", ""))
-    return (named if named.is_absolute() else Path.home() / ".config") / "sdnator"
+    return user_folder("XDG_CONFIG_HOME", ".config")
 
 
 def load(path: Path | None, environment: Mapping[str, str] | None = None) -> Config:
@@ -182,7 +182,8 @@ def _fault(error: Any, place: Callable[[config_lines.Path], str]) -> Fault:
     at: config_lines.Path = tuple(error["loc"])
     option = _dotted(at)
     if error["type"] == "extra_forbidden":
-        return Fault(place(at), option, f"there is no such {_what(at)}{_meant(at)}")
+        kind = "section" if len(at) == 1 else "option"
+        return Fault(place(at), option, f"there is no such {kind}{_meant(at)}")
     got = json.dumps(error["input"], default=str)
     if error["type"] == "literal_error":
         return Fault(place(at), option, f"{got} is none of {error['ctx']['expected']}")
@@ -192,10 +193,6 @@ def _fault(error: Any, place: Callable[[config_lines.Path], str]) -> Fault:
 
 def _dotted(at: config_lines.Path) -> str:
     return "".join(f"[{one}]" if isinstance(one, int) else f".{one}" for one in at).lstrip(".")
-
-
-def _what(at: config_lines.Path) -> str:
-    return "section" if len(at) == 1 else "option"
 
 
 def _meant(at: config_lines.Path) -> str:
@@ -359,6 +356,3 @@ def _switch_faults(config: Config, place: Callable[[config_lines.Path], str]) ->
                 place((*at, "name")), _dotted((*at, "name")), f"there are two switches named {made.name}"
             )
         names.add(made.name)
-
-
-__all__ = ["Config", "Fault", "WrongConfiguration", "find", "line_at", "load", "option_paths", "variable"]

@@ -27,11 +27,6 @@ def lines_of(text: str) -> dict[Path, int]:
     return found
 
 
-def line_at(lines: dict[Path, int], path: Path) -> int:
-    """The line of an option, or of its table; 1 if neither is in the file."""
-    return next((lines[path[:end]] for end in range(len(path), 0, -1) if path[:end] in lines), 1)
-
-
 def _statements(text: str) -> Iterator[tuple[int, str]]:
     """Headers and assignments with the line they begin in; values may span several lines."""
     began, held = 0, ""

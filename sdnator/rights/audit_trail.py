@@ -27,7 +27,7 @@ def note(deed: str, *, instruction: str = "", archive: str = "") -> None:
     """
     from due import DueError, Item
     from due.backends import open_archive
-    from sdnator.blocks.blocks_archive import archive_url
+    from sdnator.up.running import archive_url
 
     now = time.time_ns()
     done = AuditedDeed(who=unix_user(), deed=deed[:_LONGEST], source=_SOURCE, instruction=instruction)

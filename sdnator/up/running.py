@@ -22,6 +22,7 @@ from sdnator.errors import BadInput, PipelineError
 from sdnator.northbound import without_user
 from sdnator.private_files import write_private_json
 from sdnator.redaction import redacted_values
+from sdnator.user_folders import user_folder
 
 SCHEMA = 3
 """Version of the run file; grows when a reader of the old one would misunderstand it."""
@@ -71,12 +72,12 @@ def shown(found: Running) -> dict[str, Any]:
 
 def state_folder() -> Path:
     """Folder for state that the next run or other commands use."""
-    return _xdg("XDG_STATE_HOME", ".local/state")
+    return user_folder("XDG_STATE_HOME", ".local/state")
 
 
 def data_folder() -> Path:
     """Folder for data that the user keeps."""
-    return _xdg("XDG_DATA_HOME", ".local/share")
+    return user_folder("XDG_DATA_HOME", ".local/share")
 
 
 def default_archive() -> str:
@@ -84,10 +85,12 @@ def default_archive() -> str:
     return f"sqlite://{quote(str(data_folder() / 'archive.db'))}"
 
 
-def _xdg(variable: str, default: str) -> Path:
-    named = Path(os.environ.get(variable, ""))
-    # the XDG standard says to ignore relative paths
-    return (named if named.is_absolute() else Path.home() / default) / "sdnator"
+def archive_url(given: str) -> str:
+    """The archive that was named, in $DUE_ARCHIVE, too, or that of the running or last pipeline."""
+    if given or os.environ.get("DUE_ARCHIVE"):
+        return given or os.environ["DUE_ARCHIVE"]
+    found = find()
+    return found.archive if found is not None else default_archive()
 
 
 def updates_link(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from sdnator.cli.config_commands import example_lines
 from sdnator.cli.main import app
 from sdnator.config import config_file
 from sdnator.config.config_file import WrongConfiguration, load, option_paths, variable
-from sdnator.config.config_lines import line_at, lines_of
+from sdnator.config.config_lines import lines_of
 from sdnator.config.config_model import LISTS, fields, sections
 from sdnator.config.config_texts import texts
 
@@ -138,8 +138,6 @@ def test_lines_of_statements_that_go_over_several_lines():
     assert found[("b", "d", "e")] == 7
     assert found[("f", 0, "g", "h")] == 11
     assert found[("f", 1, "g")] == 13
-    assert line_at(found, ("b", "unknown")) == 3
-    assert line_at(found, ("nothing",)) == 1
 
 
 def test_check_as_a_command(tmp_path):
