@@ -25,6 +25,7 @@ from typing import Final, Self, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from sdnator.capture.table_file import open_table
 from sdnator.errors import BadInput
 
 HEADER: Final = "index,label,attacker"
@@ -171,7 +172,7 @@ _FORMS: Final = f"give lines of 0/1, the published file, or '{HEADER}' with one 
 
 
 def _rows(path: Path) -> Iterator[tuple[str, str]]:
-    with _open(path) as file:
+    with open_table(path, MissingLabels, "labels", "a label file", newline="") as file:
         rows = csv.reader(_lines(path, file))
         first = next(rows, None)
         if first is None:
@@ -215,16 +216,3 @@ def _bare(path: Path, rows: Iterable[list[str]]) -> Iterator[tuple[str, str]]:
                 f"{path}: line {number:,} has {len(row)} columns and no known header; {_FORMS}"
             )
         yield row[0].strip(), ""
-
-
-def _open(path: Path) -> TextIO:
-    try:
-        with path.open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        if packed:
-            return gzip.open(path, "rt", encoding="ascii", newline="")
-        return path.open(encoding="ascii", newline="")
-    except FileNotFoundError:
-        raise MissingLabels(f"{path}: no such file; check the path of the labels") from None
-    except OSError as error:
-        raise MissingLabels(f"{path}: cannot be read ({error.strerror}); give a label file") from None

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from apps.packets import PACKET_COLUMNS
 from due import RecordBatch
 from sdnator.capture.pcap_records import MAX_FRAME
+from sdnator.capture.table_file import open_table
 from sdnator.errors import BadInput
 
 COLUMNS: Final = (
@@ -118,7 +119,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[TsharkRow]:
         MissingTsv, MalformedTsv
     """
     path = Path(path)
-    with _open(path) as file:
+    with open_table(path, MissingTsv, "table", "a tshark table") as file:
         numbered = enumerate(_lines(path, file), 1)
         try:
             header = next(numbered, (1, ""))[1].rstrip("\r\n").split("\t")
@@ -180,19 +181,6 @@ _PLAIN = (
     *("tcp_sport", "tcp_dport", "udp_sport", "udp_dport", "icmp_type", "icmp_code"),
 )
 _ZERO_IF_ABSENT = ("arp_src_mac", "arp_src_ip", "arp_dst_mac", "arp_dst_ip")
-
-
-def _open(path: Path) -> TextIO:
-    try:
-        with path.open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        if packed:
-            return gzip.open(path, "rt", encoding="ascii", newline="\n")
-        return path.open(encoding="ascii", newline="\n")
-    except FileNotFoundError:
-        raise MissingTsv(f"{path}: no such file; check the path of the table") from None
-    except OSError as error:
-        raise MissingTsv(f"{path}: cannot be read ({error.strerror}); give a tshark table") from None
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:

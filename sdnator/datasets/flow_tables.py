@@ -31,6 +31,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple, TextIO
 
+from sdnator.capture.table_file import open_table
 from sdnator.errors import BadInput
 
 MAX_LINE: Final = 65_536
@@ -82,7 +83,8 @@ def read_flow_table(
         MissingFlowTable, MalformedFlowTable
     """
     path = Path(path)
-    with _open(path) as file:
+    # Latin-1 takes every byte: of the text only names of labels are not ASCII, and only one is looked at.
+    with open_table(path, MissingFlowTable, "table", "a table of flows", encoding="latin-1") as file:
         lines = _numbered(path, file)
         try:
             yield from _flows(path, lines, round(clock_offset_hours * 3_600) * _NS)
@@ -288,17 +290,3 @@ def _numbered(path: Path, file: TextIO) -> _Lines:
                 f"{path}: line {number:,} is longer than {MAX_LINE:,} characters; this is not a table of flows"
             )
         yield number, line.rstrip("\r\n")
-
-
-def _open(path: Path) -> TextIO:
-    # Latin-1 takes every byte: of the text only names of labels are not ASCII, and only one is looked at.
-    try:
-        with path.open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        if packed:
-            return gzip.open(path, "rt", encoding="latin-1", newline="\n")
-        return path.open(encoding="latin-1", newline="\n")
-    except FileNotFoundError:
-        raise MissingFlowTable(f"{path}: no such file; check the path of the table") from None
-    except OSError as error:
-        raise MissingFlowTable(f"{path}: cannot be read ({error.strerror}); give a table of flows") from None
