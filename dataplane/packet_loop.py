@@ -14,13 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from dataplane.compiler.machine import FrameSlices
+from dataplane.compiler.machine import BatchResult, FrameSlices
 from dataplane.errors import DataplaneError
 from dataplane.p4runtime.device import Device
 from dataplane.p4runtime.pipeline import ForwardingPipeline
 from dataplane.ports.port import Arrived, NullPort, Port, Wakeup
 from dataplane.ports.veth_port import VethPort
-from dataplane.v1model.switch import FrameResult
 
 _CHUNK = 256
 _BLOCK = 4096
@@ -238,7 +237,7 @@ class PacketLoop:
 
     def _process(
         self, pipeline: ForwardingPipeline, number: int, arrived: Arrived, *, lossless: bool
-    ) -> FrameResult:
+    ) -> BatchResult:
         if (block := arrived.block) is not None:
             if lossless:
                 self._clock.advance(int(block.times_us[-1]))
@@ -251,7 +250,7 @@ class PacketLoop:
             self._clock.advance(times[-1])
         return pipeline.switch.process_many(number, frames, times)
 
-    def _hand_out(self, pipeline: ForwardingPipeline, result: FrameResult, *, lossless: bool) -> None:
+    def _hand_out(self, pipeline: ForwardingPipeline, result: BatchResult, *, lossless: bool) -> None:
         if isinstance(result.outputs, FrameSlices):
             self._send_slices(result.outputs)
         else:

@@ -60,14 +60,17 @@ class FrameSlices:
 
 @dataclass(slots=True)
 class BatchResult:
-    """What a batch of frames led to; `verdicts` has a byte per frame."""
+    """What one frame, or one batch of frames, led to."""
 
     outputs: list[tuple[int, bytes]] | FrameSlices = field(default_factory=list)
+    """(port, frame) in the order of sending; frames to the CPU port are in `packet_ins` instead."""
     packet_ins: list[bytes] = field(default_factory=list)
+    """Payloads as sent to the CPU port: the packet_in header in front, then the frame."""
     digests: list[Digest] = field(default_factory=list)
     samples: Mapping[str, list[bytes]] = field(default_factory=dict)
-    """Digests of a block of frames, by name."""
+    """In place of `digests`, of a block of frames: by name, in order."""
     verdicts: bytes = b""
+    """One byte per frame: bit 0 it made a packet-in, bit 1 it left through a port."""
 
 
 @dataclass(frozen=True, slots=True)

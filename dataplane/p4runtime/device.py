@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from dataplane.compiler.c_machine import CMachine
-from dataplane.compiler.machine import MachineMaker
+from dataplane.compiler.machine import BatchResult, MachineMaker
 from dataplane.p4runtime import messages, pipeline_config
 from dataplane.p4runtime.arbitration import DEFAULT_ROLE, Arbitration, ArbitrationUpdate
 from dataplane.p4runtime.pipeline import ForwardingPipeline, verify
@@ -32,7 +32,6 @@ from dataplane.p4runtime.status import (
 from dataplane.p4runtime.streams import ControllerStream, PacketQueue
 from dataplane.p4runtime.trust import TrustedPrograms
 from dataplane.p4runtime.writes import Writer
-from dataplane.v1model.switch import FrameResult
 from dataplane.v1model.tables import Table, TableEntry
 from p4rt import p4runtime
 
@@ -288,7 +287,7 @@ class Device:
             return 0
         return min(queue.room() for queue in readers)
 
-    def deliver(self, pipeline: ForwardingPipeline, result: FrameResult, *, lossless: bool) -> None:
+    def deliver(self, pipeline: ForwardingPipeline, result: BatchResult, *, lossless: bool) -> None:
         """Queue the packet-ins and digests of processed frames; what has no taker is counted."""
         ready: list[bytes] = []
         if result.packet_ins:

@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from dataplane.compiler.machine import Digest
 from dataplane.compiler.samples import varint
 from dataplane.p4runtime.schema import BoundDigest, Schema
 from dataplane.p4runtime.status import Exists, InvalidArgument, MissingEntity
 from dataplane.p4runtime.table_entities import DELETE, INSERT, Undo
-from dataplane.v1model.switch import Digest
 from p4rt import p4runtime
 
 MAX_LIST = 4096

@@ -12,10 +12,10 @@ No socket, no thread and no clock in here: time is an argument (µs), so meters,
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from dataplane.compiler.c_machine import CMachine
-from dataplane.compiler.machine import DROP_PORT, BatchResult, Digest, FrameSlices, MachineMaker, Replicas
+from dataplane.compiler.machine import BatchResult, MachineMaker, Replicas
 from dataplane.errors import DataplaneError
 from dataplane.frame_block import FrameBlock
 from dataplane.v1model.externs import CounterArray, MeterArray, RegisterArray
@@ -23,25 +23,8 @@ from dataplane.v1model.program import Program
 from dataplane.v1model.tables import Table, TableEntry
 from dataplane.v1model.tree import TableNode
 
-__all__ = ["DROP_PORT", "Digest", "FrameResult", "Replica", "Switch"]
-
 _MAX_SESSION = 0x7FFF
 _MAX_GROUP = 0xFFFF
-
-
-@dataclass(slots=True)
-class FrameResult:
-    """What one frame, or one batch of frames, led to."""
-
-    outputs: list[tuple[int, bytes]] | FrameSlices = field(default_factory=list)
-    """(port, frame) in the order of sending; frames to the CPU port are in `packet_ins` instead."""
-    packet_ins: list[bytes] = field(default_factory=list)
-    """Payloads as sent to the CPU port: the packet_in header in front, then the frame."""
-    digests: list[Digest] = field(default_factory=list)
-    samples: Mapping[str, list[bytes]] = field(default_factory=dict)
-    """In place of `digests`, of a block of frames: by name, in order."""
-    verdicts: bytes = b""
-    """One byte per frame: bit 0 it made a packet-in, bit 1 it left through a port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +99,12 @@ class Switch:
         with self.lock:
             self._now = now_us
 
-    def process(self, port: int, frame: bytes, now_us: int) -> FrameResult:
+    def process(self, port: int, frame: bytes, now_us: int) -> BatchResult:
         """One frame that arrived on `port` at `now_us` (µs of the packets' clock, 48 bits)."""
         return self.process_many(port, (frame,), (now_us,))
 
-    def process_many(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> FrameResult:
-        """Many frames in order under one lock; the lists of the Result run over all of them.
+    def process_many(self, port: int, frames: Sequence[bytes], times_us: Sequence[int]) -> BatchResult:
+        """Many frames in order under one lock; the lists of the result run over all of them.
 
         `verdicts` has one byte per frame.  A digest or packet-in belongs to the frame whose turn it was;
         order is kept.
@@ -129,15 +112,15 @@ class Switch:
         with self.lock:
             if times_us:
                 self._now = times_us[-1]
-            return _result(self._machine.run(port, frames, times_us))
+            return self._machine.run(port, frames, times_us)
 
-    def process_block(self, port: int, block: FrameBlock) -> FrameResult:
+    def process_block(self, port: int, block: FrameBlock) -> BatchResult:
         """As `process_many`, of frames that stand end to end, each as long as on the wire."""
         with self.lock:
             self._now = int(block.times_us[-1])
-            return _result(self._machine.run_block(port, block.data, block.captured, block.times_us))
+            return self._machine.run_block(port, block.data, block.captured, block.times_us)
 
-    def packet_out(self, payload: bytes, now_us: int) -> FrameResult:
+    def packet_out(self, payload: bytes, now_us: int) -> BatchResult:
         """A packet-out: packet_out header in front, then the frame; enters at the CPU port."""
         return self.process(self.cpu_port, payload, now_us)
 
@@ -214,7 +197,3 @@ class Switch:
 
 def _pairs(replicas: tuple[Replica, ...]) -> Replicas:
     return tuple((r.port, r.instance) for r in replicas)
-
-
-def _result(batch: BatchResult) -> FrameResult:
-    return FrameResult(batch.outputs, batch.packet_ins, batch.digests, batch.samples, batch.verdicts)

@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 
 from dataplane.bmv2 import PROGRAM
+from dataplane.compiler.machine import BatchResult
 from dataplane.p4runtime.schema import Schema, bind
 from dataplane.p4runtime.table_codec import TableCodec
-from dataplane.v1model.switch import FrameResult, Replica, Switch
+from dataplane.v1model.switch import Replica, Switch
 from dataplane.v1model.tables import Exact, TableEntry, TableError
 from dataplane.v1model.tree import MatchKind, Program
 from p4rt import p4runtime
@@ -282,7 +283,7 @@ class Pair:
         self.controller.packet_out(payload, metadata)
         self._compare(result, [payload])
 
-    def _compare(self, result: FrameResult, frames: list[bytes]) -> None:
+    def _compare(self, result: BatchResult, frames: list[bytes]) -> None:
         shown = [f.hex() for f in frames]
         expected: dict[int, list[bytes]] = {}
         for port, data in result.outputs:

@@ -5,8 +5,9 @@ Frames are told apart by their port: those of port p are query p - 1's.
 
 from typing import NamedTuple
 
+from dataplane.compiler.machine import BatchResult
 from dataplane.v1model.externs import DataplaneError
-from dataplane.v1model.switch import FrameResult, Switch
+from dataplane.v1model.switch import Switch
 from dataplane.v1model.tables import TableEntry, Ternary
 from tests.p4.sdnator_switch import PACKET_IN_BYTES, ethernet, mac, want_all
 
@@ -96,7 +97,7 @@ def difference(
         install(switch, "difference", port - 1, stage=stage, **common, **signs)
 
 
-def send(switch: Switch, port: int, host: int, now_us: int, *, more: int = 0) -> FrameResult:
+def send(switch: Switch, port: int, host: int, now_us: int, *, more: int = 0) -> BatchResult:
     """A frame that counts `host` up or down, `more` bytes longer than the shortest."""
     source, destination = (host, 250) if port == ADDS else (250, host)
     length = (FRAME_BYTES - 14 + more).to_bytes(2, "big")
@@ -105,14 +106,14 @@ def send(switch: Switch, port: int, host: int, now_us: int, *, more: int = 0) ->
     return switch.process(port, ethernet(mac(1), mac(2), packet), now_us)
 
 
-def counts(result: FrameResult) -> list[Count]:
+def counts(result: BatchResult) -> list[Count]:
     rows = [each.values for each in result.digests if each.name == "count_digest_t"]
     return [
         Count(row[0], row[1], row[2] - (1 << 32 if row[2] >> 31 else 0), row[3] - 0x0A000000) for row in rows
     ]
 
 
-def told(result: FrameResult) -> list[Told]:
+def told(result: BatchResult) -> list[Told]:
     return [Told(*each.values[:3]) for each in result.digests if each.name == "frame_digest_t"]
 
 
@@ -121,7 +122,7 @@ def ask(switch: Switch, now_us: int = 20, **header: int) -> Answer | None:
     return answer(question(switch, now_us, **header))
 
 
-def question(switch: Switch, now_us: int, **header: int) -> FrameResult:
+def question(switch: Switch, now_us: int, **header: int) -> BatchResult:
     values = {"operation": 1, **header}
     bits = 0
     for name, width in _FIELDS:
@@ -129,7 +130,7 @@ def question(switch: Switch, now_us: int, **header: int) -> FrameResult:
     return switch.packet_out(bits.to_bytes(sum(width for _, width in _FIELDS) // 8, "big"), now_us)
 
 
-def answer(result: FrameResult) -> Answer | None:
+def answer(result: BatchResult) -> Answer | None:
     assert len(result.packet_ins) <= 1
     for packet in result.packet_ins:
         assert len(packet) == PACKET_IN_BYTES
@@ -139,6 +140,6 @@ def answer(result: FrameResult) -> Answer | None:
     return None
 
 
-def sweep(switch: Switch, now_us: int, *, always: bool = False, query: int = 0) -> FrameResult:
+def sweep(switch: Switch, now_us: int, *, always: bool = False, query: int = 0) -> BatchResult:
     """A packet-out that takes a cell out of the query's ring."""
     return question(switch, now_us, operation=2, query=query, length=int(always))

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from dataplane.compiler.machine import BatchResult
 from dataplane.p4runtime.trust import AnyProgram
 from dataplane.ports.port import MemoryPort
-from dataplane.v1model.switch import FrameResult
 from sdnator.testing.p4runtime_client import TIMEOUT_S, EntryBuilder, P4RuntimeClient, insert, program_config
 from sdnator.testing.switch_double import SwitchDouble
 from tests.dataplane.loading import MAKERS
@@ -114,7 +114,7 @@ def test_a_slow_primary_loses_packets_of_live_ports_and_they_are_counted():
 def test_what_is_shorter_than_the_packet_in_header_is_counted():
     with SwitchDouble(programs=AnyProgram()) as switch, primary(switch) as controller:
         controller.set_pipeline(program_config(PROGRAM))
-        result = FrameResult(packet_ins=[b"", b"x", bytes(20)])
+        result = BatchResult(packet_ins=[b"", b"x", bytes(20)])
         switch.device.deliver(switch.device.pipeline, result, lossless=False)
         assert switch.device.counts["packet_in_malformed"] == 2
         assert len(controller.packets.get(timeout=TIMEOUT_S).payload) == 18

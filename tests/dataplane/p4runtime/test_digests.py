@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataplane.compiler.machine import Digest
 from dataplane.compiler.samples import encode as sample
 from dataplane.p4runtime.bytestrings import encode
 from dataplane.p4runtime.digests import DigestLists, encode_list
 from dataplane.p4runtime.schema import BoundDigest, Schema
 from dataplane.p4runtime.status import Exists, InvalidArgument, MissingEntity
-from dataplane.v1model.switch import Digest
 from p4rt import p4runtime
 
 SECOND = 10**9

@@ -4,9 +4,10 @@ import zlib
 
 import pytest
 
+from dataplane.compiler.machine import Digest
 from dataplane.compiler.samples import encode
 from dataplane.v1model.externs import MeterConfig, crc16, csum16
-from dataplane.v1model.switch import Digest, Replica, Switch
+from dataplane.v1model.switch import Replica, Switch
 from dataplane.v1model.tables import Exact, Lpm, Range, TableEntry, Ternary
 from sdnator.testing.switch_traffic import ethernet, frame
 from tests.dataplane.loading import MAKERS, features, fields, shared
