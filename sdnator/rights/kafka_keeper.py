@@ -27,7 +27,6 @@ from due.drivers.kafka_names import KafkaAddress, parse_kafka_url, translated
 from due.drivers.kafka_rights import KafkaRight, kafka_rights, publishers
 from due.errors import BackendError, UpdatesUnavailable
 from sdnator.errors import PipelineError
-from sdnator.rights.identities import Identities
 from sdnator.rights.watching_keeper import RightsRefused, WatchingKeeper
 
 _CALL_SECONDS = 10.0
@@ -45,10 +44,6 @@ class KafkaRightsKeeper(WatchingKeeper):
     """
 
     _away = (BackendError,)
-
-    def __init__(self, url: str, identities: Identities) -> None:
-        super().__init__(identities)
-        self._url = url
 
     def apply(self) -> None:
         """See `WatchingKeeper.apply`."""
@@ -77,9 +72,9 @@ class KafkaRightsKeeper(WatchingKeeper):
             for right in kafka_rights(rights, self._address, apps)
         }
         self._make_users({user for user, _ in there} - {user for user, _ in wanted})
-        if fresh := [_binding(*one) for one in sorted(wanted - there)]:
+        if fresh := [AclBinding(*_places(*one)) for one in sorted(wanted - there)]:
             self._call("rights", self._admin.create_acls(fresh))
-        if gone := [_filter(*one) for one in sorted(there - wanted)]:
+        if gone := [AclBindingFilter(*_places(*one)) for one in sorted(there - wanted)]:
             self._call("rights", self._admin.delete_acls(gone))
 
     def _make_users(self, gone: set[str]) -> None:
@@ -135,11 +130,3 @@ def _places(user: str, right: KafkaRight) -> tuple[Any, ...]:
         *(ResourceType[right.resource], right.name, pattern, _USER + user, "*"),
         *(AclOperation[right.operation], AclPermissionType.ALLOW),
     )
-
-
-def _binding(user: str, right: KafkaRight) -> AclBinding:
-    return AclBinding(*_places(user, right))
-
-
-def _filter(user: str, right: KafkaRight) -> AclBindingFilter:
-    return AclBindingFilter(*_places(user, right))

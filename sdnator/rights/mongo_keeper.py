@@ -89,10 +89,6 @@ class MongoRightsKeeper(WatchingKeeper):
 
     _away = (PyMongoError, RightsRefused)
 
-    def __init__(self, url: str, identities: Identities) -> None:
-        super().__init__(identities)
-        self._url = url
-
     def apply(self) -> None:
         """See `WatchingKeeper.apply`; refused, too, where the server has no users or does not enforce rights."""
         try:

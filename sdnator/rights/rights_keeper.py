@@ -43,8 +43,7 @@ class RightsKeeper(WatchingKeeper):
     _away = (redis.RedisError, OSError)
 
     def __init__(self, url: str, identities: Identities) -> None:
-        super().__init__(identities)
-        self._url = url
+        super().__init__(url, identities)
         self._commands: Any = None  # Any: redis-py types an answer by options it cannot see
         self._newest: dict[bytes, Any] = {}
         self._seen: dict[tuple[str, ...], _Refusal] = {}

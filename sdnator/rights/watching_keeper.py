@@ -22,13 +22,15 @@ class WatchingKeeper(ABC):
     """Watches the identities of one installation for one server.
 
     Args:
+        url: of the server, with a credential that may make users there.
         identities: who may do what.
     """
 
     _away: ClassVar[tuple[type[Exception], ...]]
     """What is raised while the server cannot be reached."""
 
-    def __init__(self, identities: Identities) -> None:
+    def __init__(self, url: str, identities: Identities) -> None:
+        self._url = url
         self._identities = identities
         self._changed = 0
         self._ended = threading.Event()
