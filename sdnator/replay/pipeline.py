@@ -19,8 +19,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +39,7 @@ from sdnator.supervisor.app_command import Backends, app_command
 from sdnator.supervisor.spec import PartProcess
 from sdnator.supervisor.switch_program import SwitchProgram
 from sdnator.supervisor.updates_server import UpdatesProcess
+from sdnator.supervisor.whole_or_none import WholeOrNone
 
 SWITCH_NAME = "s1"
 INGRESS_PORT = 1
@@ -75,7 +75,7 @@ class PipelinePlan:
     firewall: Mapping[str, Any] = field(default_factory=dict)
 
 
-class ReplayPipeline:
+class ReplayPipeline(WholeOrNone):
     """A running pipeline; a context manager.
 
     Raises:
@@ -100,19 +100,6 @@ class ReplayPipeline:
         self._capture_socket = str(self._run / "capture.sock")
         self._coordinator_file = self._run / "coordinator.url"
         self._identities = made(self._run, {name: granted(name).rights for name in ("coordinator", *OURS)})
-
-    def __enter__(self) -> Self:
-        try:
-            self._start()
-        except BaseException:
-            self.stop()
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def _start(self) -> None:
         self._logs.mkdir(parents=True, exist_ok=True)

@@ -4,8 +4,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from sdnator.redaction import redacted
 from sdnator.rights.granting import OPERATOR
@@ -13,11 +12,12 @@ from sdnator.rights.keeping import keeper_of, keeps_archives, try_updates
 from sdnator.rights.watching_keeper import RightsRefused
 from sdnator.supervisor import LogLimits, PartReport, Supervisor
 from sdnator.supervisor.log_rotation import put_aside
+from sdnator.supervisor.whole_or_none import WholeOrNone
 from sdnator.up.parts import UpParts
 from sdnator.up.plan import StandingPlan, changes, taken_up
 
 
-class StandingPipeline:
+class StandingPipeline(WholeOrNone):
     """A running pipeline; a context manager.  `tell` gets a line for each part that is restarted.
 
     Raises:
@@ -35,19 +35,6 @@ class StandingPipeline:
         )
         self._supervisor = Supervisor(self._parts.specs(), tell, self._limits)
         self._keeper = keeper_of(self._parts.server, self._parts.identities)
-
-    def __enter__(self) -> Self:
-        try:
-            self._start()
-        except BaseException:
-            self.stop()
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def _start(self) -> None:
         logs = self._parts.logs

@@ -14,8 +14,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from apps.messages import Confirmation, Decision, TableCommand, TableUpdate
 from due import CONSUMER, NO_WAIT, PRODUCER, Capability, Engine, Interest, Item
@@ -28,6 +27,7 @@ from sdnator.supervisor.app_command import Backends, app_command
 from sdnator.supervisor.spec import PartProcess
 from sdnator.supervisor.switch_program import SwitchProgram
 from sdnator.supervisor.updates_server import UpdatesProcess
+from sdnator.supervisor.whole_or_none import WholeOrNone
 
 SWITCH: Final = "s1"
 PARTS: Final = ("switch", "coordinator", "p4runtime_ctrl", "sonata_adapter", "firewall")
@@ -44,7 +44,7 @@ _HEARD: Final = (
 _HEALTH: Final = "due.health.firewall"
 
 
-class FloodStage:
+class FloodStage(WholeOrNone):
     """Everything that runs; a context manager.  Raises `PipelineError` naming the part that failed."""
 
     def __init__(self, lab: Lab, folder: Path, *, switch: str, guard: Mapping[str, Any]) -> None:
@@ -61,19 +61,6 @@ class FloodStage:
         self.decisions: list[Decision] = []
         self.firewall: dict[str, Any] = {}
         """The firewall's latest health."""
-
-    def __enter__(self) -> Self:
-        try:
-            self._start()
-        except BaseException:
-            self.stop()
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def stop(self) -> None:
         """Stop all parts, the last started first."""
