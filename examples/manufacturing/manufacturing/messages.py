@@ -15,11 +15,13 @@ Simulated time moves in steps: the driver asks for the next one when the plan of
 names its run and its step, so that whoever was killed finds its place again, and what comes twice does no harm.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from logging import Logger
 from typing import Any, Final, TypeVar
 
 import msgspec
 
+from due import Item
 from manufacturing.core.orders import Order, Task
 from manufacturing.core.printer import Report
 from manufacturing.core.twins import FleetState
@@ -113,3 +115,15 @@ def to_value(message: msgspec.Struct) -> dict[str, Any]:
 def from_value(value: object, kind: type[M]) -> M:
     """A received value as a message; raises msgspec.ValidationError."""
     return msgspec.convert(value, kind)
+
+
+def tolerant(handler: Callable[[Item], None], log: Logger) -> Callable[[Item], None]:
+    """A handler that logs messages it does not understand, and goes on."""
+
+    def handle(item: Item) -> None:
+        try:
+            handler(item)
+        except msgspec.ValidationError as error:
+            log.warning("%s is not understood: %s", item.key, error)
+
+    return handle

@@ -29,6 +29,7 @@ from manufacturing.messages import (
     SimulatedClock,
     from_value,
     to_value,
+    tolerant,
 )
 
 INTERESTS = (Interest(CLOCK), Interest(f"{REPORT}.*"))
@@ -61,18 +62,14 @@ class DigitalTwinsService:
 
     def start(self) -> None:
         """Subscribe."""
-        self._engine.observe(CLOCK).subscribe(self._on_clock)
-        self._engine.observe(f"{REPORT}.*").subscribe(self._on_report)
+        self._engine.observe(CLOCK).subscribe(tolerant(self._on_clock, log))
+        self._engine.observe(f"{REPORT}.*").subscribe(tolerant(self._on_report, log))
 
     def tick(self) -> None:
         """Nothing to do between messages."""
 
     def _on_clock(self, item: Item) -> None:
-        try:
-            clock = from_value(item.value, SimulatedClock)
-        except msgspec.ValidationError as error:
-            log.warning("%s is not understood: %s", item.key, error)
-            return
+        clock = from_value(item.value, SimulatedClock)
         if clock.run != self._run:
             self._begin(clock)
         self._clock = clock
@@ -81,11 +78,7 @@ class DigitalTwinsService:
         self._look()
 
     def _on_report(self, item: Item) -> None:
-        try:
-            message = from_value(item.value, ReportMessage)
-        except msgspec.ValidationError as error:
-            log.warning("%s is not understood: %s", item.key, error)
-            return
+        message = from_value(item.value, ReportMessage)
         report = message.report
         if self._run and message.run != self._run:
             return

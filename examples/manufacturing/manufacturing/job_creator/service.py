@@ -25,6 +25,7 @@ from manufacturing.messages import (
     SimulatedClock,
     from_value,
     to_value,
+    tolerant,
 )
 
 INTERESTS = (Interest(CLOCK),)
@@ -61,17 +62,13 @@ class JobCreatorService:
 
     def start(self) -> None:
         """Subscribe."""
-        self._engine.observe(CLOCK).subscribe(self._on_clock)
+        self._engine.observe(CLOCK).subscribe(tolerant(self._on_clock, log))
 
     def tick(self) -> None:
         """Nothing to do between messages."""
 
     def _on_clock(self, item: Item) -> None:
-        try:
-            clock = from_value(item.value, SimulatedClock)
-        except msgspec.ValidationError as error:
-            log.warning("%s is not understood: %s", item.key, error)
-            return
+        clock = from_value(item.value, SimulatedClock)
         if clock.run != self._run or clock.step == self._step:  # somebody may have missed some
             self._run, self._written = clock.run, 0
         self._step = clock.step

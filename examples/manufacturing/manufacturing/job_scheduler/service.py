@@ -34,6 +34,7 @@ from manufacturing.messages import (
     PlanMessage,
     from_value,
     to_value,
+    tolerant,
 )
 
 INTERESTS = (Interest(FLEET), Interest(f"{ORDER}.*"), Interest(ORDER_BOOK))
@@ -72,7 +73,7 @@ class JobSchedulerService:
             ORDER_BOOK: self._on_book,
         }
         for key, handler in handlers.items():
-            self._engine.observe(key).subscribe(_guarded(handler))
+            self._engine.observe(key).subscribe(tolerant(handler, log))
 
     def tick(self) -> None:
         """Nothing to do between messages."""
@@ -133,16 +134,6 @@ class JobSchedulerService:
     def health(self) -> dict[str, Any]:
         """Step that was planned last, orders known."""
         return {"step": self._planned, "orders": len(self._orders)}
-
-
-def _guarded(handler: Callable[[Item], None]) -> Callable[[Item], None]:
-    def handle(item: Item) -> None:
-        try:
-            handler(item)
-        except msgspec.ValidationError as error:
-            log.warning("%s is not understood: %s", item.key, error)
-
-    return handle
 
 
 def main(argv: Sequence[str] | None = None) -> int:
