@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 
 from benchmarks import osken
 from benchmarks.measure import arguments, bars, machine, table, write_json
-from benchmarks.pairs import CHANNEL, KEY, engine, other_process, raw_client
+from benchmarks.pairs import CHANNEL, KEY, engine, other_process, publish_stamped, raw_client
 from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Item
 from due.drivers.embedded_redis import EmbeddedServer
 
@@ -97,16 +97,7 @@ def _due_producer(url: str, size: int, batch: int, count: int) -> None:
 
 def _raw_producer(url: str, size: int, batch: int, count: int) -> None:
     client = raw_client(url)
-    rest = bytes(max(0, size - 8))
-    for _ in range(count // batch):
-        if batch == 1:
-            client.publish(CHANNEL, struct.pack("<q", time.time_ns()) + rest)
-        else:
-            pipeline = client.pipeline(transaction=False)
-            for _ in range(batch):
-                pipeline.publish(CHANNEL, struct.pack("<q", time.time_ns()) + rest)
-            pipeline.execute()
-        time.sleep(GAP)
+    publish_stamped(client, bytes(max(0, size - 8)), batch, count, GAP)
     client.close()
 
 

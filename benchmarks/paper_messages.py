@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks import osken
-from benchmarks.pairs import CHANNEL, other_process, raw_client
+from benchmarks.pairs import CHANNEL, other_process, publish_stamped, raw_client
 from benchmarks.paper_findings import Measured
 from due import CONSUMER, NO_WAIT, PRODUCER, PUB_ONLY, Capability, Engine, Interest, Item, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from due.messages import Delivery
+from sdnator.testing.waiting import wait_for
 
 SIZES: Final = (100, 1_000, 10_000, 100_000)
 BATCHES: Final = (1, 100)
@@ -141,7 +142,7 @@ def _due(
         engine = _engine(url, folder)
         chosen: Delivery = "reliable" if delivery == "reliable" else "best_effort"
         engine.init("paper_producer", PRODUCER, capabilities=(Capability(key, delivery=chosen),))
-        _until(lambda: bool(engine.assignments()))
+        wait_for(engine.assignments, _WAIT_S)
         begun = time.monotonic()
         for number in range(1, count + 1):
             last = number % batch == 0
@@ -166,7 +167,7 @@ def _due_consumer(pipe: Connection, url: str, folder: str, key: str, count: int)
 
     engine.observe(key).subscribe(callback)
     pipe.send("ready")
-    _until(lambda: bool(done))
+    wait_for(lambda: done, _WAIT_S)
     pipe.send((times[:5_000], done[0]))
     engine.close()
 
@@ -191,7 +192,7 @@ def _in_process_us(size: int, count: int) -> Latencies:
     for _ in range(count):
         producer.write(key, payload, [PUB_ONLY, NO_WAIT])
         time.sleep(_GAP_S)
-    _until(lambda: len(times) == count)
+    wait_for(lambda: len(times) == count, _WAIT_S)
     producer.close()
     consumer.close()
     return times
@@ -200,18 +201,8 @@ def _in_process_us(size: int, count: int) -> Latencies:
 def _raw(url: str, payload: bytes, batch: int, count: int, gap: float) -> tuple[Latencies, float]:
     with other_process(_raw_consumer, url, count) as pipe:
         client = raw_client(url)
-        rest = payload[8:]
         begun = time.monotonic()
-        for _ in range(count // batch):
-            if batch == 1:
-                client.publish(CHANNEL, struct.pack("<q", time.time_ns()) + rest)
-            else:
-                pipeline = client.pipeline(transaction=False)
-                for _ in range(batch):
-                    pipeline.publish(CHANNEL, struct.pack("<q", time.time_ns()) + rest)
-                pipeline.execute()
-            if gap:
-                time.sleep(gap)
+        publish_stamped(client, payload[8:], batch, count, gap)
         times, ended = _answer(pipe)
         client.close()
     return times, ended - begun
@@ -236,14 +227,6 @@ def _answer(pipe: Connection) -> tuple[Latencies, float]:
         raise RuntimeError(f"not all messages arrived within {_WAIT_S:g} s")
     times, ended = pipe.recv()
     return times, ended
-
-
-def _until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + _WAIT_S
-    while not condition():
-        if time.monotonic() > end:
-            raise RuntimeError(f"not within {_WAIT_S:g} s")
-        time.sleep(0.01)
 
 
 @contextmanager
