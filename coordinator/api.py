@@ -275,7 +275,8 @@ class _Handlers:
         """Items of a key, or of a query in the MongoDB dialect."""
         query = _query(request.query_params.get("query"))
         if "key" in request.query_params:
-            query = {"$and": [query, {"dataKey": request.query_params["key"]}]} if query else _of_key(request)
+            of_key: dict[str, Any] = {"dataKey": request.query_params["key"]}
+            query = {"$and": [query, of_key]} if query else of_key
         if not query:
             raise InvalidQuery("name a key (?key=…) or a query (?query={…})")
         reader: tuple[str, ArchiveReader] | None = getattr(request.state, "reader", None)
@@ -467,10 +468,6 @@ async def _wait_for_close(socket: WebSocket) -> None:
     with suppress(WebSocketDisconnect):
         while True:
             await socket.receive_text()
-
-
-def _of_key(request: Request) -> dict[str, Any]:
-    return {"dataKey": request.query_params["key"]}
 
 
 def _same_site(socket: WebSocket) -> bool:

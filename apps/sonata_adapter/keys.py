@@ -38,7 +38,6 @@ _FLAGS: Final[dict[str, Flags]] = {
     "rst": RST,
 }
 _PREFIXES: Final = (prefix("src", "source address"), prefix("dst", "destination address"))
-_ANY: Final = "any"
 
 
 class Protocol(msgspec.Struct, frozen=True):

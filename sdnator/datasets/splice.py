@@ -24,8 +24,6 @@ class Spliced:
     labels: Path
     benign_packets: int
     attack_packets: int
-    shift_ns: int
-    """Added to the times of the second part."""
     cuts: tuple[CutCapture, ...]
     """Parts that were not whole."""
 
@@ -67,7 +65,7 @@ def splice(
         write_labels(labels_path(out), _joined([part.labels for part in parts]))
     cuts = tuple(part.cut for part in parts if part.cut is not None)
     first, second = (len(part.labels) for part in parts)
-    return Spliced(Path(out), labels_path(out), first, second, shift, cuts)
+    return Spliced(Path(out), labels_path(out), first, second, cuts)
 
 
 def _joined(parts: list[Labels]) -> Labels:

@@ -35,7 +35,6 @@ def _pass_data(title: str, result: PassResult) -> PassData:
         title,
         result.flight.score,
         result.flight.state,
-        result.alerts,
         result.decisions,
         result.confirmations,
         result.incidents,

@@ -40,7 +40,6 @@ def render(
     decisions: Sequence[Mapping[str, Any]],
     incidents: Sequence[Mapping[str, str]],
     notes: Sequence[str],
-    extra: Mapping[str, str],
     png: bytes,
     passes: Sequence[tuple[str, Mapping[str, float]]],
 ) -> str:
@@ -60,7 +59,7 @@ def render(
         _guards(summary),
         _limits(summary),
         _decisions(decisions),
-        _figures(summary, extra, passes),
+        _figures(summary, passes),
         "<p>Beside this page: <code>scores.csv</code>, <code>decisions.csv</code>, <code>eve.json</code>, ",
         "<code>scores.png</code>.</p></main></body></html>\n",
     ]
@@ -241,15 +240,12 @@ def _decisions(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"<h2>Decisions</h2><div class='wide'><table><tr>{head}</tr>{body}</table></div>{more}"
 
 
-def _figures(
-    summary: Mapping[str, Any], extra: Mapping[str, str], passes: Sequence[tuple[str, Mapping[str, float]]]
-) -> str:
+def _figures(summary: Mapping[str, Any], passes: Sequence[tuple[str, Mapping[str, float]]]) -> str:
     rows = [
         (name.replace("_", " "), _number(value))
         for name, value in summary.items()
         if isinstance(value, int | float | str) and not isinstance(value, bool)
     ]
-    rows += list(extra.items())
     rows += [(f"{title}: {name}", f"{value:.4g}") for title, facts in passes for name, value in facts.items()]
     body = "".join(
         f"<tr><td>{escape(name)}</td><td class='n'>{escape(value)}</td></tr>" for name, value in rows

@@ -15,7 +15,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.incidents import Incident
-from apps.messages import Alert, Confirmation, Decision
+from apps.messages import Confirmation, Decision
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import row
 from sdnator.report import report_files, report_page
@@ -45,7 +45,6 @@ class PassData:
     """NaN where a packet has no score."""
     state: NDArray[np.uint8]
     """`sdnator.replay.packet_accounting.PacketState` numbers."""
-    alerts: Sequence[Alert] = ()
     decisions: Sequence[Decision] = ()
     confirmations: Sequence[Confirmation] = ()
     reports: Sequence[Incident] = ()
@@ -75,8 +74,6 @@ class ReportData:
     notes: Sequence[str] = ()
     line: float = 1.0
     """Score from which on a packet is an anomaly."""
-    extra: Mapping[str, str] = field(default_factory=dict)
-    """More rows for the table of figures."""
 
     @property
     def reported(self) -> PassData:
@@ -158,7 +155,6 @@ def _write_files(data: ReportData, folder: Path) -> None:
         decisions=report_files.decision_rows(shown.decisions, shown.confirmations),
         incidents=[row(each) for each in shown.incidents],
         notes=data.notes,
-        extra=data.extra,
         png=png,
         passes=[(each.title, _facts(data, each)) for each in data.passes],
     )

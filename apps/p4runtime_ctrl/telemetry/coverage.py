@@ -35,7 +35,6 @@ FALLBACK: Final = tuple(
     for place, conditions in enumerate(_CONDITIONS)
 )
 """Copies of the frames whose digests are incomplete."""
-BITS: Final = frozenset(request.bit for request in FALLBACK)
 
 
 def uncovered(found: NDArray[Any]) -> NDArray[np.bool_]:

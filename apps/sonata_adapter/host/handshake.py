@@ -18,7 +18,7 @@ from apps.sonata_adapter.results import Handshake
 from due import RecordBatch
 
 DEFAULT_OPEN: Final = 65_536
-DEFAULT_AGE_US: Final = 30_000_000
+_AGE_US: Final = 30_000_000
 _MASK: Final = 0xFFFF_FFFF
 
 _Connection = tuple[int, int, int, int, int, int]
@@ -32,9 +32,8 @@ class Handshakes:
     counted in `forgotten`.
     """
 
-    def __init__(self, *, limit: int = DEFAULT_OPEN, age_us: int = DEFAULT_AGE_US) -> None:
+    def __init__(self, *, limit: int = DEFAULT_OPEN) -> None:
         self._limit = limit
-        self._age_us = age_us
         self._open: OrderedDict[_Connection, tuple[int, int]] = OrderedDict()
         self.completed = 0
         self.forgotten = 0
@@ -84,7 +83,7 @@ class Handshakes:
             self.wrong += 1
             return False
         del self._open[connection]
-        if at - since > self._age_us:
+        if at - since > _AGE_US:
             return False
         self.completed += 1
         return True

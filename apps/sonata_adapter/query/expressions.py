@@ -15,7 +15,6 @@ from apps.sonata_adapter.errors import QueryError
 Operator = Literal["+", "-", "*", "/", "%", "&", "|", "==", "!=", "<", "<=", ">", ">=", "and", "or"]
 Kind = Literal["number", "address", "mac", "name", "condition"]
 
-ARITHMETIC: Final = ("+", "-", "*", "/", "%", "&", "|")
 COMPARISONS: Final = ("==", "!=", "<", "<=", ">", ">=")
 
 

@@ -47,7 +47,6 @@ def _page(**changes) -> str:
         "decisions": [],
         "incidents": [],
         "notes": [],
-        "extra": {},
         "png": b"x",
         "passes": [],
     }
@@ -63,7 +62,6 @@ def test_everything_from_outside_is_escaped():
         summary={"blocks": [block], evil: 1},
         decisions=[row],
         notes=[evil],
-        extra={evil: evil},
         passes=[(evil, {evil: 1.0})],
     )
     assert evil not in page
@@ -85,7 +83,6 @@ def test_figures_and_tiles():
             "auc": 0.98,
             "mitigation": True,
         },
-        extra={"switch": "embedded"},
         passes=[("alone", {"median score, attack": 8.5})],
     )
     for text in (
@@ -93,7 +90,6 @@ def test_figures_and_tiles():
         "class='tile bad'><b>1</b>",
         "class='tile good'><b>0</b>",
         "0.980",
-        "embedded",
         "8.5",
     ):
         assert text in page

@@ -86,7 +86,6 @@ def data(**changes: Any) -> ReportData:
                 "with blocking",
                 np.where(dropped == PacketState.SCORED, score, np.nan),
                 dropped,
-                [alert()],
                 [decision()],
                 [confirmation()],
                 incidents(),
