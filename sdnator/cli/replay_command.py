@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from dataplane.p4runtime.listening import is_address
+from sdnator import training
 from sdnator.config.planned_switches import require_compiler
 from sdnator.datasets.names import named_capture
 from sdnator.errors import BadInput
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 DEFAULT_TRAIN = 55_000
 """Packets to train on: the published 5,000 + 50,000."""
-TRAIN_SHARE = 11
-"""`--train N` gives one packet in eleven to the feature map, like the published 5,000 + 50,000."""
 
 console = Console(stderr=True, highlight=False)
 
@@ -66,9 +65,7 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
     check_switch(request.switch, request.inject)
     if request.model is not None:
         _check_model(request)
-    train = request.train or DEFAULT_TRAIN
-    fm_grace = train // TRAIN_SHARE
-    ad_grace = train - fm_grace
+    fm_grace, ad_grace = training.split(request.train or DEFAULT_TRAIN)
     if request.fm_grace is not None and request.ad_grace is not None:
         fm_grace, ad_grace = request.fm_grace, request.ad_grace
     return ReplayOptions(

@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apps.messages import Alert
+from sdnator import training
 from sdnator.datasets.names import NamedCapture, named_capture
 from sdnator.errors import BadInput
 from sdnator.replay import run
@@ -18,9 +19,6 @@ from sdnator.report.writer import check_folder
 
 Training: TypeAlias = int | tuple[int, int] | None
 OnProgress: TypeAlias = Callable[[str, int, int], None]
-
-_FEATURE_MAP_SHARE: Final = 11
-"""One training packet in eleven goes to the feature map, as in the published 5,000 + 50,000."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,8 +121,7 @@ def _training(train: Training, found: NamedCapture) -> tuple[int, int]:
     if train is None:
         return ReplayOptions.fm_grace, ReplayOptions.ad_grace
     if isinstance(train, int):
-        fm_grace = train // _FEATURE_MAP_SHARE
-        train = fm_grace, train - fm_grace
+        train = training.split(train)
     if min(train) < 1:
         raise BadInput(f"train={train}: give at least 11 packets, or a pair of at least 1 packet each")
     return train

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from sdnator import app_catalogue
+from sdnator import app_catalogue, training
 from sdnator.config import config_file
 from sdnator.config.planned_switches import PlannedSwitch, planned, require_compiler
 from sdnator.config.switch_security import check_security
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from sdnator.config.config_file import Config
     from sdnator.config.up_settings import SwitchPlan, UpSettings
 
-TRAIN_SHARE = 11
-"""`--train N` gives one packet in eleven to the feature map, as in `sdnator replay`."""
 TOKEN = "SDNATOR_DASHBOARD_TOKEN"  # noqa: S105 - a variable's name
 _GIB = 1 << 30
 
@@ -115,8 +113,8 @@ def _adapter(config: "Config", given: Given) -> dict[str, Any]:
 def _kitsune(config: "Config", given: Given) -> dict[str, Any]:
     settings = config.section("kitsune")
     if given.train is not None:
-        fm_grace = given.train // TRAIN_SHARE
-        settings |= {"fm_grace": fm_grace, "ad_grace": given.train - fm_grace}
+        fm_grace, ad_grace = training.split(given.train)
+        settings |= {"fm_grace": fm_grace, "ad_grace": ad_grace}
     return settings | model_settings(given.model)
 
 
