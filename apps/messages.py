@@ -171,6 +171,22 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
         message.check()
         return message
 
+    @classmethod
+    def from_item(cls, item: Item) -> Self:
+        """Read the message in an item that the app of its key wrote.
+
+        Args:
+            item: a received item.
+
+        Returns:
+            The checked message.
+
+        Raises:
+            MessageError: another app wrote the item, or its value is no such message.
+        """
+        sender_of(item)
+        return cls.from_value(item.value)
+
     def check(self) -> None:
         """Check what the types of the fields do not express; the base class checks nothing.
 

@@ -43,16 +43,12 @@ class FramesToSend(msgspec.Struct, frozen=True):
     """The frames, concatenated."""
 
 
-def decision_in(item: Item) -> Decision:
-    """`network.block.firewall.*`, `network.protect.firewall.*`, `network.meter.firewall.*`."""
-    sender_of(item)
-    return Decision.from_value(item.value)
-
-
-def command_in(item: Item) -> TableCommand:
-    """`network.p4_command.<app>.<switch>`."""
-    sender_of(item)
-    return TableCommand.from_value(item.value)
+decision_in = Decision.from_item
+"""`network.block.firewall.*`, `network.protect.firewall.*`, `network.meter.firewall.*`."""
+command_in = TableCommand.from_item
+"""`network.p4_command.<app>.<switch>`."""
+clock_in = ClockReached.from_item
+"""`network.clock.<app>.<switch>`."""
 
 
 def offer_in(item: Item) -> tuple[str, Offer]:
@@ -62,12 +58,6 @@ def offer_in(item: Item) -> tuple[str, Offer]:
     if item.key.rpartition(".")[2] != offer.name:
         raise MessageError("fields", f"{item.key}: offers {offer.name!r}, which is not the name in the key")
     return app, offer
-
-
-def clock_in(item: Item) -> ClockReached:
-    """`network.clock.<app>.<switch>`."""
-    sender_of(item)
-    return ClockReached.from_value(item.value)
 
 
 def questions_in(item: Item) -> RecordBatch:

@@ -50,22 +50,12 @@ def state_in(item: Item) -> SwitchPrograms:
     return state
 
 
-def command_in(item: Item) -> TableCommand:
-    """An archived command of this app."""
-    sender_of(item)
-    return TableCommand.from_value(item.value)
-
-
-def training_in(item: Item) -> TrainingState:
-    """`network.training.<app>`."""
-    sender_of(item)
-    return TrainingState.from_value(item.value)
-
-
-def baseline_in(item: Item) -> CountBaseline:
-    """An archived baseline of this app."""
-    sender_of(item)
-    return CountBaseline.from_value(item.value)
+command_in = TableCommand.from_item
+"""An archived command of this app."""
+training_in = TrainingState.from_item
+"""`network.training.<app>`."""
+baseline_in = CountBaseline.from_item
+"""An archived baseline of this app."""
 
 
 def data_in(item: Item) -> RecordBatch:
