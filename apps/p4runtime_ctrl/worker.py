@@ -27,13 +27,13 @@ from apps.p4runtime_ctrl.southbound.connection import Connection, Listener
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
 from apps.p4runtime_ctrl.southbound.session import P4RuntimeSession
+from apps.p4runtime_ctrl.state.block_counters import BlockCounters
 from apps.p4runtime_ctrl.state.decision_ends import DecisionEnds
 from apps.p4runtime_ctrl.state.desired_state import check_entry
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
 from apps.p4runtime_ctrl.state.live_clock import LiveClock
 from apps.p4runtime_ctrl.state.mac_learning import DIGEST
-from apps.p4runtime_ctrl.state.readings import Readings
 from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry.demand import Demand
 from due import NO_WAIT, PUB_ONLY, Engine, Item, RecordBatch
@@ -117,7 +117,7 @@ class SwitchWorker:
         """Decisions to carry out, before any other work."""
         self._ends = DecisionEnds()
         self._clock = LiveClock(mine.clock, time.time_ns() // 1000 if mine.clock == "own" else 0)
-        self._readings = Readings()
+        self._block_counters = BlockCounters()
         self._publishing = threading.Lock()
         self._counting = threading.Event()
         self._uncounted = False
@@ -375,7 +375,7 @@ class SwitchWorker:
 
     def _say_if_none_is_left(self) -> None:
         """Without blocks no counter is read, and the last one would be listed until a packet comes."""
-        if self._readings.shown and not self._switch.blocks:
+        if self._block_counters.shown and not self._switch.blocks:
             self._write_state()
 
     def _want(self, demand: Demand) -> None:
@@ -478,7 +478,7 @@ class SwitchWorker:
         if failed is not None:
             raise failed
         if session is not None and session is self._session:
-            self._readings.take(found)
+            self._block_counters.take(found)
             self._write_state()
 
     def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
@@ -501,7 +501,7 @@ class SwitchWorker:
     def _write_state(self, *flags: int) -> None:
         self._stated = (self._heard(), self._progress.lost, time.monotonic())
         if not self._switch.blocks:
-            self._readings.take([])
+            self._block_counters.take([])
         key = f"network.switch.p4runtime_ctrl.{self.name}"
         self._engine.write(key, self._state(), [NO_WAIT, *flags], event_time=self._now()[0] or None)
 
@@ -535,7 +535,7 @@ class SwitchWorker:
             **self._sent,
             "arrival": arrival,
             "event_time": event_time,
-            "blocks": self._readings.shown,
+            "blocks": self._block_counters.shown,
             "blocks_total": self._switch.blocks,
             **self._stations(),
             "change": self._change,

@@ -5,7 +5,7 @@ from typing import Any, Final
 _FEW: Final = 256
 
 
-class Readings:
+class BlockCounters:
     """Counter values by handle; with many blocks only those that changed since the last call."""
 
     def __init__(self) -> None:

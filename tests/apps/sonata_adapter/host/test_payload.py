@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.sonata_adapter.host.payload import FrameBytes
-from sdnator.testing.oracles import sonata, texts
+from sdnator.testing.oracles import payload_measures, sonata
 from sdnator.testing.query_traffic import dns, ethernet, tcp, udp
 
 labels = st.text("abcXYZ019-", min_size=1, max_size=63)
@@ -63,7 +63,7 @@ def test_names_are_measured_as_people_write_them(given_messages):
         for message, six in given_messages
     ]
     sizes, entropies = columns(frames).names()
-    naive = [texts.name_measures(sonata.read(0, len(frame), frame)) for frame in frames]
+    naive = [payload_measures.name_measures(sonata.read(0, len(frame), frame)) for frame in frames]
     assert list(zip(sizes.tolist(), entropies.tolist(), strict=True)) == naive
 
 
@@ -77,9 +77,9 @@ def test_payloads_are_measured(payloads):
         frames.append(made)
     wire = np.array([len(frame) for frame in frames])
     sizes, entropies = columns(frames).payloads(wire)
-    assert sizes.tolist() == [texts.payload_length(frame) for frame in frames]
+    assert sizes.tolist() == [payload_measures.payload_length(frame) for frame in frames]
     copied = [sonata.read(0, len(frame), frame).payload for frame in frames]
-    assert entropies.tolist() == [texts.entropy(data) for data in copied]
+    assert entropies.tolist() == [payload_measures.entropy(data) for data in copied]
 
 
 def test_padding_is_no_payload_and_a_tag_is_no_reason():

@@ -18,7 +18,7 @@ from apps.sonata_adapter.query.text import parse_queries
 from sdnator.capture.captures import CaptureWriter
 from sdnator.cli.queries_commands import queries
 from sdnator.testing import query_traffic
-from sdnator.testing.oracles import sonata, texts
+from sdnator.testing.oracles import payload_measures, sonata
 from sdnator.testing.query_traffic import BASE_US, TimedFrame, office
 
 TEXT = (Path(__file__).resolve().parents[4] / "docs" / "sonata.md").read_text(encoding="utf-8")
@@ -65,7 +65,7 @@ def test_the_tunnel_is_found(tmp_path):
     assert {each["src"] for each in one["results"]} == {TUNNEL}
     packets = [sonata.read(*frame) for frame in frames]
     asked = [p for p in packets if p.dport == 53 and sonata.question(p.payload)[0] == 0]
-    measured = [texts.name_measures(p) for p in asked]
+    measured = [payload_measures.name_measures(p) for p in asked]
     noisy = sum(length >= 40 and bits >= 3500 for length, bits in measured)
     assert [each["rows_out"] for each in one["steps"][:2]] == [len(asked), noisy]
     assert one["cost"]["tuples_to_host"] == sum(p.dport == 53 for p in packets)
@@ -78,7 +78,7 @@ def test_the_beacon_is_found(tmp_path):
     truth: dict[tuple[str, str, int], list[int]] = {}
     for frame in frames:
         packet = sonata.read(*frame)
-        size = texts.payload_length(frame.data) if packet.protocol == 6 else -1
+        size = payload_measures.payload_length(frame.data) if packet.protocol == 6 else -1
         if size > 0:
             truth.setdefault((packet.src, packet.dst, packet.dport), []).append(size)
     wanted = {
