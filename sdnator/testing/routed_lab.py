@@ -5,17 +5,15 @@
 Linux, needs root and iproute2.  Everything is removed with the namespaces.
 """
 
-import ctypes
 import os
 import select
 import socket
 import subprocess
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Final, Self
 
+from sdnator import network_namespaces
 from sdnator.errors import BadInput
 
 SENDER_MAC: Final = "02:77:00:00:00:02"
@@ -25,7 +23,6 @@ OTHERS: Final = {4: "10.77.1.3", 6: "fd77:1::3"}
 INPUT: Final = {4: "10.77.1.1", 6: "fd77:1::1"}
 FORWARD: Final = {4: "10.77.2.2", 6: "fd77:2::2"}
 _HOSTS: Final = ("sender", "gateway", "server")
-_CLONE_NEWNET: Final = 0x4000_0000
 _ARRIVES_S: Final = 0.25
 
 
@@ -51,20 +48,9 @@ class RoutedLab:
         """Name of the namespace of `sender`, `gateway` or `server`."""
         return f"sdnl{os.getpid()}-{host}"
 
-    @contextmanager
-    def inside(self, host: str) -> Iterator[None]:
+    def inside(self, host: str) -> AbstractContextManager[None]:
         """Sockets made and children started within live in the host's namespace."""
-        home = os.open(f"/proc/self/task/{threading.get_native_id()}/ns/net", os.O_RDONLY)
-        try:
-            there = os.open(Path("/run/netns") / self.namespace(host), os.O_RDONLY)
-            try:
-                _set_namespace(there)
-            finally:
-                os.close(there)
-            yield
-        finally:
-            _set_namespace(home)
-            os.close(home)
+        return network_namespaces.inside(self.namespace(host))
 
     def path(self, target: str, source: str = "") -> "UdpPath":
         """A way for packets from the sender to an address of the gateway or server.
@@ -176,9 +162,3 @@ def _run(*command: str) -> str:
     if done.returncode:
         raise BadInput(f"{' '.join(command)}: {done.stderr.strip()}; this needs root and network namespaces")
     return done.stdout
-
-
-def _set_namespace(descriptor: int) -> None:
-    library = ctypes.CDLL(None, use_errno=True)
-    if library.setns(descriptor, _CLONE_NEWNET) != 0:
-        raise BadInput(f"entering a network namespace: {os.strerror(ctypes.get_errno())}; run as root")

@@ -7,21 +7,19 @@
 IPv4 and IPv6 side by side.  Everything is removed with the namespaces.  Linux, needs root and iproute2.
 """
 
-import ctypes
 import ipaddress
 import os
 import shutil
 import socket
 import subprocess
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
 from dataplane.ports.veth_port import turn_off_offloads
+from sdnator import network_namespaces
 from sdnator.errors import BadInput
 
 HOSTS: Final = ("attacker", "client", "victim")
@@ -30,7 +28,6 @@ BACKLOG: Final = 128
 SYNACK_RETRIES: Final = 2
 """A half-open connection lives 1 + 2 + 4 s."""
 HALF_OPEN_S: Final = 7
-_CLONE_NEWNET: Final = 0x4000_0000
 _VICTIM_SYSCTLS: Final = {
     "net/ipv4/tcp_syncookies": 0,
     "net/ipv4/tcp_max_syn_backlog": BACKLOG,
@@ -122,16 +119,9 @@ class Lab:
         """Forget what the victim's kernel knows of its peers: it keeps backlog for proven ones."""
         _ip("-n", self.namespace("victim"), "tcp_metrics", "flush", "all")
 
-    @contextmanager
-    def inside(self, host: str) -> Iterator[None]:
+    def inside(self, host: str) -> AbstractContextManager[None]:
         """Children started within live in the host's namespace."""
-        home = os.open(f"/proc/self/task/{threading.get_native_id()}/ns/net", os.O_RDONLY)
-        try:
-            _enter(Path("/run/netns") / self.namespace(host))
-            yield
-        finally:
-            _set_namespace(home)
-            os.close(home)
+        return network_namespaces.inside(self.namespace(host))
 
     def _build(self) -> None:
         for host in ("switch", *HOSTS):
@@ -193,21 +183,6 @@ def _routes(plan: LabAddresses, host: str) -> list[str]:
 
 def _read(name: str) -> int:
     return int(Path("/proc/sys", name).read_text(encoding="ascii"))
-
-
-def _enter(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        _set_namespace(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _set_namespace(descriptor: int) -> None:
-    library = ctypes.CDLL(None, use_errno=True)
-    if library.setns(descriptor, _CLONE_NEWNET) != 0:
-        number = ctypes.get_errno()
-        raise BadInput(f"entering a network namespace: {os.strerror(number)}; run as root")
 
 
 def _check_machine() -> None:
