@@ -351,7 +351,9 @@ def _kept_when_stopped() -> Iterator[None]:
         yield
     except BaseException as stopped:
         if not isinstance(stopped, Exception):
-            console.print("what has come is kept; run the command again to continue", highlight=False)
+            console.print(
+                "what has been downloaded is kept; run the command again to continue", highlight=False
+            )
         raise
 
 

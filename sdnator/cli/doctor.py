@@ -361,8 +361,10 @@ def _show(checks: list[Check], *, well: bool) -> None:
         if check.remedy:
             print(f"{check.name}: {check.remedy}")
     if any(check.state == "exposed" for check in checks):
-        print("something is EXPOSED; see above what to do")
+        print("something is EXPOSED; see above for what to do")
     else:
         print(
-            "everything is as it should be" if well else "a required part is MISSING; see above what to do"
+            "everything is as it should be"
+            if well
+            else "a required part is MISSING; see above for what to do"
         )

@@ -86,7 +86,7 @@ def make(
                 progress(writer.packets)
         if not flags:
             raise BadInput(
-                f"{out}: no packet to write; ask for more seconds of harmless traffic or of attack"
+                f"{out}: no packet to write; ask for more seconds of benign traffic or of the attack"
             )
         labels = Labels.of(flags, senders)
         write_labels(labels_path(out), labels)

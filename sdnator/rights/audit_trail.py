@@ -36,7 +36,7 @@ def note(deed: str, *, instruction: str = "", archive: str = "") -> None:
         with closing(open_archive(archive_url(archive))) as driver:
             driver.insert([item])
     except DueError as error:
-        print(f"the audit trail lacks this: {error}", file=sys.stderr)
+        print(f"this is missing from the audit trail: {error}", file=sys.stderr)
 
 
 def unix_user() -> str:

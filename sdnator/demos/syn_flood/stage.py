@@ -171,7 +171,7 @@ class FloodStage(WholeOrNone):
         while not any(said.state in ("installed", "exists") for _, said in self.confirmed):
             if time.monotonic() > deadline:
                 said = self.confirmed[-1][1].cause if self.confirmed else "nothing"
-                raise PipelineError(f"switch {SWITCH} did not take its forwarding entries; it said: {said}")
+                raise PipelineError(f"switch {SWITCH} did not accept its forwarding entries; it said: {said}")
             if time.monotonic() > again:
                 command = TableCommand(id=f"forward-{time.monotonic_ns()}", updates=updates)
                 self._engine.write(_COMMAND, command.to_value(), [NO_WAIT])
@@ -273,7 +273,7 @@ class LabHost:
             descriptor = os.open(self._orders, os.O_WRONLY | os.O_NONBLOCK)
         except OSError as error:
             self.stage.check()
-            raise PipelineError(f"{self.name} takes no orders: {error.strerror}") from error
+            raise PipelineError(f"{self.name} accepts no commands: {error.strerror}") from error
         try:
             os.write(descriptor, line)
         finally:

@@ -155,7 +155,7 @@ class TrialHosts:
                 return
             since = time.monotonic() - begun
             if since > seconds:
-                raise PipelineError(f"waited in vain for {what}, for {seconds:.0f} s")
+                raise PipelineError(f"waited {seconds:.0f} s for {what}, without success")
             if show is not None and since >= shown:
                 show()
                 shown += 1.0

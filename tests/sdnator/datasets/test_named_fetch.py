@@ -343,4 +343,4 @@ def test_who_interrupts_a_download_is_told_that_it_goes_on(tmp_path, monkeypatch
             process.send_signal(signal.SIGINT)
             said = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert "what has come is kept; run the command again to continue" in said
+    assert "what has been downloaded is kept; run the command again to continue" in said
