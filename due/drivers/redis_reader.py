@@ -31,8 +31,8 @@ from due.drivers.redis_streams import stream_name, wake_name, work_name
 from due.drivers.redis_upkeep import Upkeep
 from due.drivers.redis_wire import Wire, pack, understood
 from due.drivers.redis_work import (
-    COUNT,
     MOST_GIVEN,
+    AnswerSize,
     ReadAhead,
     ReadRound,
     ServerTime,
@@ -59,8 +59,7 @@ _TRIES = 3
 _STREAM, _WORK = stream_name(""), "due:work:"
 _Expected = tuple[str, str, str]
 """Kind of an answer, path, id."""
-_ACK, _NEW, _AHEAD = ("ack", "", ""), ("new", "", ""), ("ahead", "", "")
-_OURS, _HISTORY = ("ours", "", ""), ("history", "", "")
+_ACK, _NEW, _AHEAD, _OURS, _HISTORY = ((kind, "", "") for kind in ("ack", "new", "ahead", "ours", "history"))
 
 
 class StreamReader:
@@ -80,9 +79,10 @@ class StreamReader:
         """Up to where the ids of a stream are on the work list, as far as is known here."""
         self._found = ReadRound()
         self._read_ahead = ReadAhead()
+        self._size = AnswerSize(fixed=shared)  # whoever takes more at once leaves less to the others
         self._woken = "0-0"
-        self._listless = False
-        """A work list is gone."""
+        self._listless = self._ask_lists = False
+        """A work list is gone; lists may hold ids of a member that died before it asked for them."""
         self._acks = Acknowledgements(group)
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
@@ -266,13 +266,9 @@ class StreamReader:
 
     def _refuse(self, path: str) -> None:
         self._counts["paths_refused"] += 1
+        told = "%s reads at most %d reliable paths: %s and others are left out; observe a narrower key"
         if self._counts["paths_refused"] == 1:
-            log.error(
-                "%s reads at most %d reliable paths: %s and others are left out; observe a narrower key",
-                self._group,
-                _MOST_PATHS,
-                path,
-            )
+            log.error(told, self._group, _MOST_PATHS, path)
 
     def _deny(self, path: str, error: Exception) -> None:
         """A right is missing: this path is left out, and the others are read on."""
@@ -369,6 +365,9 @@ class StreamReader:
             paths = history or tuple(p for p in readable if p not in self._held and self._share.ask(p))
         command = self._packed_acks(quietly=self._quiet and bool(paths))
         self._requested = paths
+        if self._ask_lists:
+            self._ask_lists = False
+            self._at.clear()
         at = {path: self._at.get(path, "") for path in paths}  # other threads forget places
         unplaced = () if history else tuple(path for path, place in at.items() if not place)
         if history:
@@ -382,17 +381,17 @@ class StreamReader:
             wait = () if self._stale else (b"BLOCK", _BLOCK_MS)
             names = (*map(stream_name, paths), wake_name(self._group))
             places = (*at.values(), self._woken)
-            command += pack((b"XREAD", b"COUNT", COUNT, *wait, b"STREAMS", *names, *places))
+            command += pack((b"XREAD", b"COUNT", self._size.count, *wait, b"STREAMS", *names, *places))
             self._expected.append(_NEW)
         if command:
             wire.send_packed(command)
 
-    def _packed_work(self, paths: Sequence[str], since: bytes) -> bytes:
+    def _packed_work(self, paths: Sequence[str], since: bytes, most: int = MOST_GIVEN) -> bytes:
         """Ask the work lists for ids that wait, or with `0` for those that are ours already."""
+        self._size.asked(most, time.monotonic())
         self._expected.append(_HISTORY if since == b"0" else _OURS)
-        head = (b"XREADGROUP", b"GROUP", self._group, self._consumer, b"COUNT", MOST_GIVEN, b"STREAMS")
-        names = (work_name(self._group, path) for path in paths)
-        return pack((*head, *names, *((since,) * len(paths))))
+        head = (b"XREADGROUP", b"GROUP", self._group, self._consumer, b"COUNT", most, b"STREAMS")
+        return pack((*head, *(work_name(self._group, path) for path in paths), *((since,) * len(paths))))
 
     def _packed_acks(self, *, quietly: bool = False) -> bytes:
         """`quietly`: a read follows, so replies of their own would only cause wake-ups."""
@@ -415,9 +414,9 @@ class StreamReader:
         else:
             with understood("a request for entries"):
                 self._answered(reply, expected)
-        if _ACK not in self._expected:
+        if expected[0] != "put" and _ACK not in self._expected:
             self._acks.answered()
-        if self._expected and list(self._expected) != [_AHEAD]:
+        if len(self._expected) > 1 or (self._expected and self._expected[0] != _AHEAD):
             return []
         if self._listless and not self._expected:
             self._listless = False
@@ -457,13 +456,14 @@ class StreamReader:
                 self._found.payloads[path, token.decode()] = fields[1]
         if not found or self._wire is None or self._listless:
             return
+        self._size.came(max(map(len, found.values())), self._found.size())
         command = self._packed_acks(quietly=self._quiet)
         for path, tokens in found.items():
             command += b"".join(packed_ids(self._group, path, tokens))
             self._expected.extend([("put", path, "")] * len(tokens))
             self._at[path] = tokens[-1]
-        command += self._packed_work(list(found), b">")
-        if not self._shared:  # in a shared group others would read the same
+        command += self._packed_work(list(found), b">", self._size.most_given)
+        if not (self._shared or self._ask_lists):  # in a shared group others would read the same
             command += self._packed_ahead()
         self._wire.send_packed(command)
 
@@ -493,10 +493,11 @@ class StreamReader:
         at = {path: place for path in self._requested if (place := self._at.get(path))}
         self._expected.append(_AHEAD)
         self._read_ahead = ReadAhead(at)
-        return pack((b"XREAD", b"COUNT", COUNT, b"STREAMS", *map(stream_name, at), *at.values()))
+        return pack((b"XREAD", b"COUNT", self._size.count, b"STREAMS", *map(stream_name, at), *at.values()))
 
     def _given(self, reply: Any, *, again: bool) -> None:
         """Note which ids are ours, and ask for payloads that others have put on the list."""
+        self._size.answered(time.monotonic())
         found = set()
         for name, entries in reply or ():
             path = name.decode().removeprefix(_WORK).partition(":")[2]
@@ -507,7 +508,7 @@ class StreamReader:
                     self._found.ours.append((path, token.decode()))
                 else:
                     self._acks.add(path, token.decode())  # somebody took it off the list
-            if len(entries) >= MOST_GIVEN:
+            if len(entries) >= self._size.most_asked:
                 self._at.pop(path, None)  # there may be more
         if again:
             self._catch_up &= found
@@ -580,7 +581,7 @@ class StreamReader:
     def _look_after_the_dead(self) -> None:
         with self._lock:
             paths = list(self._paths)
-        self._at.clear()  # a member may have died between putting ids on a list and asking for them
+        self._ask_lists = True  # with the next request: what is on its way may have taken long
         self._alone = True
         for path in paths:
             unmade = self._unmade.get(path)

@@ -27,7 +27,13 @@ from due.drivers.redis_wire import pack
 from due.errors import UpdatesUnavailable
 
 COUNT = 32
-"""Most entries of a stream in one answer."""
+"""Most entries of a stream in one answer, where the server is near or they are large."""
+MOST_COUNT = 512
+"""Most in one answer anywhere."""
+MOST_ANSWER_BYTES = COUNT * (96 << 10)
+"""More entries are asked for only while an answer holds less than this: as many bytes as frames of the usual size."""
+SLOW_SECONDS = 0.01
+"""A round trip that takes longer is worth more entries."""
 FRESH_SECONDS = 0.05
 """What was read ahead is used at once within this time; after it only if nobody has moved the list since."""
 MOST_GIVEN = 2 * COUNT
@@ -81,6 +87,42 @@ def last_id(reply: Any) -> str:
     return last.decode()
 
 
+class AnswerSize:
+    """How many entries to ask for: on a long way more of them if they are small.  Times are seconds, monotonic.
+
+    Args:
+        fixed: always the same.
+    """
+
+    def __init__(self, *, fixed: bool = False) -> None:
+        self._most = COUNT if fixed else MOST_COUNT
+        self.count = COUNT
+        """Entries of each stream."""
+        self.most_asked = MOST_GIVEN
+        """Ids that the last question to the work lists asked for."""
+        self._asked = self._lap = 0.0
+
+    @property
+    def most_given(self) -> int:
+        """Ids that a list gives at once: see `MOST_GIVEN`."""
+        return 2 * self.count
+
+    def asked(self, most: int, now: float) -> None:
+        """A question to the work lists is sent."""
+        self.most_asked, self._asked = most, now
+
+    def answered(self, now: float) -> None:
+        """Its answer has come."""
+        self._lap = now - self._asked
+
+    def came(self, entries: int, size: int) -> None:
+        """An answer held so many entries of one stream, and so many bytes of all."""
+        if size > MOST_ANSWER_BYTES or 4 * entries < self.count:
+            self.count = max(COUNT, self.count // 2)
+        elif entries >= self.count and 2 * size <= MOST_ANSWER_BYTES and self._lap > SLOW_SECONDS:
+            self.count = min(self._most, 2 * self.count)
+
+
 class ReadRound:
     """What one round of requests has brought so far, by path and id."""
 
@@ -89,6 +131,10 @@ class ReadRound:
         """Of this group's members whoever is given the id processes them."""
         self.ours: list[tuple[str, str]] = []
         """What the work lists gave to this member."""
+
+    def size(self) -> int:
+        """Bytes of the payloads."""
+        return sum(map(len, self.payloads.values()))
 
     def missing(self) -> list[tuple[str, str]]:
         """What is ours and was not read here."""

@@ -114,6 +114,29 @@ def test_what_is_long_on_its_way_is_sent_once(server, monkeypatch):
     commands.close()
 
 
+def test_what_is_on_its_way_while_it_looks_after_the_dead_is_used(server):
+    """On a slow link an answer may take longer than until the next look: it would never get further."""
+    path, commands, size, batches = "r.looks", client(server.url), 10_000, 6
+    for _ in range(batches * COUNT):
+        commands.xadd(stream_name(path), {"f": b"." * size})
+    reader = StreamReader(server.url, commands, "looks", "one", shared=True)  # which never reads ahead
+    reader.add(path, "0")
+    before = commands.info("stats")["total_net_output_bytes"]
+    found: list[Delivery] = []
+    while len(found) < batches * COUNT:
+        reader.care()
+        if ("new", "", "") in reader._expected:
+            reader._look_at = 0.0
+            reader.care()
+        ready, _, _ = select.select([reader.fileno()], [], [], 30)
+        found += reader.read(set(ready))
+        sent = commands.info("stats")["total_net_output_bytes"] - before
+        assert sent < 1.1 * size * batches * COUNT, "nothing was thrown away"
+    assert len({delivery.token for delivery in found}) == len(found)
+    reader.close()
+    commands.close()
+
+
 def test_alone_in_a_group_it_looks_after_the_dead_more_rarely(server):
     commands = client(server.url)
     reader = StreamReader(server.url, commands, "alone", "one", shared=False)
