@@ -1,7 +1,8 @@
 """One direction of a bridge: frames that one site wants of the other, sent as they came.
 
     receive ──► may it cross? ──► append, publish ──► settle ──► acknowledge     forwarding thread
-                                       renew leases, resend after an outage      upkeep thread
+    renew leases, drain                                                          source thread
+                                  resend after an outage                         target thread
 
 A reliable frame is acknowledged once the other site's server has it, so it survives the death of the bridge; a full
 window there, or a cut link, stops the receiving, and with it the producers of this site.  Best-effort frames that
@@ -10,6 +11,7 @@ find no connection are lost and counted.
 
 import logging
 import threading
+import time
 from collections.abc import Iterable
 from typing import Final
 
@@ -25,9 +27,9 @@ _REST_S: Final = 1.0
 _UPKEEP_S: Final = 0.5
 _SETTLE_S: Final = 1.0
 _LINGER_S: Final = 0.005
-"""How long more is awaited before the arrival of what was sent is."""
-_BATCH_BYTES: Final = 1 << 20
-"""Reliable bytes on the way to the other site before their arrival is awaited: a slow link is kept busy."""
+_MOST_LINGER_S: Final = 1.0
+_BATCH_BYTES: Final = 4 << 20
+"""Reliable bytes on the way to the other site before their arrival is awaited: a slow link runs dry meanwhile."""
 _BATCH_FRAMES: Final = 4_096
 _END_S: Final = 5.0
 
@@ -59,9 +61,12 @@ class FrameForwarder:
         self._counts = dict.fromkeys(("frames", "bytes", "lost", "refused"), 0)
         self._unsettled: list[Delivery] = []
         self._unsettled_bytes = 0
+        self._linger = _LINGER_S
+        """How long more is awaited before the arrival of what was sent is, s: as long as that took the last time."""
         self._threads = (
             LoudThread("bridge-forward", self._forward, failed),
-            LoudThread("bridge-upkeep", self._upkeep, failed),
+            LoudThread("bridge-source", self._keep_source, failed),
+            LoudThread("bridge-target", self._keep_target, failed),
         )
 
     def start(self) -> None:
@@ -109,7 +114,7 @@ class FrameForwarder:
         while not self._closing.is_set():
             self._busy = False
             try:
-                deliveries = self._source.receive(_LINGER_S if self._unsettled else _REST_S)
+                deliveries = self._source.receive(self._linger if self._unsettled else _REST_S)
             except DueError as error:
                 self._errors.error("%s: receiving failed", self._name, error=error)
                 self._closing.wait(0.1)
@@ -152,6 +157,7 @@ class FrameForwarder:
     def _settle(self) -> None:
         """Acknowledge here what has arrived there; while the link is cut, wait."""
         while self._unsettled:
+            began = time.monotonic()
             try:
                 self._target.settle(_SETTLE_S)
             except (
@@ -161,15 +167,21 @@ class FrameForwarder:
                 if self._closing.is_set():
                     return
                 continue
+            self._linger = min(max(_LINGER_S, time.monotonic() - began), _MOST_LINGER_S)
             for delivery in self._unsettled:
                 self._source.acknowledge(delivery)
             self._unsettled, self._unsettled_bytes = [], 0
 
-    def _upkeep(self) -> None:
+    def _keep_source(self) -> None:
+        # not in one thread with the target, which waits while a link that was cut takes nothing: without leases the
+        # producers of this site would wait for us no longer, and lose what we have not read
         while not self._closing.wait(_UPKEEP_S):
             self._source.renew()
             if self._busy:  # otherwise what is drained would wait until the next message comes
                 self._source.drain()
+
+    def _keep_target(self) -> None:
+        while not self._closing.wait(_UPKEEP_S):
             try:
                 self._target.poll()
             except DueError as error:

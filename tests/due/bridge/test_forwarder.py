@@ -1,5 +1,8 @@
 """Frames cross unchanged and in order, and are acknowledged only when they have arrived."""
 
+import threading
+import time
+
 import pytest
 
 from due.backends import open_updates
@@ -90,3 +93,86 @@ def test_best_effort_frames_cross_at_once_and_others_do_not(sites, forwarder):
     assert [d.payload for d in received(reader, 1)] == [b"1"]
     for half in (reader, writer):
         half.close()
+
+
+class Stuck:
+    """A publisher whose connection takes nothing: whoever uses it waits, as on a link that was cut silently."""
+
+    def __init__(self, inner) -> None:
+        self._inner = inner
+        self.whole = threading.Event()
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def append(self, path, payload):
+        self.whole.wait()
+        self._inner.append(path, payload)
+
+    def poll(self):
+        self.whole.wait()
+        return self._inner.poll()
+
+
+class Renewing:
+    """A receiver that counts the renewals of its leases."""
+
+    def __init__(self, inner) -> None:
+        self._inner = inner
+        self.renewals = 0
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def renew(self):
+        self.renewals += 1
+        self._inner.renew()
+
+
+def test_a_link_that_takes_nothing_keeps_the_leases_of_this_site(sites):
+    """Otherwise the producers here would no longer wait for the bridge, and what waits would be lost."""
+    near, far = sites
+    source, target = Renewing(near.receiver("bridge", "b1")), Stuck(far.publisher("bridge"))
+    died: list[BaseException] = []
+    forwarder = FrameForwarder("test", BridgedKeys(["a.**"]), source, target, died.append)
+    forwarder.start()
+    forwarder.activate(True)
+    forwarder.want(["a.b.*"])
+    reader, writer = far.receiver("app", "app1"), near.publisher("maker")
+    reader.follow("a.b.*")
+    writer.append("a.b.c", b"1")
+    wait_for(lambda: forwarder._busy)
+    before = source.renewals
+    wait_for(lambda: source.renewals >= before + 3)
+    target.whole.set()
+    assert [d.payload for d in received(reader, 1)] == [b"1"]
+    forwarder.close()
+    for half in (reader, writer):
+        half.close()
+    assert not died
+
+
+def test_on_a_long_way_a_short_lull_is_no_reason_to_wait_for_arrivals(sites):
+    """What comes meanwhile would wait, too: more is awaited for as long as the arrival took."""
+    near, far = sites
+
+    class Distant(Held):
+        def settle(self, timeout=None):
+            time.sleep(0.2)
+            self._inner.settle(timeout)
+
+    died: list[BaseException] = []
+    target = Distant(far.publisher("bridge"))
+    forwarder = FrameForwarder(
+        "test", BridgedKeys(["a.**"]), near.receiver("bridge", "b1"), target, died.append
+    )
+    forwarder.start()
+    forwarder.activate(True)
+    forwarder.want(["a.b.*"])
+    writer = near.publisher("maker")
+    writer.append("a.b.c", b"1")
+    wait_for(lambda: forwarder.health()["frames"] == 1 and forwarder.health()["unsettled"] == 0)
+    assert 0.2 <= forwarder._linger <= 1.0
+    forwarder.close()
+    writer.close()
+    assert not died
