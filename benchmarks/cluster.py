@@ -5,11 +5,11 @@
     bridge    two sites with servers and Coordinators of their   cluster_bridge.py
               own, joined by 10 Mb/s with 50 ms each way
 
-The primary is killed, frozen, or killed together with a producer right after its `flush`, while a reliable stream is
+Servers are killed, frozen, or killed together with a producer right after its `flush`, while a reliable stream is
 written and read; the bridge's link is cut, and the bridge killed.
 
 `…_acknowledged_lost`: items that `flush` covered and the reader never got, in all rounds.  `failover_ms_p50`: the
-median of the reader's longest pauses, where the primary was killed.
+median of the reader's longest pauses, where the primary, or the broker that leads the stream's partition, was killed.
 `kafka_msgs_per_s`: messages of 100 bytes on a reliable path; `kafka_vs_raw`: the same against confluent-kafka alone,
 with frames of 100.  `bridge_lost`: reliable items acknowledged at the one site and never delivered at the other;
 `bridge_uncounted`: best-effort items that were missing there and not counted as gaps, or the other way round.
@@ -30,7 +30,7 @@ from benchmarks.measure import arguments, machine, table, write_json
 
 PARTS: Mapping[str, float] = {"sentinel": 420.0, "kafka": 600.0, "bridge": 420.0}
 """Modules `benchmarks.cluster_NAME`, and after how many seconds no further round begins."""
-NONE_LOST = ("sentinel_acknowledged_lost", "bridge_lost", "bridge_uncounted")
+NONE_LOST = ("sentinel_acknowledged_lost", "kafka_acknowledged_lost", "bridge_lost", "bridge_uncounted")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -43,7 +43,7 @@ def figures(rounds: int, scale: float, end: float) -> dict[str, Any]:
 def killed(folder: Path, servers: SentinelServers, scale: float) -> Round:
     """kill -9 of the primary under load."""
     with StreamStage(folder, servers.url, round(scale * _MESSAGES)) as stage:
-        stage.wait_for_quarter()
+        stage.begin().wait_for_quarter()
         servers.kill(servers.primary)
         stage.wait_for_flush()
         return stage.result()
@@ -52,7 +52,7 @@ def killed(folder: Path, servers: SentinelServers, scale: float) -> Round:
 def frozen(folder: Path, servers: SentinelServers, scale: float) -> Round:
     """SIGSTOP of the primary under load; its connections stay open."""
     with StreamStage(folder, servers.url, round(scale * _MESSAGES)) as stage:
-        stage.wait_for_quarter()
+        stage.begin().wait_for_quarter()
         servers.freeze([servers.primary])
         stage.wait_for_flush()
         return stage.result()
@@ -62,7 +62,7 @@ def killed_together(folder: Path, servers: SentinelServers, scale: float) -> Rou
     """kill -9 of producer and primary as soon as `flush` has returned, while the reader is far behind."""
     messages = round(scale * _OUTLIVING)
     with StreamStage(folder, servers.url, messages, size=OUTLIVING_SIZE, delay_us=SLOW_US) as stage:
-        stage.wait_for_flush()
+        stage.begin().wait_for_flush()
         stage.producer.process.send_signal(signal.SIGKILL)
         servers.kill(servers.primary)
         return stage.result()

@@ -1,4 +1,4 @@
-"""A reliable stream between two programs while its servers break: for `cluster_sentinel`."""
+"""A reliable stream between two programs while its servers break: for `cluster_sentinel` and `cluster_kafka`."""
 
 import statistics
 import sys
@@ -40,29 +40,43 @@ class StreamStage:
         messages: how many the producer writes.
         size: bytes of each besides its number.
         delay_us: how long the reader works on each.
+        before: how many more another producer writes, which the reader has before this one begins.
     """
 
-    def __init__(self, folder: Path, url: str, messages: int, *, size: int = SIZE, delay_us: int = 0) -> None:
+    def __init__(
+        self, folder: Path, url: str, messages: int, *, size: int = SIZE, delay_us: int = 0, before: int = 0
+    ) -> None:
         self._folder, self._url = folder, url
         self._stack = ExitStack()
-        self.messages = messages
+        self.messages = before + messages
+        self._before = before
         self._size = size
         self._delay_us = delay_us
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self.consumer = self._start(stack, "consume", self._delay_us)
+            self.consumer = self._start(stack, "consume", "consume", self._delay_us)
             self.consumer.wait(lambda line: "ready" in line)
-            self.producer = self._start(stack, "produce", "reliable", 0, self.messages, self._size)
+            if self._before:
+                self._produce(stack, 0, self._before)
+                self.consumer.wait(lambda line: line.get("received", 0) >= self._before)
             self._stack = stack.pop_all()
         return self
+
+    def begin(self) -> Self:
+        """Start the producer."""
+        self.producer = self._produce(self._stack, self._before, self.messages - self._before)
+        return self
+
+    def _produce(self, stack: ExitStack, first: int, count: int) -> ChildProgram:
+        return self._start(stack, f"produce{first}", "produce", "reliable", first, count, self._size)
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def wait_for_quarter(self) -> None:
-        """Return when a quarter is written."""
-        self.producer.wait(lambda line: line.get("written", 0) >= self.messages // 4)
+        """Return when the reader has a quarter."""
+        self.consumer.wait(lambda line: line.get("received", 0) >= self.messages // 4)
 
     def wait_for_flush(self) -> None:
         """Return when the producer's `flush` has."""
@@ -79,8 +93,8 @@ class StreamStage:
         quiet = time.monotonic() - float(last["at"])
         return int(last.get("received", 0)) >= self.messages or quiet > _QUIET_S
 
-    def _start(self, stack: ExitStack, name: str, *rest: object) -> ChildProgram:
-        program = ChildProgram(self._folder / f"{name}.jsonl", name, self._url, *rest)
+    def _start(self, stack: ExitStack, said: str, name: str, *rest: object) -> ChildProgram:
+        program = ChildProgram(self._folder / f"{said}.jsonl", name, self._url, *rest)
         stack.callback(program.kill)
         return program
 

@@ -180,6 +180,10 @@ class KafkaServers:
         process.send_signal(signal.SIGKILL)
         process.wait()
 
+    def freeze(self, number: int, *, frozen: bool = True) -> None:
+        """Stop one broker as a hung machine would, or let it go on."""
+        self._processes[number].send_signal(signal.SIGSTOP if frozen else signal.SIGCONT)
+
     def stop(self) -> None:
         """End all brokers; the folder stays."""
         for process in self._processes.values():

@@ -34,7 +34,7 @@ def test_a_part_that_breaks_ends_with_1(monkeypatch, tmp_path):
     assert (code, figures["bridge_failed"]) == (1, "RuntimeError: nothing crosses")
 
 
-@pytest.mark.parametrize("name", ["bridge_lost", "bridge_uncounted"])
+@pytest.mark.parametrize("name", ["bridge_lost", "bridge_uncounted", "kafka_acknowledged_lost"])
 def test_a_loss_ends_with_1(monkeypatch, tmp_path, name):
     for lost in (0, 3):
         part = SimpleNamespace(figures=lambda *_, lost=lost: {name: lost, "failover_ms_p50": {"bridge": 1.0}})
