@@ -109,7 +109,8 @@ class KafkaServers:
         self._folder = folder
         self._password = secrets.token_urlsafe(24) if secured else ""
         self._jars = kafka_jars()
-        self._cluster = base64.urlsafe_b64encode(uuid.uuid4().bytes).decode().rstrip("=")
+        # not with a "-" in front, which Kafka's tool takes for an option
+        self._cluster = "c" + base64.urlsafe_b64encode(uuid.uuid4().bytes).decode().rstrip("=")[1:]
         self._ports = [(free_port(), free_port()) for _ in range(brokers)]
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
 

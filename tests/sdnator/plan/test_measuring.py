@@ -1,6 +1,5 @@
 """What a measurement looks at: processes, the archive's size, the configuration of switches."""
 
-import os
 import sqlite3
 import subprocess
 import sys
@@ -24,16 +23,29 @@ sys.stdin.read()
 """
 
 
+ABOVE = """
+import subprocess, sys
+with subprocess.Popen([sys.executable, "-c", sys.argv[1]]) as child:
+    print(child.pid, file=sys.stderr, flush=True)
+"""
+
+
 def test_processes_below_one_are_found_with_what_they_use():
     """A known one by its name, with what it wrote; others belong to the one above them."""
     with subprocess.Popen(
-        [sys.executable, "-c", BUSY], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as child:
-        assert child.stdout is not None
-        assert len(child.stdout.read(100_000)) == 100_000
-        known = usages(os.getpid(), {child.pid: "kitsune"}, memory=True)
-        unknown = usages(os.getpid(), {})
-        child.kill()
+        [sys.executable, "-c", ABOVE, BUSY],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as above:
+        assert above.stdout is not None
+        assert above.stderr is not None
+        child = int(above.stderr.readline())
+        assert len(above.stdout.read(100_000)) == 100_000
+        known = usages(above.pid, {child: "kitsune"}, memory=True)
+        unknown = usages(above.pid, {})
+        assert above.stdin is not None
+        above.stdin.close()
     assert known["kitsune"].processes == 1
     assert known["kitsune"].cpu_s >= 0.2
     assert known["kitsune"].kib >= 40 << 10
