@@ -86,3 +86,16 @@ def programs(tmp_path) -> Iterator[Callable[..., Program]]:
 def own_server(tmp_path) -> Iterator[EmbeddedServer]:
     with EmbeddedServer(tmp_path / "updates") as server:
         yield server
+
+
+@pytest.fixture
+def coordinator(programs, own_server, tmp_path) -> Callable[[], Program]:
+    """Starts a real Coordinator on the server of the test."""
+
+    def start() -> Program:
+        archive = f"sqlite://{tmp_path / 'coordinator.db'}"
+        program = programs("--updates", own_server.url, "--archive", archive, module="coordinator.service")
+        program.wait_for('{"ready"')
+        return program
+
+    return start

@@ -3,19 +3,6 @@
 import signal
 import time
 
-import pytest
-
-
-@pytest.fixture
-def coordinator(programs, own_server, tmp_path):
-    def start():
-        archive = f"sqlite://{tmp_path / 'coordinator.db'}"
-        program = programs("--updates", own_server.url, "--archive", archive, module="coordinator.service")
-        program.wait_for('{"ready"')
-        return program
-
-    return start
-
 
 def _pair(programs, url, heartbeat=0.5):
     """Two speakers and a listener; returns (listener, active, standby)."""

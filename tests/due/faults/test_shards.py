@@ -17,17 +17,6 @@ from tests.due.faults.programs import CHAINS, LINKS, linked
 PATHS = tuple(f"{LINKS}.p{number}" for number in range(6))
 
 
-@pytest.fixture
-def coordinator(programs, own_server, tmp_path):
-    def start():
-        archive = f"sqlite://{tmp_path / 'coordinator.db'}"
-        program = programs("--updates", own_server.url, "--archive", archive, module="coordinator.service")
-        program.wait_for('{"ready"')
-        return program
-
-    return start
-
-
 class Load:
     """Writes numbers under all paths, and knows what their chains must be."""
 
