@@ -25,6 +25,7 @@ from due.drivers.redis_acks import Acknowledgements
 from due.drivers.redis_aside import Aside
 from due.drivers.redis_dead_members import SILENT_SECONDS, DeadMembers
 from due.drivers.redis_leases import MemberLeases
+from due.drivers.redis_places import GroupPlaces
 from due.drivers.redis_primary import backoff_for
 from due.drivers.redis_share import StreamShare
 from due.drivers.redis_streams import stream_name, wake_name, work_name
@@ -35,8 +36,6 @@ from due.drivers.redis_work import (
     AnswerSize,
     ReadAhead,
     ReadRound,
-    ServerTime,
-    WorkLists,
     last_id,
     packed_ids,
     packed_payload,
@@ -54,8 +53,6 @@ _LOOK_SECONDS = 1.0
 _HOLD_SECONDS = 0.2
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
-_TRIES = 3
-"""Immediate attempts to make a list, in case the connection was just lost."""
 _STREAM, _WORK = stream_name(""), "due:work:"
 _Expected = tuple[str, str, str]
 """Kind of an answer, path, id."""
@@ -87,15 +84,12 @@ class StreamReader:
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
-        self._unmade: dict[str, tuple[str, bool, float]] = {}
-        """Work lists that could not be made: start, and since when; their streams are not read before that."""
         self._leases = MemberLeases(commands, group, consumer)
         self._share = StreamShare()
-        self._lists = WorkLists(commands, group)
+        self._places = GroupPlaces(commands, group)
         self._dead = DeadMembers(commands, group, consumer)
         self._upkeep = Upkeep(commands, group, consumer)
         self.aside = Aside(commands, group)
-        self._server_time = ServerTime(commands)
         self._look_at = 0.0
         self._alone = False
         self._quiet = False
@@ -136,7 +130,7 @@ class StreamReader:
                 del self._paths[path]
                 self._at.pop(path, None)
                 self._held.discard(path)
-                self._unmade.pop(path, None)
+                self._places.unmade.pop(path, None)
                 self._dead.forget(path)
             self._stale = bool(gone)
             self._upkeep.withdrawn(gone, time.monotonic())
@@ -283,27 +277,17 @@ class StreamReader:
         log.error(told, self._group, path, error, self._group)
 
     def _make_list(self, path: str, start: str, *, reset: bool = False, since: float | None = None) -> None:
-        """`since`: when a list was first requested that could not be made then (s, monotonic)."""
+        """See `GroupPlaces.make`."""
         self._at.pop(path, None)
-        for _ in range(_TRIES):
-            try:
-                begin = self._server_time.start(since) if start == "$" and since is not None else start
-                self._lists.make(path, begin, reset=reset)
-            except redis.exceptions.NoPermissionError as error:
-                self._deny(path, error)
-            except (redis.RedisError, OSError) as error:
-                failed = error
-                continue
-            self._unmade.pop(path, None)
-            self._at.pop(path, None)
-            return
-        log.warning("%s has no place on %s now: %s", self._group, path, failed)
-        # entries from now on are wanted, even if the list is made later
-        self._unmade[path] = (start, reset, time.monotonic() if since is None else since)
+        try:
+            self._places.make(path, start, reset=reset, since=since)
+        except redis.exceptions.NoPermissionError as error:
+            self._deny(path, error)
+        self._at.pop(path, None)
 
     def _register(self, paths: Sequence[str]) -> None:
         try:
-            self._lists.register([path for path in paths if path in self._paths])
+            self._places.lists.register([path for path in paths if path in self._paths])
         except (redis.RedisError, OSError) as error:
             log.debug("readers could not be told: %s", error)
 
@@ -320,7 +304,7 @@ class StreamReader:
         life = wire.life()
         with understood("TIME"):
             now = seconds_of(wire.call("TIME"))
-            self._server_time.note(now)
+            self._places.server_time.note(now)
             self._woken = f"{int(now * 1000) - 1}-0"
         self._quiet = wire.call("CLIENT", "REPLY", "ON") == b"OK"
         self._backoff.succeeded()
@@ -561,7 +545,7 @@ class StreamReader:
         for path in paths:
             self._make_list(path, "0")
         with self._lock:
-            self._held.update(self._unmade)  # a new primary may take no writes yet
+            self._held.update(self._places.unmade)  # a new primary may take no writes yet
             self._look_at = 0.0
         self.renew()
         self._register(paths)
@@ -572,7 +556,7 @@ class StreamReader:
         """Rights were taken away from one of the paths of a request: find it."""
         for path in self._requested:
             try:
-                self._lists.check_right(path)
+                self._places.lists.check_right(path)
             except redis.exceptions.NoPermissionError as error:
                 self._deny(path, error)
             except (redis.RedisError, OSError):
@@ -584,7 +568,7 @@ class StreamReader:
         self._ask_lists = True  # with the next request: what is on its way may have taken long
         self._alone = True
         for path in paths:
-            unmade = self._unmade.get(path)
+            unmade = self._places.unmade.get(path)
             if unmade is not None:
                 self._make_list(path, unmade[0], reset=unmade[1], since=unmade[2])
             if not self._share.reads(path):
