@@ -3,7 +3,11 @@
     office traffic ──► veth ──► pipeline of `sdnator up` ──► veth ──► what came
     an operator, a reader of scores and of a query ──┘ └── /proc of every process, each few seconds ──► samples
 
-Fields: `seconds`, `pps`; by process `slope_kb_per_hour` (of its anonymous memory, Theil-Sen over the medians of
+Before it is measured the load trains Kitsune, and fills its tables with hosts that come once (`benchmarks.soak_fill`;
+`--no-fill` leaves that out): state that is bounded would grow for hours otherwise, and look like a leak.
+
+Fields: `seconds`, `pps`; `fill_s`, `fill_frames` (0: not filled), `fill_scored` (of them, by Kitsune), `fill_tables`
+(entries and caps then); by process `slope_kb_per_hour` (of its anonymous memory, Theil-Sen over the medians of
 minutes), `noise` (half of the 99 % interval of a block bootstrap) and `growing` (the interval lies above zero: empty
 is the bar); `lost` (frames of nobody who was blocked, and what apps say they lost); `files`, `threads`, `bytes`
 (archive, logs, rest of the state).  Samples are appended to a file: `--from FILE` makes figures of a run that was
@@ -28,6 +32,7 @@ from typing import Any
 from benchmarks.measure import machine, table, write_json
 from benchmarks.soak_client import SoakClient
 from benchmarks.soak_figures import figures, lost_in
+from benchmarks.soak_fill import PAIRS, TRAINED, fill_frames, fullness
 from benchmarks.soak_memory import folder_bytes, footprints
 from benchmarks.soak_traffic import LATE_S, OfficeLoad
 from sdnator.capture.interfaces import VethPair
@@ -40,6 +45,8 @@ _STEPS_PPS = (250, 500, 1000, 2000, 4000, 8000)
 _STEP_S = 10.0
 _SETTLE_S = 5.0
 _CARRIED = 0.98
+_TOLD_S = 15.0
+"""Until frames are late, and apps have said how full they are."""
 _PROGRESS_S = 300.0
 _WARM_S = 3600.0
 """Bounded state fills first: Kitsune keeps an idle stream for 3,000 s, producers retain up to 16 MiB."""
@@ -180,6 +187,31 @@ class SoakRun:
             carried = float(pps)
         return carried
 
+    def fill(self, pps: float) -> dict[str, Any]:
+        """Train Kitsune and fill its tables, at so many frames a second; what that took and came to."""
+        began, before = time.monotonic(), self.sample(0.0)
+        self._send(TRAINED, pps)
+        self.load.insert(fill_frames())
+        self._send(2 * PAIRS, pps)
+        time.sleep(_TOLD_S)
+        after = self.sample(0.0)
+        found = {
+            "fill_s": round(time.monotonic() - began, 1),
+            "fill_frames": after["sent"] - before["sent"],
+            "fill_scored": after["scored"] - before["scored"],
+            "fill_tables": fullness(self._health),
+        }
+        print(f"filled: {found}", file=sys.stderr, flush=True)
+        return found
+
+    def _send(self, frames: int, pps: float) -> None:
+        """So many, and as many more as are sent until that is seen."""
+        end = self.load.sent + frames
+        self.load.pps = pps
+        while self.load.sent < end:
+            time.sleep(0.1)
+        self.load.pps = 0.0
+
     def soak(self, pps: float, seconds: float, every_s: float, samples: Path) -> None:
         """Load for so long; each sample is appended to a file."""
         began, told = time.monotonic(), 0.0
@@ -250,6 +282,9 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="where to write the figures")
     parser.add_argument("--seconds", type=float, default=7200.0, help="length of the load")
     parser.add_argument("--pps", type=float, help="frames a second; default: half of what a probe finds")
+    parser.add_argument(
+        "--no-fill", dest="fill", action="store_false", help="begin with empty tables instead of full ones"
+    )
     parser.add_argument("--every", type=float, default=5.0, help="seconds between two samples")
     parser.add_argument(
         "--warm",
@@ -266,7 +301,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
 def _run(options: argparse.Namespace) -> dict[str, Any]:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _raise_ended)
-    more: dict[str, Any] = {"ended_early": False}
+    more: dict[str, Any] = {"ended_early": False, "fill_s": 0.0, "fill_frames": 0}
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
         try:
             with SoakRun(Path(folder), options.seed) as run:
@@ -274,6 +309,8 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
                 if pps is None:
                     more["capacity_pps"] = run.capacity()
                     pps = more["capacity_pps"] / 2
+                if options.fill and pps > 0:
+                    more.update(run.fill(pps))
                 print(f"{pps:g} frames/s for {options.seconds:g} s", file=sys.stderr, flush=True)
                 run.soak(pps, options.seconds, options.every, options.source)
                 more["errors"] = run.client.errors

@@ -44,6 +44,7 @@ class OfficeLoad:
         self._ended = threading.Event()
         self._ends = (_open(near), _open(far))
         self._ready: queue.Queue[tuple[int, bytes]] = queue.Queue(_AHEAD)
+        self._extra: Iterator[tuple[int, bytes]] = iter(())
         self._network = NETWORKS["office"](seed)
         self._threads = [
             threading.Thread(target=each, daemon=True) for each in (self._make, self._send, self._receive)
@@ -62,6 +63,14 @@ class OfficeLoad:
             each.join()
         for end in self._ends:
             end.close()
+
+    def insert(self, frames: Iterator[tuple[int, bytes]]) -> None:
+        """Send other frames first, at the same rate, and go on with the office afterwards.
+
+        Args:
+            frames: of each the end that it is sent into (0: the office's), and its bytes.
+        """
+        self._extra = frames
 
     def look(self, blocked: Collection[str]) -> None:
         """Count frames that are overdue: as stopped where their source is, or was at the last look, blocked.
@@ -106,7 +115,7 @@ class OfficeLoad:
             owed = min(owed + self.pps * (now - due), max(self.pps, 1.0))
             due = now
             while owed >= 1.0 and not self._ended.is_set():
-                self._put(*self._ready.get())
+                self._put(*(next(self._extra, None) or self._ready.get()))
                 owed -= 1.0
             time.sleep(_SLICE_S)
 

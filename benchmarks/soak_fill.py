@@ -1,0 +1,68 @@
+"""Traffic that fills Kitsune's tables in minutes: a chain of hosts that nobody has seen, each asks the next one once.
+
+    office traffic, until Kitsune is trained ──► host 0 ⇄ host 1 ⇄ host 2 ⇄ … ──► a soak run with full tables
+
+Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest to take the newest:
+memory that grows from then on is a leak.
+"""
+
+import struct
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS
+from apps.kitsune.behaviour.contacts import MOST_CONTACTS
+
+PAIRS: Final = round(2.1 * MOST_CONTACTS)
+"""Contacts are kept in two generations, each up to its cap.  AfterImage's tables, and those of senders and
+conversations, are smaller: a pair brings a stream to each of four tables, a link to each of two, and a sender.  Pairs
+without a host in common would leave links at half of their cap, because a link ends with either of its streams."""
+TRAINED: Final = 70_000
+"""Frames of the office before: 55,000 of training, the rest is scored."""
+CAPS: Final = {"streams": 4 * MAX_STREAMS, "links": 2 * MAX_LINKS}
+"""Of those tables of which Kitsune's health says how full they are."""
+
+_TOGETHER: Final = 64
+"""Requests before their answers, and hosts behind one MAC: an answer must not overtake its request in the switch."""
+_ADDRESSES: Final = 100 << 24 | 64 << 16
+"""100.64.0.0/10 (RFC 6598), where nobody in the office traffic is."""
+_MACS: Final = 0x02_66_00_000000
+_PORT, _UDP, _LIFE = 20_000, 17, 64
+_PAYLOAD: Final = bytes(32)
+_IP = struct.Struct("!BBHHHBBHII")
+_PORTS = struct.Struct("!HHHH")
+
+
+def fill_frames(pairs: int = PAIRS) -> Iterator[tuple[int, bytes]]:
+    """Frames, and the end that each is sent into: 0 that of the office, 1 that of the Internet.
+
+    Args:
+        pairs: of neighbours in the chain.
+    """
+    for first in range(0, pairs, _TOGETHER):
+        askers = range(first, min(first + _TOGETHER, pairs))
+        for number in askers:
+            yield number % 2, _frame(number, number + 1)
+        for number in askers:
+            yield (number + 1) % 2, _frame(number + 1, number)
+
+
+def fullness(health: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """From the Coordinator's /health: entries of Kitsune's tables and their caps."""
+    told = health.get("apps", {}).get("kitsune", {}).get("health", {}).get("app", {})
+    return {name: {"entries": int(told.get(name, 0)), "cap": cap} for name, cap in CAPS.items()}
+
+
+def _frame(sender: int, receiver: int) -> bytes:
+    """A UDP datagram from one host to another, by their numbers."""
+    length = _PORTS.size + len(_PAYLOAD)
+    ends = _ADDRESSES + sender, _ADDRESSES + receiver
+    header = _IP.pack(0x45, 0, _IP.size + length, 0, 0, _LIFE, _UDP, 0, *ends)
+    checksum = ~(sum(struct.unpack("!10H", header)) % 0xFFFF) & 0xFFFF
+    header = header[:10] + checksum.to_bytes(2, "big") + header[12:]
+    macs = _mac(receiver) + _mac(sender)
+    return macs + b"\x08\x00" + header + _PORTS.pack(_PORT, _PORT, length, 0) + _PAYLOAD
+
+
+def _mac(host: int) -> bytes:
+    return (_MACS | host % 2 << 23 | host // (2 * _TOGETHER)).to_bytes(6, "big")

@@ -1,0 +1,61 @@
+"""What fills Kitsune's tables before a soak run: hosts that come once, in a chain."""
+
+import numpy as np
+
+from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS, AfterImage
+from apps.kitsune.behaviour.contacts import MOST_CONTACTS
+from apps.kitsune.senders import MOST_CONVERSATIONS, MOST_SENDERS
+from apps.packets import read_frames
+from benchmarks.soak_fill import PAIRS, fill_frames, fullness
+
+
+def packets(pairs):
+    sides, frames = zip(*fill_frames(pairs), strict=True)
+    numbers = np.arange(len(frames))
+    return read_frames(
+        frames,
+        lengths=[len(frame) for frame in frames],
+        times_us=numbers * 250,
+        ports=[side + 1 for side in sides],
+        sequence=numbers,
+        arrival=numbers + 1,
+    )
+
+
+def test_each_host_asks_the_next_one_through_the_switch_and_is_answered():
+    columns = packets(130)
+    asked = list(zip(columns["ip_src_lo"].tolist(), columns["ip_dst_lo"].tolist(), strict=True))
+    first = min(min(asked))
+    up = [(first + number, first + number + 1) for number in range(130)]
+    assert sorted(asked) == sorted([*up, *((b, a) for a, b in up)])
+    assert all(asked.index(pair) < asked.index(pair[::-1]) for pair in up)
+    assert ((columns["ip_src_lo"] - first) % 2 + 1).tolist() == columns["port"].tolist()
+
+
+def test_headers_are_valid():
+    for _, frame in fill_frames(3):
+        words = np.frombuffer(frame[14:34], ">u2").astype(int).sum()
+        assert words % 0xFFFF == 0
+        assert int.from_bytes(frame[16:18], "big") == len(frame) - 14
+
+
+def test_tables_are_full_afterwards():
+    """A fifth more pairs than entries, as in a soak run: there, more."""
+    tables = AfterImage("bounded", max_streams=500, max_links=500)
+    tables.update(packets(600))
+    assert 4 * 490 < tables.counts["streams"] <= 4 * 500
+    assert 2 * 490 < tables.counts["links"] <= 2 * 500
+    assert tables.counts["forgotten_full"] > 0
+
+
+def test_there_are_pairs_enough_for_every_table():
+    """Contacts and conversations have two generations."""
+    assert min(PAIRS / MAX_STREAMS, PAIRS / MAX_LINKS, PAIRS / MOST_SENDERS) > 1
+    assert min(PAIRS / MOST_CONTACTS, PAIRS / MOST_CONVERSATIONS) > 2
+    assert PAIRS < 1 << 22  # addresses of 100.64.0.0/10
+
+
+def test_fullness_is_what_kitsune_says():
+    told = {"apps": {"kitsune": {"health": {"app": {"streams": 7, "links": 3}}}}}
+    assert fullness(told)["streams"] == {"entries": 7, "cap": 4 * MAX_STREAMS}
+    assert fullness({})["links"] == {"entries": 0, "cap": 2 * MAX_LINKS}
