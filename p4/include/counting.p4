@@ -4,8 +4,10 @@
 // empty, so nothing is ever reset.  Cells are banked by the window's parity: the last window stays
 // readable.  A key whose cell is taken in its window goes to the host as an overflow tuple.
 //
-// Two kinds of counts:
+// Three kinds of counts:
 //   count        only grows: its key is reported when it reaches the threshold
+//   gate         only grows, and reports nothing: from the frame on with which it reaches the threshold, the
+//                key's frames are copied (for queries that need payloads)
 //   difference   grows with some frames and falls with others (SYNs - FINs): what it comes to is known when
 //                the window is over.  Keys that reached the threshold meanwhile wait in a ring; the query's
 //                frames of later windows take one of them out each, and report it if it is still over.
@@ -15,7 +17,7 @@
 
 const bit<32> STAGE_CELLS = 65536;        // of a stage, both banks together
 const bit<32> BANK_CELLS = STAGE_CELLS / 2;
-const bit<32> CELLS = 8 * STAGE_CELLS;
+const bit<32> CELLS = 16 * STAGE_CELLS;
 const bit<32> DIFFERENCE_ZERO = 0x80000000; // in the cell of a difference: it may fall below zero
 
 // epoch (window number + 1) 32 | query 8 | source 128 | destination 128 | extra 48
@@ -84,8 +86,44 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
         }
     }
 
+    // Params as of count, and: answers: the frame's destination is the key's source, and so on. looks: the frame
+    // counts nothing. opens: the queries that get the frame where its key's count has reached the threshold.
+    // uncounted: those that get it where its key has no cell; whoever gets it must count it himself.
+    // The classifier knows neither: they stand in the query map of what is copied for them.
+    action gate(bit<8> query, address_t source_mask, address_t destination_mask, bit<32> threshold,
+                bit<64> reciprocal, bit<32> base, bit<32> size, bit<1> answers, bit<1> looks,
+                query_map_t opens, query_map_t uncounted) {
+        stage_counter.count();
+        address_t source = (answers == 1 ? meta.destination : meta.source) & source_mask;
+        address_t destination = (answers == 1 ? meta.source : meta.destination) & destination_mask;
+        bit<1> has_cell;
+        locate(query, source, destination, 0, reciprocal, base, size, has_cell);
+        meta.cell_count = 0;
+        if (has_cell == 1 && meta.cell[383:352] == meta.cell_epoch) {
+            if (meta.cell[351:344] == query && meta.cell[343:216] == source && meta.cell[215:88] == destination) {
+                meta.cell_count = meta.cell[31:0];
+            } else {
+                has_cell = 0;
+            }
+        }
+        query_map_t wanted = uncounted;
+        if (has_cell == 1) {
+            if (looks == 0) {
+                meta.cell_count = meta.cell_count |+| 1;
+                if (meta.reading == 0) {
+                    cells.write(meta.cell_slot, meta.cell_epoch ++ query ++ source ++ destination ++ 56w0 ++ meta.cell_count);
+                }
+            }
+            wanted = meta.cell_count >= threshold ? opens : 0;
+        }
+        if (meta.reading == 0) {
+            meta.query_map = meta.query_map | wanted;
+            meta.copies = meta.copies | wanted;
+        }
+    }
+
     // Params as of count, and: count_of: the query whose cells and ring these are, the same for all frames of
-    // a difference. answers: the frame's destination is the key's source, and so on. subtracts: the frame makes
+    // a difference. answers: as of gate. subtracts: the frame makes
     // the count smaller. threshold: DIFFERENCE_ZERO + what is reported. generation: 1 to 255, other than that
     // of whoever had the number count_of before.
     action difference(bit<8> count_of, query_map_t bit_of_query, address_t source_mask, address_t destination_mask,
@@ -155,7 +193,7 @@ control CountStage(in headers_t hdr, inout metadata_t meta)(bit<32> first_cell) 
     @brief("Counting queries of this stage, by their bit of the query map")
     table queries {
         key = { meta.query_map: ternary @name("query_map"); }
-        actions = { count; difference; NoAction; }
+        actions = { count; difference; gate; NoAction; }
         default_action = NoAction();
         counters = stage_counter;
         size = 32;
@@ -172,6 +210,14 @@ control Counting(in headers_t hdr, inout metadata_t meta) {
     @name(".ingress.count_5") CountStage(5 * STAGE_CELLS) count_5;
     @name(".ingress.count_6") CountStage(6 * STAGE_CELLS) count_6;
     @name(".ingress.count_7") CountStage(7 * STAGE_CELLS) count_7;
+    @name(".ingress.count_8") CountStage(8 * STAGE_CELLS) count_8;
+    @name(".ingress.count_9") CountStage(9 * STAGE_CELLS) count_9;
+    @name(".ingress.count_10") CountStage(10 * STAGE_CELLS) count_10;
+    @name(".ingress.count_11") CountStage(11 * STAGE_CELLS) count_11;
+    @name(".ingress.count_12") CountStage(12 * STAGE_CELLS) count_12;
+    @name(".ingress.count_13") CountStage(13 * STAGE_CELLS) count_13;
+    @name(".ingress.count_14") CountStage(14 * STAGE_CELLS) count_14;
+    @name(".ingress.count_15") CountStage(15 * STAGE_CELLS) count_15;
     apply {
         count_0.apply(hdr, meta);
         count_1.apply(hdr, meta);
@@ -181,6 +227,14 @@ control Counting(in headers_t hdr, inout metadata_t meta) {
         count_5.apply(hdr, meta);
         count_6.apply(hdr, meta);
         count_7.apply(hdr, meta);
+        count_8.apply(hdr, meta);
+        count_9.apply(hdr, meta);
+        count_10.apply(hdr, meta);
+        count_11.apply(hdr, meta);
+        count_12.apply(hdr, meta);
+        count_13.apply(hdr, meta);
+        count_14.apply(hdr, meta);
+        count_15.apply(hdr, meta);
     }
 }
 

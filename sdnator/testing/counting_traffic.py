@@ -34,10 +34,11 @@ def entries(random: Random, tables: Mapping[str, Table], window_us: int) -> Iter
         link = (Ternary(port, 511), Ternary(0, 0), Ternary(0, 0))
         queries = random.randrange(1, _ALL + 1)
         yield "ingress.telemetry_link", TableEntry(link, "ingress.match_link", (queries,), priority=port)
-    for stage in random.sample(range(8), 4):
+    stages = sum(name.startswith("ingress.count_") for name in tables)
+    for stage in random.sample(range(stages), 4):
         name = f"ingress.count_{stage}.queries"
         actions = {each.name.rpartition(".")[2]: each for each in tables[name].spec.actions}
-        kind = random.choice(["count", "difference", "difference"])
+        kind = random.choice(["count", "difference", "difference", "gate"])
         shared = _shared(random, kind, stage, window_us)
         for priority, bit in enumerate(random.sample(range(_BITS), random.randint(1, 3)), start=1):
             given = {**shared, "query": bit, "bit_of_query": 1 << bit, **_own(random, bit)}
@@ -70,7 +71,8 @@ def _shared(random: Random, kind: str, stage: int, window_us: int) -> dict[str, 
 
 def _own(random: Random, bit: int) -> dict[str, int]:
     signs = {"answers": random.randint(0, 1), "subtracts": int(random.random() < 0.3)}
-    return {**signs, "repeated": random.choice([0, 0, 1 << bit])}
+    gate = {"looks": int(random.random() < 0.3), "opens": 1 << _BITS + bit, "uncounted": 1 << 2 * _BITS + bit}
+    return {**signs, **gate, "repeated": random.choice([0, 0, 1 << bit])}
 
 
 def question(random: Random, time_us: int) -> dict[str, int]:

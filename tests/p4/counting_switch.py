@@ -70,7 +70,7 @@ def install(switch: Switch, action: str, bit: int, *, stage: int = 0, **params: 
     table = switch.tables[f"ingress.count_{stage}.queries"]
     spec = next(each for each in table.spec.actions if each.name == f"ingress.count_{stage}.{action}")
     given = {"bit_of_query": 1 << bit, "source_mask": ADDRESS, **params}
-    unknown = set(given) - {param.name for param in spec.params}
+    unknown = set(params) - {param.name for param in spec.params}
     if unknown:
         raise DataplaneError(f"{spec.name} has no parameter {unknown}")
     values = tuple(given.get(param.name, 0) for param in spec.params)

@@ -60,8 +60,9 @@ def fill(switch: Switch, chooser: Chooser) -> None:
     switch.tables["ingress.telemetry_link"].set_default(
         "ingress.match_link", (chooser.random.getrandbits(8),)
     )
-    for stage in range(8):
-        switch.tables[f"ingress.count_{stage}.queries"].clear()
+    for name in switch.tables:
+        if name.startswith("ingress.count_"):
+            switch.tables[name].clear()
     for name, entry in hostile_traffic.entries(chooser.random, switch.tables, _RECIPROCALS):
         with suppress(TableError):
             switch.tables[name].insert(entry)

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from apps.sonata_adapter.planner.placement import SwitchLimits
 from sdnator import p4_program
 from sdnator.testing.p4runtime_client import program_config
 from tests.contract.differences import markdown
 
 _DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "dataplane.md"
-_STAGES = 8
+_STAGES = SwitchLimits().stages
 
 
 def section(title):
@@ -49,7 +50,7 @@ def test_marks_of_tables_are_true():
     metered = {meter.direct_table_id for meter in info.direct_meters}
     text = _DOCUMENT.read_text(encoding="utf-8")
     for table in info.tables:
-        name = re.sub(r"count_\d", "count_N", table.preamble.name.removeprefix("ingress."))
+        name = re.sub(r"count_\d+", "count_N", table.preamble.name.removeprefix("ingress."))
         marks = re.search(rf"^\| `{re.escape(name)}` \|([^|]*)\|", text, re.MULTILINE).group(1).split()
         number = table.preamble.id
         mark = "◐" if number in metered else "●" if number in counted else ""
