@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from apps.sonata_adapter.host.columns import Numberings, PacketColumns, Tuples, plain_value
 from apps.sonata_adapter.host.evaluation import TupleRows, column_of
 from apps.sonata_adapter.host.flows import SeenFlows
+from apps.sonata_adapter.host.gates import GateOperator, split_by_payload
 from apps.sonata_adapter.host.operators import (
     Crossed,
     DistinctOperator,
@@ -45,7 +46,7 @@ from apps.sonata_adapter.query.dataflow import (
     sources,
 )
 from apps.sonata_adapter.query.expressions import Kind, kind_of
-from apps.sonata_adapter.query.language import PACKET_KINDS, Query
+from apps.sonata_adapter.query.language import PACKET_KINDS, Gate, Query
 from apps.sonata_adapter.query.least_packets import least_packets
 from apps.sonata_adapter.results import Captured, QueryResult
 from due import RecordBatch
@@ -92,6 +93,7 @@ class _Window:
         self._distincts: dict[DistinctNode, DistinctOperator] = {}
         self._reduces: dict[ReduceNode, ReduceOperator] = {}
         self._reported: dict[str, Reported] = {}
+        self._gates: dict[Gate, GateOperator] = {}
         self._flows = flows
         self._kept: Set[Node] = frozenset()
         self.packets = 0
@@ -143,7 +145,15 @@ class _Window:
             return self._flows.new(packets)
         rows = self.feed(_NEW_FLOWS, packets, memo) if node.once else packets
         assert not isinstance(rows, Update)  # noqa: S101 - packets are rows
-        return filtered(rows, node.filters)
+        if node.gate is None or node.gate_key is None:
+            return filtered(rows, node.filters)
+        headers, payloads = split_by_payload(node.filters)
+        gate = self._gates.get(node.gate)
+        if gate is None:
+            gate = self._gates[node.gate] = GateOperator(node.gate, self._limit)
+        some = filtered(packets, headers)
+        assert isinstance(some, PacketColumns)  # noqa: S101 - packets stay packets
+        return filtered(gate.passed(packets, some, node.gate_key), payloads)
 
     def reported(self, query: str) -> Reported:
         return self._reported.setdefault(query, Reported(self._limit))
@@ -168,10 +178,12 @@ class _Window:
     def error(self, nodes: Iterable[Node]) -> str:
         """Why results from these nodes are estimates; empty: they are exact."""
         found = [text for node in nodes for text in self._errors(node)]
-        return "; ".join(dict.fromkeys(found))
+        return "; ".join(dict.fromkeys(text for text in found if text))
 
     def _errors(self, node: Node) -> Iterator[str]:
         if isinstance(node, PacketSource):
+            if node.gate in self._gates:
+                yield self._gates[node.gate].error
             return
         operator = self._distincts.get(node) if isinstance(node, DistinctNode) else self._reduces.get(node)
         if operator is not None and operator.error:

@@ -23,6 +23,7 @@ from apps.sonata_adapter.query.dataflow import (
     TableStep,
     WindowTable,
     compile_query,
+    conjuncts,
 )
 from apps.sonata_adapter.query.expressions import PACKET_FIELDS, Expression, Field
 from apps.sonata_adapter.query.language import Distinct, Filter, Map, Query, Reduce
@@ -39,11 +40,15 @@ def parts_of(query: Query) -> list[Part]:
     outcome = compile_query(query)
     if not isinstance(outcome, WindowTable):
         return [(_packets(outcome.node), _own_keys(outcome))]
+    gate = query.gated
+    counted = [] if gate is None else [PacketSource(conjuncts(gate.condition))]
     for name in dict(outcome.names):
         fields = _follow(outcome, name)
-        if fields is not None:
-            return [(_packets(node), (field,)) for node, field in zip(_sources(outcome), fields, strict=True)]
-    return [(_packets(node), ()) for node in _sources(outcome)]
+        if fields is not None and (gate is None or name == gate.name):
+            found = zip(_sources(outcome), fields, strict=True)
+            gates = [(source, (gate.key,)) for source in counted if gate is not None]
+            return [*gates, *((_packets(node), (field,)) for node, field in found)]
+    return [*((source, ()) for source in counted), *((_packets(node), ()) for node in _sources(outcome))]
 
 
 def shard_rows(part: Part, packets: PacketColumns, shards: int) -> dict[int, NDArray[np.intp]]:

@@ -7,7 +7,7 @@ operators.  For people who write a query; a running pipeline does not count like
 import msgspec
 
 from apps.sonata_adapter.host.engine import HostEngine
-from apps.sonata_adapter.query.language import Join, Map, Pipeline, Query, text_lines
+from apps.sonata_adapter.query.language import Distinct, Join, Map, Pipeline, Query, Reduce, text_lines
 from apps.sonata_adapter.results import Captured, QueryResult
 from due import RecordBatch
 
@@ -50,9 +50,14 @@ class StepCounts:
             above = len(self._steps) - 1
             if name:
                 self._rows[name] = 0
-                self._engine.add(Query(name, self._query.window_ms, tuple(steps[:end])))
+                self._engine.add(self._up_to(name, steps[:end]))
             if isinstance(step, Join):
                 self._add(step.other, indent + "    ")
+
+    def _up_to(self, name: str, steps: Pipeline) -> Query:
+        """The query that ends with these steps; those before the first distinct or reduce see all packets."""
+        behind = any(isinstance(step, Distinct | Reduce) for step in steps)
+        return Query(name, self._query.window_ms, steps, self._query.gated if behind else None)
 
     def take(self, batch: RecordBatch) -> None:
         """Count packets in."""

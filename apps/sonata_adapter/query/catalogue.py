@@ -4,6 +4,9 @@ A key is reported when its value *reaches* the threshold (>=), as in the queries
 published.  Differences to those: a SYN-ACK is flags 0x12 (18, not 17), ssh_brute_force looks at port
 22 only, and syn_flood subtracts the ACKs.  SYN, SYN-ACK and ACK look at FIN, SYN, RST and ACK only,
 because real floods set ECN bits.
+
+The queries that read payloads look at a host's packets only from the one on with which enough of them have come in
+the window (`gate`): a switch counts until then, and copies nothing.
 """
 
 from collections.abc import Callable, Mapping
@@ -145,7 +148,7 @@ def _slowloris(values: Values) -> Query:
 
 
 def _dns_tunnel(values: Values) -> Query:
-    packets = _begin("dns_tunnel", values)
+    packets = _begin("dns_tunnel", values).gate(udp.sport == 53, int(values["gate"]), dst=ip.dst)
     answers = _towards(packets.filter((udp.sport == 53) & (dns.response == 1)), values)
     names = answers.map(dst=ip.dst, name=dns.name).distinct().reduce("dst", names=count())
     syns = _towards(packets.filter(tcp.flags == SYN), values, at="ip.src")
@@ -156,7 +159,8 @@ def _dns_tunnel(values: Values) -> Query:
 
 
 def _zorro(values: Values) -> Query:
-    telnet = _towards(_begin("zorro", values).filter(tcp.dport == 23), values)
+    packets = _begin("zorro", values).gate(tcp.dport == 23, int(values["gate"]), dst=ip.dst)
+    telnet = _towards(packets.filter(tcp.dport == 23), values)
     guesses = telnet.map(dst=ip.dst, length=length).reduce("dst", "length", similar=count())
     guessed = guesses.filter(field("similar") >= int(values["similar"])).map("dst").distinct()
     commands = telnet.filter(payload_contains(b"zorro")).map(dst=ip.dst).reduce("dst", count=count())
@@ -167,10 +171,12 @@ _ANY, _RRSIG = 255, 46
 
 
 def _dns_reflection(values: Values) -> Query:
-    packets = _begin("dns_reflection", values)
+    packets = _begin("dns_reflection", values).gate(udp.sport == 53, int(values["gate"]), dst=ip.dst)
     large = (dns.qtype == _ANY) | (dns.qtype == _RRSIG)
     answers = _towards(packets.filter((udp.sport == 53) & (dns.response == 1) & large), values)
-    questions = _towards(packets.filter(udp.dport == 53), values, at="ip.src")
+    # a packet between two ports 53 is taken for an answer
+    asks = (udp.dport == 53) & (udp.sport != 53)
+    questions = _towards(packets.filter(asks), values, at="ip.src")
     unasked = (
         answers.map(dst=ip.dst, src=ip.src)
         .distinct()
@@ -188,6 +194,12 @@ def _arp_scan(values: Values) -> Query:
 _DST: Final = prefix("dst", "only hosts in this prefix")
 _SRC: Final = prefix("src", "only senders in this prefix")
 _W: Final = window(3_000)
+
+
+def _gate(default: int, what: str) -> Parameter:
+    return number("gate", default, f"look at a host's packets from its {what} of this number on", unit=what)
+
+
 _REFINE: Final = levels()
 
 CATALOGUE: Final[dict[str, Template]] = {
@@ -287,6 +299,7 @@ CATALOGUE: Final[dict[str, Template]] = {
                 # 40 as for the other counts: a page asks for tens of names but connects to their hosts
                 _W,
                 number("threshold", 40, "report at this difference", unit="names"),
+                _gate(10, "DNS answer"),
                 _DST,
             ),
             build=_dns_tunnel,
@@ -301,6 +314,7 @@ CATALOGUE: Final[dict[str, Template]] = {
                 number("threshold", 1, "report at this many frames with the command", unit="frames"),
                 # 10: a telnet login that is typed by hand has fewer frames of one length
                 number("similar", 10, "telnet frames of one length that count as guessing", unit="frames"),
+                _gate(10, "telnet frame"),
                 _DST,
             ),
             build=_zorro,
@@ -309,7 +323,12 @@ CATALOGUE: Final[dict[str, Template]] = {
             name="dns_reflection",
             meaning="hosts that get DNS answers of type ANY or RRSIG from many servers they did not ask",
             result="dst: the host; count: servers",
-            parameters=(_W, number("threshold", 40, "report at this many servers", unit="servers"), _DST),
+            parameters=(
+                _W,
+                number("threshold", 40, "report at this many servers", unit="servers"),
+                _gate(10, "DNS answer"),
+                _DST,
+            ),
             build=_dns_reflection,
         ),
         Template(

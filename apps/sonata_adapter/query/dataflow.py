@@ -28,6 +28,7 @@ from apps.sonata_adapter.query.language import (
     Distinct,
     Filter,
     Function,
+    Gate,
     Join,
     JoinKind,
     Map,
@@ -53,6 +54,9 @@ class PacketSource(msgspec.Struct, frozen=True, tag=True):
     filters: tuple[Expression, ...]
     once: bool = False
     """The first packet of each flow in a window is enough."""
+    gate: Gate | None = None
+    gate_key: Expression | None = None
+    """The packets' field that must have passed the gate."""
 
 
 class DistinctNode(msgspec.Struct, frozen=True, tag=True):
@@ -122,8 +126,10 @@ def compile_query(query: Query) -> Outcome:
     """The graph of a query and how it reports results; raises `QueryError`."""
     if not query.steps:
         raise QueryError(f"{query.name}: a query needs at least one step")
-    table = _compile(query.steps)
+    table = _compile(query.steps, query.gated)
     if isinstance(table.node, PacketSource):
+        if query.gated is not None:
+            raise QueryError(f"{query.name}: a gate needs a distinct or a reduce behind it")
         mapped = any(isinstance(step, Map) for step in query.steps)
         return TupleStream(table.node, table.names if mapped else None)
     return _crossing(table) or table
@@ -176,7 +182,8 @@ def conjuncts(condition: Expression) -> tuple[Expression, ...]:
 class _Walk:
     """Steps turned into nodes, up to the first that needs the whole window."""
 
-    def __init__(self) -> None:
+    def __init__(self, gate: Gate | None) -> None:
+        self._gate = gate
         self.node: Node = PacketSource(())
         self.filters: tuple[Expression, ...] = ()
         self.names: dict[str, Expression] = {name: Field(name) for name in PACKET_KINDS}
@@ -198,15 +205,27 @@ class _Walk:
 
     def _source(self) -> tuple[Node, tuple[Expression, ...]]:
         if isinstance(self.node, PacketSource):
-            return PacketSource(self.node.filters + self.filters), ()
+            return PacketSource(self.node.filters + self.filters, False, self._gate, self._gate_key()), ()
         return self.node, self.filters
+
+    def _gate_key(self) -> Expression | None:
+        if self._gate is None:
+            return None
+        key = self.names.get(self._gate.name)
+        if key is None or kind_of(key, PACKET_KINDS) != kind_of(self._gate.key, PACKET_KINDS):
+            raise QueryError(
+                f"a map before the first distinct or reduce makes {self._gate.name}, which has the gate"
+            )
+        return key
 
     def _distinct(self) -> None:
         source, filters = self._source()
         values = tuple(sorted(set(self.names.values()), key=text_of))
         if isinstance(source, PacketSource):
             used = {name for part in (*source.filters, *values) for name in fields_of(part)}
-            source = PacketSource(source.filters, used <= FLOW_FIELDS)
+            # which packet of a flow is the first behind a gate, is not known before
+            once = used <= FLOW_FIELDS and source.gate is None
+            source = msgspec.structs.replace(source, once=once)
         self.node, self.filters = DistinctNode(source, filters, values), ()
         self.names = {name: Field(text_of(value)) for name, value in self.names.items()}
 
@@ -220,20 +239,20 @@ class _Walk:
         self.names[step.name] = Field(VALUE)
 
 
-def _compile(steps: Pipeline) -> WindowTable:
-    walk = _Walk()
+def _compile(steps: Pipeline, gate: Gate | None) -> WindowTable:
+    walk = _Walk(gate)
     rest = list(steps)
     while rest and not isinstance(walk.node, ReduceNode) and walk.take(rest[0]):
         rest.pop(0)
     node, filters = walk._source()  # noqa: SLF001 - both belong together
     return WindowTable(
-        node, filters, tuple(sorted(walk.names.items())), tuple(_table_step(step) for step in rest)
+        node, filters, tuple(sorted(walk.names.items())), tuple(_table_step(step, gate) for step in rest)
     )
 
 
-def _table_step(step: Step) -> TableStep:
+def _table_step(step: Step, gate: Gate | None) -> TableStep:
     if isinstance(step, Join):
-        return TableJoin(_compile(step.other), step.keys, step.kind)
+        return TableJoin(_compile(step.other, gate), step.keys, step.kind)
     return step
 
 

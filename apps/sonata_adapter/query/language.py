@@ -77,6 +77,27 @@ class Join(msgspec.Struct, frozen=True, tag=True):
     kind: JoinKind
 
 
+class Gate(msgspec.Struct, frozen=True, tag=True):
+    """Look at a key's packets only from the one on with which enough of them have come in the window.
+
+    The packet that opens the gate is the first that is looked at.  For queries that read payloads: a switch counts
+    who passes the gate, and copies only those packets.
+    """
+
+    name: str
+    """The field of the tuples that must have passed."""
+    key: Expression
+    """That field of the packets that the gate counts."""
+    condition: Expression
+    """Of the packets that the gate counts."""
+    count: int
+
+    def text(self) -> str:
+        """As in a query's text."""
+        name = self.name if self.key == Field(self.name) else f"{self.name} = {text_of(self.key)}"
+        return f"gate {name}: count() >= {self.count} where {text_of(self.condition)}"
+
+
 Step: TypeAlias = Filter | Map | Distinct | Reduce | Join
 Pipeline: TypeAlias = tuple[Step, ...]
 
@@ -84,6 +105,7 @@ ETHERTYPE_ARP: Final = 0x0806
 PACKET_KINDS: Final[dict[str, Kind]] = {name: kind for name, (kind, _) in PACKET_FIELDS.items()}
 MIN_WINDOW_MS: Final = 10
 MAX_WINDOW_MS: Final = 3_600_000
+MOST_GATE: Final = 1_000_000_000
 
 
 class Aggregate(msgspec.Struct, frozen=True):
@@ -136,6 +158,8 @@ class Query(msgspec.Struct, frozen=True):
     name: str
     window_ms: int = 3_000
     steps: Pipeline = ()
+    gated: Gate | None = None
+    """Of all its packets, those of joined queries too."""
 
     def __post_init__(self) -> None:
         if not MIN_WINDOW_MS <= self.window_ms <= MAX_WINDOW_MS:
@@ -147,6 +171,32 @@ class Query(msgspec.Struct, frozen=True):
     def window_us(self) -> int:
         """Length of a window, microseconds."""
         return self.window_ms * 1000
+
+    def gate(self, condition: Term, at_least: int, **key: Term) -> "Query":
+        """Look at a key's packets only from the one on with which enough of a kind have come in the window.
+
+        Args:
+            condition: which packets are counted, for instance `udp.sport == 53`.
+            at_least: how many of them open the gate, 1 or more; the last of these is looked at.
+            key: one field, under the name that it has in the first `map` of the query and of all that it is joined
+                with: `dst=ip.dst`.
+
+        Returns:
+            The query with this gate.
+
+        Raises:
+            QueryError: there are steps already, not exactly one field, or an expression does not fit.
+        """
+        if self.steps or len(key) != 1:
+            raise QueryError(f"{self.name}: a gate comes first, and has one field, as in dst=ip.dst")
+        ((name, value),) = key.items()
+        made = Gate(name, as_node(value), as_node(condition), at_least)
+        if kind_of(made.condition, PACKET_KINDS) != "condition":
+            raise QueryError(f"{self.name}: a gate needs a condition, not {text_of(made.condition)}")
+        kind_of(made.key, PACKET_KINDS)
+        if not 1 <= at_least <= MOST_GATE:
+            raise QueryError(f"{self.name}: a gate opens at 1 to {MOST_GATE:,} packets, not {at_least}")
+        return Query(self.name, self.window_ms, (), made)
 
     def filter(self, condition: Term) -> "Query":
         """Keep the tuples that meet a condition.
@@ -220,12 +270,14 @@ class Query(msgspec.Struct, frozen=True):
             The query with this step.
 
         Raises:
-            QueryError: the windows differ, or fields are missing, of another kind or on both sides.
+            QueryError: the windows or gates differ, or fields are missing, of another kind or on both sides.
         """
         if other.window_ms != self.window_ms:
             raise QueryError(
                 f"{self.name}: windows of {self.window_ms} and {other.window_ms} ms cannot be joined"
             )
+        if other.gated != self.gated:
+            raise QueryError(f"{self.name}: both sides of a join have the same gate")
         return self._with(Join(other.steps, tuple(sorted(on)), kind))
 
     def _with(self, step: Step) -> "Query":
@@ -234,7 +286,7 @@ class Query(msgspec.Struct, frozen=True):
             output_kinds(steps)
         except QueryError as error:
             raise QueryError(f"{self.name}: step {len(steps)}: {error}") from None
-        return Query(self.name, self.window_ms, steps)
+        return Query(self.name, self.window_ms, steps, self.gated)
 
     @property
     def fields(self) -> dict[str, Kind]:
@@ -247,9 +299,9 @@ class Query(msgspec.Struct, frozen=True):
         Returns:
             Lines that `text.parse_queries` reads back.
         """
-        return "\n".join(
-            (f"query {self.name}(window={duration_text(self.window_ms)}):", *text_lines(self.steps))
-        )
+        head = [f"query {self.name}(window={duration_text(self.window_ms)}):"]
+        head += [] if self.gated is None else [f"    {self.gated.text()}"]
+        return "\n".join((*head, *text_lines(self.steps)))
 
 
 def output_kinds(steps: Iterable[Step]) -> dict[str, Kind]:

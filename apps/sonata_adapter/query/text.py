@@ -16,7 +16,8 @@ other side of a join is indented below it:
             map dst = ip.src
             reduce by dst: fins = count()
 
-`len` and `entropy` measure `dns.name` and `payload` of packets: `filter len(dns.name) >= 50`.
+`gate dst = ip.dst: count() >= 10 where udp.sport == 53`, as the first line, has a host's packets looked at only from
+its tenth DNS answer of the window on.  `len` and `entropy` measure `dns.name` and `payload` of packets: `filter len(dns.name) >= 50`.
 `join` is `inner`, `left`, `outer` or `anti`.  Aggregates are `count()`, `sum(…)`, `max(…)`.
 Every error names line and column.
 """
@@ -30,6 +31,7 @@ import msgspec
 
 from apps.sonata_adapter.errors import InvalidRequest, QueryError, QueryTextError
 from apps.sonata_adapter.query.catalogue import Template, Values
+from apps.sonata_adapter.query.dataflow import compile_query
 from apps.sonata_adapter.query.expressions import (
     FLAG_PATTERNS,
     FUNCTIONS,
@@ -48,10 +50,12 @@ from apps.sonata_adapter.query.expressions import (
     size_of,
 )
 from apps.sonata_adapter.query.language import (
+    MOST_GATE,
     Aggregate,
     Distinct,
     Filter,
     Function,
+    Gate,
     Join,
     JoinKind,
     Map,
@@ -338,9 +342,13 @@ def _query(where: str, head: _Line, body: list[_Line]) -> Template:
     reader.end()
     if not body:
         raise QueryTextError(where, head.number, 1, f"query {name} has no steps")
-    values = {each.name: int(each.default) for each in parameters}
-    steps = _block(where, body, {key: value for key, value in values.items() if key != "window"})
-    fields = ", ".join(output_kinds(steps))
+    query = _build(where, name, tuple(body), {each.name: each.default for each in parameters})
+    if query.gated is not None:
+        try:
+            compile_query(query)
+        except QueryError as error:
+            raise QueryTextError(where, body[0].number, body[0].tokens[0].column, str(error)) from None
+    fields = ", ".join(query.fields)
     return Template(
         name=name,
         meaning=f"defined in {where}",
@@ -352,7 +360,34 @@ def _query(where: str, head: _Line, body: list[_Line]) -> Template:
 
 def _build(where: str, name: str, body: tuple[_Line, ...], values: Values) -> Query:
     numbers = {key: int(value) for key, value in values.items() if key != "window"}
-    return Query(name, int(values["window"]), _block(where, list(body), numbers))
+    lines = list(body)
+    gate = _gate(where, name, lines.pop(0), numbers) if lines[0].tokens[0].text == "gate" else None
+    if not lines:
+        raise QueryTextError(where, body[0].number, 1, f"query {name} has no steps behind its gate")
+    return Query(name, int(values["window"]), _block(where, lines, numbers), gate)
+
+
+def _gate(where: str, name: str, line: _Line, parameters: Mapping[str, int]) -> Gate:
+    """`gate dst = ip.dst: count() >= 10 where udp.sport == 53`."""
+    reader = _Reader(where, line, parameters)
+    reader.expect("gate")
+    field_name = reader.name("the name of a field")
+    key = reader.expression() if reader.accept("=") else Field(field_name)
+    for sign in (":", "count", "(", ")", ">="):
+        reader.expect(sign)
+    known = parameters.get(reader.token.text)
+    at_least = reader.number(1, MOST_GATE) if known is None else known
+    if known is not None:
+        reader.next()
+    reader.expect("where")
+    condition = reader.expression()
+    reader.end()
+    try:
+        made = Query(name).gate(Term(condition), at_least, **{field_name: Term(key)}).gated
+    except QueryError as error:
+        raise QueryTextError(where, line.number, line.tokens[0].column, str(error)) from None
+    assert made is not None  # noqa: S101 - it was just made
+    return made
 
 
 def _parameters(reader: _Reader) -> tuple[Parameter, ...]:

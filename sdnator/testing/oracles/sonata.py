@@ -282,7 +282,26 @@ def _slowloris(window: Window, p: Parameters) -> Reported:
     return found
 
 
+def _gated(
+    window: Window, p: Parameters, counts: Callable[[NaivePacket], bool], host: Callable[[NaivePacket], str]
+) -> Window:
+    """The packets of hosts (`host` of a packet) to which `gate` packets that count have come, from the last of these on."""
+    came: dict[str, int] = defaultdict(int)
+    found = []
+    for packet in window:
+        if counts(packet):
+            came[packet.dst] += 1
+        if came[host(packet)] >= p["gate"]:
+            found.append(packet)
+    return found
+
+
+def _of_dns(packet: NaivePacket) -> bool:
+    return packet.protocol == 17 and packet.sport == 53
+
+
 def _dns_tunnel(window: Window, p: Parameters) -> Reported:
+    window = _gated(window, p, _of_dns, lambda packet: packet.src if is_syn(packet) else packet.dst)
     names: dict[str, set[bytes]] = defaultdict(set)
     peers: dict[str, set[str]] = defaultdict(set)
     for packet in window:
@@ -300,6 +319,9 @@ def _dns_tunnel(window: Window, p: Parameters) -> Reported:
 
 
 def _zorro(window: Window, p: Parameters) -> Reported:
+    window = _gated(
+        window, p, lambda packet: packet.protocol == 6 and packet.dport == 23, lambda packet: packet.dst
+    )
     similar: dict[tuple[str, int], int] = defaultdict(int)
     commands: dict[str, int] = defaultdict(int)
     for packet in window:
@@ -315,12 +337,11 @@ def _zorro(window: Window, p: Parameters) -> Reported:
 def _dns_reflection(window: Window, p: Parameters) -> Reported:
     answers: set[tuple[str, str]] = set()
     asked: set[tuple[str, str]] = set()
-    for packet in window:
-        if packet.protocol != 17:
-            continue
-        if packet.dport == 53:
+    for packet in _gated(window, p, _of_dns, lambda packet: packet.src):
+        if packet.protocol == 17 and packet.dport == 53 and packet.sport != 53:
             asked.add((packet.src, packet.dst))
-        if packet.sport == 53:
+    for packet in _gated(window, p, _of_dns, lambda packet: packet.dst):
+        if _of_dns(packet):
             response, qtype, _ = question(packet.payload)
             if response == 1 and qtype in (46, 255):
                 answers.add((packet.dst, packet.src))
