@@ -15,6 +15,7 @@ import msgspec
 from apps.messages import TableUpdate
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
+from apps.sonata_adapter.host.gates import with_passed
 from apps.sonata_adapter.host.handshake import Handshakes
 from apps.sonata_adapter.host.merge import Merger, patience
 from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
@@ -76,6 +77,8 @@ class _Lane:
         self.merger = Merger()
         self.names: set[str] = set()
         """The streams from which its packets come."""
+        self.opens = ""
+        """Of a query with a gate in the switch: the stream of packets that have passed it."""
         self.brought: dict[str, int] = {}
         """Packets by stream."""
 
@@ -87,6 +90,8 @@ class _Station:
         self.name = name
         self.headers = _Lane(engine())
         self.frames = _Lane(engine())
+        self.gated: dict[str, _Lane] = {}
+        """By query, of those with a gate in the switch: what the switch says of packets holds for one query only."""
         self.handshakes = Handshakes()
         self.reports: dict[str, _Counts] = {}
         self.base_us = base_us
@@ -100,8 +105,8 @@ class _Station:
         return [each for each in self.reports.values() if isinstance(each, (RegisterReads, Differences))]
 
     @property
-    def lanes(self) -> tuple[_Lane, _Lane]:
-        return self.headers, self.frames
+    def lanes(self) -> tuple[_Lane, ...]:
+        return self.headers, self.frames, *self.gated.values()
 
 
 class Control:
@@ -119,6 +124,8 @@ class Control:
         self._templates = templates
         self._limits = limits or SwitchLimits()
         self._engine = partial(engine, limit=keys_limit, lateness_us=lateness_us)
+        # what comes through a gate is little
+        self._gate_engine = partial(HostEngine, limit=keys_limit, lateness_us=lateness_us)
         self._stations: dict[str, _Station] = {}
         self._refinement = Refinement()
         self._asked: dict[str, QueryRequest] = {}
@@ -155,6 +162,7 @@ class Control:
         found |= {
             Source("frames" if copy.payload else "packets", _name(copy.bit)) for copy in self.plan.copies
         }
+        found |= {Source("frames", _name(bit)) for bit in self.plan.gate_bits}
         return found
 
     def know(self, templates: Mapping[str, Template]) -> None:
@@ -210,7 +218,8 @@ class Control:
         for lane in station.lanes:
             if name in lane.names:
                 lane.brought[name] = lane.brought.get(name, 0) + len(batch)
-                written += self._processed(station, lane, lane.merger.put(name, batch, now), now)
+                mine = with_passed(batch, passed=name == lane.opens) if lane.opens else batch
+                written += self._processed(station, lane, lane.merger.put(name, mine, now), now)
         return written
 
     def busy(self, switch: str, now: float) -> None:
@@ -327,7 +336,7 @@ class Control:
             },
             "tuples": {one.identity: self._tuples(one) for one in self.plan.queries},
             "overflow": {one.identity: self._overflow(one) for one in self.plan.queries},
-            "bits": len(self.plan.entries) + len(self.plan.copies),
+            "bits": len(self.plan.entries) + len(self.plan.copies) + len(self.plan.gate_bits),
             "host_packets": sum(lane.host.packets for lane in lanes),
             "late": sum(lane.host.late for lane in lanes),
             "disordered": sum(lane.merger.disordered for lane in lanes),
@@ -371,6 +380,9 @@ class Control:
         """Tuples that reached the host for a query, from all switches."""
         found = 0
         for station in self._stations.values():
+            if one.identity in station.gated:
+                found += sum(station.gated[one.identity].brought.values())
+                continue
             lane = station.frames if one.payload else station.headers
             found += sum(lane.brought.get(_name(copy.bit), 0) for copy in one.copies)
             if one.identity in station.reports:
@@ -431,7 +443,8 @@ class Control:
 
     def _refit(self, station: _Station, old: Mapping[str, QueryRequest]) -> None:
         """Adapt a switch's operators to the plan."""
-        for lane in station.lanes:
+        self._refit_gates(station)
+        for lane in (station.headers, station.frames):
             mine = [
                 one
                 for one in self.plan.queries
@@ -449,10 +462,26 @@ class Control:
             lane.merger.hurry(patience(min(windows, default=None)))
         reports: dict[str, _Counts] = {}
         for one in self.plan.queries:
-            if one.in_switch:
+            if one.in_switch and one.gate is None:
                 held = station.reports.get(one.identity)
                 reports[one.identity] = held or self._new_reports(one, station)
         station.reports = reports
+
+    def _refit_gates(self, station: _Station) -> None:
+        gates = {one.identity: one.gate for one in self.plan.queries if one.gate is not None}
+        for identity in station.gated.keys() - gates.keys():
+            station.gated.pop(identity).host.close()
+        for identity, gate in gates.items():
+            lane = station.gated.get(identity)
+            query = self._requests[identity].query
+            if lane is None:
+                lane = station.gated[identity] = _Lane(self._gate_engine())
+                lane.host.base_us = station.base_us
+                lane.host.add(query)
+            lane.opens = _name(gate.opens)
+            lane.names = {lane.opens, _name(gate.uncounted)}
+            lane.merger.expect(lane.names)
+            lane.merger.hurry(patience(query.window_us))
 
     def _new_reports(self, one: QueryPlan, station: _Station) -> _Counts:
         request = self._requests[one.identity]
@@ -489,8 +518,9 @@ class Control:
         return written
 
     def _withdrawn(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:
-        now = {**dict.fromkeys(self.plan.entries, True), **{copy.bit: True for copy in self.plan.copies}}
-        gone = [bit for bit in (*before.entries, *(copy.bit for copy in before.copies)) if bit not in now]
+        now = {*self.plan.entries, *self.plan.gate_bits, *(copy.bit for copy in self.plan.copies)}
+        were = (*before.entries, *before.gate_bits, *(copy.bit for copy in before.copies))
+        gone = [bit for bit in were if bit not in now]
         return tuple({"name": _name(bit), "bit": bit, "active": False} for bit in gone)
 
     def _offered(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:
@@ -506,6 +536,8 @@ class Control:
             for copy in self.plan.copies
             if copied.get(copy.bit) != copy.match
         ]
+        passed = [bit for bit in self.plan.gate_bits if bit not in before.gate_bits]
+        found += [{**_offer(bit, {}, copy=True), "by_stage": True} for bit in passed]
         return tuple(found)
 
     def _updates(self, before: QueryPlans) -> tuple[TableUpdate, ...]:

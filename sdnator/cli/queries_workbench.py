@@ -75,8 +75,8 @@ class Tested(msgspec.Struct, frozen=True):
 
     @property
     def tuples(self) -> int:
-        """What reaches the host: copies, or reports of the switch."""
-        return self.found if self.plan.in_switch else self.copied
+        """What reaches the host: copies (behind a gate: at most), or reports of the switch."""
+        return self.found if self.plan.in_switch and self.plan.gate is None else self.copied
 
 
 def tested(file: Path, captures: list[Path], most: int) -> Iterator[Tested]:
@@ -226,6 +226,8 @@ def tested_text(one: Tested) -> str:
 def _cost(one: Tested) -> str:
     cpu = f"on the host alone it takes {_per_million(one):.2f} s of CPU per million packets"
     share = one.tuples / max(1, one.packets)
+    if one.plan.gate is not None:
+        return f"the switch counts up to the gate, and copies {counted(one.tuples, 'packet')} at most; {cpu}"
     if one.plan.in_switch:
         return (
             f"the switch counts; {counted(one.found, 'report')} to the host, and keys without a cell; {cpu}"

@@ -51,6 +51,8 @@ class TelemetryRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     copy: bool = True
     """Send packet-ins of the matching packets; otherwise they are only counted."""
     digest: bool = False
+    by_stage: bool = False
+    """The packets are chosen and copied by a counting stage: the bit has no entries here."""
 
 
 class Classifier:
@@ -81,6 +83,7 @@ class Classifier:
         for a condition that the classifier cannot express.
         """
         _check_bits(requests)
+        requests = [request for request in requests if not request.by_stage]
         conditions = [self._assign(request) for request in requests]
         found = EntrySet([self._active_entry(requests)])
         for table in self._tables:
@@ -110,7 +113,7 @@ class Classifier:
         return EntrySet(entry for entry in entries if entry.table_id != self._active.id)
 
     def _active_entry(self, requests: Iterable[TelemetryRequest]) -> Any:
-        chosen = list(requests)
+        chosen = [request for request in requests if not request.by_stage]
         maps = {
             "active": _map(chosen),
             "copies": _map(request for request in chosen if request.copy),

@@ -58,11 +58,18 @@ class Offer(Message, frozen=True, kw_only=True):
     come under `network.digests` and `network.counts`."""
     digest: bool = False
     """A digest of every matching packet."""
+    by_stage: bool = False
+    """A counting stage chooses the packets and copies them, not the classifier; there are no conditions."""
     active: bool = True
 
     def request(self) -> TelemetryRequest:
         return TelemetryRequest(
-            name=self.name, bit=self.bit, conditions=self.conditions, copy=self.copy, digest=self.digest
+            name=self.name,
+            bit=self.bit,
+            conditions=self.conditions,
+            copy=self.copy,
+            digest=self.digest,
+            by_stage=self.by_stage,
         )
 
 
@@ -154,6 +161,8 @@ def demand_for(
 def _by_digest(
     request: TelemetryRequest, routes: Mapping[Kind, Mapping[str, int]], which: str
 ) -> TelemetryRequest:
+    if request.by_stage:
+        return request
     digest = request.digest or which in routes["packets"]
     return msgspec.structs.replace(request, copy=which in routes["frames"], digest=digest)
 

@@ -30,8 +30,15 @@ def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "") -> s
     for copy in one.copies:
         what = "frames" if copy.payload else "headers"
         lines.append(f"    bit {copy.bit:<3} copies {what} of {match_text(copy.match)}")
+    if one.gate is not None:
+        lines.append(f"    bit {one.gate.opens:<3} copies frames that have passed the gate")
+        lines.append(f"    bit {one.gate.uncounted:<3} copies frames of keys without a cell")
     lines.append("  on the host")
-    if any(entry.role == "clock" for entry in one.entries):
+    if one.gate is not None:
+        lines.append(
+            "    all operators, on what has passed the gate; the gate itself for keys without a cell"
+        )
+    elif any(entry.role == "clock" for entry in one.entries):
         lines.append("    keys that may become results; their other counts are read when the window is over")
     elif any(entry.role == "difference" for entry in one.entries):
         lines.append("    keys at or above the threshold when the window is over; keys without a cell")
@@ -78,6 +85,8 @@ def _entry_lines(entry: StageEntry) -> list[str]:
         "distinct": f"lets new ({key}) pass",
         "reduce": f"counts {unit} by ({key}), reports {entry.threshold}",
         "difference": _difference_text(entry, unit, key),
+        "gate": f"counts frames by ({key}), lets them pass from {entry.threshold} on",
+        "look": f"lets frames pass whose ({key}){_side(entry)} has passed",
     }[entry.role]
     cells = f"{entry.size:,} cells"
     return [
@@ -87,10 +96,13 @@ def _entry_lines(entry: StageEntry) -> list[str]:
 
 
 def _difference_text(entry: StageEntry, unit: str, key: str) -> str:
-    side = ", of answers" if entry.answers else ""
     sign = "subtracts" if entry.subtracts else "adds"
     at_end = f", reports {entry.threshold} at the window's end" if entry.bit == entry.count_of else ""
-    return f"{sign} {unit} by ({key}){side}{at_end}"
+    return f"{sign} {unit} by ({key}){_side(entry)}{at_end}"
+
+
+def _side(entry: StageEntry) -> str:
+    return ", of answers" if entry.answers else ""
 
 
 def _prefix_text(name: str, mask: int) -> str:

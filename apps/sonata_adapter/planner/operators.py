@@ -37,8 +37,17 @@ def placed_operators(request: QueryRequest, one: QueryPlan) -> list[PlacedOperat
         request: the query.
         one: its plan.
     """
-    walk = _InSwitch(request, one) if one.in_switch else _OnHost(one)
-    return list(walk.steps(request.query.steps, ""))
+    walk: _Walk = _InSwitch(request, one) if one.in_switch else _OnHost(one)
+    gated = request.query.gated
+    if gated is None:
+        return list(walk.steps(request.query.steps, ""))
+    gate = one.gate
+    if gate is None:
+        first = PlacedOperator(gated.text(), "host", one.reason)
+    else:
+        walk = _BehindGate(gate)
+        first = PlacedOperator(gated.text(), "switch", _stages([gate]))
+    return [first, *walk.steps(request.query.steps, "")]
 
 
 class _Walk:
@@ -157,6 +166,22 @@ class _OnHost(_Walk):
 
     def _later(self, step: Step) -> tuple[Place, str]:  # noqa: ARG002
         return "host", self._one.reason
+
+
+class _BehindGate(_Walk):
+    """A query of which the switch copies what has passed the gate."""
+
+    def __init__(self, gate: StageEntry) -> None:
+        self._why = f"on the copies of what has passed the gate (bit {gate.opens})"
+
+    def _packets(self, step: Step, source: int) -> tuple[Place, str]:  # noqa: ARG002
+        return "host", self._why
+
+    def _behind(self, step: Step, source: int) -> tuple[Place, str]:  # noqa: ARG002
+        return "host", self._why
+
+    def _later(self, step: Step) -> tuple[Place, str]:  # noqa: ARG002
+        return "host", self._why
 
 
 def _unplaced(condition: Expression) -> str:

@@ -27,7 +27,7 @@ _KEY_PARTS: Final = {
 }
 _LAST_KNOWN_PORT: Final = 1_023
 """The last well-known port: servers send from these, clients from the others."""
-Role = Literal["distinct", "reduce", "difference", "clock"]
+Role = Literal["distinct", "reduce", "difference", "gate", "look", "clock"]
 _DIFFERENCE_ZERO: Final = 1 << 31
 """The cell's value for a difference of 0, because differences may be negative."""
 
@@ -38,7 +38,7 @@ class SwitchLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     bits: int = 196
     """Classifier bits from 0 on; the firewall uses four for samples, the controller the others for ports and the
     whole stream."""
-    stages: int = 8
+    stages: int = 16
     """Counting stages that the adapter may use."""
     entries: int = 32
     """Entries of a stage."""
@@ -73,12 +73,16 @@ class StageEntry(msgspec.Struct, frozen=True, kw_only=True):
     behind: tuple[int, ...] = ()
     """Of a reduce: the bits of the distincts that let its tuples pass, each those of other packets."""
     count_of: int = 0
-    """Of a difference: the bit of its first entry, whose cells all of them count in."""
+    """Of a difference or a gate: the bit of its first entry, whose cells all of them use."""
     answers: int = 0
-    """Of a difference: 1 where the packets come from the other side, and their source is the key's destination."""
+    """1 where the packets come from the other side, and their source is the key's destination."""
     subtracts: int = 0
     generation: int = 1
     """Of a difference: 1 to 255, other than that of who had the bit before."""
+    opens: int = 0
+    """Of a gate: the bit of the copies of packets that have passed it."""
+    uncounted: int = 0
+    """Of a gate: the bit of the copies of packets whose key has no cell."""
 
     def params(self, repeated: int = 0) -> dict[str, int]:
         """Parameters of the action; `repeated`: bits to forget for a key seen before."""
@@ -95,6 +99,17 @@ class StageEntry(msgspec.Struct, frozen=True, kw_only=True):
             "base": self.base,
             "size": self.size,
         }
+        if self.action == "gate":
+            kept = ("source_mask", "destination_mask", "reciprocal", "base", "size")
+            return {
+                **{name: common[name] for name in kept},
+                "query": self.count_of,
+                "threshold": self.threshold,
+                "answers": self.answers,
+                "looks": int(self.role == "look"),
+                "opens": 1 << self.opens,
+                "uncounted": 1 << self.uncounted,
+            }
         if self.role != "difference":
             return {**common, "query": self.bit, "threshold": self.threshold, "repeated": repeated}
         return {
@@ -109,7 +124,14 @@ class StageEntry(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def action(self) -> str:
         """Name of the counting stages' action."""
+        if self.role in ("gate", "look"):
+            return "gate"
         return "difference" if self.role == "difference" else "count"
+
+    @property
+    def bits(self) -> tuple[int, ...]:
+        """Bits that the entry takes."""
+        return (self.bit, self.opens, self.uncounted) if self.action == "gate" else (self.bit,)
 
     def value(self, count: int) -> int:
         """What a count that was read from its cell means."""
@@ -180,7 +202,7 @@ class Space:
     def hold(self, entries: Iterable[StageEntry]) -> None:
         for entry in entries:
             if entry.bit not in self._bits:
-                self._bits.add(entry.bit)
+                self._bits.update(entry.bits)
                 self._stages[entry.stage].append(entry)
 
     def take_bits(self, bits: Iterable[int]) -> None:
@@ -285,10 +307,16 @@ class Space:
             return entry
         raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its {wanted.role}")
 
-    def difference(self, wanted: Sequence[StageEntry]) -> list[StageEntry]:
-        """Entries for one difference: all in one stage, on the same cells; raises `NotPlaced`."""
+    def gate(self, wanted: Sequence[StageEntry]) -> list[StageEntry]:
+        """Entries for one gate, and the bits of its copies; raises `NotPlaced`."""
+        entries = self.together(wanted)
+        opens, uncounted = self.bit(), self.bit()
+        return [msgspec.structs.replace(entry, opens=opens, uncounted=uncounted) for entry in entries]
+
+    def together(self, wanted: Sequence[StageEntry]) -> list[StageEntry]:
+        """Entries for one difference or gate: all in one stage, on the same cells; raises `NotPlaced`."""
         apart = all(disjoint(one.match, other.match) for one, other in combinations(wanted, 2))
-        wish = len(wanted) * self._limits.reduce_cells
+        wish = sum(entry.role != "look" for entry in wanted) * self._limits.reduce_cells
         for number, held in enumerate(self._stages if apart else ()):
             gap = self._gap(held, wish)
             fits = all(disjoint(one.match, other.match) for one in wanted for other in held)
@@ -303,7 +331,7 @@ class Space:
             ]
             held.extend(found)
             return found
-        raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its difference")
+        raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its {wanted[0].role}")
 
     def _gap(self, held: Iterable[StageEntry], wish: int) -> tuple[int, int] | None:
         """The first gap of cells that is as large as wished, else the largest of at least a quarter."""

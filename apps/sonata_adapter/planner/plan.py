@@ -6,7 +6,7 @@
 The switch can count a reduce over packets, or over a distinct over packets, whose keys are addresses, the destination
 port and the length; and, in one cell, differences of such counts.  Each distinct and each reduce takes a bit of the
 classifier for each alternative of its filter, and a place in a counting stage; within one stage, no frame may match
-two entries.  If there is not room for all queries, those that save most tuples come first.
+two entries.  Of a query with a gate the switch counts what opens it, and copies only what comes behind.  If there is not room for all queries, those that save most tuples come first.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,9 +18,17 @@ import msgspec
 
 from apps.sonata_adapter.errors import NotPlaced
 from apps.sonata_adapter.keys import QueryRequest
-from apps.sonata_adapter.planner.conditions import Match, conditions_of, disjoint
+from apps.sonata_adapter.planner.conditions import Match, conditions_of, disjoint, narrowed
 from apps.sonata_adapter.planner.estimates import packets_per_second
-from apps.sonata_adapter.planner.placement import Copy, Space, StageEntry, SwitchLimits, by_bytes, masks_of
+from apps.sonata_adapter.planner.placement import (
+    Copy,
+    Role,
+    Space,
+    StageEntry,
+    SwitchLimits,
+    by_bytes,
+    masks_of,
+)
 from apps.sonata_adapter.planner.pushdown import Difference, candidates, difference
 from apps.sonata_adapter.planner.refinement_levels import address_of, by_family, cut
 from apps.sonata_adapter.query.dataflow import (
@@ -37,7 +45,7 @@ from apps.sonata_adapter.query.dataflow import (
     sources,
 )
 from apps.sonata_adapter.query.expressions import PAYLOAD_FIELDS, Expression, Field, fields_of, text_of
-from apps.sonata_adapter.query.language import duration_text
+from apps.sonata_adapter.query.language import Gate, duration_text
 
 _LONGEST_PERIOD_MS: Final = 10_000
 """Longest period between two time reports of the switch, ms."""
@@ -71,6 +79,11 @@ class QueryPlan(msgspec.Struct, frozen=True, kw_only=True):
     def in_switch(self) -> bool:
         return bool(self.entries)
 
+    @property
+    def gate(self) -> StageEntry | None:
+        """Of a query that the switch counts up to its gate, and the host from there on: the gate's first entry."""
+        return next((entry for entry in self.entries if entry.role == "gate"), None)
+
 
 class QueryPlans(msgspec.Struct, frozen=True):
     """Where all queries run."""
@@ -83,6 +96,12 @@ class QueryPlans(msgspec.Struct, frozen=True):
     def entries(self) -> dict[int, StageEntry]:
         """By bit: queries share the entries of a distinct."""
         return {entry.bit: entry for query in self.queries for entry in query.entries}
+
+    @property
+    def gate_bits(self) -> tuple[int, ...]:
+        """Bits of the copies behind gates."""
+        gates = [query.gate for query in self.queries if query.gate is not None]
+        return tuple(bit for gate in gates for bit in (gate.opens, gate.uncounted))
 
     def repeated(self, bit: int) -> int:
         """Map of the bits that wait behind a distinct."""
@@ -173,7 +192,7 @@ def _timed(plans: Mapping[str, QueryPlan], limits: SwitchLimits) -> dict[str, Qu
         for one in plans.values()
         if any(entry.role == "clock" for entry in one.entries)
         for entry in one.entries
-        if entry.role == "reduce"
+        if entry.role in ("reduce", "gate")
     ]
     period_us = 1000 * clock_period(windows, limits.read_window_ms)
     return {
@@ -277,6 +296,8 @@ def _entries(request: QueryRequest, space: Space, limits: SwitchLimits) -> list[
     outcome = compile_query(request.query)
     if request.kind != "query":
         raise NotPlaced("it asks for the packets themselves")
+    if request.query.gated is not None:
+        return _gate_entries(request, request.query.gated, outcome, space, limits)
     if isinstance(outcome, Crossing):
         return _count_entries(request, outcome.node, space, limits, outcome.threshold)
     if not isinstance(outcome, WindowTable) or not limits.reads:
@@ -286,15 +307,64 @@ def _entries(request: QueryRequest, space: Space, limits: SwitchLimits) -> list[
     if signed is not None:
         with suppress(NotPlaced):  # then it is counted apart, if there is room for that
             return _difference_entries(request, outcome, signed, space)
-    if request.query.window_ms < limits.read_window_ms:
-        raise NotPlaced(
-            f"its result is known at the window's end only, and cells of windows shorter than "
-            f"{duration_text(limits.read_window_ms)} are not read: they would come too late"
-        )
-    found: list[StageEntry] = [space.clock()]
+    found: list[StageEntry] = [_clock(request, space, limits)]
     for place, (node, threshold) in enumerate(zip(nodes, candidates(outcome), strict=True)):
         found += _count_entries(request, node, space, limits, threshold, source=place)
     return found
+
+
+def _clock(request: QueryRequest, space: Space, limits: SwitchLimits) -> StageEntry:
+    if request.query.window_ms < limits.read_window_ms:
+        raise NotPlaced(
+            f"its result is known at the window's end only, and the switch says the time no oftener than every "
+            f"{duration_text(limits.read_window_ms)}: it would come too late"
+        )
+    return space.clock()
+
+
+def _gate_entries(
+    request: QueryRequest, gate: Gate, outcome: Outcome, space: Space, limits: SwitchLimits
+) -> list[StageEntry]:
+    """Entries that count what opens the gate, and that copy what comes behind it."""
+    counted = conditions_of(conjuncts(gate.condition))
+    if not counted.exact:
+        raise NotPlaced(f"the classifier cannot express {text_of(gate.condition)}")
+    clock = [_clock(request, space, limits)] if isinstance(outcome, WindowTable) else []
+    masks = masks_of((gate.key,))
+    wanted: list[tuple[Match, Expression, Role]] = [
+        (match, gate.key, "gate") for match in counted.alternatives
+    ]
+    for node in _nodes(outcome):
+        packets = _packets(node)
+        for match in conditions_of(packets.filters).alternatives:
+            same = [key for other, key, _ in wanted if narrowed(match, other) == match]
+            if packets.gate_key in same:
+                continue
+            wanted.append((match, packets.gate_key or gate.key, "look"))
+    entries = [
+        StageEntry(
+            role=role,
+            bit=0,
+            stage=0,
+            match=match,
+            masks=masks,
+            threshold=gate.count,
+            by_bytes=0,
+            window_us=request.query.window_us,
+            answers=_answers(gate.key, key),
+        )
+        for match, key, role in wanted
+    ]
+    return [*clock, *space.gate(entries)]
+
+
+def _answers(key: Expression, other: Expression) -> int:
+    """Whether the key of other packets is that of the other side; raises `NotPlaced` where it is neither."""
+    if other == key:
+        return 0
+    if not (isinstance(key, Field) and other == Field(_OTHER_SIDE.get(key.name, ""))):
+        raise NotPlaced("what goes through a gate is one side of a conversation")
+    return 1
 
 
 def _difference_entries(
@@ -327,7 +397,7 @@ def _difference_entries(
             )
             for match in matches
         ]
-    return space.difference(found)
+    return space.together(found)
 
 
 def _count_entries(

@@ -11,9 +11,11 @@ from zlib import crc32
 
 import numpy as np
 
+from apps.sonata_adapter.planner.placement import SwitchLimits
 from due import RecordBatch
 
 CELLS = 65_536
+STAGES = SwitchLimits().stages
 ZERO = 1 << 31
 """A difference of 0."""
 
@@ -32,8 +34,8 @@ class SwitchModel:
 
     base_us: int = 0
     offers: dict[str, Any] = field(default_factory=dict)
-    stages: list[dict[int, dict[str, int]]] = field(default_factory=lambda: [{} for _ in range(8)])
-    cells: list[dict[Any, Any]] = field(default_factory=lambda: [{} for _ in range(8)])
+    stages: list[dict[int, dict[str, int]]] = field(default_factory=lambda: [{} for _ in range(STAGES)])
+    cells: list[dict[Any, Any]] = field(default_factory=lambda: [{} for _ in range(STAGES)])
     rings: dict[int, Ring] = field(default_factory=dict)
     """By query."""
     shrink: int = 0
@@ -65,11 +67,13 @@ class SwitchModel:
         counts: dict[str, list[dict[str, int]]] = {}
         for row in range(len(batch)):
             packet = {name: batch[name][row] for name in batch.columns}
-            matched = {o["bit"] for o in self.offers.values() if matches(o["conditions"], packet)}
+            mine = [offer for offer in self.offers.values() if not offer.get("by_stage")]
+            matched = {offer["bit"] for offer in mine if matches(offer["conditions"], packet)}
+            copied = {offer["bit"] for offer in mine if offer["copy"]} & matched
+            crossed, overflow, passed, ripe = self._count(set(matched), packet)
             for offer in self.offers.values():
-                if offer["copy"] and offer["bit"] in matched:
+                if offer["bit"] in copied | passed:
                     copies.setdefault(offer["name"], []).append(row)
-            crossed, overflow, ripe = self._count(set(matched), packet)
             if ripe is not None and not crossed and not overflow:
                 for told in self._swept(ripe, int(packet["time_us"])):
                     counts.setdefault(f"q{told['query']}", []).append(told)
@@ -140,7 +144,7 @@ class SwitchModel:
         )
 
     def _count(self, matched, packet):
-        crossed, overflow, ripe = set(), set(), None
+        crossed, overflow, passed, ripe = set(), set(), set(), None
         source, destination, port, length, now = numbers(packet, self.base_us)
         source_port = max(int(packet["tcp_sport"]), int(packet["udp_sport"]), 0)
         for stage, cells in zip(self.stages, self.cells, strict=True):
@@ -149,6 +153,9 @@ class SwitchModel:
             if not hit:
                 continue
             p = hit[0]
+            if "looks" in p:
+                passed.add(self._gate(p, cells, packet).bit_length() - 1)
+                continue
             if "count_of" in p:
                 if not self._differ(p, cells, packet, now):
                     overflow.add(p["bit_of_query"].bit_length() - 1)
@@ -178,7 +185,24 @@ class SwitchModel:
                 overflow.add(p["query"])
             if not empty:
                 matched -= {bit for bit in range(256) if p["repeated"] >> bit & 1}
-        return crossed, overflow, ripe
+        return crossed, overflow, passed - {-1}, ripe
+
+    def _gate(self, p, cells, packet):
+        """Map of the query that gets the frame."""
+        source, destination, _, _, now = numbers(packet, self.base_us)
+        if p["answers"]:
+            source, destination = destination, source
+        key = (p["query"], source & p["source_mask"], destination & p["destination_mask"])
+        epoch = now * p["reciprocal"] >> 64
+        slot = self._slot(key, epoch, p)
+        held = cells.get(slot, (-1, None, 0, False))
+        if held[0] == epoch and held[1] != key:
+            return p["uncounted"]
+        count = held[2] if held[0] == epoch else 0
+        if not p["looks"]:
+            count += 1
+            cells[slot] = (epoch, key, count, False)
+        return p["opens"] if count >= p["threshold"] else 0
 
     def _differ(self, p, cells, packet, now):
         """Count up or down; returns whether the key has a cell."""

@@ -14,17 +14,22 @@ from sdnator.testing.query_traffic import HOSTS, TimedFrame, mixed, office, udp
 from sdnator.testing.waiting import wait_for
 from tests.apps.sonata_adapter.query.test_catalogue import expect
 
-ON_HOST = ("dns_tunnel", "zorro", "dns_reflection")
-"""They read payloads."""
-
 
 @pytest.mark.timeout(600)
 def test_each_query_alone_is_right_and_counted_in_the_switch(tmp_path):
     """One after the other in one switch, so that each counts in cells that others have used."""
     with SetsStage(tmp_path) as stage:
-        for number, name in enumerate((name for name in PAPER if name not in ON_HOST), start=1):
+        for number, name in enumerate(PAPER, start=1):
             outcome = stage.round((name,), mixed((name,), seconds=4), number)
             assert (outcome.wrong, outcome.in_switch) == ([], [name]), stage.log()[-2000:]
+
+
+@pytest.mark.timeout(300)
+def test_all_queries_of_the_paper_are_counted_in_one_switch(tmp_path):
+    """All eleven at once, each under attack: none falls back to the host, none disturbs another."""
+    with SetsStage(tmp_path) as stage:
+        outcome = stage.round(PAPER, mixed(PAPER, seconds=8), 1)
+        assert (outcome.wrong, outcome.in_switch) == ([], sorted(PAPER)), stage.log()[-2000:]
 
 
 def spreading(seconds):

@@ -200,10 +200,10 @@ def test_windows_follow_the_clock_of_the_switch():
     import random
 
     frames = office(7, random.Random(5))
-    for name in ("new_tcp", "dns_tunnel"):
+    for key in ("new_tcp:threshold=1,window=2s", "dns_tunnel:gate=1,threshold=1,window=2s"):
         control = Control(CATALOGUE)
         control.switch("s1", frames[0].time_us - 700_000)
-        control.want([f"{PREFIX}.{name}:threshold=1,window=2s"])
+        control.want([f"{PREFIX}.{key}"])
         switch = SwitchModel(base_us=frames[0].time_us - 700_000)
         switch.change(control.everything())
         written = []
