@@ -51,12 +51,14 @@ CAPABILITIES = (
     Capability("network.digests.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.counts.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.cell.p4runtime_ctrl.*", delivery="reliable"),
+    Capability("network.telemetry_counters.p4runtime_ctrl.*"),
     Capability("network.confirmation.p4runtime_ctrl.*", delivery="reliable", archive="always"),
     Capability("network.switch.p4runtime_ctrl.*", archive="always"),
 )
 
 _OFFERS: Final = "network.telemetry.*.*"
-_DATA: Final = tuple(key_of(kind, "*", "*") for kind in KINDS)
+_COUNTERS: Final = "network.telemetry_counters.p4runtime_ctrl.*"
+_DATA: Final = (*(key_of(kind, "*", "*") for kind in KINDS), _COUNTERS)
 _LOG = logging.getLogger(__name__)
 _START_S: Final = 30.0
 """For the first connections. A switch that has to compile its program takes long on a busy machine, and `up` says

@@ -36,6 +36,7 @@ from apps.p4runtime_ctrl.state.live_clock import LiveClock
 from apps.p4runtime_ctrl.state.mac_learning import DIGEST
 from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry.demand import Demand
+from apps.p4runtime_ctrl.telemetry.telemetry_counters import TelemetryCounters
 from due import NO_WAIT, PUB_ONLY, Engine, Item, RecordBatch
 
 _LOG = logging.getLogger(__name__)
@@ -110,14 +111,16 @@ class SwitchWorker:
         self._closing = threading.Event()
         self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
         self._session: P4RuntimeSession | None = None
-        self._connected = False
-        self._was_backup = False
+        self._connected = self._was_backup = False
         self._recent: deque[Decision] = deque(maxlen=_JOBS)
         self._urgent: deque[Decision] = deque()
         """Decisions to carry out, before any other work."""
         self._ends = DecisionEnds()
         self._clock = LiveClock(mine.clock, time.time_ns() // 1000 if mine.clock == "own" else 0)
         self._block_counters = BlockCounters()
+        self._telemetry_counters = TelemetryCounters(
+            mine.name, program, self._publish_counters, lambda error: self._put(partial(_fail, error))
+        )
         self._publishing = threading.Lock()
         self._counting = threading.Event()
         self._uncounted = False
@@ -207,6 +210,7 @@ class SwitchWorker:
             self._put(self._check_alive)
         if now - self._counted_at > (_CALM_S if self._uncounted else 1):
             self._count_soon()
+        self._telemetry_counters.look(self._session, now)
         self._settle(now)
         ends_us = self._ends.next_us
         time_us = self._clock.look(
@@ -277,6 +281,10 @@ class SwitchWorker:
 
     def _publish(self, key: str, value: Any, event_time: int) -> None:
         self._engine.write(key, value, [NO_WAIT], event_time=event_time or None)
+
+    def _publish_counters(self, counters: RecordBatch) -> None:
+        key = f"network.telemetry_counters.p4runtime_ctrl.{self.name}"
+        self._engine.write(key, counters, [NO_WAIT], event_time=self._now()[0] or None)
 
     def _count_each_second(self) -> None:
         if self._outbound.second != self._counted_second:
@@ -381,6 +389,7 @@ class SwitchWorker:
     def _want(self, demand: Demand) -> None:
         """Unwanted keys are no longer published; new keys are, before they are requested of the switch."""
         self._outbound.route(demand)
+        self._telemetry_counters.wanted = demand.counters
         for text in self._switch.want(demand.requests, self._session):
             _LOG.error("%s: %s", self.name, text)
         names = ", ".join(each.name for each in demand.requests if each not in FALLBACK) or "nothing"
@@ -576,3 +585,7 @@ class SwitchWorker:
             return self._engine.get(query, limit=limit)
 
         return youngest(find, {"dataKey": key}, since, _RESTORED)
+
+
+def _fail(error: Exception) -> None:
+    raise error

@@ -29,6 +29,7 @@ _COUNTED: Final = {
     "length": "u2", "source_port": "u2", "time_us": "i8",
 }  # fmt: skip
 _CELLS: Final = {"id": "u8", "count": "u4"}
+_COUNTERS: Final = {"bit": "u1", "packets": "u8"}
 _KINDS: Final = {"packets": PACKET_COLUMNS, "digests": _REPORTED, "counts": _COUNTED}
 
 
@@ -72,6 +73,13 @@ def cells_in(item: Item) -> tuple[list[int], list[int]]:
     sender_of(item)
     cells = read_columns(item.value, _CELLS, "cells")
     return cells["id"].tolist(), cells["count"].tolist()
+
+
+def counters_in(item: Item) -> dict[int, int]:
+    """`network.telemetry_counters.p4runtime_ctrl.<switch>`: packets by bit."""
+    sender_of(item)
+    counters = read_columns(item.value, _COUNTERS, "counters")
+    return dict(zip(counters["bit"].tolist(), counters["packets"].tolist(), strict=True))
 
 
 def with_frames(value: object) -> RecordBatch:

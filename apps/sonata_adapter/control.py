@@ -12,15 +12,24 @@ from typing import Any, Final
 
 import msgspec
 
-from apps.messages import TableUpdate
+from apps.sonata_adapter.controller_updates import (
+    ControllerUpdates,
+    Source,
+    offered,
+    stream,
+    updates,
+    withdrawn,
+)
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.host.gates import with_passed
 from apps.sonata_adapter.host.handshake import Handshakes
 from apps.sonata_adapter.host.merge import Merger, patience
 from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
-from apps.sonata_adapter.planner.placement import StageEntry, SwitchLimits
-from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, plan
+from apps.sonata_adapter.planner.moves import Moves, improvements
+from apps.sonata_adapter.planner.placement import SwitchLimits
+from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, copies_saved, plan
+from apps.sonata_adapter.planner.rates import Rates
 from apps.sonata_adapter.planner.refinement import Crossings, Refinement, coarsest
 from apps.sonata_adapter.query.catalogue import Template
 from apps.sonata_adapter.query.dataflow import WindowTable, compile_query
@@ -34,27 +43,6 @@ from due import RecordBatch
 from due.errors import DueError
 
 
-class Source(msgspec.Struct, frozen=True, order=True):
-    """A stream of the controller: `network.<kind>.p4runtime_ctrl.*.<name>`."""
-
-    kind: str
-    """packets, frames, digests or counts."""
-    name: str
-
-
-class ControllerUpdates(msgspec.Struct, frozen=True):
-    """Changes for the controller, in this order."""
-
-    withdraw: tuple[dict[str, Any], ...] = ()
-    """Offers that end."""
-    updates: tuple[TableUpdate, ...] = ()
-    """Entries of counting stages, for every switch."""
-    offer: tuple[dict[str, Any], ...] = ()
-    """Offers that begin or change."""
-    refused: tuple[tuple[str, str], ...] = ()
-    """Keys that cannot be served, with the reason and what is accepted."""
-
-
 class Written(msgspec.Struct, frozen=True):
     """An output and the keys to write it under."""
 
@@ -64,6 +52,10 @@ class Written(msgspec.Struct, frozen=True):
     """The switch whose packets it is made from."""
 
 
+WEIGH_S: Final = 2.0
+"""Seconds between two looks at where queries had better run."""
+_IN_FORCE_S: Final = 2.0
+"""Seconds after which entries that were asked for are taken to be in the switch."""
 MOST_KEYS: Final = 1_024
 """Most keys that are served at a time."""
 _Counts = CountReportReader | RegisterReads | Differences | Crossings
@@ -128,6 +120,9 @@ class Control:
         self._gate_engine = partial(HostEngine, limit=keys_limit, lateness_us=lateness_us)
         self._stations: dict[str, _Station] = {}
         self._refinement = Refinement()
+        self._moves = Moves()
+        self._rates = Rates()
+        self._weighed_at = float("-inf")
         self._asked: dict[str, QueryRequest] = {}
         """Requests as asked for, by identity."""
         self._keys: dict[str, tuple[str, ...]] = {}
@@ -153,16 +148,16 @@ class Control:
     @property
     def sources(self) -> set[Source]:
         """Streams to observe now; none when nothing is wanted."""
-        found = {Source("digests", _name(bit)) for bit in self.plan.entries}
+        found = {Source("digests", stream(bit)) for bit in self.plan.entries}
         found |= {
-            Source("counts", _name(entry.count_of))
+            Source("counts", stream(entry.count_of))
             for entry in self.plan.entries.values()
             if entry.role == "difference"
         }
         found |= {
-            Source("frames" if copy.payload else "packets", _name(copy.bit)) for copy in self.plan.copies
+            Source("frames" if copy.payload else "packets", stream(copy.bit)) for copy in self.plan.copies
         }
-        found |= {Source("frames", _name(bit)) for bit in self.plan.gate_bits}
+        found |= {Source("frames", stream(bit)) for bit in self.plan.gate_bits}
         return found
 
     def know(self, templates: Mapping[str, Template]) -> None:
@@ -197,10 +192,69 @@ class Control:
                     crossed.setdefault(identity, set()).update(report.crossed(station.clock.heard_us))
         return self._planned() if self._refinement.note(crossed) else None
 
+    def measured(self, switch: str, counters: Mapping[int, int], now_us: int) -> None:
+        """Take the counters of a switch's counting entries: packets by bit, at a capture time."""
+        entries = self.plan.entries
+        for bit, packets in counters.items():
+            if bit in entries:
+                self._rates.note(switch, stream(bit), entries[bit].match, packets, now_us)
+
+    @property
+    def needs_rates(self) -> bool:
+        """Whether the rates of queries decide anything: one that the switch could count is on the host."""
+        return any(
+            not one.in_switch and copies_saved(self._requests[one.identity], self._limits) > 0
+            for one in self.plan.queries
+        )
+
+    def weigh(self, now: float) -> ControllerUpdates | None:
+        """Move queries where the traffic has changed, a window at a time; None: no changes."""
+        if now - self._weighed_at < WEIGH_S:
+            return None
+        self._weighed_at = now
+        self._count_copies()
+        changed = self._moves.end(self._since_zero())
+        if not changed and not self._moves.under_way and self.needs_rates:
+            better = improvements(
+                self._requests.values(), self._limits, self.plan, self._rates, self._refinement.resting
+            )
+            for count, side in better.items():
+                request = self._asked.get(self._moves.owner(count))
+                if request is not None:
+                    self._moves.begin(request, side, self._surely_us(request, now))
+                    changed = True
+        return self._planned() if changed else None
+
+    def _count_copies(self) -> None:
+        self._rates.keep(map(stream, (*self.plan.entries, *(copy.bit for copy in self.plan.copies))))
+        for station in self._stations.values():
+            now_us = station.clock.heard_us
+            for copy in self.plan.copies if now_us is not None else ():
+                lane = station.frames if copy.payload else station.headers
+                packets = lane.brought.get(stream(copy.bit), 0)
+                self._rates.note(station.name, stream(copy.bit), copy.match, packets, now_us or 0)
+
+    def _since_zero(self) -> dict[str, int | None]:
+        """For each switch the capture time since its clock zero."""
+        return {
+            name: None if station.clock.heard_us is None else station.clock.heard_us - station.base_us
+            for name, station in self._stations.items()
+        }
+
+    def _surely_us(self, request: QueryRequest, now: float) -> dict[str, int]:
+        """For each switch the capture time at which a count that is asked for now will be in force."""
+        found = {}
+        for name, heard_us in self._since_zero().items():
+            rate = max(1.0, self._stations[name].clock.rate)
+            margin_us = max(request.query.window_us, round(_IN_FORCE_S * rate * 1e6))
+            idle_us = round(self._stations[name].clock.idle_s(now) * rate * 1e6)
+            found[name] = 0 if heard_us is None else heard_us + idle_us + margin_us
+        return found
+
     def everything(self) -> ControllerUpdates:
         """Everything in force, for a controller that has just started."""
         none = QueryPlans((), ())
-        return ControllerUpdates(updates=self._updates(none), offer=self._offered(none))
+        return ControllerUpdates(updates=updates(none, self.plan), offer=offered(none, self.plan))
 
     def switch(self, name: str, base_us: int) -> bool:
         """Note a switch; returns whether it is new."""
@@ -331,11 +385,12 @@ class Control:
         lanes = [lane for station in stations for lane in station.lanes]
         return {
             "queries": {
-                one.identity: "switch" if one.in_switch else f"host: {one.reason}"
+                self._moves.owner(one.identity): "switch" if one.in_switch else f"host: {one.reason}"
                 for one in self.plan.queries
             },
-            "tuples": {one.identity: self._tuples(one) for one in self.plan.queries},
-            "overflow": {one.identity: self._overflow(one) for one in self.plan.queries},
+            "tuples": {self._moves.owner(one.identity): self._tuples(one) for one in self.plan.queries},
+            "overflow": {self._moves.owner(one.identity): self._overflow(one) for one in self.plan.queries},
+            "moved": self._moves.moved,
             "bits": len(self.plan.entries) + len(self.plan.copies) + len(self.plan.gate_bits),
             "host_packets": sum(lane.host.packets for lane in lanes),
             "late": sum(lane.host.late for lane in lanes),
@@ -355,7 +410,12 @@ class Control:
             self._limits,
             before=self.plan,
             generation=self._generation,
+            rates=self._rates,
         )
+
+    def count_of(self, request: QueryRequest) -> QueryRequest:
+        """The count that is in force for a request that is served; where it moves, the one that it moves from."""
+        return self._requests.get(self._moves.current(request.identity), request)
 
     def came(self, one: QueryPlan) -> dict[str, int]:
         """What has come from the switches for a query of the plan since it is there: totals."""
@@ -384,7 +444,7 @@ class Control:
                 found += sum(station.gated[one.identity].brought.values())
                 continue
             lane = station.frames if one.payload else station.headers
-            found += sum(lane.brought.get(_name(copy.bit), 0) for copy in one.copies)
+            found += sum(lane.brought.get(stream(copy.bit), 0) for copy in one.copies)
             if one.identity in station.reports:
                 found += station.reports[one.identity].tuples
         return found
@@ -430,15 +490,27 @@ class Control:
         before, old = self.plan, self._requests
         clocks = {name: station.clock.heard_us for name, station in self._stations.items()}
         self._generation = 1 + self._generation % 255
-        counts = self._refinement.planned(
-            self._asked, self._limits, before, clocks, generation=self._generation
-        )
+        while True:
+            counts = self._refinement.planned(
+                self._moves.counts(self._asked),
+                self._limits,
+                before,
+                clocks,
+                generation=self._generation,
+                rates=self._rates,
+            )
+            if not self._moves.settle(self._asked, counts.plan):
+                break
         self.plan, self._requests = counts.plan, counts.by_identity
-        self._outputs = {count: self._keys[owner] for count, owner in counts.owners.items()}
+        self._outputs = {
+            count: self._keys[self._moves.owner(owner)] for count, owner in counts.owners.items()
+        }
         for station in self._stations.values():
             self._refit(station, old)
         return ControllerUpdates(
-            withdraw=self._withdrawn(before), updates=self._updates(before), offer=self._offered(before)
+            withdraw=withdrawn(before, self.plan),
+            updates=updates(before, self.plan),
+            offer=offered(before, self.plan),
         )
 
     def _refit(self, station: _Station, old: Mapping[str, QueryRequest]) -> None:
@@ -455,7 +527,7 @@ class Control:
                 lane.host.remove(identity)
             for identity in sorted(host - lane.host.names):
                 lane.host.add(self._requests[identity].query)
-            lane.names = {_name(copy.bit) for one in mine for copy in one.copies}
+            lane.names = {stream(copy.bit) for one in mine for copy in one.copies}
             lane.merger.expect(lane.names)
             asked = [self._requests[one.identity] for one in mine]
             windows = [request.query.window_us for request in asked if request.kind == "query"]
@@ -478,8 +550,8 @@ class Control:
                 lane = station.gated[identity] = _Lane(self._gate_engine())
                 lane.host.base_us = station.base_us
                 lane.host.add(query)
-            lane.opens = _name(gate.opens)
-            lane.names = {lane.opens, _name(gate.uncounted)}
+            lane.opens = stream(gate.opens)
+            lane.names = {lane.opens, stream(gate.uncounted)}
             lane.merger.expect(lane.names)
             lane.merger.hurry(patience(query.window_us))
 
@@ -513,81 +585,9 @@ class Control:
                 written += [
                     Written(keys, found, station.name) for found in station.handshakes.process(output.batch)
                 ]
-            elif isinstance(output, Captured) or self._refinement.is_first(id(station), output):
+            elif isinstance(output, Captured) or (
+                self._moves.accepts(output.query, station.name, output.window_us - station.base_us)
+                and self._refinement.is_first(id(station), output)
+            ):
                 written.append(Written(keys, output, station.name))
         return written
-
-    def _withdrawn(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:
-        now = {*self.plan.entries, *self.plan.gate_bits, *(copy.bit for copy in self.plan.copies)}
-        were = (*before.entries, *before.gate_bits, *(copy.bit for copy in before.copies))
-        gone = [bit for bit in were if bit not in now]
-        return tuple({"name": _name(bit), "bit": bit, "active": False} for bit in gone)
-
-    def _offered(self, before: QueryPlans) -> tuple[dict[str, Any], ...]:
-        known = {entry.bit: entry.match for entry in before.entries.values()}
-        found = [
-            _offer(entry.bit, entry.match, copy=False)
-            for entry in self.plan.entries.values()
-            if known.get(entry.bit) != entry.match
-        ]
-        copied = {copy.bit: copy.match for copy in before.copies}
-        found += [
-            _offer(copy.bit, copy.match, copy=True)
-            for copy in self.plan.copies
-            if copied.get(copy.bit) != copy.match
-        ]
-        passed = [bit for bit in self.plan.gate_bits if bit not in before.gate_bits]
-        found += [{**_offer(bit, {}, copy=True), "by_stage": True} for bit in passed]
-        return tuple(found)
-
-    def _updates(self, before: QueryPlans) -> tuple[TableUpdate, ...]:
-        old, new = before.entries, self.plan.entries
-        found = [_update("delete", entry) for bit, entry in old.items() if not _is_kept(new.get(bit), entry)]
-        for bit, entry in sorted(new.items()):
-            params = entry.params(self.plan.repeated(bit))
-            kept = _is_kept(old.get(bit), entry)
-            if not kept:
-                found.append(_update("insert", entry, params))
-            elif old[bit] != entry or before.repeated(bit) != self.plan.repeated(bit):
-                found.append(_update("modify", entry, params))
-        return tuple(found)
-
-
-def _is_kept(one: StageEntry | None, other: StageEntry) -> bool:
-    """Whether two entries of one bit are the same; clocks are, whatever their period."""
-    return one == other or (one is not None and one.role == other.role == "clock")
-
-
-def _name(bit: int) -> str:
-    return f"q{bit}"
-
-
-def _offer(bit: int, match: Mapping[str, Any], *, copy: bool) -> dict[str, Any]:
-    """The value of `network.telemetry.sonata.<name>`."""
-    return {"name": _name(bit), "bit": bit, "conditions": dict(match), "copy": copy, "active": True}
-
-
-def _update(kind: Any, entry: StageEntry, params: Mapping[str, int] | None = None) -> TableUpdate:
-    map_of_bit = hex(1 << entry.bit)
-    return TableUpdate(
-        kind=kind,
-        table=f"ingress.count_{entry.stage}.queries",
-        match={"query_map": [map_of_bit, map_of_bit]},
-        action=f"ingress.count_{entry.stage}.{entry.action}",
-        # DUE does not encode integers of more than 64 bits
-        params={} if params is None else {name: hex(value) for name, value in params.items()},
-        priority=1 + entry.bit,
-    )
-
-
-def leftovers(commands: Iterable[Sequence[TableUpdate]]) -> tuple[TableUpdate, ...]:
-    """Deletions of the entries that a killed adapter's commands, oldest first, left in a switch."""
-    held: dict[tuple[str, str], TableUpdate] = {}
-    for updates in commands:
-        for update in updates:
-            key = (update.table, str(update.match))
-            if update.kind == "delete":
-                held.pop(key, None)
-            elif update.kind == "insert":
-                held[key] = update
-    return tuple(msgspec.structs.replace(update, kind="delete", params={}) for update in held.values())

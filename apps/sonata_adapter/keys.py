@@ -79,6 +79,8 @@ class QueryRequest(msgspec.Struct, frozen=True):
     """Count by prefixes of this many bits for IPv4, four times as many for IPv6; 0: by addresses."""
     within: str = ""
     """A prefix that the query was narrowed down to by refinement; its filters say so, too."""
+    on_host: bool = False
+    """It stays on the host for now, whatever room the switch has."""
 
 
 def request_of(key: str, templates: Mapping[str, Template]) -> QueryRequest | None:

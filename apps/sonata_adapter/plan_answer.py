@@ -69,7 +69,7 @@ def _planned(
     plans = control.plan if running else control.plan_beside(request)
     first = coarsest(request)
     planned = {one.identity for one in plans.queries}
-    shown = first if first.identity in planned else request
+    shown = first if first.identity in planned else control.count_of(request)
     one = plans.of(shown.identity)
     meaning = templates[request.name].meaning if request.kind == "query" else ""
     answer: dict[str, Any] = {
@@ -85,7 +85,7 @@ def _planned(
             {"bit": copy.bit, "match": match_text(copy.match), "payload": copy.payload} for copy in one.copies
         ],
         "others": sum(each.identity != request.identity for each in control.requests),
-        "text": explain(request, plans, meaning=meaning),
+        "text": explain(request, plans, meaning=meaning, count=shown.identity),
     }
     return answer | ({"came": control.came(one)} if running else {})
 

@@ -30,11 +30,13 @@ from apps.sonata_adapter.arrivals import (
     baseline_in,
     cells_in,
     command_in,
+    counters_in,
     data_in,
     state_in,
     training_in,
 )
-from apps.sonata_adapter.control import Control, ControllerUpdates, Source, Written, leftovers
+from apps.sonata_adapter.control import Control, Written
+from apps.sonata_adapter.controller_updates import ControllerUpdates, Source, leftovers
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.evidence.auto_thresholds import AutoThresholds, auto_keys
 from apps.sonata_adapter.evidence.count_baseline import CountBaseline
@@ -61,6 +63,7 @@ TELEMETRY: Final = "network.telemetry.sonata"
 COMMAND: Final = "network.p4_command.sonata_adapter"
 CELL_REQUEST: Final = "network.cell_request.sonata_adapter"
 CELLS: Final = "network.cell.p4runtime_ctrl.*"
+COUNTERS: Final = "network.telemetry_counters.p4runtime_ctrl.*"
 INCOMPATIBLE: Final = "network.incompatible.sonata_adapter"
 BASELINE: Final = "network.baseline.sonata_adapter"
 TRAININGS: Final = f"{TRAINING}.*"
@@ -154,6 +157,7 @@ class SonataAdapterService:
         """Clocks of the switches, us."""
         self._observed: dict[Source, Any] = {}
         self._cells: Any = None
+        self._counters: Any = None
         self._switches: dict[str, Any] = {}
         self._wanted: frozenset[str] = frozenset()
         self._evidence = EvidenceQueries(self._stored)
@@ -192,6 +196,7 @@ class SonataAdapterService:
             self._write(self._control.tick(time.monotonic()))
             self._read_cells()
             self._refine()
+            self._weigh()
             self._hear()
             self._tell_plans()
 
@@ -341,6 +346,13 @@ class SonataAdapterService:
             self._cells.dispose()
             self._cells = None
 
+        if self._control.needs_rates and self._counters is None:
+            on_counters = self._intake.reading("counters", counters_in, self._on_counters)
+            self._counters = self._engine.observe(COUNTERS).subscribe(on_counters)
+        elif not self._control.needs_rates and self._counters is not None:
+            self._counters.dispose()
+            self._counters = None
+
     def _refuse(self, key: str, reason: str) -> None:
         _LOG.warning("%s", one_line(reason))
         name = key.split(":", maxsplit=1)[0].rpartition(".")[2]
@@ -445,6 +457,18 @@ class SonataAdapterService:
         changes = self._control.refine()
         if changes is not None:
             self._apply(changes)
+
+    def _weigh(self) -> None:
+        changes = self._control.weigh(time.monotonic())
+        if changes is not None:
+            self._apply(changes)
+
+    def _on_counters(self, item: Item, counters: dict[int, int]) -> None:
+        switch = item.key.rpartition(".")[2]
+        with self._lock:
+            clock = self._clock(item, switch)
+            if clock is not None and item.event_time and clock.hear(item.event_time // 1000):
+                self._control.measured(switch, counters, item.event_time // 1000)
 
     def _ask(self, questions: dict[str, list[CellRead]]) -> None:
         for switch, reads in questions.items():

@@ -5,6 +5,8 @@
     network.digests.p4runtime_ctrl.<switch>.<which>   reports of the switch's counting stages
     network.counts.p4runtime_ctrl.<switch>.<which>    differences over their threshold, after their window
 
+    network.telemetry_counters.p4runtime_ctrl.<switch>   packets of each counting entry, every two seconds
+
     <which>: all       every packet: request `packets`, bit 255
              a port    packets of that port: request `port<n>`, bits 254 down
              a name    packets of a request that an app offered under that name
@@ -27,6 +29,7 @@ from due import Key
 
 Kind = Literal["packets", "frames", "digests", "counts"]
 KINDS: Final[tuple[Kind, ...]] = ("packets", "frames", "digests", "counts")
+COUNTERS: Final = "telemetry_counters"
 APP: Final = "p4runtime_ctrl"
 ALL: Final = "all"
 _PORT_BITS: Final = 47
@@ -124,6 +127,8 @@ class Demand:
     requests: tuple[TelemetryRequest, ...] = ()
     routes: dict[Kind, dict[str, int]] = field(default_factory=dict)
     """Kind of data → last segment of the key → bit of the request whose packets go there."""
+    counters: bool = False
+    """The counters of the counting stages are wanted, too."""
 
     def to(self, kind: Kind) -> dict[str, int]:
         return self.routes.get(kind, {})
@@ -138,7 +143,8 @@ def demand_for(
     or if the digest is incomplete.
     """
     keys = [Key.parse(text) for text in wanted]
-    named = sorted({key.segments[-1] for key in keys} - {"*", "**", ALL})
+    data = [key for key in keys if key.segments[1:2] != (COUNTERS,)]
+    named = sorted({key.segments[-1] for key in data} - {"*", "**", ALL})
     ports = [name for name in named if name.isdecimal()][:_PORT_BITS]
     known = {ALL: TelemetryRequest(name="packets", bit=EVERY_PACKET)}
     for bit, port in enumerate(sorted(ports, key=int), start=EVERY_PACKET - len(ports)):
@@ -149,13 +155,15 @@ def demand_for(
     routes: dict[Kind, dict[str, int]] = {}
     for kind in KINDS:
         routes[kind] = {
-            which: request.bit for which, request in known.items() if _is_wanted(kind, switch, which, keys)
+            which: request.bit for which, request in known.items() if _is_wanted(kind, switch, which, data)
         }
     if by_digest:
         known = {which: _by_digest(request, routes, which) for which, request in known.items()}
     requests = {which: known[which] for kind in KINDS for which in routes[kind]}
     wanted_requests = [*requests.values(), *(FALLBACK if by_digest and routes["packets"] else ())]
-    return Demand(tuple(sorted(wanted_requests, key=lambda request: -request.bit)), routes)
+    counters = Key.parse(f"network.{COUNTERS}.{APP}.{switch}")
+    ordered = tuple(sorted(wanted_requests, key=lambda request: -request.bit))
+    return Demand(ordered, routes, any(key.matches(counters) for key in keys))
 
 
 def _by_digest(

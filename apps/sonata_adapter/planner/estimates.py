@@ -1,11 +1,14 @@
-"""Rough shares of traffic, to choose which queries gain most from counting in the switch.
+"""Packets a second by condition, to choose which queries gain most from counting in the switch.
 
-Of 10,000 packets a second of mixed traffic.  Shares of the classifier's fields are multiplied; they
-need to be right to an order of magnitude only, since they order queries and decide nothing else.
+Measured where something counts them.  Elsewhere rough shares of all packets (10,000 a second of mixed traffic where
+these are not measured either): shares of the classifier's fields, multiplied; they need to be right to an order of
+magnitude only, since they order queries and decide nothing else.
 """
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
+
+from apps.sonata_adapter.planner.rates import Rates
 
 PACKETS: Final = 10_000.0
 _PROTOCOLS: Final = {6: 0.75, 17: 0.2, 1: 0.02, 58: 0.01}
@@ -16,9 +19,15 @@ _FLAGS: Final = {(0x02, 0x17): 0.04, (0x12, 0x17): 0.04, (0x10, 0x17): 0.85, (0x
 _ONE_HOST: Final = 0.01
 
 
-def packets_per_second(matches: Iterable[Mapping[str, Any]]) -> float:
+def packets_per_second(matches: Iterable[Mapping[str, Any]], rates: Rates | None = None) -> float:
     """How many packets meet at least one of the conditions, at most."""
-    return min(PACKETS, sum(PACKETS * _share(match) for match in matches))
+    every = rates.of({}) if rates is not None else None
+    packets = PACKETS if every is None else every
+    found = 0.0
+    for match in matches:
+        measured = rates.of(match) if rates is not None else None
+        found += packets * _share(match) if measured is None else measured
+    return found if every is None and rates is not None else min(packets, found)
 
 
 def _share(match: Mapping[str, Any]) -> float:

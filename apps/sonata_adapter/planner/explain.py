@@ -14,11 +14,18 @@ _WHOLE = 128
 """Bits of an address in a cell's key."""
 
 
-def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "") -> str:
-    """The plan of one query as a text diagram; for a refined query, while no prefix crosses."""
+def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "", count: str = "") -> str:
+    """The plan of one query as a text diagram; for a refined query, while no prefix crosses.
+
+    Args:
+        request: the query.
+        found: plans, that of the query among them.
+        meaning: of the query, in words.
+        count: identity under which it is planned, if not its own.
+    """
     planned = {query.identity for query in found.queries}
     first = coarsest(request)
-    one = found.of(first.identity if first.identity in planned else request.identity)
+    one = found.of(count or (first.identity if first.identity in planned else request.identity))
     lines = [request.identity]
     if meaning:
         lines.append(f"  {meaning}")
@@ -44,12 +51,11 @@ def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "") -> s
         lines.append("    keys at or above the threshold when the window is over; keys without a cell")
     elif one.in_switch:
         lines.append("    keys that reached the threshold, reported once in a window; keys without a cell")
+    of_all = "" if found.measured else " of 10,000 packets"
     if one.in_switch:
-        lines.append(f"    saves about {one.saved_per_second:,.0f} copies a second of 10,000 packets")
+        lines.append(f"    saves about {one.saved_per_second:,.0f} copies a second{of_all}")
     else:
-        lines.append(
-            f"    all operators, on about {one.tuples_per_second:,.0f} tuples a second of 10,000 packets"
-        )
+        lines.append(f"    all operators, on about {one.tuples_per_second:,.0f} tuples a second{of_all}")
     lines.append(f"    results for windows of {duration_text(request.query.window_ms)}")
     return "\n".join(lines)
 

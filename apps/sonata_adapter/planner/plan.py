@@ -30,6 +30,7 @@ from apps.sonata_adapter.planner.placement import (
     masks_of,
 )
 from apps.sonata_adapter.planner.pushdown import Difference, candidates, difference
+from apps.sonata_adapter.planner.rates import Rates
 from apps.sonata_adapter.planner.refinement_levels import address_of, by_family, cut
 from apps.sonata_adapter.query.dataflow import (
     Crossing,
@@ -56,6 +57,7 @@ _OTHER_SIDE: Final = {
     "udp.sport": "udp.dport", "udp.dport": "udp.sport", "length": "length",
 }  # fmt: skip
 """Where the answer to a packet has a part of its key."""
+MOVES: Final = "it is on the host until a window is over, and moves to the switch then if there is room"
 _CELLS_A_PREFIX: Final = 8
 """Cells of a coarse level for each prefix that there can be of IPv4: then hardly one is without."""
 
@@ -91,6 +93,8 @@ class QueryPlans(msgspec.Struct, frozen=True):
     queries: tuple[QueryPlan, ...]
     copies: tuple[Copy, ...]
     """All copies, each condition once: queries that need the same packets share a bit."""
+    measured: bool = False
+    """Whether rates are those of the running network."""
 
     @property
     def entries(self) -> dict[int, StageEntry]:
@@ -118,12 +122,14 @@ def plan(
     before: QueryPlans | None = None,
     resting: Iterable[int] = (),
     generation: int = 1,
+    rates: Rates | None = None,
 ) -> QueryPlans:
     """The plan for all requests; entries of the plan `before` keep their place in the switch.
 
     The order of requests does not matter; new ones that save most come first.  Bits that are
     `resting` are not given away: their cells of this window still hold what they counted before.
     `generation` (1 to 255) is other than that of the plans before, for who gets a bit that was another's.
+    `rates`: of the running network.  Requests that are `on_host` stay there.
     """
     limits = limits or SwitchLimits()
     space = Space(limits)
@@ -136,8 +142,8 @@ def plan(
             kept[old.identity] = old
             space.hold(old.entries)
     fresh = [request for request in wanted.values() if request.identity not in kept]
-    ordered = sorted(fresh, key=lambda request: (-_saving(request, limits), request.identity))
-    placed, space = _placed(ordered, space, limits)
+    ordered = sorted(fresh, key=lambda request: (-_saving(request, limits, rates), request.identity))
+    placed, space = _placed(ordered, space, limits, rates)
     found = _timed({**kept, **_marked(placed, generation)}, limits)
     copies = _copies([wanted[one.identity] for one in found.values() if not one.in_switch], held, space)
     plans = []
@@ -149,20 +155,21 @@ def plan(
                 one,
                 copies=mine,
                 payload=any(bytes_too for _, bytes_too in _needed(wanted[identity])),
-                tuples_per_second=packets_per_second(copy.match for copy in mine),
+                tuples_per_second=packets_per_second((copy.match for copy in mine), rates),
             )
         plans.append(one)
-    return QueryPlans(tuple(plans), tuple(copies))
+    measured = rates is not None and rates.of({}) is not None
+    return QueryPlans(tuple(plans), tuple(copies), measured)
 
 
 def _placed(
-    requests: Sequence[QueryRequest], space: Space, limits: SwitchLimits
+    requests: Sequence[QueryRequest], space: Space, limits: SwitchLimits, rates: Rates | None
 ) -> tuple[dict[str, QueryPlan], Space]:
     """Plans for new requests, and what is free then; distincts are split where that takes no query's room."""
     trials = []
     for splits in (True, False):
         trial = space.copy(splits=splits)
-        trials.append(({one.identity: _counted(one, trial, limits) for one in requests}, trial))
+        trials.append(({one.identity: _counted(one, trial, limits, rates) for one in requests}, trial))
     (split, less), (whole, more) = trials
     as_many = all(split[identity].in_switch for identity, one in whole.items() if one.in_switch)
     return trials[0] if as_many and (less.free_stages or not more.free_stages) else trials[1]
@@ -219,13 +226,21 @@ def clock_period(windows: Iterable[int], least: int) -> int:
     return next((period for period in (common // parts, common) if period >= least), least)
 
 
-def _saving(request: QueryRequest, limits: SwitchLimits) -> float:
+def copies_saved(request: QueryRequest, limits: SwitchLimits, rates: Rates | None = None) -> float:
+    """Copies a second that counting in the switch saves; 0: it cannot count it."""
+    return _saving(request, limits, rates, a_stage=False)
+
+
+def _saving(
+    request: QueryRequest, limits: SwitchLimits, rates: Rates | None, *, a_stage: bool = True
+) -> float:
     """Copies a second that counting in the switch saves, for each stage that it takes; 0: it cannot."""
     try:
         stages = {entry.stage for entry in _entries(request, Space(limits), limits)}
     except NotPlaced:
         return 0.0
-    return packets_per_second(match for match, _ in _needed(request)) / len(stages)
+    saved = packets_per_second((match for match, _ in _needed(request)), rates)
+    return saved / len(stages) if a_stage else saved
 
 
 def _needed(request: QueryRequest) -> list[tuple[Match, bool]]:
@@ -277,18 +292,20 @@ def _expressions(node: Node) -> Iterator[Expression]:
             yield from _expressions(source)
 
 
-def _counted(request: QueryRequest, space: Space, limits: SwitchLimits) -> QueryPlan:
+def _counted(request: QueryRequest, space: Space, limits: SwitchLimits, rates: Rates | None) -> QueryPlan:
     """The query in the switch, or the reason why it is not there."""
     trial = space.copy()
     try:
         entries = _entries(request, trial, limits)
     except NotPlaced as reason:
         return QueryPlan(identity=request.identity, reason=str(reason))
+    if request.on_host:
+        return QueryPlan(identity=request.identity, reason=MOVES)
     space.hold(entries)
     return QueryPlan(
         identity=request.identity,
         entries=tuple(entries),
-        saved_per_second=packets_per_second(match for match, _ in _needed(request)),
+        saved_per_second=packets_per_second((match for match, _ in _needed(request)), rates),
     )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from apps.sonata_adapter.keys import QueryRequest
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.planner.plan import QueryPlans, plan
+from apps.sonata_adapter.planner.rates import Rates
 from apps.sonata_adapter.planner.refinement_levels import address_of, levels_of, narrowed, prefixes
 from apps.sonata_adapter.results import QueryResult
 from due import RecordBatch
@@ -98,6 +99,11 @@ class Refinement:
         """Counts in force of requests with levels, to their request."""
         self._seen: dict[tuple[int, str], dict[int, set[str]]] = {}
 
+    @property
+    def resting(self) -> list[int]:
+        """Bits that are not given away yet."""
+        return [each.bit for each in self._resting]
+
     def note(self, crossed: Mapping[str, Iterable[str]]) -> bool:
         """Prefixes that cross now, by identity of their count; returns whether the plan is to follow."""
         new = {identity: frozenset(found) for identity, found in crossed.items() if found}
@@ -113,6 +119,7 @@ class Refinement:
         clocks: Mapping[str, int | None],
         *,
         generation: int = 1,
+        rates: Rates | None = None,
     ) -> RefinementCounts:
         """Counts for these requests and their plan; `clocks`: the time (us) that each switch has reached."""
         self._resting = [each for each in self._resting if _rests(each, clocks)]
@@ -121,7 +128,14 @@ class Refinement:
             self._looked_at.clear()
             counts = {request.identity: self._of(request) for request in requests.values()}
             found = {count.identity: count for each in counts.values() for count in each}
-            made = plan(list(found.values()), limits, before=before, resting=resting, generation=generation)
+            made = plan(
+                list(found.values()),
+                limits,
+                before=before,
+                resting=resting,
+                generation=generation,
+                rates=rates,
+            )
             failed = {
                 each.identity for each in made.queries if found[each.identity].coarse and not each.in_switch
             }

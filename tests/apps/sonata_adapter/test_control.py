@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from apps.sonata_adapter.control import Control, ControllerUpdates, leftovers
+from apps.sonata_adapter.control import Control
+from apps.sonata_adapter.controller_updates import ControllerUpdates, leftovers
 from apps.sonata_adapter.planner.placement import reciprocal
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from apps.sonata_adapter.results import Captured, QueryResult
