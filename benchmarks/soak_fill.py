@@ -61,8 +61,10 @@ def _frame(sender: int, receiver: int) -> bytes:
     checksum = ~(sum(struct.unpack("!10H", header)) % 0xFFFF) & 0xFFFF
     header = header[:10] + checksum.to_bytes(2, "big") + header[12:]
     macs = _mac(receiver) + _mac(sender)
-    return macs + b"\x08\x00" + header + _PORTS.pack(_PORT, _PORT, length, 0) + _PAYLOAD
+    made: bytes = macs + b"\x08\x00" + header + _PORTS.pack(_PORT, _PORT, length, 0) + _PAYLOAD
+    return made
 
 
 def _mac(host: int) -> bytes:
-    return (_MACS | host % 2 << 23 | host // (2 * _TOGETHER)).to_bytes(6, "big")
+    address: int = _MACS | host % 2 << 23 | host // (2 * _TOGETHER)
+    return address.to_bytes(6, "big")
