@@ -492,3 +492,6 @@ class TableCommand(Message, frozen=True, kw_only=True):
 
     id: Name
     updates: Annotated[tuple[TableUpdate, ...], Meta(max_length=20_000)]
+    requests: Annotated[tuple[dict[str, Any], ...], Meta(max_length=1_024)] = ()
+    """Packet requests, each as under `network.telemetry.<app>.<name>`: those that end do so before the updates, the
+    others begin or change after them."""

@@ -114,6 +114,7 @@ _COMMAND = TableCommand(
             action="ingress.drop_src",
         ),
     ),
+    requests=({"name": "q1", "bit": 3, "conditions": {"protocol": 6}, "copy": False, "active": True},),
 )
 _REPORT = EnforcementReport(
     enforcer="nftables", place="h1", working=True, event_time=_NOW, blocks=(HeldBlock(id="d1", target=_TARGET, packets=3),)
@@ -171,9 +172,10 @@ _PROGRAM = ProgramInfo.from_text(find().p4info.read_text(encoding="utf-8"))
 _OUTS = PacketOuts(_PROGRAM, _NOW // 1000)
 
 
-def command_in(item: Item) -> list[Any]:
+def command_and_requests_in(item: Item) -> list[Any]:
     """A command, and the entries that it means."""
-    return [_PROGRAM.entry(update) for update in controller.command_in(item).updates]
+    command, _, requests = controller.command_and_requests_in(item)
+    return [*(_PROGRAM.entry(update) for update in command.updates), *requests]
 
 
 def frames_in(item: Item) -> list[Any]:
@@ -273,11 +275,17 @@ TARGETS = (
     _target("kitsune", "network.packets.p4runtime_ctrl.s1.all", kitsune.packets_in, _PACKETS),
     _target("kitsune", "network.block.firewall.ipv4", kitsune.decision_in, DECISION.to_value()),
     _target("controller", "network.block.firewall.ipv4", controller.decision_in, DECISION.to_value()),
-    _target("controller", "network.p4_command.app.s1", command_in, _COMMAND.to_value()),
-    _target("controller", "network.telemetry.sonata.q1", controller.offer_in, _OFFER.to_value()),
+    _target("controller", "network.p4_command.app.s1", command_and_requests_in, _COMMAND.to_value()),
+    _target("controller", "network.telemetry.firewall.q1", controller.offer_in, _OFFER.to_value()),
     _target("controller", "network.cell_request.sonata.s1", questions_in, _QUESTIONS),
     _target("controller", "network.packet_out.firewall.s1", frames_in, _SEND),
     _target("sonata", _SWITCH_KEY, adapter.state_in, STATE),
+    _target(
+        "sonata",
+        "network.telemetry_counters.p4runtime_ctrl.s1",
+        adapter.counters_in,
+        _ones(bit="u1", packets="u8"),
+    ),
     _target("sonata", "network.p4_command.sonata.s1", adapter.command_in, _COMMAND.to_value()),
     _target("sonata", "network.packets.p4runtime_ctrl.s1.q", adapter.data_in, _PACKETS),
     _target("sonata", "network.frames.p4runtime_ctrl.s1.q", adapter.data_in, _raw()),

@@ -60,6 +60,12 @@ def offer_in(item: Item) -> tuple[str, Offer]:
     return app, offer
 
 
+def command_and_requests_in(item: Item) -> tuple[TableCommand, str, tuple[Offer, ...]]:
+    """`network.p4_command.<app>.<switch>`: the command, the app, and its packet requests."""
+    command = command_in(item)
+    return command, sender_of(item), tuple(Offer.from_value(value) for value in command.requests)
+
+
 def questions_in(item: Item) -> RecordBatch:
     """`network.cell_request.<app>.<switch>`: a batch with the columns `QUESTION` and `OPTIONAL`."""
     sender_of(item)

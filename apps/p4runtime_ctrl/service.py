@@ -17,7 +17,7 @@ from apps.p4runtime_ctrl.arrivals import (
     ClockReached,
     FramesToSend,
     clock_in,
-    command_in,
+    command_and_requests_in,
     decision_in,
     frames_in,
     offer_in,
@@ -57,6 +57,7 @@ CAPABILITIES = (
 )
 
 _OFFERS: Final = "network.telemetry.*.*"
+_COMMANDS: Final = "network.p4_command.*.*"
 _COUNTERS: Final = "network.telemetry_counters.p4runtime_ctrl.*"
 _DATA: Final = (*(key_of(kind, "*", "*") for kind in KINDS), _COUNTERS)
 _LOG = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ _START_S: Final = 30.0
 """For the first connections. A switch that has to compile its program takes long on a busy machine, and `up` says
 afterwards that the pipeline runs."""
 _OFFERS_READ: Final = 10_000
-"""Most archived packet requests restored at a start."""
+"""Most archived packet requests, and commands with such, restored at a start."""
 _LOOK_EVERY_S: Final = 0.25
 
 
@@ -102,7 +103,7 @@ class P4RuntimeCtrlService:
         observe, reading = self._engine.observe, self._intake.reading
         for key in DECISIONS:
             observe(key).subscribe(reading("decision", decision_in, self._on_decision))
-        observe("network.p4_command.*.*").subscribe(reading("command", command_in, self._on_command))
+        observe(_COMMANDS).subscribe(reading("command", command_and_requests_in, self._on_command))
         observe(_OFFERS).subscribe(reading("offer", offer_in, self._on_offer))
         observe("network.cell_request.*.*").subscribe(
             reading("cell_request", questions_in, self._on_questions)
@@ -173,10 +174,21 @@ class P4RuntimeCtrlService:
             if is_for(decision, agent.name):
                 agent.decide(decision)
 
-    def _on_command(self, item: Item, command: TableCommand) -> None:
+    def _on_command(self, item: Item, told: tuple[TableCommand, str, tuple[Offer, ...]]) -> None:
+        """A frame that meets a request meets the entries behind it."""
+        command, app, offers = told
         agent = self._agents.get(item.key.rpartition(".")[2])
-        if agent is not None:
-            agent.command(command)
+        if agent is None:
+            return
+        self._take_offers(item, app, [offer for offer in offers if not offer.active])
+        agent.command(command)
+        self._take_offers(item, app, [offer for offer in offers if offer.active])
+
+    def _take_offers(self, item: Item, app: str, offers: Sequence[Offer]) -> None:
+        for offer in offers:
+            self._take_offer(item, (app, offer))
+        if offers:
+            self._demand_changed()
 
     def _on_questions(self, item: Item, questions: RecordBatch) -> None:
         agent = self._agents.get(item.key.rpartition(".")[2])
@@ -212,6 +224,16 @@ class P4RuntimeCtrlService:
         take = self._intake.reading("offer", offer_in, self._take_offer)
         for item in youngest(find, query, since, _OFFERS_READ):
             take(item)
+        take = self._intake.reading("command", command_and_requests_in, self._take_requests)
+        for item in youngest(find, {"dataKey": _COMMANDS}, since, _OFFERS_READ):
+            take(item)
+
+    def _take_requests(self, item: Item, told: tuple[TableCommand, str, tuple[Offer, ...]]) -> None:
+        """Those of an archived command, whose updates the switches' workers take up."""
+        _, app, offers = told
+        if item.key.rpartition(".")[2] in self._agents:
+            for offer in offers:
+                self._take_offer(item, (app, offer))
 
     def _on_assignments(self, _: tuple[Assignment, ...]) -> None:
         self._demand_changed()

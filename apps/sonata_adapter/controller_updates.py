@@ -83,7 +83,7 @@ def _is_kept(one: StageEntry | None, other: StageEntry) -> bool:
 
 
 def _offer(bit: int, match: Mapping[str, Any], *, copy: bool) -> dict[str, Any]:
-    """The value of `network.telemetry.sonata.<name>`."""
+    """A packet request."""
     return {"name": stream(bit), "bit": bit, "conditions": dict(match), "copy": copy, "active": True}
 
 

@@ -1,6 +1,6 @@
 """The Sonata adapter as a DUE app: turns requested keys into queries in the switch, and writes the results.
 
-    network.traffic_query.sonata.*  ─ wanted ─► network.telemetry.sonata.*, network.p4_command.sonata_adapter.*
+    network.traffic_query.sonata.*  ─ wanted ─► network.p4_command.sonata_adapter.*
     network.packets|frames|digests|counts.p4runtime_ctrl.*.q<bit> ─► operators ─► results under the keys wanted
     network.evidence.sonata_adapter.<query> ─ wanted ─► the query runs, and what goes beyond training is written
 
@@ -59,7 +59,6 @@ from apps.sonata_adapter.switch.cell_read import CellRead
 from due import NO_WAIT, PUB_ONLY, Assignment, Capability, Engine, Interest, Item, RecordBatch
 
 SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
-TELEMETRY: Final = "network.telemetry.sonata"
 COMMAND: Final = "network.p4_command.sonata_adapter"
 CELL_REQUEST: Final = "network.cell_request.sonata_adapter"
 CELLS: Final = "network.cell.p4runtime_ctrl.*"
@@ -92,7 +91,6 @@ CAPABILITIES = (
         for name, protocol in PROTOCOLS.items()
     ),
     Capability(HANDSHAKE, delivery="reliable", archive="always"),
-    Capability(f"{TELEMETRY}.*", delivery="reliable"),
     Capability(f"{COMMAND}.*", delivery="reliable", archive="always"),
     Capability(f"{CELL_REQUEST}.*", delivery="reliable"),
     Capability(f"{INCOMPATIBLE}.*", archive="always"),
@@ -323,19 +321,18 @@ class SonataAdapterService:
             past = (self._intake.read("command", command_in, item) for item in archived)
             self._command(switch, leftovers(command.updates for command in past if command is not None))
 
-    def _command(self, switch: str, updates: tuple[TableUpdate, ...]) -> None:
-        if updates:
-            command = TableCommand(id=f"sonata-{time.time_ns()}-{next(self._commands)}", updates=updates)
+    def _command(
+        self, switch: str, updates: tuple[TableUpdate, ...], requests: tuple[dict[str, Any], ...] = ()
+    ) -> None:
+        if updates or requests:
+            name = f"sonata-{time.time_ns()}-{next(self._commands)}"
+            command = TableCommand(id=name, updates=updates, requests=requests)
             self._engine.write(f"{COMMAND}.{switch}", command.to_value(), [NO_WAIT])
 
     def _apply(self, changes: ControllerUpdates, only: str = "") -> None:
-        """Send changes to the controller: withdrawals first, then counting entries, then classifier bits."""
-        for offer in changes.withdraw:
-            self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
+        """Send changes to the controller, in one message for each switch."""
         for switch in [only] if only else sorted(self._switches):
-            self._command(switch, changes.updates)
-        for offer in changes.offer:
-            self._engine.write(f"{TELEMETRY}.{offer['name']}", offer, [NO_WAIT])
+            self._command(switch, changes.updates, (*changes.withdraw, *changes.offer))
         for key, reason in changes.refused:
             self._refuse(key, reason)
         self._observe(self._control.sources)

@@ -128,6 +128,27 @@ def test_offers_take_no_bit_and_no_name_of_another():
         assert service.health()["offers"] == 0
 
 
+def test_requests_come_and_go_with_the_command_that_has_their_entries():
+    """One that cannot be read refuses the whole command; one that clashes is refused alone."""
+    pattern, key = "network.p4_command.*.*", "network.p4_command.sonata_adapter.s1"
+    request = {"name": "q1", "bit": 1, "conditions": {"protocol": 6}, "copy": False}
+
+    def command(number, *requests):
+        return TableCommand(id=f"c{number}", updates=(), requests=requests).to_value()
+
+    with controller() as (engine, service, _):
+        engine.hand(pattern, key, command(1, request, {**request, "name": "q2", "bit": 2}))
+        assert service.health()["offers"] == 2
+        engine.hand(pattern, key, command(2, {"name": "q3"}))
+        engine.hand(pattern, key, command(3, {**request, "name": "q4"}, {**request, "name": "q5", "bit": 5}))
+        health = service.health()
+        assert (health["offers"], health["refused_messages"]) == (3, 2)
+        engine.hand(pattern, "network.p4_command.sonata_adapter.s2", command(4, {**request, "active": False}))
+        assert service.health()["offers"] == 3, "of a switch that is another controller's"
+        engine.hand(pattern, key, command(5, {**request, "active": False}))
+        assert service.health()["offers"] == 2
+
+
 def test_any_plain_value_under_any_key():
     """Whatever values hypothesis makes, no callback raises."""
     with controller() as (engine, service, _):
