@@ -17,7 +17,7 @@ from typing import Literal
 import msgspec
 
 from sdnator.errors import BadInput
-from sdnator.private_files import write_private
+from due.private_files import write_private
 
 FILE = "users.json"
 OWNER = "owner"

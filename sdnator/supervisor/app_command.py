@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sdnator.app_catalogue import OURS
-from sdnator.private_files import write_private_json
+from due.private_files import write_private_json
 
 MODULES: Mapping[str, str] = {
     "coordinator": "coordinator.service",
