@@ -106,7 +106,6 @@ COMMAND = "network.p4_command.firewall"
 MOST_SWITCHES = 256
 STEP_S = 3600
 """Seconds; a larger jump of capture time is not accepted at once."""
-START_PATIENCE_S = 30.0
 ARCHIVED_WORD_S = 2.0
 CLOCKS_DIFFER_NS = 2 * 3600 * 1_000_000_000
 PANICS = {"dataKey": history.INSTRUCTIONS, "value.verb": "panic"}
@@ -208,19 +207,19 @@ class FirewallService:
             self._past.teach(self._known)
             self._known.changes()
             self._hear(HANDSHAKES, arrivals.handshake_in, self._on_handshake)
-        self._hear("network.anomaly.kitsune.alert", arrivals.alert_in, self._on_alert)
+        self._hear("network.anomaly.kitsune.alert", Alert.from_item, self._on_alert)
         self._hear(f"{TRAINING}.*", arrivals.training_in, self._on_training)
         queries = (f"sonata_adapter.{query}" for query in self._settings.evidence_queries)
         apps = (f"{app}.*" for app in self._settings.evidence_apps)
         for key in (KITSUNES_EVIDENCE, *(f"{EVIDENCE}.{each}" for each in (*queries, *apps))):
-            self._hear(key, arrivals.spoken_in, self._on_evidence)
+            self._hear(key, Evidence.from_item, self._on_evidence)
         for enforcer in dict.fromkeys((SWITCHES, *self._settings.enforcers)):
-            self._hear(f"{CONFIRMED}.{enforcer}.*", arrivals.confirmation_in, self._on_confirmation)
+            self._hear(f"{CONFIRMED}.{enforcer}.*", Confirmation.from_item, self._on_confirmation)
             if enforcer != SWITCHES:
                 self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
         self._answer_earlier()
-        self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)
+        self._hear(history.INSTRUCTIONS, Instruction.from_item, self._on_instruction)
         if self._settings.detect:
             self._hear_tcp()
         if self._settings.detect and self._settings.arp != "off":
@@ -381,7 +380,7 @@ class FirewallService:
         with self._lock:
             for item in items:
                 self._words_since = max(self._words_since, min(item.timestamp, time.time_ns()))
-                said = self._intake.read(history.INSTRUCTIONS, arrivals.instruction_in, item)
+                said = self._intake.read(history.INSTRUCTIONS, Instruction.from_item, item)
                 if said is None or said.id in self._panics:
                     continue
                 self._panics.append(said.id)
