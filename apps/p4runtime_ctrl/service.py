@@ -205,12 +205,9 @@ class P4RuntimeCtrlService:
             self._intake.refuse("offer", error, item.key)
 
     def _take_up_offers(self) -> None:
-        def find(query: Mapping[str, Any], limit: int) -> list[Item]:
-            return self._engine.get(query, limit=limit)
-
         query, since = {"dataKey": _OFFERS}, self._settings.restore_since
         take = self._intake.reading("offer", offer_in, self._take_offer)
-        for item in youngest(find, query, since, _OFFERS_READ):
+        for item in youngest(self._engine, query, since, _OFFERS_READ):
             take(item)
 
     def _on_assignments(self, _: tuple[Assignment, ...]) -> None:

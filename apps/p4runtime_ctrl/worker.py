@@ -581,10 +581,7 @@ class SwitchWorker:
             _LOG.warning("%s: not restored: %s", self.name, one_line(problem))
 
     def _archived(self, key: str, since: int) -> list[Item]:
-        def find(query: Mapping[str, Any], limit: int) -> list[Item]:
-            return self._engine.get(query, limit=limit)
-
-        return youngest(find, {"dataKey": key}, since, _RESTORED)
+        return youngest(self._engine, {"dataKey": key}, since, _RESTORED)
 
 
 def _fail(error: Exception) -> None:
