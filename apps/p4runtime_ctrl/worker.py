@@ -546,20 +546,20 @@ class SwitchWorker:
             "event_time": event_time,
             "blocks": self._block_counters.shown,
             "blocks_total": self._switch.blocks,
-            **self._stations(),
+            **self._learning(),
             "change": self._change,
             "brought_up_ms": self._brought_up_ms,
         }
 
-    def _stations(self) -> dict[str, Any]:
-        stations = self._switch.stations
-        if stations is None:
+    def _learning(self) -> dict[str, Any]:
+        learning = self._switch.mac_learning
+        if learning is None:
             return {}
         return {
-            "stations": len(stations),
-            "moved": stations.moved,
-            "stations_refused": stations.refused,
-            "stations_malformed": stations.malformed,
+            "stations": len(learning),
+            "moved": learning.moved,
+            "stations_refused": learning.refused,
+            "stations_malformed": learning.malformed,
         }
 
     def _now(self) -> tuple[int, int]:
