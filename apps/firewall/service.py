@@ -160,7 +160,9 @@ class FirewallService:
         self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
         self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
         self._lessons = FalseAlarms(settings.rules.false_alarm_days)
-        self._desk = Desk(self._lifecycle, self._syn, self._limits, allowed, self._lessons, self._past.decision)
+        self._desk = Desk(
+            self._lifecycle, self._syn, self._limits, allowed, self._lessons, self._past.decision
+        )
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(

@@ -20,7 +20,6 @@ _PAGE = "dashboard"
 """Its instructions stand among the deeds, with the name of the user who gave them."""
 
 
-
 def audit(
     *,
     since: Annotated[

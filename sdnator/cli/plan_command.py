@@ -37,10 +37,13 @@ def plan_command(
     pps: Annotated[
         float | None,
         typer.Option(
-            help="Packets per second, at all switches together; required unless --measure is given.", show_default=False
+            help="Packets per second, at all switches together; required unless --measure is given.",
+            show_default=False,
         ),
     ] = None,
-    queries: Annotated[int, typer.Option(help="Queries in addition to those that the pipeline itself asks.")] = 0,
+    queries: Annotated[
+        int, typer.Option(help="Queries in addition to those that the pipeline itself asks.")
+    ] = 0,
     consumers: Annotated[int, typer.Option(help="Further apps that read every score.")] = 0,
     archive_days: Annotated[float, typer.Option(help="Days for which the archive keeps items.")] = 1.0,
     blocks: Annotated[int, typer.Option(help="Blocks in force.")] = 0,

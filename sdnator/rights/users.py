@@ -16,8 +16,8 @@ from typing import Literal
 
 import msgspec
 
-from sdnator.errors import BadInput
 from due.private_files import write_private
+from sdnator.errors import BadInput
 
 FILE = "users.json"
 OWNER = "owner"

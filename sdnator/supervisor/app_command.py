@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sdnator.app_catalogue import OURS
 from due.private_files import write_private_json
+from sdnator.app_catalogue import OURS
 
 MODULES: Mapping[str, str] = {
     "coordinator": "coordinator.service",

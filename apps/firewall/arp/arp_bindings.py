@@ -100,9 +100,7 @@ class ArpBindings:
             found += self._heard(address, BoundHost(port, sender), at * 1000, honest=sender == mac)
         return found
 
-    def _heard(
-        self, address: int, host: BoundHost, now: int, *, honest: bool
-    ) -> Iterator[BindingConflict]:
+    def _heard(self, address: int, host: BoundHost, now: int, *, honest: bool) -> Iterator[BindingConflict]:
         if host.port in self._behind or len(self._behind) < PORTS:
             neighbours = self._behind[host.port]
             if len(neighbours) < STATIONS:

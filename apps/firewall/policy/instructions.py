@@ -77,7 +77,9 @@ class Desk:
                 f"{target.address} is on the allow-list, which always wins; `sdnator allow remove` it first"
             )
         if len(self._lifecycle.blocks) >= self._lifecycle.rules.max_blocks:
-            raise ValueError(f"{len(self._lifecycle.blocks)} blocks are in force (max_blocks); lift some first")
+            raise ValueError(
+                f"{len(self._lifecycle.blocks)} blocks are in force (max_blocks); lift some first"
+            )
         if self._lifecycle.matching(target.address):
             raise ValueError(f"{target.address} is already blocked")
         reason = f"by hand: {instruction.reason or 'no reason given'}"

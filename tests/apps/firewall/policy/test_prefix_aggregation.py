@@ -56,7 +56,9 @@ def test_a_block_that_was_asked_for_outlives_that_of_its_prefix():
     """Whoever lifts the prefix lifts what the firewall decided, not what an operator has."""
     lifecycle = BlockLifecycle(Rules())
     said = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary="block")
-    by_hand = lifecycle.open("*", Target(kind="ip", address="192.0.2.1"), "by hand", [said], NOW, seconds=36_000)
+    by_hand = lifecycle.open(
+        "*", Target(kind="ip", address="192.0.2.1"), "by hand", [said], NOW, seconds=36_000
+    )
     for address in hosts("192.0.2.", 130)[2:]:
         lifecycle.open("*", Target(kind="ip", address=address), "why", (), NOW)
     made = list(gather_blocks(lifecycle, lambda each: {"192.0.2.0/24": list(each)}, NOW))
