@@ -85,7 +85,7 @@ class P4RuntimeCtrlService:
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
         self._by_digest = {each.name: settings.by_digest(each) for each in settings.switches}
-        self._sentinel = FailClosedWatchdog(settings)
+        self._watchdog = FailClosedWatchdog(settings)
         self._active = True
         self._looked_at = 0.0
 
@@ -96,7 +96,7 @@ class P4RuntimeCtrlService:
         self._active = bool(self._engine.health()["active"])
         if self._settings.restore:
             self._take_up_offers()
-        self._sentinel.start()
+        self._watchdog.start()
         for agent in self._agents.values():
             agent.start(active=self._active)
         observe, reading = self._engine.observe, self._intake.reading
@@ -138,7 +138,7 @@ class P4RuntimeCtrlService:
             agent.tick()
         if time.monotonic() - self._looked_at > _LOOK_EVERY_S:
             self._looked_at = time.monotonic()
-            self._sentinel.keep()
+            self._watchdog.keep()
             self._look_at_duty()
             self._demand_changed()
 
@@ -158,12 +158,12 @@ class P4RuntimeCtrlService:
     def stop(self) -> None:
         for agent in self._agents.values():
             agent.stop()
-        self._sentinel.dismiss()
+        self._watchdog.dismiss()
 
     def health(self) -> dict[str, Any]:
         return {
             "switches": [agent.health() for agent in self._agents.values()],
-            "sentinel": self._sentinel.watches,
+            "watchdog": self._watchdog.watches,
             "offers": len(self._offers),
             **self._intake.health(),
         }

@@ -556,10 +556,10 @@ class SwitchWorker:
         if learning is None:
             return {}
         return {
-            "stations": len(learning),
+            "learnt": len(learning),
             "moved": learning.moved,
-            "stations_refused": learning.refused,
-            "stations_malformed": learning.malformed,
+            "learn_refused": learning.refused,
+            "learn_malformed": learning.malformed,
         }
 
     def _now(self) -> tuple[int, int]:
