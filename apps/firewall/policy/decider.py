@@ -231,7 +231,7 @@ class Decider:
         reason = _reason(tally, now, bound, total, bound, 0)
         if evidence.address:
             refusal = (
-                f"on which port {evidence.address} is, and whether the address is its own, nobody has told"
+                f"it is not known on which port {evidence.address} is, nor whether the address is its own"
             )
             return self._refused(evidence, reason, refusal, tally, total, bound)
         pieces = [each.latest for each in tally.contributions.values()]
