@@ -175,7 +175,7 @@ _OUTS = PacketOuts(_PROGRAM, _NOW // 1000)
 
 def command_in(item: Item) -> list[Any]:
     """A command, and the entries that it means."""
-    return [_PROGRAM.entry(update) for update in controller.command_in(item).updates]
+    return [_PROGRAM.entry(update) for update in TableCommand.from_item(item).updates]
 
 
 def frames_in(item: Item) -> list[Any]:
@@ -267,11 +267,11 @@ TARGETS = (
     _target("firewall", "network.incident.firewall.scan", Incident.from_item, INCIDENT),
     _target("kitsune", _SWITCH_KEY, kitsune.tick_in, STATE),
     _target(
-        "controller", "network.clock.replay.s1", controller.clock_in, {"switch": "s1", "event_time": _NOW}
+        "controller", "network.clock.replay.s1", controller.ClockReached.from_item, {"switch": "s1", "event_time": _NOW}
     ),
     _target("kitsune", "network.packets.p4runtime_ctrl.s1.all", kitsune.packets_in, _PACKETS),
-    _target("kitsune", "network.block.firewall.ipv4", kitsune.decision_in, DECISION.to_value()),
-    _target("controller", "network.block.firewall.ipv4", controller.decision_in, DECISION.to_value()),
+    _target("kitsune", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
+    _target("controller", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
     _target("controller", "network.p4_command.app.s1", command_in, _COMMAND.to_value()),
     _target("controller", "network.telemetry.sonata.q1", controller.offer_in, _OFFER.to_value()),
     _target("controller", "network.cell_request.sonata.s1", questions_in, _QUESTIONS),

@@ -16,9 +16,6 @@ from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
 from apps.p4runtime_ctrl.arrivals import (
     ClockReached,
     FramesToSend,
-    clock_in,
-    command_in,
-    decision_in,
     frames_in,
     offer_in,
     questions_in,
@@ -101,14 +98,14 @@ class P4RuntimeCtrlService:
             agent.start(active=self._active)
         observe, reading = self._engine.observe, self._intake.reading
         for key in DECISIONS:
-            observe(key).subscribe(reading("decision", decision_in, self._on_decision))
-        observe("network.p4_command.*.*").subscribe(reading("command", command_in, self._on_command))
+            observe(key).subscribe(reading("decision", Decision.from_item, self._on_decision))
+        observe("network.p4_command.*.*").subscribe(reading("command", TableCommand.from_item, self._on_command))
         observe(_OFFERS).subscribe(reading("offer", offer_in, self._on_offer))
         observe("network.cell_request.*.*").subscribe(
             reading("cell_request", questions_in, self._on_questions)
         )
         observe("network.packet_out.*.*").subscribe(reading("packet_out", frames_in, self._on_frames))
-        observe("network.clock.*.*").subscribe(reading("clock", clock_in, self._on_clock))
+        observe("network.clock.*.*").subscribe(reading("clock", ClockReached.from_item, self._on_clock))
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
