@@ -1,1 +1,1 @@
-"""The network apps.  They share two files, `messages` and `packets`, and never import each other."""
+"""The network apps.  They share the files of this folder, which are the contract between them, and never import each other."""

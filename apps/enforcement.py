@@ -65,5 +65,13 @@ class EnforcementReport(Message, frozen=True, kw_only=True):
 
 
 def place_text(enforcer: str, place: str) -> str:
-    """An enforcer and its place in words, such as `nftables gateway`."""
+    """Name an enforcer and its place for people.
+
+    Args:
+        enforcer: app id.
+        place: where it carries out decisions.
+
+    Returns:
+        Both, such as `nftables gateway`.
+    """
     return f"{enforcer} {place}"

@@ -64,7 +64,7 @@ class Evidence(Message, frozen=True, kw_only=True):
     forged: bool = False
     """The sender's address is another's, by what training saw: only the MAC and port are the sender's own."""
     supporting: bool = False
-    """It supports other evidence and is never enough by itself: what is merely unlike training may be harmless."""
+    """It supports other evidence and is never enough by itself: what is merely unlike training may be benign."""
     victims: Annotated[tuple[Name, ...], Meta(max_length=MOST_VICTIMS)] = ()
     """Addresses of the first victims; `victim_count` says how many there are."""
     victim_count: Number = 0

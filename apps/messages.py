@@ -13,7 +13,7 @@ but `MessageError` (`apps.intake`).
 
 import ipaddress
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal, Self
 
 import msgspec
@@ -24,7 +24,7 @@ from apps.intake import Intake as Intake  # noqa: PLC0414 - part of the contract
 from apps.intake import MessageError as MessageError  # noqa: PLC0414 - part of the contract that is imported from here
 from apps.intake import as_map
 from apps.intake import one_line as one_line  # noqa: PLC0414 - part of the contract that is imported from here
-from due import Item
+from due import Engine, Item
 
 LONGEST_BLOCK_S: Final = 30 * 86_400
 """The longest block that people may ask for."""
@@ -103,15 +103,11 @@ def sender_of(item: Item) -> str:
     return item.app_id
 
 
-Find = Callable[[Mapping[str, Any], int], Sequence[Item]]
-"""Data Archives: a query, and how many of the youngest items that match are wanted; oldest first."""
-
-
-def youngest(find: Find, query: Mapping[str, Any], since: int, most: int) -> list[Item]:
+def youngest(engine: Engine, query: Mapping[str, Any], since: int, most: int) -> list[Item]:
     """Read the youngest matching items from the archive, page by page.
 
     Args:
-        find: reads one page from Data Archives.
+        engine: of the app that asks.
         query: query in MongoDB's dialect.
         since: only items written after this time, ns since the epoch.
         most: number of items at most.
@@ -123,7 +119,7 @@ def youngest(find: Find, query: Mapping[str, Any], since: int, most: int) -> lis
     left, before = most, (1 << 63) - 1
     while left > 0:
         asked = min(_PAGE, left)
-        page = list(find({**query, "timestamp": {"$gt": since, "$lt": before}}, asked))
+        page = engine.get({**query, "timestamp": {"$gt": since, "$lt": before}}, limit=asked)
         if len(page) == asked and page[0].timestamp != page[-1].timestamp:
             # others of the oldest moment may be left: all of that moment come with the next page
             before = page[0].timestamp + 1

@@ -87,8 +87,16 @@ _Numbers = Sequence[int] | npt.NDArray[Any]
 def read_columns(value: object, kinds: Mapping[str, str], what: str) -> RecordBatch:
     """Check a received record batch: columns of these names and types, within the bounds of packet columns.
 
-    Columns of other types are converted if every value fits; columns not in `kinds` are left out.
-    Raises `MessageError`.
+    Args:
+        value: a decoded value.
+        kinds: column name to numpy's dtype as text; other columns are left out.
+        what: what the batch should be, for the error message.
+
+    Returns:
+        The columns of `kinds`, each of shape (n,); those of another type are converted.
+
+    Raises:
+        MessageError: no record batch, too many rows, a missing column, or a value that does not fit.
     """
     if not isinstance(value, RecordBatch):
         raise MessageError("shape", f"{what}: a record batch is expected, not {type(value).__name__}")
@@ -104,7 +112,19 @@ def read_columns(value: object, kinds: Mapping[str, str], what: str) -> RecordBa
 
 
 def as_column(column: object, kind: str, what: str) -> _Array:
-    """A one-dimensional array of numbers as this type; raises `MessageError`."""
+    """Check a received array of whole numbers, and convert it to a type.
+
+    Args:
+        column: a decoded value.
+        kind: numpy's dtype as text, such as `u2`.
+        what: what the array should be, for the error message.
+
+    Returns:
+        The array of that type, shape (n,); the same object if it has the type already.
+
+    Raises:
+        MessageError: no one-dimensional array of whole numbers, or a value that does not fit into the type.
+    """
     dtype = np.dtype(kind)
     if not isinstance(column, np.ndarray) or column.ndim != 1 or column.dtype.kind not in "iu":
         found = (
@@ -151,7 +171,14 @@ class SteadyTime:
         self._agreed = 0
 
     def hear(self, time: int) -> bool:
-        """Whether this time is accepted; it may be older than others."""
+        """Take note of the time of one item.
+
+        Args:
+            time: in the unit of `most`; it may be older than others.
+
+        Returns:
+            Whether it is accepted.
+        """
         now = self.now
         if now is None or -self._most <= time - now <= self._most:
             self.now = time if now is None else max(now, time)
@@ -166,13 +193,27 @@ class SteadyTime:
         return False
 
     def fit(self, time: int) -> int:
-        """This time, or the newest accepted one if it is too far ahead of that; past times stay unchanged."""
+        """Replace a time that is too far ahead.
+
+        Args:
+            time: in the unit of `most`.
+
+        Returns:
+            The same time, also if it is in the past; or the newest accepted one if it is too far ahead of that.
+        """
         if self.now is not None and time < self.now - self._most:
             return time
         return time if self.hear(time) or self.now is None else self.now
 
     def believed(self, times: _Array) -> npt.NDArray[np.bool_] | None:
-        """Mask of the accepted times, in order; None: all of them."""
+        """Take note of the times of a batch, in order.
+
+        Args:
+            times: integers in the unit of `most`, shape (n,).
+
+        Returns:
+            Mask of the accepted ones, shape (n,); None: all of them are.
+        """
         if not len(times):
             return None
         low, high, now = int(times.min()), int(times.max()), self.now
@@ -199,16 +240,28 @@ def read_frames(
     sequence: _Numbers,
     arrival: _Numbers,
 ) -> RecordBatch:
-    """Ethernet frames (whole, cut or zero-padded) as a record batch with all `PACKET_COLUMNS`.
+    """Read Ethernet frames, whole, cut or zero-padded, as a record batch with all `PACKET_COLUMNS`.
 
-    `lengths` are bytes on the wire, `times_us` absolute capture time in microseconds; the five
-    number columns have one entry per frame (otherwise a `ValueError` names the column).  No frame is
-    refused: missing or malformed headers are absent in its row.
+    No frame is refused: missing or malformed headers are absent in its row.
 
     Differences from tshark: ports of a fragmented datagram stand in its first fragment (tshark
     reassembles and shows them in the last); the inside of tunnels (IP in IP, GRE, VXLAN, PPPoE,
     MPLS, IPsec over IPv4), of more than two VLAN tags and of more than three IPv6 extension headers
     is not read; ARP other than IPv4 over Ethernet counts as not ARP.
+
+    Args:
+        frames: n frames.
+        lengths: bytes of each on the wire, shape (n,).
+        times_us: capture time of each, µs since the epoch, shape (n,).
+        ports: ingress port of each, shape (n,).
+        sequence: number of each packet-in, shape (n,).
+        arrival: arrival number of each at the switch, shape (n,).
+
+    Returns:
+        One row per frame, in the same order.
+
+    Raises:
+        ValueError: a column of numbers has another shape; the text names it.
     """
     given = {
         "sequence": sequence,

@@ -17,12 +17,15 @@ STANDING: Final = ("block", "protect", "meter")
 
 
 def in_force(decisions: Iterable[Decision]) -> list[Decision]:
-    """Decisions in force: the newest for each target on each switch that nobody has lifted.
+    """Find the decisions in force: the newest for each target on each switch that nobody has lifted.
 
     Expired ones are included: the firewall decides whether to extend or lift them.
 
     Args:
         decisions: in the order of writing, as far as that is known; without dry runs.
+
+    Returns:
+        Those in force, in the same order.
     """
     given = list(decisions)
     lifted = {each.id for each in given if each.action not in STANDING}

@@ -17,7 +17,7 @@ from benchmarks.cluster_stage import PartMissing
 from due.drivers.embedded_redis import SUBSCRIBER_LIMIT, server_program
 from due.drivers.redis_wire import Wire
 from due.errors import UpdatesUnavailable
-from sdnator.private_files import write_private_json
+from due.private_files import write_private_json
 
 ITEM_BYTES: Final = 1_000
 DIRECTIONS: Final = {"to_far": ("near", "far"), "to_near": ("far", "near")}

@@ -90,10 +90,10 @@ class DecisionRun:
 
     def __post_init__(self) -> None:
         self.detector = self.shared or detector_for(self.training_packets)
-        self._ledger = BlockLifecycle(self.rules)
+        self._lifecycle = BlockLifecycle(self.rules)
         # capture times of generated traffic: ARP claims are weighed by the detector
         bindings = ArpBindings(training_s=0, settle_s=3_600, contest_s=60)
-        self.decider = Decider(self.rules, self._ledger, bindings, (), AllowList)
+        self.decider = Decider(self.rules, self._lifecycle, bindings, (), AllowList)
         self._told = False
         self._untold: list[Decision] = []
         """Decisions that the detector does not know of."""
@@ -112,7 +112,7 @@ class DecisionRun:
     @property
     def drops(self) -> bool:
         """Whether packets are dropped now, so that the detector sees what other runs do not have it see."""
-        return bool(self._ledger.blocks or self._limits.standing)
+        return bool(self._lifecycle.blocks or self._limits.standing)
 
     def begin(self, packets: int) -> None:
         """So many packets are going to come."""
@@ -150,13 +150,13 @@ class DecisionRun:
                     event_time=0,
                 )
             )
-        for decision in self._ledger.due(now):
+        for decision in self._lifecycle.due(now):
             self._carry_out(decision)
         for name, packets in self._meters.counters().items():
             self._limits.count_drops(name, packets, now)
         self._meters.decide(self._limits.due(now))
         for alert in alerts:
-            if self._ledger.covering(alert.sender) is None:
+            if self._lifecycle.covering(alert.sender) is None:
                 verdict = self.decider.alert(alert)
                 if verdict.target is not None:
                     self._block(alert, verdict.target, verdict.reason)
@@ -194,7 +194,7 @@ class DecisionRun:
 
     def _block(self, cause: Alert | Evidence, target: Target, reason: str) -> None:
         host = "" if cause.sender is None else cause.sender.ip
-        decision = self._ledger.open(
+        decision = self._lifecycle.open(
             SWITCH, target, reason, (), cause.event_time, training_rate=cause.training_rate, host=host
         )
         self._carry_out(decision)

@@ -62,11 +62,11 @@ class ChildProgram:
 class FaultStage:
     """One Data Updates server and the programs that use it; a context manager."""
 
-    def __init__(self, folder: Path, *, durable: bool = False) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._stack = ExitStack()
         self._programs: list[ChildProgram] = []
-        self.server = EmbeddedServer(folder / "updates", durable=durable)
+        self.server = EmbeddedServer(folder / "updates")
 
     def __enter__(self) -> Self:
         self._stack.enter_context(self.server)

@@ -10,8 +10,9 @@ import numpy as np
 from apps.enforcement import AllowedEntries, EnforcementReport, HeldBlock
 from apps.enforcers import arrivals as enforcers
 from apps.enforcers.webhook_enforcer.exchange import answer_in, listing_in
-from apps.evidence import TrainingState
+from apps.evidence import Evidence, TrainingState
 from apps.firewall import arrivals as firewall
+from apps.incidents import Incident
 from apps.kitsune import service as kitsune
 from apps.kitsune.model_orders import ModelOrder, order_in
 from apps.messages import (
@@ -86,7 +87,8 @@ def _decoding(key: str, decode: Decode) -> Callable[[bytes], object]:
 
 
 def _target(app: str, key: str, decode: Decode, *values: Any) -> DecoderTarget:
-    name = f"{app} {decode.__name__.removesuffix('_in').strip('_')} {key.split('.')[1]}"
+    words = (app, decode.__name__.removesuffix("_in").strip("_"), key.split(".")[1])
+    name = " ".join(word for word in words if word != "from_item")
     errors = (MessageError, DecodeError, EntryError)
     return DecoderTarget(name, _decoding(key, decode), errors, tuple(map(encode_value, values)), mutate_value)
 
@@ -208,15 +210,12 @@ _PACKETS = packets()
 _SWITCH_KEY = "network.switch.p4runtime_ctrl.s1"
 
 TARGETS = (
-    _target("firewall", "network.anomaly.kitsune.alert", firewall.alert_in, ALERT.to_value()),
+    _target("firewall", "network.anomaly.kitsune.alert", Alert.from_item, ALERT.to_value()),
     _target(
-        "firewall",
-        "network.confirmation.p4runtime_ctrl.s1",
-        firewall.confirmation_in,
-        CONFIRMATION.to_value(),
+        "firewall", "network.confirmation.p4runtime_ctrl.s1", Confirmation.from_item, CONFIRMATION.to_value()
     ),
     _target("firewall", "network.enforced.nftables.h1", firewall.report_in, _REPORT.to_value()),
-    _target("firewall", "network.false_alarm.firewall.taught", firewall.lesson_in, _LESSON.to_value()),
+    _target("firewall", "network.false_alarm.firewall.taught", FalseAlarm.from_item, _LESSON.to_value()),
     _target("enforcers", "network.block.firewall.ipv4", enforcers.decision_in, DECISION.to_value()),
     _target(
         "enforcers",
@@ -240,9 +239,9 @@ TARGETS = (
         (b'{"blocks": [{"id": "d1", "packets": 3}]}',),
         mutate_text,
     ),
-    _target("firewall", "network.block.firewall.ipv4", firewall.decision_in, DECISION.to_value()),
-    _target("firewall", "network.p4_command.firewall.s1", firewall.command_in, _COMMAND.to_value()),
-    _target("firewall", "network.instruction.cli.firewall", firewall.instruction_in, _INSTRUCTION.to_value()),
+    _target("firewall", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
+    _target("firewall", "network.p4_command.firewall.s1", TableCommand.from_item, _COMMAND.to_value()),
+    _target("firewall", "network.instruction.cli.firewall", Instruction.from_item, _INSTRUCTION.to_value()),
     _target(
         "firewall",
         "network.answer.firewall.cli",
@@ -265,16 +264,19 @@ TARGETS = (
     _target("firewall", "network.traffic_capture.sonata.tcp", firewall.syns_in, _PACKETS),
     _target("firewall", "network.traffic_capture.sonata.tcp", firewall.syn_acks_in, _PACKETS),
     _target("firewall", "network.traffic_capture.sonata.arp", firewall.arps_in, _PACKETS),
-    _target("firewall", "network.evidence.kitsune.contacts", firewall.spoken_in, _EVIDENCE),
+    _target("firewall", "network.evidence.kitsune.contacts", Evidence.from_item, _EVIDENCE),
     _target("firewall", "network.training.kitsune", firewall.training_in, _TRAINING.to_value()),
-    _target("firewall", "network.incident.firewall.scan", firewall.incident_in, INCIDENT),
+    _target("firewall", "network.incident.firewall.scan", Incident.from_item, INCIDENT),
     _target("kitsune", _SWITCH_KEY, kitsune.tick_in, STATE),
     _target(
-        "controller", "network.clock.replay.s1", controller.clock_in, {"switch": "s1", "event_time": _NOW}
+        "controller",
+        "network.clock.replay.s1",
+        controller.ClockReached.from_item,
+        {"switch": "s1", "event_time": _NOW},
     ),
     _target("kitsune", "network.packets.p4runtime_ctrl.s1.all", kitsune.packets_in, _PACKETS),
-    _target("kitsune", "network.block.firewall.ipv4", kitsune.decision_in, DECISION.to_value()),
-    _target("controller", "network.block.firewall.ipv4", controller.decision_in, DECISION.to_value()),
+    _target("kitsune", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
+    _target("controller", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
     _target("controller", "network.p4_command.app.s1", command_and_requests_in, _COMMAND.to_value()),
     _target("controller", "network.telemetry.firewall.q1", controller.offer_in, _OFFER.to_value()),
     _target("controller", "network.cell_request.sonata.s1", questions_in, _QUESTIONS),

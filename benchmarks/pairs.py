@@ -29,8 +29,6 @@ CHANNEL = "bench"
 _STILL_S = 20.0
 """After this long without a message, once all are written, the rest is lost: longer than any reconnection."""
 
-Runner = Callable[[str, int, int], float]
-
 
 class MeasuredRun(NamedTuple):
     """What came of the messages of one run."""

@@ -1,9 +1,11 @@
 """Memory, threads and open files of all processes below one, from /proc."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from sdnator.plan.processes import process_tree
 
 _WANTED = {"Rss": "rss_kb", "Pss": "pss_kb", "Pss_Anon": "anonymous_kb"}
 
@@ -29,27 +31,19 @@ def footprints(root: int, names: Mapping[int, str]) -> dict[str, dict[str, int]]
         names: of known processes, by id; others are named after the nearest one above and their program.
     """
     found: dict[str, Footprint] = {}
-    for pid, name in _tree(root, {root: "up", **names}, "up"):
+    for pid, name in process_tree(root, {root: "up", **names}, _called):
         with suppress(OSError):
             _add(found.setdefault(name, Footprint()), Path(f"/proc/{pid}"))
     return {name: asdict(each) for name, each in sorted(found.items()) if each.processes}
 
 
-def _tree(pid: int, names: Mapping[int, str], above: str) -> Iterator[tuple[int, str]]:
-    name = names.get(pid) or f"{above}/{_program(pid)}"
-    yield pid, name
-    for task in _listed(f"/proc/{pid}/task"):
-        with suppress(OSError):
-            for child in Path(f"/proc/{pid}/task/{task}/children").read_text().split():
-                yield from _tree(int(child), names, name)
-
-
-def _program(pid: int) -> str:
+def _called(pid: int, above: str) -> str:
+    program = "gone"
     with suppress(OSError):
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         module = words[words.index(b"-m") + 1] if b"-m" in words[:-1] else words[0]
-        return Path(module.decode(errors="replace")).name or "gone"
-    return "gone"
+        program = Path(module.decode(errors="replace")).name or program
+    return f"{above}/{program}"
 
 
 def _listed(folder: str) -> list[str]:

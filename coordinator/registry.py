@@ -22,6 +22,8 @@ from coordinator.sharding import ShardTable
 from due.membership import Assignments, Heartbeat, Registration
 
 _SILENCE = 3.0
+_SHORTEST_TIMEOUT_S = 0.3
+"""However short its heartbeat is, an instance counts as unresponsive no sooner."""
 _MOST_EPOCHS = 4096
 """Apps whose epochs are remembered after they have ended; the oldest is forgotten first."""
 _MOST_EVENTS = 10_000
@@ -144,7 +146,6 @@ class Registry:
         *,
         select: Strategy = at_random,
         missed: float = 4.0,
-        shortest_timeout_s: float = 0.3,
         forget_s: float = 300.0,
         first_epoch: int = 1,
         version: int = 1,
@@ -157,7 +158,6 @@ class Registry:
         """Grows when a checkpoint would differ."""
         self._select = select
         self._missed = missed
-        self._shortest_timeout_s = shortest_timeout_s
         self._forget_s = forget_s
         self._apps: dict[str, _App] = {}
         self._epochs: dict[str, int] = {}
@@ -243,7 +243,7 @@ class Registry:
         self._looked = now
         for name, app in list(self._apps.items()):
             for instance in list(app.instances.values()):
-                if paused > self._shortest_timeout_s:
+                if paused > _SHORTEST_TIMEOUT_S:
                     instance.seen = min(instance.seen + paused, now)
                 silent = now - instance.seen
                 if instance.alive and silent > self._patience(instance, now):
@@ -356,7 +356,7 @@ class Registry:
             del self._epochs[next(iter(self._epochs))]
 
     def _timeout(self, instance: Instance) -> float:
-        return max(self._missed * instance.registration.heartbeat, self._shortest_timeout_s)
+        return max(self._missed * instance.registration.heartbeat, _SHORTEST_TIMEOUT_S)
 
     def _patience(self, instance: Instance, now: float) -> float:
         """Seconds to wait for a heartbeat; longer while no instance is heard, as then the connection is suspect."""
@@ -366,7 +366,7 @@ class Registry:
     def _hear(self, sender: Instance | None, now: float) -> None:
         """Note a heartbeat; after a silence of all instances, none is marked unresponsive for it."""
         heard, self._heard = self._heard, now
-        if heard is None or sender is None or now - heard <= self._shortest_timeout_s:
+        if heard is None or sender is None or now - heard <= _SHORTEST_TIMEOUT_S:
             return
         known = [one for app in self._apps.values() for one in app.instances.values()]
         blamed = [

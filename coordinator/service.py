@@ -10,7 +10,6 @@ Run it with `python -m coordinator.service`; like any app it registers, with its
 """
 
 import logging
-import os
 import sys
 import threading
 import time
@@ -35,6 +34,7 @@ from due.backoff import LONGEST_S
 from due.codec import encode_value
 from due.errors import InvalidOption
 from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
+from due.private_files import write_private
 
 INTERESTS = (
     Interest(f"{REGISTRATION}.*"),
@@ -235,7 +235,7 @@ class CoordinatorService:
         self._api.start()
         log.info("HTTP API at %s", self._api.url)
         if self._settings.address_file:
-            _write_private(Path(self._settings.address_file), self._api.url_with_token)
+            write_private(Path(self._settings.address_file), self._api.url_with_token)
 
     def _obey(self, led: bool) -> None:
         """Apply a change of leadership to the registry."""
@@ -321,13 +321,6 @@ def _fits(value: Any) -> bool:
         return len(encode_value(value)) <= _HEALTH_BYTES
     except DueError:
         return False
-
-
-def _write_private(path: Path, text: str) -> None:
-    path.unlink(missing_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        file.write(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -196,7 +196,7 @@ class ShardWork:
         try:
             saved = _parsed(place) if place is not None else saved
         except DecodeError as error:
-            log.error("%s begins anew, and frames that come again count twice: %s", path, error)  # noqa: TRY400
+            log.error("the place of %s cannot be read, repeated frames count twice: %s", path, error)  # noqa: TRY400
         held.number = max(held.grant, saved.number + 1)
         self._tracker.resume(path, {(instance, key): count for instance, key, count in saved.next})
         return True

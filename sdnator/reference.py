@@ -317,8 +317,8 @@ def http_api() -> str:
     found = document()
     intro = (
         "Read-only, JSON, on loopback, with the token of `coordinator.token` in the state folder as "
-        "`Authorization: Bearer …` (metrics need none); `sdnator status` names the address, `/openapi.json` is this page for "
-        "programs. Requests under another host's name are refused."
+        "`Authorization: Bearer …` (metrics need none, or the one in `metrics.token_file`); `sdnator status` names the "
+        "address, `/openapi.json` is this page for programs. Requests under another host's name are refused."
     )
     lines = [found["info"]["description"], ""]
     for path, operations in found["paths"].items():

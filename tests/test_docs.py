@@ -163,3 +163,37 @@ def test_links_lead_somewhere(path):
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (path.parent / target).exists(), f"{path.name} links to {target}"
+
+
+def _rows(document: str, title: str) -> list[list[str]]:
+    """Cells of the table under a heading that is the map of the code."""
+    text = (ROOT / document).read_text(encoding="utf-8").partition(f"# {title}\n")[2]
+    table = re.search(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    return [line.strip("| ").split(" | ") for line in table[0].splitlines()[2:]] if table else []
+
+
+def _has(path: Path, name: str) -> bool:
+    """Whether a file defines each part of a dotted name."""
+    source = path.read_text(encoding="utf-8")
+    return all(re.search(rf"^ *(class|def) {part}\b", source, re.MULTILINE) for part in name.split("."))
+
+
+README_MAP = _rows("README.md", "Where to look in the code")
+MAP = _rows("docs/architecture.md", "Where to look")
+
+
+@pytest.mark.parametrize(("what", "name", "files"), MAP, ids=[what for what, *_ in MAP])
+def test_the_map_leads_to_the_code(what, name, files):
+    """A row of the map names a class or function, and its file is the first one."""
+    first, *others = re.findall(r"`([\w/]+\.py)`", files)
+    assert _has(ROOT / first, name.strip("`"))
+    assert [other for other in others if not (ROOT / other).exists()] == []
+
+
+def test_the_readme_has_part_of_the_map():
+    """Whoever reads the README alone gets to the same places."""
+    places = {(name.strip("`"), re.findall(r"`([\w/]+\.py)`", files)[0]) for _, name, files in MAP}
+    link = re.compile(r"`([\w.]+)` in \[`[\w/.]+`\]\(([\w/.]+)\)")
+    named = {found for _, cell in README_MAP for found in link.findall(cell)}
+    assert len(named) >= len(README_MAP)
+    assert named <= places

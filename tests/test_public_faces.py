@@ -15,22 +15,35 @@ import pytest
 
 import due
 import sdnator
+import sdnator.testing
 
 DUE = [
     "CONSUMER", "DB_ONLY", "NO_WAIT", "PRODUCER", "PUB_ONLY", "Assignment", "Capability", "DueError", "Engine",
     "Interest", "Item", "Key", "Observation", "Options", "RecordBatch", "Role",
 ]  # fmt: skip
 SDNATOR = ["CaptureReplay", "Kitsune", "Query", "QueryResults", "replay_capture", "run_query"]
+TESTING = [
+    "AppRun", "Bystander", "Cable", "ControllerRun", "EntryBuilder", "Heard", "NothingWritten", "P4RuntimeClient",
+    "SwitchDouble", "SwitchTarget", "TookTooLong", "wait_for",
+]  # fmt: skip
 FACES = {
     "due": DUE,
     "due.aio": ["items"],
     "due.service": ["Announcing", "Service", "read_struct", "run"],
     "sdnator": SDNATOR,
+    "sdnator.testing": TESTING,
     "apps.kitsune.online": ["Kitsune"],
     "apps.sonata_adapter.query.language": None,
     "apps.sonata_adapter.query.expressions": None,
     "apps.sonata_adapter.query.text": None,
+    "apps.enforcement": None,
+    "apps.evidence": None,
+    "apps.incidents": None,
+    "apps.intake": None,
     "apps.messages": None,
+    "apps.packets": None,
+    "apps.standing_decisions": None,
+    "apps.talkers": None,
 }
 """Module to its public names; None = every public function and class that the module defines."""
 HEAVY = ["numpy", "scipy", "grpc", "redis", "due", "apps", "msgspec", "sdnator.replay"]
@@ -101,7 +114,11 @@ def _with_bases(name, function):
     return {base.__name__ for base in error.__mro__} - {"Exception", "BaseException", "object"}
 
 
-@pytest.mark.parametrize(("module", "names"), [(due, DUE), (sdnator, SDNATOR)], ids=["due", "sdnator"])
+@pytest.mark.parametrize(
+    ("module", "names"),
+    [(due, DUE), (sdnator, SDNATOR), (sdnator.testing, TESTING)],
+    ids=["due", "sdnator", "sdnator.testing"],
+)
 def test_nothing_becomes_public_by_accident(module, names):
     """A package exports what is listed here, in this order, and every name leads to something."""
     assert module.__all__ == names

@@ -162,7 +162,7 @@ class EnforcementWorker:
         try:
             self._enforcer.end(list(self._desired.standing.values()))
         except EnforcerAway as error:
-            log.warning("at the end: %s", one_line(str(error)))
+            log.warning("the enforcer did not end in order: %s", one_line(str(error)))
 
     def _wait_s(self) -> float:
         """Seconds until there is something to do by time alone."""

@@ -5,7 +5,6 @@ import re
 import socket
 import time
 from collections import deque
-from collections.abc import Mapping
 from typing import Any, Final
 
 import due
@@ -142,11 +141,10 @@ class EnforcerApp:
             self._early.append(Spoken(*spoken, restored=True))
 
     def _read(self, query: str | dict[str, Any], since: int, most: int) -> list[Item]:
-        def find(narrowed: Mapping[str, Any], limit: int) -> list[Item]:
-            return self._engine.get(narrowed, limit=limit)
-
         try:
-            return youngest(find, {"dataKey": query} if isinstance(query, str) else query, since, most)
+            return youngest(
+                self._engine, {"dataKey": query} if isinstance(query, str) else query, since, most
+            )
         except DueError as error:
             self._archive_away += 1
             log.warning("Data Archives do not answer: %s", one_line(str(error)))

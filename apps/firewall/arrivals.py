@@ -1,6 +1,6 @@
-"""DUE items → the firewall's own types: one decoder for each kind of message.  Pure.
+"""DUE items → the firewall's own types, where `Message.from_item` is not all there is to do.  Pure.
 
-Each accepts an item of any origin, and raises `MessageError` only.
+Each decoder accepts an item of any origin, and raises `MessageError` only.
 """
 
 from typing import Annotated, Final
@@ -9,26 +9,19 @@ import msgspec
 from msgspec import Meta
 
 from apps.enforcement import EnforcementReport
-from apps.evidence import Evidence, TrainingState
+from apps.evidence import TrainingState
 from apps.firewall.syn.recent_syns import SYN_COLUMNS
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_ack_buffer import ANSWER_COLUMNS
-from apps.incidents import Incident
 from apps.messages import (
     LATEST_NS,
-    Alert,
     Answer,
-    Confirmation,
-    Decision,
     Exhibit,
-    FalseAlarm,
-    Instruction,
     Message,
     MessageError,
     Name,
     Number,
     Port,
-    TableCommand,
     Time,
     address_in,
     sender_of,
@@ -77,29 +70,11 @@ class FloodReported(Message, frozen=True, kw_only=True):
     window_start: Time
 
 
-def alert_in(item: Item) -> Alert:
-    """`network.anomaly.kitsune.alert`."""
-    sender_of(item)
-    return Alert.from_value(item.value)
-
-
-def spoken_in(item: Item) -> Evidence:
-    """`network.evidence.<app>.<kind>`."""
-    sender_of(item)
-    return Evidence.from_value(item.value)
-
-
 def training_in(item: Item) -> TrainingState:
     """`network.training.kitsune`: another app's word would move the bound that all evidence has to reach."""
     if sender_of(item) != "kitsune":
         raise MessageError("sender", f"{item.key}: only Kitsune says how far training is")
     return TrainingState.from_value(item.value)
-
-
-def confirmation_in(item: Item) -> Confirmation:
-    """`network.confirmation.<enforcer>.<place>`."""
-    sender_of(item)
-    return Confirmation.from_value(item.value)
 
 
 def report_in(item: Item) -> EnforcementReport:
@@ -109,36 +84,6 @@ def report_in(item: Item) -> EnforcementReport:
     if (report.enforcer, report.place) != (app, item.key.rpartition(".")[2]):
         raise MessageError("fields", f"{item.key}: its value is about {report.enforcer!r} {report.place!r}")
     return report
-
-
-def decision_in(item: Item) -> Decision:
-    """An archived decision of this app."""
-    sender_of(item)
-    return Decision.from_value(item.value)
-
-
-def incident_in(item: Item) -> Incident:
-    """An archived incident of this app."""
-    sender_of(item)
-    return Incident.from_value(item.value)
-
-
-def command_in(item: Item) -> TableCommand:
-    """An archived command of this app."""
-    sender_of(item)
-    return TableCommand.from_value(item.value)
-
-
-def instruction_in(item: Item) -> Instruction:
-    """`network.instruction.<app>.firewall`."""
-    sender_of(item)
-    return Instruction.from_value(item.value)
-
-
-def lesson_in(item: Item) -> FalseAlarm:
-    """An archived lesson of this app."""
-    sender_of(item)
-    return FalseAlarm.from_value(item.value)
 
 
 def answer_in(item: Item) -> Answer:

@@ -31,7 +31,7 @@ class EvidenceHandler:
 
     Args:
         decider: the rule.
-        ledger: blocks in force.
+        lifecycle: blocks in force.
         syn: guards.
         limits: rate limits in force.
         archive: earlier offences.
@@ -45,7 +45,7 @@ class EvidenceHandler:
     def __init__(
         self,
         decider: Decider,
-        ledger: BlockLifecycle,
+        lifecycle: BlockLifecycle,
         syn: SynDefence,
         limits: RateLimits,
         archive: Archive,
@@ -56,7 +56,7 @@ class EvidenceHandler:
         clock: Callable[[], float],
     ) -> None:
         self.decider = decider
-        self._ledger = ledger
+        self._lifecycle = lifecycle
         self._syn = syn
         self._limits = limits
         self._archive = archive
@@ -73,7 +73,7 @@ class EvidenceHandler:
         """A sender had an anomalous second."""
         self._incidents.alert(alert)
         self._exhibits.add(alert.sender, evidence_of(item, alert.reason), alert.event_time)
-        if self._ledger.covering(alert.sender) is not None:
+        if self._lifecycle.covering(alert.sender) is not None:
             return
         verdict = self.decider.alert(alert)
         if verdict.target is None:
@@ -135,11 +135,11 @@ class EvidenceHandler:
         """Block a sender, unless a cap forbids it."""
         sender = cause.sender
         assert sender is not None  # noqa: S101 - callers have a sender
-        cap = self._ledger.cap_reached(cause.event_time, sender.ip)
+        cap = self._lifecycle.cap_reached(cause.event_time, sender.ip)
         if cap is not None:
-            self._ledger.refuse(cap, sender.ip or sender.mac, cause.event_time)
+            self._lifecycle.refuse(cap, sender.ip or sender.mac, cause.event_time)
             return
-        decision = self._ledger.open(
+        decision = self._lifecycle.open(
             sender.switch,
             target,
             reason,
@@ -152,7 +152,7 @@ class EvidenceHandler:
         )
         grounds = self._lessons.book.take(sender, cause.event_time) if isinstance(cause, Evidence) else ()
         self._publish(structs.replace(decision, grounds=grounds))
-        for each in gather_blocks(self._ledger, self._syn.gather, cause.event_time):
+        for each in gather_blocks(self._lifecycle, self._syn.gather, cause.event_time):
             self._publish(each)
 
     def _offences_of(self, target: Target, now: int) -> int | None:

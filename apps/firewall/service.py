@@ -106,7 +106,6 @@ COMMAND = "network.p4_command.firewall"
 MOST_SWITCHES = 256
 STEP_S = 3600
 """Seconds; a larger jump of capture time is not accepted at once."""
-START_PATIENCE_S = 30.0
 ARCHIVED_WORD_S = 2.0
 CLOCKS_DIFFER_NS = 2 * 3600 * 1_000_000_000
 PANICS = {"dataKey": history.INSTRUCTIONS, "value.verb": "panic"}
@@ -125,7 +124,7 @@ class FirewallService:
         self._settings = settings
         self._rules = settings.rules
         self._known = KnownSources(settings.known_limit, settings.known_days)
-        self._ledger = BlockLifecycle(settings.rules, known=self._known)
+        self._lifecycle = BlockLifecycle(settings.rules, known=self._known)
         self._counts = dict.fromkeys(("alerts", "evidence"), 0)
         self._order: WritingOrder[Callable[[], None]] = WritingOrder()
         self._judged: Counter[str] = Counter()
@@ -141,7 +140,7 @@ class FirewallService:
         self._floods = FloodHandler(
             engine,
             settings,
-            self._ledger,
+            self._lifecycle,
             allowed,
             self._known,
             self._switches,
@@ -161,12 +160,14 @@ class FirewallService:
         self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
         self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
         self._lessons = FalseAlarms(settings.rules.false_alarm_days)
-        self._desk = Desk(self._ledger, self._syn, self._limits, allowed, self._lessons, self._past.decision)
+        self._desk = Desk(
+            self._lifecycle, self._syn, self._limits, allowed, self._lessons, self._past.decision
+        )
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
-            Decider(settings.rules, self._ledger, self._bindings, self._known, lambda: self._desk.allow),
-            self._ledger,
+            Decider(settings.rules, self._lifecycle, self._bindings, self._known, lambda: self._desk.allow),
+            self._lifecycle,
             self._syn,
             self._limits,
             self._archive,
@@ -179,7 +180,7 @@ class FirewallService:
         self._thefts = TheftHandler(
             settings.arp,
             self._bindings,
-            self._ledger,
+            self._lifecycle,
             self._announcer,
             lambda: self._desk.allow,
             self._switches,
@@ -208,19 +209,19 @@ class FirewallService:
             self._past.teach(self._known)
             self._known.changes()
             self._hear(HANDSHAKES, arrivals.handshake_in, self._on_handshake)
-        self._hear("network.anomaly.kitsune.alert", arrivals.alert_in, self._on_alert)
+        self._hear("network.anomaly.kitsune.alert", Alert.from_item, self._on_alert)
         self._hear(f"{TRAINING}.*", arrivals.training_in, self._on_training)
         queries = (f"sonata_adapter.{query}" for query in self._settings.evidence_queries)
         apps = (f"{app}.*" for app in self._settings.evidence_apps)
         for key in (KITSUNES_EVIDENCE, *(f"{EVIDENCE}.{each}" for each in (*queries, *apps))):
-            self._hear(key, arrivals.spoken_in, self._on_evidence)
+            self._hear(key, Evidence.from_item, self._on_evidence)
         for enforcer in dict.fromkeys((SWITCHES, *self._settings.enforcers)):
-            self._hear(f"{CONFIRMED}.{enforcer}.*", arrivals.confirmation_in, self._on_confirmation)
+            self._hear(f"{CONFIRMED}.{enforcer}.*", Confirmation.from_item, self._on_confirmation)
             if enforcer != SWITCHES:
                 self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
         self._answer_earlier()
-        self._hear(history.INSTRUCTIONS, arrivals.instruction_in, self._on_instruction)
+        self._hear(history.INSTRUCTIONS, Instruction.from_item, self._on_instruction)
         if self._settings.detect:
             self._hear_tcp()
         if self._settings.detect and self._settings.arp != "off":
@@ -251,21 +252,21 @@ class FirewallService:
         self._desk.take_up(history.carried_out(self._past.instructions(), self._stored.carried_out()))
         self._panics.extend(self._past.panics())
         standing = self._past.standing()
-        self._ledger.restore(standing)
+        self._lifecycle.restore(standing)
         self._syn.restore(standing)
         self._limits.restore(standing)
         self._incidents.restore(self._past.incidents())
         self._lessons.restore(self._past.false_alarms())
         training = self._past.training()
         self._handler.decider.trained(training)
-        self._ledger.trained_hosts = 0 if training is None else training.hosts
+        self._lifecycle.trained_hosts = 0 if training is None else training.hosts
         if standing:
             log.info("decisions in force from the archive: %d", len(standing))
 
     def _take_up_entries(self) -> None:
         """Restore allowed entries; stale ones of an earlier run are deleted when their switch connects."""
         self._allow_entries.change(self._desk.entries)
-        targets = [block.decision.target for block in self._ledger.blocks.values()]
+        targets = [block.decision.target for block in self._lifecycle.blocks.values()]
         wanted = self._allow_entries.everything()
         wanted += [prefix_update("insert", target.address) for target in targets if is_prefix(target)]
         self._leftovers = self._past.leftovers(wanted)
@@ -298,17 +299,17 @@ class FirewallService:
             **self._counts,
             **self._floods.health(),
             "arp_thefts": self._thefts.thefts,
-            "blocks": sum(not each.decision.dry_run for each in self._ledger.blocks.values()),
-            "would_block": sum(each.decision.dry_run for each in self._ledger.blocks.values()),
+            "blocks": sum(not each.decision.dry_run for each in self._lifecycle.blocks.values()),
+            "would_block": sum(each.decision.dry_run for each in self._lifecycle.blocks.values()),
             "rate_limits": len(self._limits.standing),
             "rate_limits_refused": self._limits.refused,
             "known_sources": len(self._known),
             "allowed": len(self._desk.entries),
             "false_alarms": len(self._lessons),
             "allowed_left_out": self._allow_entries.left_out,
-            "refused_by_cap": self._ledger.refused,
-            "blocking_stopped": int(bool(self._ledger.stopped)),
-            "stopped_by": self._ledger.stopped,
+            "refused_by_cap": self._lifecycle.refused,
+            "blocking_stopped": int(bool(self._lifecycle.stopped)),
+            "stopped_by": self._lifecycle.stopped,
             "bindings": len(self._bindings),
             "evidence_missed": self._order.missed,
             "archive_away": self._archive.unanswered,
@@ -381,7 +382,7 @@ class FirewallService:
         with self._lock:
             for item in items:
                 self._words_since = max(self._words_since, min(item.timestamp, time.time_ns()))
-                said = self._intake.read(history.INSTRUCTIONS, arrivals.instruction_in, item)
+                said = self._intake.read(history.INSTRUCTIONS, Instruction.from_item, item)
                 if said is None or said.id in self._panics:
                     continue
                 self._panics.append(said.id)
@@ -453,7 +454,7 @@ class FirewallService:
 
     def _trained(self, state: TrainingState) -> None:
         self._handler.decider.trained(state)
-        self._ledger.trained_hosts = state.hosts
+        self._lifecycle.trained_hosts = state.hosts
 
     def _judge(self, item: Item, evidence: Evidence) -> None:
         self._counts["evidence"] += 1
@@ -496,7 +497,7 @@ class FirewallService:
         self._keep(switch, self._allow_entries.everything())
         for decision in self._syn.arm(switch, self._now or evidence_of(item, "").timestamp):
             self._publish(decision)
-        for block in self._ledger.blocks.values():
+        for block in self._lifecycle.blocks.values():
             if is_prefix(block.decision.target):
                 self._carry_out_prefix(block.decision, [switch])
         self._command(switch, self._known.everything())
@@ -504,7 +505,7 @@ class FirewallService:
     def _on_confirmation(self, item: Item, confirmation: Confirmation) -> None:
         with self._lock:
             if self._enforcers.confirmed(item.app_id, confirmation):
-                self._ledger.confirm(confirmation)
+                self._lifecycle.confirm(confirmation)
                 self._limits.confirm(confirmation)
             self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
             self._floods.confirmed(confirmation)
@@ -521,7 +522,7 @@ class FirewallService:
 
     def _count(self, enforcer: str, place: str, decision: str, packets: int, now: int) -> None:
         total = self._enforcers.count(decision, enforcer, place, packets)
-        self._ledger.count_drops(decision, total, now)
+        self._lifecycle.count_drops(decision, total, now)
         self._limits.count_drops(decision, total, now)
         self._incidents.count(decision, total, now)
 
@@ -537,7 +538,7 @@ class FirewallService:
                 self._lapse(state.event_time)
 
     def _lapse(self, now: int) -> None:
-        for decision in [*self._ledger.due(now), *self._syn.due(now), *self._limits.due(now)]:
+        for decision in [*self._lifecycle.due(now), *self._syn.due(now), *self._limits.due(now)]:
             self._publish(decision)
         self._incidents.lapse(now)
 
@@ -546,8 +547,8 @@ class FirewallService:
     def _publish(self, decision: Decision, *, resets: bool = True) -> Decision:
         """Returns the decision as it was published: where only copies are seen, as a dry run."""
         decision = self._mirrors.marked(decision, self._switches)
-        if decision.id in self._ledger.blocks:
-            self._ledger.blocks[decision.id].decision = decision
+        if decision.id in self._lifecycle.blocks:
+            self._lifecycle.blocks[decision.id].decision = decision
         if decision.id in self._limits.standing:
             self._limits.standing[decision.id].decision = decision
         target = decision.target
@@ -582,7 +583,7 @@ class FirewallService:
     def _say_notices(self) -> None:
         if (notice := self._floods.one_direction(self._now)) is not None:
             self._announcer.say(notice)
-        for notices in (self._ledger.notices, self._limits.notices):
+        for notices in (self._lifecycle.notices, self._limits.notices):
             while notices:
                 self._announcer.say(notices.popleft(), logging.ERROR)
 

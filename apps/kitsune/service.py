@@ -75,12 +75,6 @@ def packets_in(item: Item) -> RecordBatch:
     return read_columns(item.value, _USED, "packets")
 
 
-def decision_in(item: Item) -> Decision:
-    """A block or its end; raises `MessageError`."""
-    sender_of(item)
-    return Decision.from_value(item.value)
-
-
 class ClockTick(Message, frozen=True, kw_only=True):
     """The fields that Kitsune needs of a switch's state: its time, and the newest packet that it has sent."""
 
@@ -144,7 +138,7 @@ class KitsuneService:
         """Subscribes; the engine is initialised."""
         observe, reading = self._engine.observe, self._intake.reading
         self._subscriptions = [
-            observe(BLOCKS).subscribe(reading(BLOCKS, decision_in, self._on_decision)),
+            observe(BLOCKS).subscribe(reading(BLOCKS, Decision.from_item, self._on_decision)),
             observe(PACKETS).subscribe(reading(PACKETS, packets_in, self._score)),
             observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self._on_tick)),
             observe(ORDERS).subscribe(reading(ORDERS, order_in, self._on_order)),

@@ -1,6 +1,6 @@
-"""DUE items → the controller's own types: one decoder for each kind of message.  Pure.
+"""DUE items → the controller's own types, where `Message.from_item` is not all there is to do.  Pure.
 
-Each accepts an item of any origin, and raises `MessageError` only.
+Each decoder accepts an item of any origin, and raises `MessageError` only.
 """
 
 from typing import Final
@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from apps.intake import as_map
-from apps.messages import Decision, Message, MessageError, TableCommand, Time, sender_of
+from apps.messages import Message, MessageError, TableCommand, Time, sender_of
 from apps.p4runtime_ctrl.telemetry.demand import Offer
 from apps.packets import as_column, read_columns
 from due import Item, RecordBatch
@@ -43,14 +43,6 @@ class FramesToSend(msgspec.Struct, frozen=True):
     """The frames, concatenated."""
 
 
-decision_in = Decision.from_item
-"""`network.block.firewall.*`, `network.protect.firewall.*`, `network.meter.firewall.*`."""
-command_in = TableCommand.from_item
-"""`network.p4_command.<app>.<switch>`."""
-clock_in = ClockReached.from_item
-"""`network.clock.<app>.<switch>`."""
-
-
 def offer_in(item: Item) -> tuple[str, Offer]:
     """`network.telemetry.<app>.<name>`: the app and its packet request."""
     app = sender_of(item)
@@ -62,7 +54,7 @@ def offer_in(item: Item) -> tuple[str, Offer]:
 
 def command_and_requests_in(item: Item) -> tuple[TableCommand, str, tuple[Offer, ...]]:
     """`network.p4_command.<app>.<switch>`: the command, the app, and its packet requests."""
-    command = command_in(item)
+    command = TableCommand.from_item(item)
     return command, sender_of(item), tuple(Offer.from_value(value) for value in command.requests)
 
 

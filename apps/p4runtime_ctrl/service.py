@@ -6,7 +6,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -16,9 +16,7 @@ from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
 from apps.p4runtime_ctrl.arrivals import (
     ClockReached,
     FramesToSend,
-    clock_in,
     command_and_requests_in,
-    decision_in,
     frames_in,
     offer_in,
     questions_in,
@@ -86,7 +84,7 @@ class P4RuntimeCtrlService:
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
         self._by_digest = {each.name: settings.by_digest(each) for each in settings.switches}
-        self._sentinel = FailClosedWatchdog(settings)
+        self._watchdog = FailClosedWatchdog(settings)
         self._active = True
         self._looked_at = 0.0
 
@@ -97,19 +95,19 @@ class P4RuntimeCtrlService:
         self._active = bool(self._engine.health()["active"])
         if self._settings.restore:
             self._take_up_offers()
-        self._sentinel.start()
+        self._watchdog.start()
         for agent in self._agents.values():
             agent.start(active=self._active)
         observe, reading = self._engine.observe, self._intake.reading
         for key in DECISIONS:
-            observe(key).subscribe(reading("decision", decision_in, self._on_decision))
+            observe(key).subscribe(reading("decision", Decision.from_item, self._on_decision))
         observe(_COMMANDS).subscribe(reading("command", command_and_requests_in, self._on_command))
         observe(_OFFERS).subscribe(reading("offer", offer_in, self._on_offer))
         observe("network.cell_request.*.*").subscribe(
             reading("cell_request", questions_in, self._on_questions)
         )
         observe("network.packet_out.*.*").subscribe(reading("packet_out", frames_in, self._on_frames))
-        observe("network.clock.*.*").subscribe(reading("clock", clock_in, self._on_clock))
+        observe("network.clock.*.*").subscribe(reading("clock", ClockReached.from_item, self._on_clock))
         self._engine.on_assignments(self._on_assignments)
         deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
@@ -139,7 +137,7 @@ class P4RuntimeCtrlService:
             agent.tick()
         if time.monotonic() - self._looked_at > _LOOK_EVERY_S:
             self._looked_at = time.monotonic()
-            self._sentinel.keep()
+            self._watchdog.keep()
             self._look_at_duty()
             self._demand_changed()
 
@@ -159,12 +157,12 @@ class P4RuntimeCtrlService:
     def stop(self) -> None:
         for agent in self._agents.values():
             agent.stop()
-        self._sentinel.dismiss()
+        self._watchdog.dismiss()
 
     def health(self) -> dict[str, Any]:
         return {
             "switches": [agent.health() for agent in self._agents.values()],
-            "sentinel": self._sentinel.watches,
+            "watchdog": self._watchdog.watches,
             "offers": len(self._offers),
             **self._intake.health(),
         }
@@ -217,15 +215,12 @@ class P4RuntimeCtrlService:
             self._intake.refuse("offer", error, item.key)
 
     def _take_up_offers(self) -> None:
-        def find(query: Mapping[str, Any], limit: int) -> list[Item]:
-            return self._engine.get(query, limit=limit)
-
         query, since = {"dataKey": _OFFERS}, self._settings.restore_since
         take = self._intake.reading("offer", offer_in, self._take_offer)
-        for item in youngest(find, query, since, _OFFERS_READ):
+        for item in youngest(self._engine, query, since, _OFFERS_READ):
             take(item)
         take = self._intake.reading("command", command_and_requests_in, self._take_requests)
-        for item in youngest(find, {"dataKey": _COMMANDS}, since, _OFFERS_READ):
+        for item in youngest(self._engine, {"dataKey": _COMMANDS}, since, _OFFERS_READ):
             take(item)
 
     def _take_requests(self, item: Item, told: tuple[TableCommand, str, tuple[Offer, ...]]) -> None:

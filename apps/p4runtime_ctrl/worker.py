@@ -12,7 +12,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -546,20 +546,20 @@ class SwitchWorker:
             "event_time": event_time,
             "blocks": self._block_counters.shown,
             "blocks_total": self._switch.blocks,
-            **self._stations(),
+            **self._learning(),
             "change": self._change,
             "brought_up_ms": self._brought_up_ms,
         }
 
-    def _stations(self) -> dict[str, Any]:
-        stations = self._switch.stations
-        if stations is None:
+    def _learning(self) -> dict[str, Any]:
+        learning = self._switch.mac_learning
+        if learning is None:
             return {}
         return {
-            "stations": len(stations),
-            "moved": stations.moved,
-            "stations_refused": stations.refused,
-            "stations_malformed": stations.malformed,
+            "learnt": len(learning),
+            "moved": learning.moved,
+            "learn_refused": learning.refused,
+            "learn_malformed": learning.malformed,
         }
 
     def _now(self) -> tuple[int, int]:
@@ -581,10 +581,7 @@ class SwitchWorker:
             _LOG.warning("%s: not restored: %s", self.name, one_line(problem))
 
     def _archived(self, key: str, since: int) -> list[Item]:
-        def find(query: Mapping[str, Any], limit: int) -> list[Item]:
-            return self._engine.get(query, limit=limit)
-
-        return youngest(find, {"dataKey": key}, since, _RESTORED)
+        return youngest(self._engine, {"dataKey": key}, since, _RESTORED)
 
 
 def _fail(error: Exception) -> None:

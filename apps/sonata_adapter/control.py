@@ -29,7 +29,7 @@ from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
 from apps.sonata_adapter.planner.moves import Moves, improvements
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, copies_saved, plan
-from apps.sonata_adapter.planner.rates import Rates
+from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.planner.refinement import Crossings, Refinement, coarsest
 from apps.sonata_adapter.query.catalogue import Template
 from apps.sonata_adapter.query.dataflow import WindowTable, compile_query
@@ -121,7 +121,7 @@ class Control:
         self._stations: dict[str, _Station] = {}
         self._refinement = Refinement()
         self._moves = Moves()
-        self._rates = Rates()
+        self._rates = MeasuredRates()
         self._weighed_at = float("-inf")
         self._asked: dict[str, QueryRequest] = {}
         """Requests as asked for, by identity."""

@@ -12,7 +12,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -179,11 +179,11 @@ class SonataAdapterService:
     def start(self) -> None:
         """Subscribe to assignments and to the states of switches."""
         on_switch = self._intake.reading("switch", state_in, self._on_switch)
-        for item in youngest(self._find, {"dataKey": SWITCHES}, 0, _STATES_READ):
+        for item in youngest(self._engine, {"dataKey": SWITCHES}, 0, _STATES_READ):
             on_switch(item)
         self._engine.observe(SWITCHES).subscribe(on_switch)
         on_training = self._intake.reading("training", training_in, self._on_training)
-        for item in youngest(self._find, {"dataKey": TRAININGS}, 0, _TRAININGS_READ):
+        for item in youngest(self._engine, {"dataKey": TRAININGS}, 0, _TRAININGS_READ):
             on_training(item)
         self._engine.observe(TRAININGS).subscribe(on_training)
         self._engine.on_assignments(self._on_assignments)
@@ -227,9 +227,6 @@ class SonataAdapterService:
                 "auto_thresholds": self._auto.health(),
                 **self._intake.health(),
             }
-
-    def _find(self, query: Mapping[str, Any], limit: int) -> list[Item]:
-        return self._engine.get(query, limit=limit)
 
     def _clock(self, item: Item, switch: str) -> SteadyTime | None:
         """The clock of a switch; None, counted, for a switch beyond the limit."""
@@ -317,7 +314,7 @@ class SonataAdapterService:
         """Once active, remove the entries that a killed instance left in the switches."""
         for switch in sorted(self._switches.keys() - self._swept) if self._active else ():
             self._swept.add(switch)
-            archived = youngest(self._find, {"dataKey": f"{COMMAND}.{switch}"}, 0, _COMMANDS_READ)
+            archived = youngest(self._engine, {"dataKey": f"{COMMAND}.{switch}"}, 0, _COMMANDS_READ)
             past = (self._intake.read("command", command_in, item) for item in archived)
             self._command(switch, leftovers(command.updates for command in past if command is not None))
 
@@ -357,7 +354,7 @@ class SonataAdapterService:
 
     def _stored(self, query: str, text: str) -> CountBaseline | None:
         """The newest baseline in the archive of a query of this name that counts just this."""
-        for item in reversed(youngest(self._find, {"dataKey": f"{BASELINE}.{query}"}, 0, _BASELINES_READ)):
+        for item in reversed(youngest(self._engine, {"dataKey": f"{BASELINE}.{query}"}, 0, _BASELINES_READ)):
             found = self._intake.read("baseline", baseline_in, item)
             if found is not None and found.text == text:
                 return found

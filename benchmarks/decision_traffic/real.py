@@ -38,7 +38,6 @@ from sdnator.capture.tshark_tsv import read_rows
 from sdnator.datasets.rebuild import frame
 
 BENIGN: Final = "kitsune/mirai_38k.tsv.gz"
-BENIGN_SECONDS: Final = 1_404.6
 _MACS: Final = ("eth_src", "eth_dst", "arp_src_mac", "arp_dst_mac")
 _ADDRESSES: Final = ("ip_src_lo", "ip_dst_lo", "arp_src_ip", "arp_dst_ip")
 

@@ -14,6 +14,11 @@ import msgspec
 
 from due.messages import Item, PackedFrame
 
+NO_RIGHT = (
+    "%s has no right to %s: %s; grant its key by `sdnator app enrol`, or under [[grants]] in sdnator.toml"
+)
+"""Logged where the server refuses an app: its id, what it may not do, and the server's words."""
+
 
 @runtime_checkable
 class ArchiveDriver(Protocol):

@@ -21,6 +21,7 @@ from typing import Self
 
 from due.drivers.redis_wire import Wire, as_user
 from due.errors import UpdatesUnavailable
+from due.private_files import write_private
 
 _PR_SET_PDEATHSIG = 1
 _STARTER = """
@@ -142,7 +143,7 @@ class EmbeddedServer:
         self._directory.mkdir(parents=True, exist_ok=True)
         self.socket.unlink(missing_ok=True)
         if self._users is not None:
-            self._write_users(self._users())
+            write_private(self._directory / _USERS, self._users())
         log = self.log.open("ab")
         with log:
             self._process = subprocess.Popen(
@@ -189,13 +190,6 @@ class EmbeddedServer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
-
-    def _write_users(self, text: str) -> None:
-        path = self._directory / _USERS
-        path.unlink(missing_ok=True)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            file.write(text)
 
     def _arguments(self) -> list[str]:
         arguments = {

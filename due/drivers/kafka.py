@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 
 from confluent_kafka import Consumer, KafkaError, KafkaException, Message, Producer, TopicPartition
 
+from due.drivers.base import NO_RIGHT
 from due.drivers.kafka_control import ControlLog, topic_record
 from due.drivers.kafka_names import MOST_BYTES, KafkaAddress, is_denied, parse_kafka_url, topic_prefix
 from due.drivers.kafka_progress import Partition, PathWindow, SentRecord
@@ -298,9 +299,7 @@ class KafkaPublisher:
         if len(self._denied) >= _MOST_DENIED:
             self._denied.clear()
         self._denied.add(topic)
-        log.error(
-            "%s has no right to %s: %s; grant its key in [grants.%s]", self._app, path, reason, self._app
-        )
+        log.error(NO_RIGHT, self._app, path, reason)
         return True
 
     def _announced(self, path: str, *, reliable: bool) -> str:

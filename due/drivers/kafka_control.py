@@ -192,14 +192,14 @@ class ControlLog:
                 if group == app and not seen.left and now - seen.changed_at > seconds
             ]
 
-    def make_topic(self, topic: str, *, timeout: float = _CALL_SECONDS) -> None:
+    def make_topic(self, topic: str) -> None:
         """Make a topic with the settings of its kind, unless it is there.
 
         Raises:
             UpdatesUnavailable: no broker answers.
             BackendError: the brokers refuse.
         """
-        copies = self._address.replication or min(3, max(1, self._brokers(timeout)))
+        copies = self._address.replication or min(3, max(1, self._brokers(_CALL_SECONDS)))
         settings = {"min.insync.replicas": str(2 if copies > 2 else 1), "max.message.bytes": str(MOST_BYTES)}
         partitions = 1
         if topic.startswith(self._address.controls):
@@ -222,32 +222,32 @@ class ControlLog:
             }
         future = self._admin.create_topics([NewTopic(topic, partitions, copies, config=settings)])[topic]
         try:
-            translated(lambda: future.result(timeout), f"topic {topic}")
+            translated(lambda: future.result(_CALL_SECONDS), f"topic {topic}")
         except BackendError as error:
             if "already exists" not in str(error):
                 raise
 
-    def partitions(self, topic: str, timeout: float = _CALL_SECONDS) -> list[int]:
+    def partitions(self, topic: str) -> list[int]:
         """The numbers of a topic's partitions, remembered: they never change while we use a topic.
 
         Raises:
-            UpdatesUnavailable: not every partition has a leader; a new topic gets them within `timeout` seconds.
+            UpdatesUnavailable: not every partition has a leader; a new topic gets them within seconds.
         """
         found = self._partitions.get(topic)
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + _CALL_SECONDS
         while found is None:
             try:
-                found = self._partitions[topic] = self._described(topic, timeout)
+                found = self._partitions[topic] = self._described(topic)
             except UpdatesUnavailable:
                 if time.monotonic() > deadline or self._closed:
                     raise
                 time.sleep(0.05)
         return found
 
-    def _described(self, topic: str, timeout: float) -> list[int]:
+    def _described(self, topic: str) -> list[int]:
         # asking for a topic by `list_topics` would make it, with the brokers' settings instead of ours
-        future = self._admin.describe_topics(TopicCollection([topic]), request_timeout=timeout)[topic]
-        found = translated(lambda: future.result(timeout + 1), f"topic {topic}").partitions
+        future = self._admin.describe_topics(TopicCollection([topic]), request_timeout=_CALL_SECONDS)[topic]
+        found = translated(lambda: future.result(_CALL_SECONDS + 1), f"topic {topic}").partitions
         if not found or any(partition.leader is None for partition in found):
             raise UpdatesUnavailable(f"topic {topic} has no leader yet")
         return sorted(int(partition.id) for partition in found)

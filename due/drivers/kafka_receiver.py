@@ -22,7 +22,7 @@ from confluent_kafka import (
     TopicPartition,
 )
 
-from due.drivers.base import Delivery
+from due.drivers.base import NO_RIGHT, Delivery
 from due.drivers.kafka_control import ControlLog, ReaderRecord, reader_key, reader_record
 from due.drivers.kafka_names import MOST_BYTES, TOO_EARLY, KafkaAddress, is_denied
 from due.drivers.kafka_progress import Partition, PartitionProgress
@@ -113,7 +113,7 @@ class KafkaReceiver:
                 self._control.catch_up(_CALL_SECONDS)
                 self._listen(self._topics(pattern, reliable=False), late=False)
             except (Timeout, UpdatesUnavailable) as error:
-                log.warning("%s is subscribed to when Kafka answers: %s", pattern, error)
+                log.warning("not yet subscribed to %s, trying again: %s", pattern, error)
                 self._changed.set()
 
     def unsubscribe(self, pattern: str) -> None:
@@ -136,7 +136,7 @@ class KafkaReceiver:
                 for topic in self._topics(pattern, reliable=True):
                     self._join_if_allowed(topic, start, late=False)
             except (Timeout, UpdatesUnavailable) as error:
-                log.warning("%s is followed when Kafka answers: %s", pattern, error)
+                log.warning("not yet reading %s, trying again: %s", pattern, error)
             self._changed.set()
 
     def unfollow(self, pattern: str) -> None:
@@ -409,13 +409,7 @@ class KafkaReceiver:
             raise error
         self._counts["paths_denied"] += 1
         self._denied.add(topic)
-        log.error(
-            "%s has no right to read %s: %s; grant its key in [grants.%s]",
-            self._group,
-            topic,
-            error,
-            self._group,
-        )
+        log.error(NO_RIGHT, self._group, f"read {topic}", error)
 
     def _join_if_allowed(self, topic: str, start: str, *, late: bool) -> None:
         try:

@@ -18,6 +18,7 @@ from typing import Any
 
 import hiredis
 
+from due.drivers.base import NO_RIGHT
 from due.drivers.redis_primary import backoff_for, watch_for
 from due.drivers.redis_progress import Question
 from due.drivers.redis_receiver import RedisReceiver, channel_name
@@ -481,9 +482,7 @@ class RedisPublisher:
             self._ledgers[awaited.path].discard(awaited)
         if what not in self._denied and len(self._denied) < _DENIED_TOLD:
             self._denied.add(what)
-            log.error(
-                "%s has no right to %s: %s; grant its key in [grants.%s]", self._app, what, reply, self._app
-            )
+            log.error(NO_RIGHT, self._app, what, reply)
 
     def _lose(self, error: Exception) -> None:
         if self._wire is None:

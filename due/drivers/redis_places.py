@@ -47,6 +47,6 @@ class GroupPlaces:
                 continue
             self.unmade.pop(path, None)
             return
-        log.warning("%s has no place on %s now: %s", self._group, path, failed)
+        log.warning("the place of %s on %s is not kept yet, trying again: %s", self._group, path, failed)
         # entries from now on are wanted, even if the list is made later
         self.unmade[path] = (start, reset, time.monotonic() if since is None else since)

@@ -20,7 +20,7 @@ from typing import Any
 import hiredis
 import redis
 
-from due.drivers.base import Delivery
+from due.drivers.base import NO_RIGHT, Delivery
 from due.drivers.redis_acks import Acknowledgements
 from due.drivers.redis_aside import Aside
 from due.drivers.redis_dead_members import SILENT_SECONDS, DeadMembers
@@ -273,8 +273,7 @@ class StreamReader:
             if len(self._denied) < _MOST_PATHS:
                 self._denied.add(path)
         self._counts["paths_denied"] += 1
-        told = "%s has no right to read %s: %s; grant its key in [grants.%s]"
-        log.error(told, self._group, path, error, self._group)
+        log.error(NO_RIGHT, self._group, f"read {path}", error)
 
     def _make_list(self, path: str, start: str, *, reset: bool = False, since: float | None = None) -> None:
         """See `GroupPlaces.make`."""

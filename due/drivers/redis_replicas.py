@@ -87,7 +87,7 @@ class Confirmations:
         if now - self._missing_since > _TOLD_AFTER and not self._told:
             self._told = True
             log.warning(
-                "%d of %d replicas of %s confirm what is sent: it is kept, and writers wait when the window is full",
+                "only %d of %d replicas of %s confirm items: these are kept, and writers wait when the window is full",
                 replicas,
                 self.least,
                 self._place,

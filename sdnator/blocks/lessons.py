@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from datetime import UTC, datetime
 
-from apps.firewall.arrivals import lesson_in
 from apps.firewall.evidence.history import LESSONS
 from apps.firewall.policy.false_alarms import WEIGHT
 from apps.messages import FalseAlarm, Ground, MessageError, one_line
@@ -15,7 +14,7 @@ def lessons_in_force(archive: str) -> list[FalseAlarm]:
     held: dict[str, FalseAlarm] = {}
     for item in find(archive, LESSONS):
         try:
-            lesson = lesson_in(item)
+            lesson = FalseAlarm.from_item(item)
         except MessageError:
             continue
         held.pop(lesson.id, None)

@@ -9,9 +9,9 @@ import typer
 from due.drivers.redis_rights import Rights
 from due.errors import InvalidKey
 from due.keys import Key
+from due.private_files import write_private_json
 from sdnator.config import config_file
 from sdnator.errors import BadInput
-from sdnator.private_files import write_private_json
 from sdnator.rights.audit_trail import note
 from sdnator.rights.granting import OPERATOR, is_dangerous
 from sdnator.rights.identities import Identities, credential_file

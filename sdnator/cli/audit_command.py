@@ -10,6 +10,7 @@ import typer
 from apps.messages import Instruction, MessageError
 from due import Item
 from sdnator.blocks.blocks_archive import find
+from sdnator.cli.due_commands import Archive
 from sdnator.cli.plain_table import plain_table
 from sdnator.notation import instant_ns
 from sdnator.rights.audited_deed import AUDITED, AuditedDeed
@@ -18,8 +19,6 @@ _INSTRUCTIONS = "network.instruction.*.*"
 _PAGE = "dashboard"
 """Its instructions stand among the deeds, with the name of the user who gave them."""
 
-ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
-
 
 def audit(
     *,
@@ -27,7 +26,7 @@ def audit(
         str, typer.Option(help="Since: 1h or 7d ago, or a local time such as 2024-05-01T12:00.")
     ] = "7d",
     who: Annotated[str, typer.Option(help="Only what this user or app did.", metavar="NAME")] = "",
-    archive: ArchiveOption = "",
+    archive: Archive = "",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Show the audit trail: sign-ins, refusals, changes of users and apps, instructions to firewall and detector.

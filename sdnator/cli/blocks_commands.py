@@ -31,6 +31,7 @@ from sdnator.blocks.blocks_nft import nft_sets
 from sdnator.blocks.blocks_places import PlaceAnswer, answers_of
 from sdnator.blocks.blocks_why import as_text, decision_line, life_of
 from sdnator.blocks.lessons import lesson_lines, lessons_in_force
+from sdnator.cli.due_commands import Archive, Updates
 from sdnator.cli.plain_table import fitted
 from sdnator.cli.switch_place import Insecure, SwitchAddress, place_of
 from sdnator.errors import BadInput, PipelineError
@@ -48,8 +49,6 @@ _ANSWER: Final = "network.answer.firewall.operator"
 _ANSWER_SECONDS: Final = 10.0
 _PANIC_SECONDS: Final = 3.0
 
-UpdatesOption = Annotated[str, typer.Option("--updates", help="Data Updates URL; default: $DUE_UPDATES.")]
-ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
 ReasonOption = Annotated[str, typer.Option(help="Reason; it is stored with the decision.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard output.")]
 
@@ -57,7 +56,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard outpu
 @blocks.command("list")
 def list_blocks(
     *,
-    archive: ArchiveOption = "",
+    archive: Archive = "",
     every: Annotated[bool, typer.Option("--all", help="Include lifted decisions.")] = False,
     nft: Annotated[
         bool, typer.Option("--nft", help="Print sets for `nft -f`, for hosts without a switch.")
@@ -92,7 +91,7 @@ def why(
         str, typer.Argument(metavar="ID", help="ID of a decision, as shown by `blocks list`.")
     ],
     *,
-    archive: ArchiveOption = "",
+    archive: Archive = "",
     as_json: JsonOption = False,
 ) -> None:
     """Why a decision was made, in five lines; then its history, earlier offences, confirmations, drops.
@@ -109,8 +108,8 @@ def add_block(
     *,
     reason: ReasonOption = "",
     seconds: Annotated[int, typer.Option(help="Length of the block in seconds.", min=1)] = 600,
-    updates: UpdatesOption = "",
-    archive: ArchiveOption = "",
+    updates: Updates = "",
+    archive: Archive = "",
 ) -> None:
     """Block an address, a prefix or a MAC (on one port) on all switches; the allow-list wins.
 
@@ -124,8 +123,8 @@ def remove_block(
     subject: Annotated[str, typer.Argument(metavar="ID|ADDRESS")],
     *,
     reason: ReasonOption = "",
-    updates: UpdatesOption = "",
-    archive: ArchiveOption = "",
+    updates: Updates = "",
+    archive: Archive = "",
 ) -> None:
     """Lift blocks, or guards and rate limits set because of a flood, by decision id or address.
 
@@ -144,8 +143,8 @@ def false_alarm(
         bool, typer.Option("--revoke", help="Revoke a false alarm: its evidence counts in full again.")
     ] = False,
     reason: ReasonOption = "",
-    updates: UpdatesOption = "",
-    archive: ArchiveOption = "",
+    updates: Updates = "",
+    archive: Archive = "",
 ) -> None:
     """Undo a block or guard, and let evidence of this kind about this sender count a tenth from now on.
 
@@ -158,7 +157,7 @@ def false_alarm(
 
 
 @blocks.command("false-alarms")
-def false_alarms(*, archive: ArchiveOption = "", as_json: JsonOption = False) -> None:
+def false_alarms(*, archive: Archive = "", as_json: JsonOption = False) -> None:
     """List the decisions called false alarms, whose evidence still counts less.
 
     Example: sdnator blocks false-alarms
@@ -174,8 +173,8 @@ def false_alarms(*, archive: ArchiveOption = "", as_json: JsonOption = False) ->
 @blocks.command("panic")
 def panic(
     *,
-    updates: UpdatesOption = "",
-    archive: ArchiveOption = "",
+    updates: Updates = "",
+    archive: Archive = "",
     direct: Annotated[
         bool, typer.Option("--direct", help="Do not ask the firewall; change archive and switch directly.")
     ] = False,
@@ -233,8 +232,8 @@ def allow_add(
     entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC")],
     *,
     reason: ReasonOption = "",
-    updates: UpdatesOption = "",
-    archive: ArchiveOption = "",
+    updates: Updates = "",
+    archive: Archive = "",
 ) -> None:
     """Never block this entry; blocks that overlap it are lifted.
 
@@ -248,8 +247,8 @@ def allow_remove(
     entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC")],
     *,
     reason: ReasonOption = "",
-    updates: UpdatesOption = "",
-    archive: ArchiveOption = "",
+    updates: Updates = "",
+    archive: Archive = "",
 ) -> None:
     """Take an entry off the allow-list.
 
@@ -259,7 +258,7 @@ def allow_remove(
 
 
 @allow.command("list")
-def allow_list(*, archive: ArchiveOption = "") -> None:
+def allow_list(*, archive: Archive = "") -> None:
     """Entries that operators have added; those of the firewall's settings are not listed.
 
     Example: sdnator allow list

@@ -71,7 +71,7 @@ def keys(*, url: Url = "", as_json: Json = False) -> None:
     if as_json:
         print(json.dumps(found))
         return
-    names = ("made by", "delivery", "archive", "goes to", "key")
+    names = ("producer", "delivery", "archive", "consumers", "key")
     print(plain_table(names, _made(found["capabilities"], found["flow"])))
     served = {(flow["consumer"], flow["interest"]) for flow in found["flow"]}
     unserved = [

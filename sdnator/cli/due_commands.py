@@ -34,7 +34,9 @@ KeyArgument = Annotated[
 ]
 Updates = Annotated[
     str,
-    typer.Option(help="Data Updates; default: of the running pipeline.", metavar="URL", envvar="DUE_UPDATES"),
+    typer.Option(
+        help="Data Updates; default: those of the running pipeline.", metavar="URL", envvar="DUE_UPDATES"
+    ),
 ]
 Archive = Annotated[
     str,

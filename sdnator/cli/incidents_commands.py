@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from sdnator.cli.due_commands import Archive
 from sdnator.cli.plain_table import fitted
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import as_json, as_text, row
@@ -14,7 +15,6 @@ from sdnator.notation import instant_ns
 
 incidents = typer.Typer(help="Incidents: list them, show one.", no_args_is_help=True)
 
-ArchiveOption = Annotated[str, typer.Option("--archive", help="Data Archives URL; default: $DUE_ARCHIVE.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on standard output.")]
 
 
@@ -28,7 +28,7 @@ def list_incidents(
         ),
     ] = "",
     only_open: Annotated[bool, typer.Option("--open", help="Only open incidents.")] = False,
-    archive: ArchiveOption = "",
+    archive: Archive = "",
     as_json_list: JsonOption = False,
 ) -> None:
     """List incidents, oldest first: time, kind, attacker, victims, remedy, packets stopped.
@@ -55,7 +55,7 @@ def list_incidents(
 def show_incident(
     name: Annotated[str, typer.Argument(metavar="ID", help="ID of an incident, or of a decision in one.")],
     *,
-    archive: ArchiveOption = "",
+    archive: Archive = "",
     as_json_object: JsonOption = False,
 ) -> None:
     """Show everything about one incident: evidence, decisions, packets stopped.

@@ -37,12 +37,15 @@ def plan_command(
     pps: Annotated[
         float | None,
         typer.Option(
-            help="Packets a second, at all switches together; needed unless --measure.", show_default=False
+            help="Packets per second, at all switches together; required unless --measure is given.",
+            show_default=False,
         ),
     ] = None,
-    queries: Annotated[int, typer.Option(help="Queries beside those that the pipeline asks by itself.")] = 0,
+    queries: Annotated[
+        int, typer.Option(help="Queries in addition to those that the pipeline itself asks.")
+    ] = 0,
     consumers: Annotated[int, typer.Option(help="Further apps that read every score.")] = 0,
-    archive_days: Annotated[float, typer.Option(help="Days that the archive keeps.")] = 1.0,
+    archive_days: Annotated[float, typer.Option(help="Days for which the archive keeps items.")] = 1.0,
     blocks: Annotated[int, typer.Option(help="Blocks in force.")] = 0,
     costs: Annotated[
         Path | None,
@@ -57,11 +60,11 @@ def plan_command(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Calculate what a pipeline takes: processes, cores, memory, archive, and what limits it.
+    """Calculate what a pipeline needs: processes, cores, memory, archive, and what limits it.
 
-    The costs of a packet come from a measurement: the product's, of the machine that is named in the output, or with
-    --measure one of this machine. For that a pipeline runs for two minutes in a folder and on interfaces of its own,
-    and needs the machine for itself.
+    What a packet costs was measured: on the machine that the output names or, with --measure, on this one. The
+    measurement runs a pipeline for two minutes, in a folder and on interfaces of its own; nothing else should run
+    meanwhile.
 
     Exit codes: 0 done, 1 the measurement failed, 2 bad input or misuse.
 
@@ -99,14 +102,14 @@ def _measured(path: Path) -> "Costs":
 
     if sys.platform != "linux" or os.geteuid() != 0 or shutil.which("ip") is None:
         raise BadInput(
-            "--measure: interfaces for its switches need Linux, root and the program ip (iproute2)"
+            "--measure: the interfaces of its switches need Linux, root and the program ip (iproute2)"
         )
     require_compiler()
     if not path.absolute().parent.is_dir():
         raise BadInput(f"--costs {path}: there is no folder {path.absolute().parent}")
     found = measured(Schedule(), lambda text: print(f"sdnator: {text}", file=sys.stderr, flush=True))
     write(path, found)
-    print(f"sdnator: the costs stand in {path}; use them with --costs {path}", file=sys.stderr)
+    print(f"sdnator: the costs are in {path}; use them with --costs {path}", file=sys.stderr)
     return found
 
 

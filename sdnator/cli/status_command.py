@@ -201,9 +201,9 @@ def controlled(health: Mapping[str, Any]) -> dict[str, Any] | None:
     told = health.get("apps", {}).get("p4runtime_ctrl", {}).get("health", {}).get("app", {})
     if "switches" not in told:
         return None
-    names = ("connected", "primary", "fail", "stations")
+    names = ("connected", "primary", "fail", "learnt")
     switches = {one["switch"]: {name: one[name] for name in names if name in one} for one in told["switches"]}
-    return {"sentinel": bool(told.get("sentinel")), "switches": switches}
+    return {"watchdog": bool(told.get("watchdog")), "switches": switches}
 
 
 def control_lines(control: Mapping[str, Any] | None, wired: Collection[str]) -> Iterator[str]:
@@ -211,11 +211,11 @@ def control_lines(control: Mapping[str, Any] | None, wired: Collection[str]) -> 
     for name, one in (control or {"switches": {}})["switches"].items():
         state = "under control" if one.get("connected") and one.get("primary") else "NOT under control"
         if one.get("fail") == "closed":
-            watch = "a watchdog runs" if control and control["sentinel"] else "but NO watchdog runs"
+            watch = "a watchdog runs" if control and control["watchdog"] else "but NO watchdog runs"
             fails = f"fails closed, {watch if name in wired else 'and has no port forwarding'}"
         else:
             fails = "fails open: port forwarding stays without a controller"
-        learnt = f"; {counted(one['stations'], 'MAC address')} learnt" if "stations" in one else ""
+        learnt = f"; {counted(one['learnt'], 'MAC address')} learnt" if "learnt" in one else ""
         yield f"switch {name} is {state}; it {fails}{learnt}"
 
 

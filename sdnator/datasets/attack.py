@@ -5,7 +5,7 @@
                                     UDP flood … SYN flood … ACK flood … (again)
 
 Every packet here belongs to the attack and names its sender.  What victims answer, and what the
-infected camera sends for its own purposes, is harmless and made elsewhere.
+infected camera sends for its own purposes, is benign and made elsewhere.
 
 Source of the behaviour: Antonakakis et al., Understanding the Mirai Botnet, USENIX Security 2017:
 stateless SYN scan with the target's address as sequence number, port 23 nine times of ten, else 2323.

@@ -1,4 +1,4 @@
-"""Harmless traffic of a house full of devices whose uplink is dead.
+"""Benign traffic of a house full of devices whose uplink is dead.
 
 Every function is one device, or one habit of several: it yields what is sent from `start` to `end`.
 Periods, sizes and destinations resemble the first 38,363 packets of the public Mirai capture: 27
@@ -16,7 +16,7 @@ Device = Callable[[Chance, int, int], Iterator[SentPacket]]
 
 
 def traffic(seed: int, start: int, end: int, news: int) -> list[SentPacket]:
-    """All harmless packets from `start` to `end` (µs), in order of time; from `news` on there is a new habit."""
+    """All benign packets from `start` to `end` (µs), in order of time; from `news` on there is a new habit."""
     sent = [
         packet
         for number, device in enumerate((*DEVICES, media_player))

@@ -4,7 +4,7 @@
     flows   ──► key, begin and end of each attack ───┴─► packets between begin and end ──► Labels
 
 A packet is one of an attack when the *originator* of a flow with such a label sent it, to the flow's
-destination, within the flow's time and a second around it.  Replies of victims are not: they are harmless,
+destination, within the flow's time and a second around it.  Replies of victims are not: they are benign,
 as in all labels of this product.  Where flows of two labels share their key and time (CICIDS2017 knows
 minutes only), the attack wins.  Packets without ports of their own (fragments, quoted headers) match flows
 of protocols without ports only.

@@ -38,9 +38,9 @@ class MiraiLikeOptions:
 
     seed: int = 1
     benign_seconds: float = 3_000
-    """Harmless traffic before the infection, about 27 packets a second."""
+    """Benign traffic before the infection, about 27 packets a second."""
     attack_seconds: float = 720
-    """From the infection to the end; harmless traffic goes on. 0 = no attack."""
+    """From the infection to the end; benign traffic goes on. 0 = no attack."""
     background: bool = True
     """False = the attack and its answers only, to be spliced behind a real capture."""
     plan: attack.AttackPlan = field(default_factory=attack.AttackPlan)
@@ -104,7 +104,7 @@ def generate(options: MiraiLikeOptions) -> Iterator[WireFrame]:
     """The frames of a capture, in order of time."""
     onset = int(options.benign_seconds * SECOND) if options.background else 0
     end = onset + int(options.attack_seconds * SECOND)
-    harmless = benign.traffic(options.seed, 0, end, int(onset * _NEWS_AT)) if options.background else []
+    background = benign.traffic(options.seed, 0, end, int(onset * _NEWS_AT)) if options.background else []
     hostile = attack.traffic(options.seed, onset, end, options.plan)
-    sent: Iterator[SentPacket] = heapq.merge(harmless, hostile, key=lambda packet: packet.time)
+    sent: Iterator[SentPacket] = heapq.merge(background, hostile, key=lambda packet: packet.time)
     return NetworkModel(Chance(options.seed, 3), SNAP, cookies=options.plan.answer_all).carry(sent)

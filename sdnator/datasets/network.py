@@ -3,7 +3,7 @@
     Sent … (in order of time) ──► NetworkModel.answers ──► Frame …
 
 The uplink is dead, as it was in the lab of the original: the gateway answers what goes out with ICMP
-unreachable, at most one a second for each asker.  Victims answer floods; their answers are harmless.
+unreachable, at most one a second for each asker.  Victims answer floods; their answers are benign.
 """
 
 import heapq

@@ -3,7 +3,7 @@
     BENIGN ─────────────────► gap ─► ATTACK ─────► OUT.pcap + OUT.labels.csv
 
 Packets keep their bytes.  Labels of either part are used where there are any; without them every
-packet of BENIGN is harmless and every packet of ATTACK belongs to the attack, its attacker being the
+packet of BENIGN is benign and every packet of ATTACK belongs to the attack, its attacker being the
 sender of its first packet.
 """
 

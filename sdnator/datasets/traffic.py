@@ -34,7 +34,7 @@ class SentPacket(NamedTuple):
     payload: bytes = b""
     """What is known of the payload (or the whole frame, when raw); the rest is zeros."""
     attacker: str = ""
-    """MAC of the attacking sender; empty for harmless packets."""
+    """MAC of the attacking sender; empty for benign packets."""
     answered: bool = False
     """A name server answers this query."""
 

@@ -110,7 +110,7 @@ def read(path: Path) -> Costs:
     except OSError as error:
         raise BadInput(f"--costs {path}: {error.strerror}; `sdnator plan --measure` writes one") from None
     if len(text) > _MOST_BYTES:
-        raise BadInput(f"--costs {path}: larger than {_MOST_BYTES:,} bytes, so it is no file of costs")
+        raise BadInput(f"--costs {path}: larger than {_MOST_BYTES:,} bytes, so it is not a file of costs")
     return decoded(text, f"--costs {path}")
 
 

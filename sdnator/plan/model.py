@@ -205,7 +205,7 @@ def _notes(demand: PipelineDemand, costs: Costs, cores: float, gb_per_day: float
     if rate > high:
         yield (
             f"{rate:,.0f} packets a second at each switch is more than was measured (up to {high:,.0f}): "
-            f"extrapolated with what a packet costs there"
+            f"extrapolated from what a packet costs there"
         )
     elif rate < low:
         yield (
@@ -221,8 +221,8 @@ def _notes(demand: PipelineDemand, costs: Costs, cores: float, gb_per_day: float
         yield f"a switch serves {MOST_QUERIES} requests for packets at most; some of these queries will be refused"
     if demand.blocks:
         yield (
-            f"{demand.blocks:,} blocks are {demand.blocks * demand.switches:,} table entries, since each stands in "
-            "every switch; they hardly cost CPU for a packet, and what they take in memory was not measured"
+            f"{demand.blocks:,} blocks are {demand.blocks * demand.switches:,} table entries, since each is in "
+            "every switch; they hardly add CPU time to a packet, and how much memory they take was not measured"
         )
     if demand.blocks > MOST_BLOCKS:
         yield f"the firewall holds {MOST_BLOCKS:,} blocks at most, unless rules.max_blocks says otherwise"

@@ -1,7 +1,7 @@
 """CPU, memory and traffic of a process and all below it, from /proc."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,25 +31,37 @@ def usages(root: int, names: Mapping[int, str], *, memory: bool = False) -> dict
         memory: whether to look at it.
     """
     found: dict[str, Usage] = {}
-    for pid, name in _tree(root, {root: "supervisor", **names}, "supervisor"):
+    for pid, name in process_tree(root, {root: "supervisor", **names}, _called):
         with suppress(OSError, ValueError):
             _add(found.setdefault(name, Usage()), Path(f"/proc/{pid}"), memory=memory)
     return {name: each for name, each in found.items() if each.processes}
 
 
-def _tree(pid: int, names: Mapping[int, str], above: str) -> Iterator[tuple[int, str]]:
-    name = names.get(pid) or ("spare" if _is_switch(pid) else above)
+def process_tree(
+    pid: int, names: Mapping[int, str], called: Callable[[int, str], str], above: str = ""
+) -> Iterator[tuple[int, str]]:
+    """A process and all below it, with their names.
+
+    Args:
+        pid: process id.
+        names: of known processes, by id.
+        called: name of another one, from its id and the name of the process above.
+        above: that name for `pid` itself.
+    """
+    name = names.get(pid) or called(pid, above)
     yield pid, name
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
-            for child in (task / "children").read_text().split():
-                yield from _tree(int(child), names, name)
+            with suppress(OSError):  # a thread that ends meanwhile
+                for child in (task / "children").read_text().split():
+                    yield from process_tree(int(child), names, called, name)
 
 
-def _is_switch(pid: int) -> bool:
+def _called(pid: int, above: str) -> str:
     with suppress(OSError):
-        return b"\0-m\0dataplane\0" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    return False
+        if b"\0-m\0dataplane\0" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            return "spare"
+    return above
 
 
 def _add(total: Usage, process: Path, *, memory: bool) -> None:

@@ -1,4 +1,4 @@
-"""Harmless frames of a house, over and over, into interfaces at a steady rate."""
+"""Benign frames of a house, over and over, into interfaces at a steady rate."""
 
 import itertools
 import time

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sdnator.replay.packet_accounting import PacketState
 
-HARMLESS, ATTACK, DROPPED, BLOCK, INK = "#3b78c3", "#d1342f", "#e08a00", "#111111", "#555555"
+BENIGN, ATTACK, DROPPED, BLOCK, INK = "#3b78c3", "#d1342f", "#e08a00", "#111111", "#555555"
 FLOOR, CEILING = 1e-3, 1e4
 """Scores outside are drawn at the edge: some are rounding noise, some are 1e16 by construction."""
 _STRIP: Final = FLOOR / 3
@@ -75,7 +75,7 @@ def _draw_curve(plot: Any, curve: Curve, scale: float, line: float) -> None:
     shown = (curve.state == PacketState.SCORED) & np.isfinite(curve.score)
     attack = curve.attack if curve.attack is not None else np.zeros(len(time), np.bool_)
     for chosen, colour, size, layer in (
-        (shown & ~attack, HARMLESS, 1.1, 2),
+        (shown & ~attack, BENIGN, 1.1, 2),
         (shown & attack, ATTACK, 1.6, 3),
     ):
         heights = np.clip(curve.score[chosen], FLOOR, CEILING)
@@ -159,7 +159,7 @@ def _legend(figure: Figure, curves: Sequence[Curve]) -> None:
         return Line2D([], [], marker="o", linestyle="", markersize=5, color=colour, label=text)
 
     labelled = any(curve.attack is not None for curve in curves)
-    handles = [dot(HARMLESS, "harmless packet" if labelled else "packet")]
+    handles = [dot(BENIGN, "benign packet" if labelled else "packet")]
     if labelled:
         handles.append(dot(ATTACK, "attack packet"))
     if any((curve.state == PacketState.DROPPED).any() for curve in curves):

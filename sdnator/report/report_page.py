@@ -107,7 +107,7 @@ def _stopped(summary: Mapping[str, Any]) -> str:
         return ""
     hit = summary.get("benign_dropped")
     others = (
-        "" if hit is None else "; nobody else was hit" if hit == 0 else f"; {hit:,} harmless packets were hit"
+        "" if hit is None else "; nobody else was hit" if hit == 0 else f"; {hit:,} benign packets were hit"
     )
     return f"; {share} of the attack stopped from then on{others}"
 
@@ -142,9 +142,9 @@ def _tiles(summary: Mapping[str, Any]) -> Iterator[str]:
             f"of {summary['attack_after_first_block']:,} attack packets after the block were dropped",
         )
     if (hit := summary.get("benign_dropped")) is not None:
-        yield _tile("good" if hit == 0 else "bad", f"{hit:,}", "packets of harmless senders dropped")
+        yield _tile("good" if hit == 0 else "bad", f"{hit:,}", "packets of benign senders dropped")
     if (collateral := summary.get("collateral_dropped")) is not None:
-        yield _tile("plain", f"{collateral:,}", "harmless packets of the attacker itself dropped with it")
+        yield _tile("plain", f"{collateral:,}", "benign packets of the attacker itself dropped with it")
     if (lost := summary.get("packets_lost")) is not None:
         yield _tile("good" if lost == 0 else "bad", f"{lost:,}", "packets lost on the way")
     if (area := summary.get("auc")) is not None:

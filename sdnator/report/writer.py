@@ -183,11 +183,11 @@ def _curves(data: ReportData) -> list[Curve]:
 
 
 def _facts(data: ReportData, each: PassData) -> dict[str, float]:
-    """Median scores of harmless and attack packets of a pass, where labels tell them apart."""
+    """Median scores of benign and attack packets of a pass, where labels tell them apart."""
     scored = np.isfinite(each.score) & (each.state == report_files.SCORED)
     attack = data.attack if data.attack is not None else np.zeros(len(scored), np.bool_)
     facts = {}
-    for name, chosen in (("harmless", scored & ~attack), ("attack", scored & attack)):
+    for name, chosen in (("benign", scored & ~attack), ("attack", scored & attack)):
         if chosen.any():
             facts[f"median score, {name}"] = float(np.median(each.score[chosen]))
     return facts

@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from due.private_files import write_private
 from sdnator.errors import BadInput
-from sdnator.private_files import write_private
 
 CA = "ca"
 _CA_DAYS = 3_650

@@ -23,8 +23,8 @@ import msgspec
 from due.drivers.redis_rights import Rights, acl_rules
 from due.drivers.redis_wire import as_user
 from due.keys import Key
+from due.private_files import write_private
 from sdnator.errors import BadInput
-from sdnator.private_files import write_private
 from sdnator.rights.granting import OPERATOR, operator
 
 FILE = "identities.json"

@@ -4,7 +4,7 @@ import hmac
 import secrets
 from pathlib import Path
 
-from sdnator.private_files import write_private
+from due.private_files import write_private
 
 FILE = "dashboard.link"
 PATH = "/link/"

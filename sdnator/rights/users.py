@@ -16,8 +16,8 @@ from typing import Literal
 
 import msgspec
 
+from due.private_files import write_private
 from sdnator.errors import BadInput
-from sdnator.private_files import write_private
 
 FILE = "users.json"
 OWNER = "owner"

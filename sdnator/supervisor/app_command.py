@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from due.private_files import write_private_json
 from sdnator.app_catalogue import OURS
-from sdnator.private_files import write_private_json
 
 MODULES: Mapping[str, str] = {
     "coordinator": "coordinator.service",

@@ -29,6 +29,7 @@ SECRET_VARIABLES = (
 _PARENT_VARIABLE = "DUE_PARENT"
 """`due.service.PARENT_VARIABLE`; importing that takes longer than `sdnator --help` may."""
 _LONGEST_LINE = 1 << 20
+_LAST_LINES = 5
 _COUNT = re.compile(rb"\.([0-9]{1,18});")
 """See `dataplane.heartbeat`."""
 
@@ -223,12 +224,12 @@ class Child:
                 setattr(self, name, -1)
 
 
-def last_words(log: Path, lines: int = 5) -> str:
+def last_words(log: Path) -> str:
     """The end of a log, as the second half of a message."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - 8192))
-            last = file.read().decode("utf-8", "replace").splitlines()[-lines:]
+            last = file.read().decode("utf-8", "replace").splitlines()[-_LAST_LINES:]
     except OSError:
         return ""
     return "; its last log lines:\n  " + "\n  ".join(last) if last else " with an empty log"

@@ -269,10 +269,10 @@ class Part:
         self.state, self._start_at = "waiting", float("inf")
 
 
-def stop(process: PartProcess, seconds: float = _END_SECONDS) -> None:
+def stop(process: PartProcess) -> None:
     """Ask a process to end, wait for it, and kill it if it does not end."""
     process.ask_to_end()
-    deadline = time.monotonic() + seconds
+    deadline = time.monotonic() + _END_SECONDS
     while process.ended() is None and time.monotonic() < deadline:
         time.sleep(0.005)
     process.close()

@@ -113,13 +113,28 @@ class AppRun:
         writer.flush()
 
     def written(self, key: str = "**") -> list[Item]:
-        """What the app has published so far under a key (wildcards allowed), in order."""
+        """What the app has published so far.
+
+        Args:
+            key: under which key; wildcards are allowed.
+
+        Returns:
+            The items, in the order in which they were written.
+        """
         wanted = Key.parse(key)
         with self._changed:
             return [item for item in self._written if wanted.matches(Key(item.key))]
 
     def wait_for(self, key: str, count: int = 1, *, seconds: float = 30.0) -> list[Item]:
-        """The first `count` items under a key, as soon as they are there.
+        """Wait until the app has published something.
+
+        Args:
+            key: under which key; wildcards are allowed.
+            count: number of items to wait for.
+            seconds: how long at most.
+
+        Returns:
+            The first `count` items, as soon as they are there.
 
         Raises:
             NothingWritten: after `seconds`, with what the app wrote instead.
@@ -131,11 +146,22 @@ class AppRun:
             return self.written(key)[:count]
 
     def archived(self, key: str) -> list[Item]:
-        """What the archive holds under a key, oldest first."""
+        """What the archive holds, whoever wrote it.
+
+        Args:
+            key: under which key; wildcards are allowed.
+
+        Returns:
+            The items, oldest first.
+        """
         return self._world.get(key)
 
     def health(self) -> dict[str, Any]:
-        """The app's own health report."""
+        """Ask the app how it is.
+
+        Returns:
+            Its health report, as the service makes it.
+        """
         return dict(self.service.health())
 
     def _engine(self, app_id: str, options: Options, stack: ExitStack, **declared: Any) -> Engine:

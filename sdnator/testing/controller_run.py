@@ -99,6 +99,9 @@ class ControllerRun:
             settings: of the service; None: its defaults.
             engine: options of its engine, as of `due.Options`; None: the defaults.
 
+        Returns:
+            Its process, which the run ends.
+
         Raises:
             PipelineError: it ended instead; the text has its last words.
         """
@@ -119,6 +122,9 @@ class ControllerRun:
 
         Args:
             options: of its settings; `switches` instead of the one switch of this run.
+
+        Returns:
+            Its process, which the run ends.
         """
         switch = {
             "name": "s1",
@@ -133,16 +139,23 @@ class ControllerRun:
         return self.run("apps.p4runtime_ctrl.service", settings)
 
     def kill(self, process: Child) -> None:
-        """As `kill -9` does."""
+        """End a process as `kill -9` does.
+
+        Args:
+            process: one that `run` or `controller` has started.
+        """
         process.kill()
         process.close()
 
     def engine(self, app_id: str = "firewall", **init: Any) -> Engine:
-        """An engine of this process, closed at the end.
+        """Open an engine in this process; the run closes it.
 
         Args:
             app_id: whose keys it may write.
             init: further arguments of `Engine.init`.
+
+        Returns:
+            The engine, connected.
         """
         engine = Engine(Options(directory=str(self.folder / "due"), handshake_timeout=5.0))
         engine.set_pubsub(self.server.url)
@@ -152,11 +165,19 @@ class ControllerRun:
         return engine
 
     def feed(self) -> CaptureFeed:
-        """What feeds the capture port 1; to be closed by the caller."""
+        """Connect to the capture port 1.
+
+        Returns:
+            What feeds it; the caller closes it.
+        """
         return CaptureFeed(str(self._sockets))
 
     def log(self) -> str:
-        """What the controller has logged."""
+        """Read the controller's log.
+
+        Returns:
+            All that it has logged so far.
+        """
         return (self.folder / "apps.p4runtime_ctrl.service.log").read_text(encoding="utf-8")
 
 
@@ -224,23 +245,43 @@ class Bystander:
         self._connection.close()
 
     def became_primary(self, _session: object) -> None:
-        """It is primary."""
+        """It is primary.
+
+        Args:
+            _session: of the connection.
+        """
         self._primary.set()
 
     def became_backup(self) -> None:
         """Nothing follows from it."""
 
     def lost(self, cause: str) -> None:
-        """Nothing follows from it."""
+        """Nothing follows from it.
+
+        Args:
+            cause: why the connection ended.
+        """
 
     def packets(self, messages: object) -> None:
-        """They are dropped."""
+        """Drop packet-ins.
+
+        Args:
+            messages: PacketIn messages.
+        """
 
     def digests(self, lists: object) -> None:
-        """They are dropped."""
+        """Drop digests.
+
+        Args:
+            lists: serialized DigestLists.
+        """
 
     def other(self, message: object) -> None:
-        """It is dropped."""
+        """Drop any other message.
+
+        Args:
+            message: a StreamMessageResponse.
+        """
 
 
 class Heard:
@@ -257,12 +298,23 @@ class Heard:
         self.subscriptions = [engine.observe(key).subscribe(self.items.append) for key in keys]
 
     def arrivals(self) -> NDArray[np.uint64]:
-        """Arrival numbers of all packets heard so far, shape (n,)."""
+        """Which packets it has heard of.
+
+        Returns:
+            Arrival numbers of all packets so far, in the order of their items, shape (n,).
+        """
         batches = [item.value["arrival"] for item in self.items if item.key == PACKETS]
         return np.concatenate(batches) if batches else np.zeros(0, dtype=np.uint64)
 
     def values(self, part: str) -> list[dict[str, Any]]:
-        """Values of the items whose key has this part."""
+        """Values of some of the items.
+
+        Args:
+            part: text that their keys contain.
+
+        Returns:
+            The values, in the order of the items.
+        """
         return [item.value for item in self.items if part in item.key]
 
     def stop(self) -> None:

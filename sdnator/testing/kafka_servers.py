@@ -21,7 +21,7 @@ from confluent_kafka import KafkaException
 from confluent_kafka.admin import AdminClient
 
 from due.drivers.kafka_names import parse_kafka_url
-from sdnator.private_files import write_private
+from due.private_files import write_private
 from sdnator.rights.certificates import CA, CertificateFolder
 from sdnator.testing.ports import free_port
 

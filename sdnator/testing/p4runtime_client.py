@@ -83,14 +83,21 @@ class P4RuntimeClient:
     # -- stream ---------------------------------------------------------------------------------------
 
     def send(self, request: Any) -> None:
-        """Put a StreamMessageRequest on the stream."""
+        """Put a message on the stream.
+
+        Args:
+            request: a StreamMessageRequest.
+        """
         self._requests.put(request)
 
     def arbitrate(self, election_id: int | None = None) -> Any:
-        """Ask to be primary and return the switch's first answer, a MasterArbitrationUpdate.
+        """Ask to be primary, and wait for the switch's answer.
 
         Args:
             election_id: from now on; None: as before.
+
+        Returns:
+            The first answer, a MasterArbitrationUpdate.
 
         Raises:
             queue.Empty: no answer came within TIMEOUT_S.
@@ -112,7 +119,12 @@ class P4RuntimeClient:
         self.send(request)
 
     def packet_out(self, payload: bytes, metadata: dict[int, bytes]) -> None:
-        """Send a frame; `metadata` by the ids of the p4info's packet_out header."""
+        """Send a packet-out.
+
+        Args:
+            payload: the frame.
+            metadata: values by the ids of the p4info's packet_out header.
+        """
         request = p4runtime.StreamMessageRequest()
         request.packet.payload = payload
         for number, value in metadata.items():
@@ -126,7 +138,15 @@ class P4RuntimeClient:
         message.high, message.low = number >> 64, number & (1 << 64) - 1
 
     def set_pipeline(self, config: Any | None, action: str = "VERIFY_AND_COMMIT") -> Any:
-        """Load a program: a ForwardingPipelineConfig, or None with an action that takes none."""
+        """Load a program.
+
+        Args:
+            config: a ForwardingPipelineConfig; None with an action that takes none.
+            action: name of an Action of SetForwardingPipelineConfigRequest.
+
+        Returns:
+            The SetForwardingPipelineConfigResponse.
+        """
         request = p4runtime.SetForwardingPipelineConfigRequest(device_id=self.device_id, role=self.role)
         self._number(request.election_id)
         request.action = getattr(p4runtime.SetForwardingPipelineConfigRequest, action)
@@ -135,7 +155,14 @@ class P4RuntimeClient:
         return self.stub.SetForwardingPipelineConfig(request, timeout=TIMEOUT_S)
 
     def get_pipeline(self, kind: str = "ALL") -> Any:
-        """The switch's ForwardingPipelineConfig; `kind` says which of its parts."""
+        """Read which program is loaded.
+
+        Args:
+            kind: which parts: name of a ResponseType of GetForwardingPipelineConfigRequest.
+
+        Returns:
+            The ForwardingPipelineConfig.
+        """
         kind_number = getattr(p4runtime.GetForwardingPipelineConfigRequest, kind)
         request = p4runtime.GetForwardingPipelineConfigRequest(
             device_id=self.device_id, response_type=kind_number
@@ -143,18 +170,41 @@ class P4RuntimeClient:
         return self.stub.GetForwardingPipelineConfig(request, timeout=TIMEOUT_S).config
 
     def write_request(self, *updates: Any, atomicity: str = "CONTINUE_ON_ERROR") -> Any:
-        """The WriteRequest that `write` sends."""
+        """Make the request that `write` sends.
+
+        Args:
+            updates: as `insert`, `modify` and `delete` make them.
+            atomicity: name of an Atomicity of WriteRequest.
+
+        Returns:
+            The WriteRequest.
+        """
         request = p4runtime.WriteRequest(device_id=self.device_id, role=self.role, updates=updates)
         self._number(request.election_id)
         request.atomicity = getattr(p4runtime.WriteRequest, atomicity)
         return request
 
     def write(self, *updates: Any, atomicity: str = "CONTINUE_ON_ERROR") -> Any:
-        """Write updates, as `insert`, `modify` and `delete` make them, in one request."""
+        """Write updates in one request.
+
+        Args:
+            updates: as `insert`, `modify` and `delete` make them.
+            atomicity: name of an Atomicity of WriteRequest.
+
+        Returns:
+            The WriteResponse.
+        """
         return self.stub.Write(self.write_request(*updates, atomicity=atomicity), timeout=TIMEOUT_S)
 
     def read(self, *entities: Any) -> list[Any]:
-        """Entities that match any of these, in the order in which the switch sends them."""
+        """Read entities.
+
+        Args:
+            entities: filters: Entities in which what is left out matches everything.
+
+        Returns:
+            Entities that match any of the filters, in the order in which the switch sends them.
+        """
         request = p4runtime.ReadRequest(device_id=self.device_id, entities=entities)
         return [
             entity for response in self.stub.Read(request, timeout=TIMEOUT_S) for entity in response.entities
@@ -210,7 +260,7 @@ class EntryBuilder:
         params: Iterable[int] = (),
         **fields: Any,
     ) -> Any:
-        """An Entity with a TableEntry.
+        """Make an Entity with a TableEntry.
 
         Args:
             table: full name, such as `ingress.block_src`.
@@ -218,6 +268,9 @@ class EntryBuilder:
             action: full name; None: no action, as in a deletion.
             params: of the action, in the order of the p4info.
             fields: of the TableEntry, such as `priority`.
+
+        Returns:
+            The Entity.
         """
         known = self.tables[table]
         entity = p4runtime.Entity()
@@ -234,14 +287,29 @@ class EntryBuilder:
         return entity
 
     def set_action(self, entry: Any, action: str, params: Iterable[int]) -> None:
-        """Put an action into a TableEntry."""
+        """Put an action into a TableEntry.
+
+        Args:
+            entry: the TableEntry.
+            action: full name, such as `ingress.drop_src`.
+            params: of the action, in the order of the p4info.
+        """
         known = self.actions[action]
         entry.action.action.action_id = known.preamble.id
         for param, value in zip(known.params, params, strict=True):
             entry.action.action.params.add(param_id=param.id, value=text(value))
 
     def default(self, table: str, action: str | None, params: Iterable[int] = ()) -> Any:
-        """The default entry of a table."""
+        """Make the default entry of a table.
+
+        Args:
+            table: full name.
+            action: full name; None: the one that the program defines.
+            params: of the action, in the order of the p4info.
+
+        Returns:
+            The Entity.
+        """
         entity = self.entry(table, {}, action, params)
         entity.table_entry.is_default_action = True
         return entity

@@ -16,7 +16,7 @@ from redis.backoff import NoBackoff
 from redis.retry import Retry
 
 from due.drivers.embedded_redis import SUBSCRIBER_LIMIT, ending_with_us, server_program
-from sdnator.private_files import write_private
+from due.private_files import write_private
 from sdnator.testing.ports import free_port
 
 SERVICE = "due"

@@ -79,6 +79,9 @@ class SwitchDouble:
             count: how many.
             seconds: how long to wait for them.
 
+        Returns:
+            The frames, in the order in which they left.
+
         Raises:
             TookTooLong: fewer came.
         """

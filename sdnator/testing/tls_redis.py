@@ -15,7 +15,7 @@ from urllib.parse import urlencode
 from due.drivers.embedded_redis import SUBSCRIBER_LIMIT
 from due.drivers.redis_wire import Wire, as_user
 from due.errors import UpdatesUnavailable
-from sdnator.private_files import write_private
+from due.private_files import write_private
 from sdnator.rights.certificates import CA, CertificateFolder
 from sdnator.testing.ports import free_port
 

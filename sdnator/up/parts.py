@@ -25,12 +25,12 @@ import msgspec
 
 from due.drivers.embedded_redis import EmbeddedServer
 from due.errors import InvalidOption
+from due.private_files import kept_secret
 from due.status_server import metrics_token
 from sdnator import p4_program
 from sdnator.app_catalogue import OURS
 from sdnator.config.planned_switches import PlannedSwitch
 from sdnator.config.switch_security import security_of, switch_options
-from sdnator.private_files import kept_secret
 from sdnator.rights.granting import OPERATOR, granted
 from sdnator.rights.identities import ADMIN, READERS, made, observable
 from sdnator.supervisor import Child, PartSpec, RestartPolicy

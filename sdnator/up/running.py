@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from due.private_files import write_private_json
 from sdnator.errors import BadInput, PipelineError
 from sdnator.northbound import without_user
-from sdnator.private_files import write_private_json
 from sdnator.redaction import redacted_values
 from sdnator.user_folders import user_folder
 

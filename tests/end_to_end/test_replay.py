@@ -33,7 +33,7 @@ def real_capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def attacked_capture(real_capture):
-    """The real harmless packets with a generated attack behind them, and its labels."""
+    """The real benign packets with a generated attack behind them, and its labels."""
     attack = real_capture.with_name("attack.pcap")
     done = sdnator(
         "dataset", "make", "mirai-like", attack, "--no-background", "--seed", "5", "--attack-seconds", "240"
@@ -47,7 +47,7 @@ def attacked_capture(real_capture):
 
 @pytest.fixture(scope="module")
 def short_capture(tmp_path_factory):
-    """Four minutes of harmless traffic, half a one of an attack."""
+    """Four minutes of benign traffic, half a one of an attack."""
     path = tmp_path_factory.mktemp("short") / "short.pcap"
     make(MiraiLikeOptions(seed=4, benign_seconds=240, attack_seconds=30), path)
     return path
@@ -75,7 +75,7 @@ def test_scores_of_the_real_packets_are_the_published_detectors(real_capture, tm
     np.testing.assert_allclose(score[scored], reference[scored], rtol=1e-6)
 
 
-def test_nobody_is_blocked_in_the_real_harmless_traffic(real_capture):
+def test_nobody_is_blocked_in_the_real_benign_traffic(real_capture):
     """33 packets of the gateway score above the threshold; they raise alerts, and nobody is cut off."""
     found = figures("replay", real_capture, "--fm-grace", "2000", "--ad-grace", "10000")
     assert (found["blocks"], found["packets_dropped"], found["packets_lost"]) == ([], 0, 0)
@@ -95,7 +95,7 @@ def attacked_replay(attacked_capture):
 
 
 def test_attackers_are_blocked_and_nobody_else(attacked_replay):
-    """The infected camera is stopped, with the report to prove it, and no harmless device loses a packet."""
+    """The infected camera is stopped, with the report to prove it, and no benign device loses a packet."""
     found, report, _ = attacked_replay
     assert found["packets_lost"] == 0
     assert found["packets_in"] == (

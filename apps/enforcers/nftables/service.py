@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 import due.service
 from apps.enforcers.enforcer_app import ENFORCER_WANTS, EnforcerApp, enforcer_makes, place_name
@@ -16,30 +15,14 @@ INTERESTS = ENFORCER_WANTS
 CAPABILITIES = enforcer_makes("nftables")
 
 
-class NftablesService:
+class NftablesService(EnforcerApp):
     """Keeps one table of this network namespace as the firewall decides; needs CAP_NET_ADMIN."""
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
         plan = TablePlan(settings.table, settings.hooks, settings.priority)
         table = NftTable(plan, NftProgram(settings.program), settings.at_end)
         patience = {"check_s": settings.check_s, "patience_s": settings.patience_s}
-        self._app = EnforcerApp(engine, "nftables", place_name(settings.place), table, **patience)
-
-    def start(self) -> None:
-        """Restore what is in force, then subscribe."""
-        self._app.start()
-
-    def tick(self) -> None:
-        """Look whether the worker works, and for what was lifted without us."""
-        self._app.tick()
-
-    def stop(self) -> None:
-        """Carry out what waits; the table stays or goes, as the settings say."""
-        self._app.stop()
-
-    def health(self) -> dict[str, Any]:
-        """Counters for the operator and for Prometheus."""
-        return self._app.health()
+        super().__init__(engine, "nftables", place_name(settings.place), table, **patience)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from typing import Any
 from urllib.parse import urlsplit
 
 import due.service
@@ -17,7 +16,7 @@ INTERESTS = ENFORCER_WANTS
 CAPABILITIES = enforcer_makes("webhook_enforcer")
 
 
-class WebhookEnforcerService:
+class WebhookEnforcerService(EnforcerApp):
     """Posts blocks to one URL.  Raises `InvalidOption` without a URL, or for a secret that cannot be used."""
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
@@ -26,7 +25,7 @@ class WebhookEnforcerService:
         client = SignedHttpClient(
             settings.url, read_secret(settings.secret_file), settings.ca_file, settings.timeout_s
         )
-        self._app = EnforcerApp(
+        super().__init__(
             engine,
             "webhook_enforcer",
             place_name(settings.place or urlsplit(settings.url).hostname or ""),
@@ -35,22 +34,6 @@ class WebhookEnforcerService:
             patience_s=settings.patience_s,
             size=settings.queue,
         )
-
-    def start(self) -> None:
-        """Restore what is in force, then subscribe."""
-        self._app.start()
-
-    def tick(self) -> None:
-        """Look whether the worker works, and for what was lifted without us."""
-        self._app.tick()
-
-    def stop(self) -> None:
-        """Send what waits."""
-        self._app.stop()
-
-    def health(self) -> dict[str, Any]:
-        """Counters for the operator and for Prometheus."""
-        return self._app.health()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

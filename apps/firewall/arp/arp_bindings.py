@@ -43,7 +43,7 @@ class BoundHost(NamedTuple):
 
 @dataclass
 class _Binding:
-    station: BoundHost
+    host: BoundHost
     since: int
     seen: int
     trained: bool
@@ -100,51 +100,49 @@ class ArpBindings:
             found += self._heard(address, BoundHost(port, sender), at * 1000, honest=sender == mac)
         return found
 
-    def _heard(
-        self, address: int, station: BoundHost, now: int, *, honest: bool
-    ) -> Iterator[BindingConflict]:
-        if station.port in self._behind or len(self._behind) < PORTS:
-            neighbours = self._behind[station.port]
+    def _heard(self, address: int, host: BoundHost, now: int, *, honest: bool) -> Iterator[BindingConflict]:
+        if host.port in self._behind or len(self._behind) < PORTS:
+            neighbours = self._behind[host.port]
             if len(neighbours) < STATIONS:
-                neighbours.add(station.mac)
+                neighbours.add(host.mac)
         bound = self._bound.get(address)
         if bound is None:
             if honest:
-                self._bind(address, station, now)
-        elif bound.station == station and honest:
+                self._bind(address, host, now)
+        elif bound.host == host and honest:
             bound.seen = now
             self._bound.move_to_end(address)
             yield from self._contested(address, bound, now)
-        elif not self._settled(bound, now) or bound.station.mac == station.mac:
+        elif not self._settled(bound, now) or bound.host.mac == host.mac:
             # too new to have an owner, or the owner moved to another port
-            self._bind(address, station, now)
+            self._bind(address, host, now)
         else:
-            self._claims[address, station] = now
+            self._claims[address, host] = now
             if len(self._claims) > CLAIMS:
                 self._claims.popitem(last=False)
             if now - bound.seen > self._settle:  # the owner is gone
-                self._bind(address, station, now)
+                self._bind(address, host, now)
 
     def _settled(self, bound: _Binding, now: int) -> bool:
         return (bound.trained and now >= self._trained_at) or now - bound.since >= self._settle
 
-    def forged(self, address: str, station: BoundHost) -> bool:
+    def forged(self, address: str, host: BoundHost) -> bool:
         """Whether an address certainly belongs to another host than the one that uses it."""
         if ":" in address or not address:
             return False
         bound = self._bound.get(int(ipaddress.IPv4Address(address)))
-        return bound is not None and bound.trained and bound.station != station
+        return bound is not None and bound.trained and bound.host != host
 
-    def addresses_of(self, station: BoundHost) -> list[str]:
+    def addresses_of(self, host: BoundHost) -> list[str]:
         """Addresses that belong to a host."""
-        found = (address for address, bound in self._bound.items() if bound.station == station)
+        found = (address for address, bound in self._bound.items() if bound.host == host)
         return [str(ipaddress.IPv4Address(address)) for address in found]
 
-    def _bind(self, address: int, station: BoundHost, now: int) -> None:
+    def _bind(self, address: int, host: BoundHost, now: int) -> None:
         trained = now < self._trained_at and address not in self._bound
-        self._bound[address] = _Binding(station, now, now, trained)
+        self._bound[address] = _Binding(host, now, now, trained)
         self._bound.move_to_end(address)
-        self._claims.pop((address, station), None)
+        self._claims.pop((address, host), None)
         if len(self._bound) > ADDRESSES:
             self._bound.popitem(last=False)
 
@@ -154,10 +152,10 @@ class ArpBindings:
                 thief = key[1]
                 text = str(ipaddress.IPv4Address(address))
                 certain = bound.trained and self.is_alone(thief)
-                yield BindingConflict(text, bound.station, thief, now, certain)
+                yield BindingConflict(text, bound.host, thief, now, certain)
 
-    def is_alone(self, station: BoundHost) -> bool:
+    def is_alone(self, host: BoundHost) -> bool:
         """Whether it is the only host behind its port."""
-        others = self._behind.get(station.port, {station.mac, 0}) - {station.mac}
-        lives_here = any(each.station == station for each in self._bound.values())
+        others = self._behind.get(host.port, {host.mac, 0}) - {host.mac}
+        lives_here = any(each.host == host for each in self._bound.values())
         return not (others and lives_here)

@@ -18,7 +18,7 @@ class TheftHandler:
     Args:
         mode: `tell`: nobody is blocked.
         bindings: which address is whose.
-        ledger: blocks in force.
+        lifecycle: blocks in force.
         announcer: notices.
         allowed: the allow-list in force.
         switches: names of connected switches.
@@ -29,7 +29,7 @@ class TheftHandler:
         self,
         mode: Literal["off", "tell", "block"],
         bindings: ArpBindings,
-        ledger: BlockLifecycle,
+        lifecycle: BlockLifecycle,
         announcer: Announcer,
         allowed: Callable[[], AllowList],
         switches: Collection[str],
@@ -37,7 +37,7 @@ class TheftHandler:
     ) -> None:
         self._mode = mode
         self._bindings = bindings
-        self._ledger = ledger
+        self._lifecycle = lifecycle
         self._announcer = announcer
         self._allowed = allowed
         self._switches = switches
@@ -57,9 +57,9 @@ class TheftHandler:
         spared = self._why_spared(theft, target)
         if spared:
             self._announcer.say(OperatorNotice("arp", f"{summary}; not blocked: {spared}", theft.at))
-        elif not any(block.decision.target == target for block in self._ledger.blocks.values()):
+        elif not any(block.decision.target == target for block in self._lifecycle.blocks.values()):
             where, why = next(iter(self._switches)), f"{summary}, and is there"
-            self._publish(self._ledger.open(where, target, why, (evidence_of(item, summary),), theft.at))
+            self._publish(self._lifecycle.open(where, target, why, (evidence_of(item, summary),), theft.at))
 
     def _why_spared(self, theft: BindingConflict, target: Target) -> str:
         """Why the claimant of an address is not blocked; empty if it is."""
@@ -73,7 +73,7 @@ class TheftHandler:
         mine = self._bindings.addresses_of(theft.thief)
         if allow.covers_target(target) or any(allow.covers_address(each) for each in mine):
             return "it is on the allow-list"
-        cap = self._ledger.cap_reached(theft.at)
+        cap = self._lifecycle.cap_reached(theft.at)
         if cap:
-            self._ledger.refuse(cap, target.address, theft.at)
+            self._lifecycle.refuse(cap, target.address, theft.at)
         return cap or ""

@@ -33,12 +33,9 @@ class _Question(threading.Thread):
 
     def run(self) -> None:
         try:
-            self.items = youngest(self._find, *self._asked)
+            self.items = youngest(self._engine, *self._asked)
         except DueError as error:
             self.problem = str(error)
-
-    def _find(self, query: Mapping[str, Any], limit: int) -> list[Item]:
-        return self._engine.get(query, limit=limit)
 
 
 class Archive:

@@ -7,16 +7,7 @@ from collections.abc import Callable, Container, Iterable
 from typing import Any, Final, TypeVar
 
 from apps.evidence import TRAINING, TrainingState
-from apps.firewall.arrivals import (
-    answer_in,
-    command_in,
-    decision_in,
-    handshake_in,
-    incident_in,
-    instruction_in,
-    lesson_in,
-    training_in,
-)
+from apps.firewall.arrivals import answer_in, handshake_in, training_in
 from apps.firewall.enforcement.switch_entries import KEPT, leftovers
 from apps.firewall.evidence.archive import MOST, Archive
 from apps.firewall.evidence.history import ANSWERS, DECISIONS, INSTRUCTIONS, LESSONS
@@ -31,6 +22,7 @@ from apps.messages import (
     Instruction,
     Intake,
     MessageError,
+    TableCommand,
     TableUpdate,
 )
 from apps.standing_decisions import in_force
@@ -66,7 +58,7 @@ class ArchivedState:
     def instructions(self) -> list[Instruction]:
         """Instructions that change the allow-list, oldest first."""
         query = {"dataKey": INSTRUCTIONS, "value.verb": {"$in": ["allow", "disallow"]}}
-        return self._read(query, "instruction", instruction_in, most=_INSTRUCTIONS)
+        return self._read(query, "instruction", Instruction.from_item, most=_INSTRUCTIONS)
 
     def answered(self) -> list[Answer]:
         """What was answered most recently."""
@@ -86,25 +78,25 @@ class ArchivedState:
     def panics(self) -> list[str]:
         """Ids of the panics in the archive, which were carried out already."""
         query = {"dataKey": INSTRUCTIONS, "value.verb": "panic"}
-        return [each.id for each in self._read(query, "instruction", instruction_in, most=_ANSWERS)]
+        return [each.id for each in self._read(query, "instruction", Instruction.from_item, most=_ANSWERS)]
 
     def standing(self) -> list[Decision]:
         """The newest decision for each target, if it is in force."""
         since = time.time_ns() - _LONGEST_NS
-        found = [each for key in DECISIONS for each in self._read(key, "decision", decision_in, since=since)]
-        return in_force(each for each in found if not each.dry_run)
+        read = (self._read(key, "decision", Decision.from_item, since=since) for key in DECISIONS)
+        return in_force(each for found in read for each in found if not each.dry_run)
 
     def decision(self, name: str) -> Decision | None:
         """A decision by its id, as it was made; None if the archive has none or does not answer."""
         for key in DECISIONS:
-            found = self._read({"dataKey": key, "value.id": name}, "decision", decision_in)
+            found = self._read({"dataKey": key, "value.id": name}, "decision", Decision.from_item)
             if found:
                 return found[0]
         return None
 
     def false_alarms(self) -> list[FalseAlarm]:
         """What operators have called false alarms, and taken back, oldest first."""
-        return self._read(LESSONS, "false alarm", lesson_in, most=_LESSONS)
+        return self._read(LESSONS, "false alarm", FalseAlarm.from_item, most=_LESSONS)
 
     def training(self) -> TrainingState | None:
         """How far training was when that was last said; None if nothing was."""
@@ -113,7 +105,7 @@ class ArchivedState:
     def incidents(self) -> list[Incident]:
         """Reports of incidents that may still be open, oldest first."""
         since = time.time_ns() - _LONGEST_NS
-        return self._read(INCIDENTS, "incident", incident_in, since=since, most=_INCIDENTS)
+        return self._read(INCIDENTS, "incident", Incident.from_item, since=since, most=_INCIDENTS)
 
     def teach(self, known: KnownSources) -> None:
         """Known sources, from the handshakes of the last `known_days`."""
@@ -128,7 +120,7 @@ class ArchivedState:
         """By switch: deletions of entries of an earlier run that are no longer wanted."""
         past: defaultdict[str, list[Item]] = defaultdict(list)
         for item in self._archive.find(f"{KEPT}.*", _PATIENCE_S) or ():
-            if self._intake.read("command", command_in, item) is not None:
+            if self._intake.read("command", TableCommand.from_item, item) is not None:
                 past[item.key.rpartition(".")[2]].append(item)
         return {switch: leftovers(items, wanted) for switch, items in past.items()}
 
@@ -151,7 +143,7 @@ def _keyed_answer(item: Item) -> tuple[str, Answer]:
 
 
 def _whole_instruction(item: Item) -> tuple[Item, Instruction]:
-    return item, instruction_in(item)
+    return item, Instruction.from_item(item)
 
 
 def _archived_handshake(item: Item) -> tuple[str, int]:

@@ -14,6 +14,8 @@ from apps.messages import TableUpdate
 HANDSHAKES: Final = "network.handshake.sonata.tcp"
 TABLE: Final = "ingress.known_sources"
 DAY: Final = 86_400_000_000_000
+_BATCH: Final = 200
+"""Updates of one command."""
 
 
 class KnownSources:
@@ -76,8 +78,8 @@ def _update(kind: Any, source: str) -> TableUpdate:
     return TableUpdate(kind=kind, table=TABLE, match=match, action="" if kind == "delete" else "known")
 
 
-def in_batches(updates: Iterable[TableUpdate], size: int = 200) -> Iterable[tuple[TableUpdate, ...]]:
+def in_batches(updates: Iterable[TableUpdate]) -> Iterable[tuple[TableUpdate, ...]]:
     """Commands small enough for one write to a switch."""
     rest = iter(updates)
-    while batch := tuple(islice(rest, size)):
+    while batch := tuple(islice(rest, _BATCH)):
         yield batch

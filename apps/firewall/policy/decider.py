@@ -60,7 +60,7 @@ class Decider:
 
     Args:
         rules: options.
-        ledger: blocks in force and senders on probation.
+        lifecycle: blocks in force and senders on probation.
         bindings: whose an address is.
         known: addresses known from handshakes.
         allow: the allow-list of now.
@@ -69,13 +69,13 @@ class Decider:
     def __init__(
         self,
         rules: Rules,
-        ledger: BlockLifecycle,
+        lifecycle: BlockLifecycle,
         bindings: ArpBindings,
         known: Collection[str],
         allow: Callable[[], AllowList],
     ) -> None:
         self._rules = rules
-        self._ledger = ledger
+        self._lifecycle = lifecycle
         self._bindings = bindings
         self._known = known
         self._allow = allow
@@ -91,7 +91,7 @@ class Decider:
         """The rule of seconds."""
         if self._rules.rule != "seconds":
             return PolicyVerdict(None, "alerts alone decide nothing under this rule")
-        probation = self._ledger.on_probation(alert.sender, alert.event_time)
+        probation = self._lifecycle.on_probation(alert.sender, alert.event_time)
         verdict = judge(alert, self._rules, self._allow(), on_probation=probation)
         if verdict.target is None:
             return verdict
@@ -130,7 +130,7 @@ class Decider:
 
     def _paper(self, evidence: Evidence) -> Proposal | None:
         sender = evidence.sender
-        if evidence.source != "threshold" or sender is None or self._ledger.covering(sender) is not None:
+        if evidence.source != "threshold" or sender is None or self._lifecycle.covering(sender) is not None:
             return None
         target = narrowest_target(sender, evidence.mac_addresses)
         if target is None or self._allow().covers(sender) or evidence.role in self._rules.protected_roles:
@@ -141,12 +141,12 @@ class Decider:
         self, evidence: Evidence, sender: Sender, tally: EvidenceSum, bound: float, offences: Offences
     ) -> Proposal | None:
         now = evidence.event_time
-        if self._ledger.covering(sender) is not None:
+        if self._lifecycle.covering(sender) is not None:
             return None
         total = tally.total(now, bound)
         target = _target_of(evidence, sender)
         needed, earlier = bound, 0
-        if self._ledger.on_probation(sender, now):
+        if self._lifecycle.on_probation(sender, now):
             needed = max(LEAST_BOUND, PROBATION_SHARE * bound)
         if target is not None and needed - MOST_OFFENCES * OFFENCE_NATS <= total:
             found = offences(target)
@@ -199,9 +199,9 @@ class Decider:
         """An address that others can forge is not blocked; the forger is, if it is known for certain."""
         if target.kind != "ip":
             return target, ""
-        station = BoundHost.of(sender.port, sender.mac)
-        if self._bindings.forged(target.address, station):
-            if self._bindings.is_alone(station):
+        host = BoundHost.of(sender.port, sender.mac)
+        if self._bindings.forged(target.address, host):
+            if self._bindings.is_alone(host):
                 forger = Target(kind="mac", address=sender.mac, port=sender.port)
                 return forger, f"{target.address} belongs to another, so its forger is blocked"
             return None, f"{target.address} belongs to another, and its forger shares a port"
@@ -231,7 +231,7 @@ class Decider:
         reason = _reason(tally, now, bound, total, bound, 0)
         if evidence.address:
             refusal = (
-                f"on which port {evidence.address} is, and whether the address is its own, nobody has told"
+                f"it is not known on which port {evidence.address} is, nor whether the address is its own"
             )
             return self._refused(evidence, reason, refusal, tally, total, bound)
         pieces = [each.latest for each in tally.contributions.values()]

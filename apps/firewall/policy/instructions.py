@@ -24,7 +24,7 @@ class Desk:
     """Applies instructions to blocks, guards, rate limits, the allow-list and lessons; time is capture time in ns.
 
     Args:
-        ledger: blocks in force.
+        lifecycle: blocks in force.
         syn: guards in force.
         limits: rate limits in force.
         entries: the allow-list of the settings.
@@ -34,14 +34,14 @@ class Desk:
 
     def __init__(
         self,
-        ledger: BlockLifecycle,
+        lifecycle: BlockLifecycle,
         syn: SynDefence,
         limits: RateLimits,
         entries: Iterable[str],
         lessons: FalseAlarms,
         archived: Callable[[str], Decision | None] = lambda _: None,
     ) -> None:
-        self._ledger = ledger
+        self._lifecycle = lifecycle
         self._syn = syn
         self._limits = limits
         self._lessons = lessons
@@ -64,7 +64,7 @@ class Desk:
     def decided_before(self, instruction: Instruction, evidence: Exhibit) -> Answer | None:
         """The answer to an instruction whose block stands: the firewall was killed before it could answer."""
         if instruction.verb == "block":
-            for block in self._ledger.blocks.values():
+            for block in self._lifecycle.blocks.values():
                 if evidence in block.decision.evidence:
                     text = f"block {block.decision.id} of {instruction.subject}, decided before a restart"
                     return Answer(id=instruction.id, done=True, text=text)
@@ -76,18 +76,20 @@ class Desk:
             raise ValueError(
                 f"{target.address} is on the allow-list, which always wins; `sdnator allow remove` it first"
             )
-        if len(self._ledger.blocks) >= self._ledger.rules.max_blocks:
-            raise ValueError(f"{len(self._ledger.blocks)} blocks are in force (max_blocks); lift some first")
-        if self._ledger.matching(target.address):
+        if len(self._lifecycle.blocks) >= self._lifecycle.rules.max_blocks:
+            raise ValueError(
+                f"{len(self._lifecycle.blocks)} blocks are in force (max_blocks); lift some first"
+            )
+        if self._lifecycle.matching(target.address):
             raise ValueError(f"{target.address} is already blocked")
         reason = f"by hand: {instruction.reason or 'no reason given'}"
-        decision = self._ledger.open(
+        decision = self._lifecycle.open(
             EVERY_SWITCH, target, reason, (evidence,), now, seconds=instruction.seconds
         )
         return [decision], f"block {decision.id} of {target.address} for {instruction.seconds} s"
 
     def _unblock(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
-        found = self._ledger.matching(instruction.subject)
+        found = self._lifecycle.matching(instruction.subject)
         others = self._syn.release(instruction.subject, now, "by hand")
         others += self._limits.release(instruction.subject, now, "by hand")
         if not found and not others:
@@ -100,7 +102,7 @@ class Desk:
     def _false_alarm(self, instruction: Instruction, _: Exhibit, now: int) -> tuple[list[Decision], str]:
         """Undo a decision, and learn that its evidence means less."""
         name = instruction.subject
-        found = self._ledger.matching(name)
+        found = self._lifecycle.matching(name)
         names = [each.id for each in found] or [name]
         if not found and (past := self._archived(name)) is not None:
             self._lessons.decided(past)
@@ -128,7 +130,7 @@ class Desk:
         return [], f"{', '.join(kinds)} counts in full again; the decision itself is not restored"
 
     def _panic(self, _: Instruction, __: Exhibit, now: int) -> tuple[list[Decision], str]:
-        blocks = [block.decision for block in self._ledger.blocks.values()]
+        blocks = [block.decision for block in self._lifecycle.blocks.values()]
         decisions = self._lift(blocks, now, "panic: everything is lifted")
         decisions += self._syn.release_all(now, "panic: everything is lifted")
         decisions += self._limits.release_all(now, "panic: everything is lifted")
@@ -138,7 +140,7 @@ class Desk:
         if len(self.entries) >= _MOST_ENTRIES:
             raise ValueError(f"the allow-list has {_MOST_ENTRIES} entries; remove some, or name prefixes")
         self._set_entries((*self.entries, instruction.subject))
-        blocks = [block.decision for block in self._ledger.blocks.values()]
+        blocks = [block.decision for block in self._lifecycle.blocks.values()]
         touched = [each for each in blocks if self.allow.covers_target(each.target)]
         lifted = self._lift(touched, now, f"{instruction.subject} is on the allow-list now")
         blocks_lifted = "1 block" if len(lifted) == 1 else f"{len(lifted)} blocks"
@@ -153,7 +155,7 @@ class Desk:
         return [], f"{instruction.subject} is no longer allowed"
 
     def _lift(self, decisions: Iterable[Decision], now: int, reason: str) -> list[Decision]:
-        lifted = (self._ledger.lift(each.id, now, reason) for each in decisions)
+        lifted = (self._lifecycle.lift(each.id, now, reason) for each in decisions)
         return [each for each in lifted if each is not None]
 
     def _set_entries(self, entries: tuple[str, ...]) -> None:

@@ -45,12 +45,12 @@ def any_within(network: Network, addresses: Collection[str]) -> bool:
 
 
 def gather_blocks(
-    ledger: BlockLifecycle, gather: Callable[[Iterable[str]], Mapping[str, Collection[str]]], now: int
+    lifecycle: BlockLifecycle, gather: Callable[[Iterable[str]], Mapping[str, Collection[str]]], now: int
 ) -> Iterator[Decision]:
     """Replace blocks of many addresses of a prefix by one block of the prefix; those asked for stay as they are."""
     single = {
         block.decision.target.address: block.decision
-        for block in ledger.blocks.values()
+        for block in lifecycle.blocks.values()
         if block.decision.target.kind == "ip"
         and "/" not in block.decision.target.address
         and not block.is_asked_for
@@ -62,7 +62,7 @@ def gather_blocks(
         reason = (
             f"{len(members)} addresses of {prefix} are blocked: the whole prefix is, instead of each of them"
         )
-        yield ledger.open(
+        yield lifecycle.open(
             switches.pop() if len(switches) == 1 else "*",
             Target(kind="ip", address=prefix),
             reason,
@@ -71,6 +71,6 @@ def gather_blocks(
             seconds=max(1, max(each.expires for each in made) - now) // SECOND or 1,
         )
         for each in made:
-            lifted = ledger.lift(each.id, now, f"{prefix} is blocked as a whole")
+            lifted = lifecycle.lift(each.id, now, f"{prefix} is blocked as a whole")
             if lifted is not None:
                 yield lifted

@@ -34,7 +34,7 @@ class FloodHandler:
     Args:
         engine: writes requests for samples and packet-outs.
         settings: of the firewall.
-        ledger: blocks in force.
+        lifecycle: blocks in force.
         allowed: the allow-list of the settings.
         known: addresses known from handshakes.
         switches: names of connected switches.
@@ -48,7 +48,7 @@ class FloodHandler:
         self,
         engine: Engine,
         settings: Settings,
-        ledger: BlockLifecycle,
+        lifecycle: BlockLifecycle,
         allowed: tuple[str, ...],
         known: KnownSources,
         switches: Collection[str],
@@ -69,7 +69,7 @@ class FloodHandler:
         self._answers = Answers(rules.sample, AGED_S + after_s)
         services = tuple(TcpService.parse(text) for text in settings.guard)
         allow_list = AllowList.parse(allowed)
-        self.defence = SynDefence(rules, services, ledger, allow_list, known, self._is_silent)
+        self.defence = SynDefence(rules, services, lifecycle, allow_list, known, self._is_silent)
         self._surges = Surges(rules.threshold, rules.window_ms)
         self._examinations = Examinations(rules.grace_ms, rules.patience_ms)
         self._samples = SuspectSamples(rules.sample_most, rules.sample_ms / 1000)

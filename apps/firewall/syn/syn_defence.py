@@ -78,7 +78,7 @@ class SynDefence:
         self,
         rules: SynRules,
         services: Iterable[TcpService],
-        ledger: BlockLifecycle,
+        lifecycle: BlockLifecycle,
         allow: AllowList,
         known: KnownSources,
         is_silent: Callable[[TcpService], bool] = lambda _: False,
@@ -88,7 +88,7 @@ class SynDefence:
         self._is_silent = is_silent
         self.known = known
         self._always = frozenset(services)
-        self._ledger = ledger
+        self._lifecycle = lifecycle
         self.allow = allow
         self._guarded: dict[TcpService, Decision] = {}
         self.services: dict[TcpService, None] = {}
@@ -176,7 +176,7 @@ class SynDefence:
 
     def gather(self, addresses: Iterable[str]) -> dict[str, list[str]]:
         """Prefixes that may be blocked in place of the addresses."""
-        rules = self._ledger.rules
+        rules = self._lifecycle.rules
         found = crowded_prefixes(
             addresses, rules.prefix_neighbours, rules.prefix_v4, rules.prefix_v6, self.is_inhabited
         )
@@ -237,18 +237,18 @@ class SynDefence:
         decisions: list[Decision] = []
         if verdict.protects:
             decisions += self._guard(service, verdict.reason, watch)
-        blocked = {block.decision.target.address for block in self._ledger.blocks.values()}
+        blocked = {block.decision.target.address for block in self._lifecycle.blocks.values()}
         for source in verdict.block:
-            if source in blocked or self._ledger.in_blocked_prefix(source):
+            if source in blocked or self._lifecycle.in_blocked_prefix(source):
                 continue
-            cap = self._ledger.cap_reached(watch.now)
+            cap = self._lifecycle.cap_reached(watch.now)
             if cap is not None:
-                self._ledger.refuse(cap, source, watch.now)
+                self._lifecycle.refuse(cap, source, watch.now)
                 continue
             target = Target(kind="ip", address=source)
             note = "" if offences is not None else f" ({UNKNOWN_HISTORY})"
             decisions.append(
-                self._ledger.open(
+                self._lifecycle.open(
                     EVERY_SWITCH,
                     target,
                     verdict.reason + note,
@@ -295,7 +295,7 @@ class SynDefence:
             evidence=evidence,
             event_time=now,
             expires=expires,
-            dry_run=self._ledger.rules.dry_run or not self.rules.challenge,
+            dry_run=self._lifecycle.rules.dry_run or not self.rules.challenge,
         )
 
 

@@ -126,18 +126,18 @@ class DesiredSwitch:
         self.fail = fail
         self._clock = clock
         self._classifier = Classifier(program)
-        self._book = EntryUpdates(program, guard or GuardSettings(), self._classifier.table_ids)
+        self._entry_updates = EntryUpdates(program, guard or GuardSettings(), self._classifier.table_ids)
         self._blocks = {program.table(each).id: 0 for each in (*BLOCK_TABLES, limits.OVER)}
         self._over, self._limit = program.table(limits.OVER).id, program.table(limits.LIMIT).id
         self._forward = wires_of(program, forward or {})
         self._desired = EntrySet(self._forward)
-        self.stations = MacLearning(program, learn) if learn is not None else None
+        self.mac_learning = MacLearning(program, learn) if learn is not None else None
         """Learnt MAC addresses, if learning is on."""
-        self._unlearnt = no_flood(program) if self.stations is None else []
-        for entry in new_senders(program, learn=self.stations is not None):
+        self._unlearnt = no_flood(program) if self.mac_learning is None else []
+        for entry in new_senders(program, learn=self.mac_learning is not None):
             self._desired.put(entry)
-        if self.stations is not None:
-            self._desired.put(self.stations.flood())
+        if self.mac_learning is not None:
+            self._desired.put(self.mac_learning.flood())
         self._owners: dict[bytes, Owner] = {}
         self._unconfirmed: dict[bytes, EntryUpdate] = {}
         self._telemetry = EntrySet()
@@ -146,7 +146,7 @@ class DesiredSwitch:
     @property
     def guards(self) -> bool:
         """Whether any service is protected."""
-        return self._book.guards
+        return self._entry_updates.guards
 
     def restore(self, decisions: Iterable[Decision], commands: Iterable[TableCommand]) -> list[str]:
         """Build the desired state from history, oldest first; returns errors for what did not fit the program."""
@@ -155,14 +155,14 @@ class DesiredSwitch:
             if decision.dry_run:
                 continue
             try:
-                self._remember(self._book.of_decision(decision))
+                self._remember(self._entry_updates.of_decision(decision))
             except (EntryError, P4InfoError) as error:
                 problems.append(f"decision {decision.id}: {error}")
         for command in commands:
-            orders, refused = self._book.of_command(command)
+            updates, refused = self._entry_updates.of_command(command)
             problems += [f"command {command.id}: {reason}" for _, reason in refused]
-            for order in [] if refused else orders:
-                self._remember(order)
+            for update in [] if refused else updates:
+                self._remember(update)
         return problems
 
     def bring_up(self, transport: Transport) -> BringUp:
@@ -170,8 +170,8 @@ class DesiredSwitch:
         report = BringUp(program_loaded=transport.ensure_program())
         transport.ensure_copies()
         transport.ensure_digests()
-        if self.stations is not None:
-            transport.ensure_group(GROUP, self.stations.ports)
+        if self.mac_learning is not None:
+            transport.ensure_group(GROUP, self.mac_learning.ports)
         standing = [entry for entry in self._desired if is_standing(entry)]
         standing += [entry for entry in self._classifier.entries(()) if is_standing(entry)]
         unlearnt = [entry for entry in self._unlearnt if entry not in self._desired]
@@ -180,7 +180,7 @@ class DesiredSwitch:
         for entry in unlearnt:  # an earlier controller may have configured flooding
             if entry in EntrySet(each for each in read if is_standing(each)):
                 self._desired.put(entry)
-        for learnt in self.stations.adopt(read) if self.stations is not None else ():
+        for learnt in self.mac_learning.adopt(read) if self.mac_learning is not None else ():
             self._desired.put(learnt)
         ids = self._classifier.table_ids
         present = EntrySet(entry for entry in read if table_id(entry) not in ids)
@@ -194,26 +194,26 @@ class DesiredSwitch:
 
     def decide(self, decisions: Sequence[Decision], transport: Transport | None) -> list[Confirmation]:
         """Carry decisions out; dry runs are ignored and not confirmed."""
-        orders: list[EntryUpdate] = []
+        updates: list[EntryUpdate] = []
         answers: list[Confirmation] = []
         for decision in decisions:
             if decision.dry_run:
                 continue
             try:
-                orders.append(self._book.of_decision(decision))
+                updates.append(self._entry_updates.of_decision(decision))
             except (EntryError, P4InfoError) as error:
                 answers.append(self._confirmation(owner_of(decision), "failed", cause=str(error)))
-        return answers + self._carry_out(orders, transport)
+        return answers + self._carry_out(updates, transport)
 
     def command(self, command: TableCommand, transport: Transport | None) -> list[Confirmation]:
         """Carry a command out: one confirmation for each of its updates, in order.
 
         A command with an update that does not fit the program is refused as a whole.
         """
-        orders, refused = self._book.of_command(command)
+        updates, refused = self._entry_updates.of_command(command)
         if refused:
             return [self._confirmation(owner, "failed", cause=reason) for owner, reason in refused]
-        return self._carry_out(orders, transport)
+        return self._carry_out(updates, transport)
 
     def want(self, requests: Sequence[TelemetryRequest], transport: Transport | None) -> list[str]:
         """Change the telemetry requests; returns what the switch refused.
@@ -237,8 +237,8 @@ class DesiredSwitch:
 
     def learn(self, lists: Iterable[Any], transport: Transport) -> None:
         """Add entries for MAC addresses that the switch reports; a refused one is reported again."""
-        if self.stations is not None:
-            self._write_stations(self.stations.learn(lists), transport)
+        if self.mac_learning is not None:
+            self._write_learnt(self.mac_learning.learn(lists), transport)
 
     def change_secret(self, first: int, second: int, transport: Transport | None) -> None:
         """Replace the older of the two cookie secrets, and use it from now on."""
@@ -254,10 +254,10 @@ class DesiredSwitch:
     def expire(self, entries: Iterable[Any], transport: Transport) -> list[Confirmation]:
         """Delete entries that the switch reports as idle; those already gone are not confirmed twice."""
         idle = [entry for entry in entries if entry in self._desired]
-        if self.stations is not None:
-            silent = [entry for entry in idle if self.stations.owns(entry)]
-            gone = [change for entry in silent for change in self.stations.forget(entry)]
-            self._write_stations(gone, transport)
+        if self.mac_learning is not None:
+            silent = [entry for entry in idle if self.mac_learning.owns(entry)]
+            gone = [change for entry in silent for change in self.mac_learning.forget(entry)]
+            self._write_learnt(gone, transport)
             idle = [entry for entry in idle if entry in self._desired]
         outcomes = transport.write([deletion(entry) for entry in idle]) if idle else []
         answers = []
@@ -312,7 +312,7 @@ class DesiredSwitch:
         if self.fail == "closed" and self._forward:
             transport.write([deletion(entry) for entry in self._forward])
 
-    def _write_stations(self, changes: list[Change], transport: Transport) -> None:
+    def _write_learnt(self, changes: list[Change], transport: Transport) -> None:
         for change in changes:
             if change.kind == DELETE:
                 self._desired.discard(change.entry)
@@ -320,8 +320,8 @@ class DesiredSwitch:
                 self._desired.put(change.entry)
         outcomes = transport.write([_bare(change) for change in changes]) if changes else []
         bad = [change for change, said in zip(changes, outcomes, strict=True) if not _achieved(change, said)]
-        if bad and self.stations is not None:
-            self.stations.undo(bad)
+        if bad and self.mac_learning is not None:
+            self.mac_learning.undo(bad)
             for change in bad:
                 self._desired.discard(change.entry)
 
@@ -350,84 +350,84 @@ class DesiredSwitch:
         """Confirm postponed updates as done or failed."""
         pending, self._unconfirmed = self._unconfirmed, {}
         answers = []
-        for key, order in pending.items():
-            done: State = "removed" if order.main.kind == DELETE else "installed"
+        for key, update in pending.items():
+            done: State = "removed" if update.main.kind == DELETE else "installed"
             cause = report.failed.get(key)
             state: State = "failed" if cause else done
             text = cause or "done when the switch was connected again"
-            answers.append(self._confirmation(order.owner, state, order.main.entry, cause=text))
+            answers.append(self._confirmation(update.owner, state, update.main.entry, cause=text))
         return answers
 
-    def _remember(self, order: EntryUpdate) -> None:
-        for change in order.changes:
+    def _remember(self, update: EntryUpdate) -> None:
+        for change in update.changes:
             if change.kind == DELETE:
                 self._forget(change.entry)
                 continue
             if table_id(change.entry) in self._blocks and change.entry not in self._desired:
                 self._blocks[table_id(change.entry)] += 1
             self._desired.put(change.entry)
-            self._owners[entry_key(change.entry)] = order.owner
+            self._owners[entry_key(change.entry)] = update.owner
 
     def _forget(self, entry: Any) -> None:
         if self._desired.discard(entry) and table_id(entry) in self._blocks:
             self._blocks[table_id(entry)] -= 1
         self._owners.pop(entry_key(entry), None)
 
-    def _carry_out(self, orders: Sequence[EntryUpdate], transport: Transport | None) -> list[Confirmation]:
+    def _carry_out(self, updates: Sequence[EntryUpdate], transport: Transport | None) -> list[Confirmation]:
         """In batches without repeated keys: P4Runtime leaves the order within a batch open."""
         answers: list[Confirmation] = []
         batch: list[EntryUpdate] = []
         taken: set[bytes] = set()
-        for order in orders:
-            if taken & order.keys:
+        for update in updates:
+            if taken & update.keys:
                 answers += self._write(batch, transport)
                 batch, taken = [], set()
-            batch.append(order)
-            taken |= order.keys
+            batch.append(update)
+            taken |= update.keys
         return answers + self._write(batch, transport)
 
-    def _write(self, orders: list[EntryUpdate], transport: Transport | None) -> list[Confirmation]:
-        if not orders:
+    def _write(self, updates: list[EntryUpdate], transport: Transport | None) -> list[Confirmation]:
+        if not updates:
             return []
         if transport is None:
-            return [self._postpone(order, "the switch is not connected") for order in orders]
+            return [self._postpone(update, "the switch is not connected") for update in updates]
         try:
-            outcomes = iter(transport.write([change for order in orders for change in order.changes]))
+            outcomes = iter(transport.write([change for update in updates for change in update.changes]))
         except SwitchError as error:
-            return [self._postpone(order, str(error)) for order in orders]
-        return [self._conclude(order, [next(outcomes) for _ in order.changes]) for order in orders]
+            return [self._postpone(update, str(error)) for update in updates]
+        return [self._conclude(update, [next(outcomes) for _ in update.changes]) for update in updates]
 
-    def _postpone(self, order: EntryUpdate, cause: str) -> Confirmation:
+    def _postpone(self, update: EntryUpdate, cause: str) -> Confirmation:
         """Kept as desired; written and confirmed when the switch is connected again."""
-        self._remember(order)
-        self._unconfirmed[entry_key(order.main.entry)] = order
+        self._remember(update)
+        self._unconfirmed[entry_key(update.main.entry)] = update
         text = f"{cause}; it is kept, and written when the switch is connected again"
-        return self._confirmation(order.owner, "failed", order.main.entry, cause=text)
+        return self._confirmation(update.owner, "failed", update.main.entry, cause=text)
 
-    def _conclude(self, order: EntryUpdate, outcomes: list[UpdateOutcome]) -> Confirmation:
-        main = order.main
-        results = list(zip(order.changes, outcomes, strict=True))
+    def _conclude(self, update: EntryUpdate, outcomes: list[UpdateOutcome]) -> Confirmation:
+        main = update.main
+        results = list(zip(update.changes, outcomes, strict=True))
         bad = [(change, outcome) for change, outcome in results if not _achieved(change, outcome)]
         if bad:
-            self._book.give_up(order)
-            return self._confirmation(order.owner, "failed", bad[0][0].entry, cause=bad[0][1].message)
+            self._entry_updates.give_up(update)
+            return self._confirmation(update.owner, "failed", bad[0][0].entry, cause=bad[0][1].message)
         said = next(outcome for change, outcome in results if change is main)
         if main.kind == DELETE:
-            self._remember(order)
-            return self._confirmation(order.owner, "removed", main.entry, cause=said.message)
+            self._remember(update)
+            return self._confirmation(update.owner, "removed", main.entry, cause=said.message)
         if said.code == _EXISTS:
             return self._confirmation(
-                order.owner, "exists", main.entry, cause=self._kept(order, said.message)
+                update.owner, "exists", main.entry, cause=self._kept(update, said.message)
             )
-        self._remember(order)
-        return self._confirmation(order.owner, "installed", main.entry)
+        self._remember(update)
+        return self._confirmation(update.owner, "installed", main.entry)
 
-    def _kept(self, order: EntryUpdate, said: str) -> str:
+    def _kept(self, update: EntryUpdate, said: str) -> str:
         """The existing entry stays; returns the text for the confirmation."""
-        held = self._desired.get(order.main.entry)
+        held = self._desired.get(update.main.entry)
         if held is None:
-            self._remember(order)
-        elif entry_body(held) != entry_body(order.main.entry):
+            self._remember(update)
+        elif entry_body(held) != entry_body(update.main.entry):
             return "it exists with another action or other parameters; use modify to change it"
         return said
 

@@ -89,22 +89,22 @@ class EntryUpdates:
 
     def of_command(self, command: TableCommand) -> tuple[list[EntryUpdate], list[tuple[Owner, str]]]:
         """One `EntryUpdate` for each update that fits the program; owner and reason of those that do not."""
-        orders: list[EntryUpdate] = []
+        updates: list[EntryUpdate] = []
         refused: list[tuple[Owner, str]] = []
         for update in command.updates:
             owner = Owner(command.id, update.kind)
             try:
-                orders.append(EntryUpdate(owner, (self._checked(update),)))
+                updates.append(EntryUpdate(owner, (self._checked(update),)))
             except EntryError as error:
                 refused.append((owner, str(error)))
-        return orders, refused
+        return updates, refused
 
-    def give_up(self, order: EntryUpdate) -> None:
+    def give_up(self, update: EntryUpdate) -> None:
         """The switch refused the update: free its slot."""
-        if order.owner.action == "protect" and order.service is not None:
-            self._slots.pop(order.service, None)
-        if order.owner.action == "meter" and order.limit is not None:
-            self._limits.pop(order.limit, None)
+        if update.owner.action == "protect" and update.service is not None:
+            self._slots.pop(update.service, None)
+        if update.owner.action == "meter" and update.limit is not None:
+            self._limits.pop(update.limit, None)
 
     def _limit(self, owner: Owner, target: Target, limit: RateLimit) -> EntryUpdate:
         key = limits.key_of(target, limit)

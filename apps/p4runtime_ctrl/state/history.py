@@ -4,7 +4,6 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from apps.messages import Decision, Intake, TableCommand
-from apps.p4runtime_ctrl.arrivals import command_in, decision_in
 from apps.standing_decisions import STANDING, in_force
 from due import Item
 
@@ -30,7 +29,7 @@ def decisions_for(
         (item for item in archived if item.timestamp > since),
         key=lambda item: (item.timestamp, item.sequence),
     )
-    found = [decision for item in items if (decision := intake.read("decision", decision_in, item))]
+    found = [decision for item in items if (decision := intake.read("decision", Decision.from_item, item))]
     heard = [each for each in [*found, *recent] if not each.dry_run]
     lifts = [each for each in heard if each.action not in STANDING]  # of what this controller may still hold
     return [each for each in [*lifts, *in_force(heard)] if is_for(each, switch)]
@@ -44,4 +43,4 @@ def is_for(decision: Decision, switch: str) -> bool:
 def commands_of(archived: Iterable[Item], since: int, intake: Intake) -> list[TableCommand]:
     """Commands written after `since` (ns), oldest first."""
     items = (item for item in archived if item.timestamp > since)
-    return [command for item in items if (command := intake.read("command", command_in, item))]
+    return [command for item in items if (command := intake.read("command", TableCommand.from_item, item))]

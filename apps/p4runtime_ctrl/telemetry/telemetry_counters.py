@@ -1,6 +1,6 @@
 """Reads how many frames each counting entry has met, while somebody wants to know: planning goes by it.
 
-In a thread of its own: a switch under a flood answers late.
+In a thread of its own: a switch under a flood answers late.  I/O.
 """
 
 import logging

@@ -8,7 +8,7 @@ magnitude only, since they order queries and decide nothing else.
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from apps.sonata_adapter.planner.rates import Rates
+from apps.sonata_adapter.planner.rates import MeasuredRates
 
 PACKETS: Final = 10_000.0
 _PROTOCOLS: Final = {6: 0.75, 17: 0.2, 1: 0.02, 58: 0.01}
@@ -19,7 +19,7 @@ _FLAGS: Final = {(0x02, 0x17): 0.04, (0x12, 0x17): 0.04, (0x10, 0x17): 0.85, (0x
 _ONE_HOST: Final = 0.01
 
 
-def packets_per_second(matches: Iterable[Mapping[str, Any]], rates: Rates | None = None) -> float:
+def packets_per_second(matches: Iterable[Mapping[str, Any]], rates: MeasuredRates | None = None) -> float:
     """How many packets meet at least one of the conditions, at most."""
     every = rates.of({}) if rates is not None else None
     packets = PACKETS if every is None else every

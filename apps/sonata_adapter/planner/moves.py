@@ -15,7 +15,7 @@ import msgspec
 from apps.sonata_adapter.keys import QueryRequest
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.planner.plan import QueryPlans, copies_saved, plan
-from apps.sonata_adapter.planner.rates import Rates
+from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.planner.refinement_levels import levels_of
 
 Side = Literal["switch", "host"]
@@ -118,7 +118,7 @@ def improvements(
     counts: Iterable[QueryRequest],
     limits: SwitchLimits,
     present: QueryPlans,
-    rates: Rates,
+    rates: MeasuredRates,
     resting: Iterable[int] = (),
 ) -> dict[str, Side]:
     """Counts that should move, by identity: into room that there is; or out, for others that save much more.

@@ -30,7 +30,7 @@ from apps.sonata_adapter.planner.placement import (
     masks_of,
 )
 from apps.sonata_adapter.planner.pushdown import Difference, candidates, difference
-from apps.sonata_adapter.planner.rates import Rates
+from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.planner.refinement_levels import address_of, by_family, cut
 from apps.sonata_adapter.query.dataflow import (
     Crossing,
@@ -122,7 +122,7 @@ def plan(
     before: QueryPlans | None = None,
     resting: Iterable[int] = (),
     generation: int = 1,
-    rates: Rates | None = None,
+    rates: MeasuredRates | None = None,
 ) -> QueryPlans:
     """The plan for all requests; entries of the plan `before` keep their place in the switch.
 
@@ -163,7 +163,7 @@ def plan(
 
 
 def _placed(
-    requests: Sequence[QueryRequest], space: Space, limits: SwitchLimits, rates: Rates | None
+    requests: Sequence[QueryRequest], space: Space, limits: SwitchLimits, rates: MeasuredRates | None
 ) -> tuple[dict[str, QueryPlan], Space]:
     """Plans for new requests, and what is free then; distincts are split where that takes no query's room."""
     trials = []
@@ -226,13 +226,13 @@ def clock_period(windows: Iterable[int], least: int) -> int:
     return next((period for period in (common // parts, common) if period >= least), least)
 
 
-def copies_saved(request: QueryRequest, limits: SwitchLimits, rates: Rates | None = None) -> float:
+def copies_saved(request: QueryRequest, limits: SwitchLimits, rates: MeasuredRates | None = None) -> float:
     """Copies a second that counting in the switch saves; 0: it cannot count it."""
     return _saving(request, limits, rates, a_stage=False)
 
 
 def _saving(
-    request: QueryRequest, limits: SwitchLimits, rates: Rates | None, *, a_stage: bool = True
+    request: QueryRequest, limits: SwitchLimits, rates: MeasuredRates | None, *, a_stage: bool = True
 ) -> float:
     """Copies a second that counting in the switch saves, for each stage that it takes; 0: it cannot."""
     try:
@@ -292,7 +292,9 @@ def _expressions(node: Node) -> Iterator[Expression]:
             yield from _expressions(source)
 
 
-def _counted(request: QueryRequest, space: Space, limits: SwitchLimits, rates: Rates | None) -> QueryPlan:
+def _counted(
+    request: QueryRequest, space: Space, limits: SwitchLimits, rates: MeasuredRates | None
+) -> QueryPlan:
     """The query in the switch, or the reason why it is not there."""
     trial = space.copy()
     try:

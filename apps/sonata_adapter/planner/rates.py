@@ -17,7 +17,7 @@ class _Rate(NamedTuple):
     per_s: float
 
 
-class Rates:
+class MeasuredRates:
     """What the switches' packets have been like since the last look."""
 
     def __init__(self) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from apps.sonata_adapter.keys import QueryRequest
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.planner.plan import QueryPlans, plan
-from apps.sonata_adapter.planner.rates import Rates
+from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.planner.refinement_levels import address_of, levels_of, narrowed, prefixes
 from apps.sonata_adapter.results import QueryResult
 from due import RecordBatch
@@ -119,7 +119,7 @@ class Refinement:
         clocks: Mapping[str, int | None],
         *,
         generation: int = 1,
-        rates: Rates | None = None,
+        rates: MeasuredRates | None = None,
     ) -> RefinementCounts:
         """Counts for these requests and their plan; `clocks`: the time (us) that each switch has reached."""
         self._resting = [each for each in self._resting if _rests(each, clocks)]

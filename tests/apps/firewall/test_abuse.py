@@ -144,7 +144,7 @@ def test_a_million_forged_sources():
     assert [each.action for each in decisions] == ["protect"]
     assert len(made.recent) <= 2 * size
     assert len(made.known) == 1
-    assert len(made._ledger.blocks) == 0
+    assert len(made._lifecycle.blocks) == 0
     assert surges.hosts == 1
 
 

@@ -148,7 +148,7 @@ def test_drops_of_all_places_count():
     desk.switch(at=NOW + 2 * SECOND)
     report(desk, held(packets=30))
     report(desk, held(packets=5), place="second")
-    (standing,) = desk.service._ledger.blocks.values()
+    (standing,) = desk.service._lifecycle.blocks.values()
     assert standing.readings[-1][1] == 30
     desk.switch(at=NOW + 3 * SECOND)
     report(desk, held(packets=40), place="second")

@@ -117,7 +117,7 @@ def test_a_block_that_is_over_can_still_teach():
     after.engine.archived = [
         Item("network.block.firewall.mac", block.to_value(), NOW, NOW, "firewall", "i1", 1)
     ]
-    after.service._ledger.blocks.clear()
+    after.service._lifecycle.blocks.clear()
     assert say(after, "false_alarm", block.id).done
     hear(after, *backup(AT + 60))
     assert not after.blocked

@@ -1,7 +1,7 @@
 """What the other apps write is what the controller's decoders take."""
 
 from apps.messages import TableCommand
-from apps.p4runtime_ctrl.arrivals import command_in, offer_in
+from apps.p4runtime_ctrl.arrivals import offer_in
 from apps.p4runtime_ctrl.telemetry.classifier import Classifier
 from apps.p4runtime_ctrl.telemetry.demand import Offers
 from due import Item
@@ -26,4 +26,4 @@ def test_offers_and_commands_of_all_queries_are_taken():
     assert len(offers) == len(changes.offer)
     command = TableCommand(id="sonata-1", updates=changes.updates).to_value()
     key = "network.p4_command.sonata_adapter.s1"
-    assert len(command_in(item(key, "sonata_adapter", command)).updates) == len(changes.updates)
+    assert len(TableCommand.from_item(item(key, "sonata_adapter", command)).updates) == len(changes.updates)

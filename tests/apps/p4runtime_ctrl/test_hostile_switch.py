@@ -80,7 +80,7 @@ def test_malformed_messages_are_counted_and_the_connection_goes_on(telemetry):
 
         engine.until(lambda: state()["packet_in"] >= 1)
         still_works(engine, service, 7)
-        engine.until(lambda: state()["malformed"] > 60 and state()["stations_malformed"] > 0)
+        engine.until(lambda: state()["malformed"] > 60 and state()["learn_malformed"] > 0)
         assert state()["primary"]
         assert sum("primary" in value["change"] for value in engine.values("network.switch")) >= 1
         assert not any("lost:" in value["change"] for value in engine.values("network.switch"))

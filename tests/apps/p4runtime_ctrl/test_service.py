@@ -286,19 +286,19 @@ def test_stations_are_learnt_and_forgotten_by_the_capture_clock(tmp_path):
         wait_for(lambda: any(v["telemetry"] == ["packets"] for v in heard.values("switch")), why=stage.log)
         feed = stage.feed()
 
-        def stations():
-            return heard.values("network.switch")[-1]["stations"]
+        def learnt():
+            return heard.values("network.switch")[-1]["learnt"]
 
         feed.send([1, 2], [60, 60], [frame(1), frame(2)])
-        wait_for(lambda: stations() == 2, 90, why=lambda: (heard.values("switch")[-1], stage.log()))
+        wait_for(lambda: learnt() == 2, 90, why=lambda: (heard.values("switch")[-1], stage.log()))
         wait_for(lambda: len(heard.arrivals()) == 2, 90, why=stage.log)
         sent = 2
-        while stations() == 2:
+        while learnt() == 2:
             feed.send([sent * 1_000_000], [60], [frame(2)])
             sent += 1
             assert sent < 100_000
             wait_for(lambda: len(heard.arrivals()) == sent, 90, why=stage.log)  # noqa: B023 - run at once
-        assert stations() == 1
+        assert learnt() == 1
         assert not heard.values("confirmation"), "nobody asked for these entries"
         feed.close()
 

@@ -84,8 +84,8 @@ def test_apps_with_their_instances(url):
 
 def test_keys_with_makers_and_takers_and_what_nobody_makes(url):
     shown = run("keys", "--url", url)
-    assert "maker    reliable     always     taker    a.b.maker:window=*" in shown
-    assert "maker    best_effort  on_demand  -        a.c.maker" in shown
+    assert "maker     reliable     always     taker      a.b.maker:window=*" in shown
+    assert "maker     best_effort  on_demand  -          a.c.maker" in shown
     assert shown.splitlines()[-1] == "taker      x.y"
     assert json.loads(run("keys", "--url", url, "--json"))["interests"] == ANSWERS["/interests"]
 

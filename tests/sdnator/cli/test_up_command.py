@@ -154,10 +154,10 @@ def test_a_pipeline_that_starts_is_told(tmp_path):
 
 def test_status_tells_who_closes_a_switch_that_nobody_controls():
     told = {
-        "sentinel": False,
+        "watchdog": False,
         "switches": [
             {"switch": "s1", "connected": True, "primary": True, "fail": "open", "packet_in": 3},
-            {"switch": "s2", "connected": False, "primary": False, "fail": "closed", "stations": 2},
+            {"switch": "s2", "connected": False, "primary": False, "fail": "closed", "learnt": 2},
         ],
     }
     control = controlled({"apps": {"p4runtime_ctrl": {"health": {"app": told, "engine": {}}}}})
@@ -165,12 +165,12 @@ def test_status_tells_who_closes_a_switch_that_nobody_controls():
         "connected": False,
         "primary": False,
         "fail": "closed",
-        "stations": 2,
+        "learnt": 2,
     }
     first, second = control_lines(control, {"s1", "s2"})
     assert first == "switch s1 is under control; it fails open: port forwarding stays without a controller"
     assert "s2 is NOT under control; it fails closed, but NO watchdog runs; 2 MAC addresses learnt" in second
-    assert "a watchdog runs" in list(control_lines({**control, "sentinel": True}, {"s2"}))[1]
+    assert "a watchdog runs" in list(control_lines({**control, "watchdog": True}, {"s2"}))[1]
     assert "closed, and has no port forwarding" in list(control_lines(control, ()))[1]
     assert controlled({"apps": {}}) is None, "the controller has said nothing yet"
     assert list(control_lines(None, ())) == []

@@ -77,7 +77,7 @@ def test_a_table_of_another_capture_is_refused(capture):
 
 
 def test_no_attacks_at_all(capture):
-    """Harmless flows make harmless labels."""
+    """Benign flows make benign labels."""
     found = labels_of_flows(capture, [_flow(0, 9, attack=False)])
     assert not found.labels.attack.any()
     assert found.labels.names == ("",)

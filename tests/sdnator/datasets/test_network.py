@@ -68,7 +68,7 @@ def _syn(time: int, port: int, dport: int = 80) -> SentPacket:
     return SentPacket(time, TCP_KIND, bot, hosts.PC.ip, 74, port, dport, frames.SYN, attacker=bot.mac_text)
 
 
-def test_a_victim_answers_and_its_answers_are_harmless():
+def test_a_victim_answers_and_its_answers_are_benign():
     """SYN-ACK with retries from an open port, RST from a closed one and to a stray ACK."""
     found = _carry(_syn(0, 1024))
     assert [round(frame.time / SECOND) for frame in found] == [0, 0, 1, 3, 7, 15, 31]

@@ -25,7 +25,7 @@ def _read(path: Path) -> list[CapturedFrame]:
 
 
 def test_splice(tmp_path):
-    """Without labels the first part is harmless, the second an attack of its first sender."""
+    """Without labels the first part is benign, the second an attack of its first sender."""
     benign = _capture(tmp_path / "b.pcap", [T0, T0 + 5_000_000])
     attack = _capture(tmp_path / "a.pcap", [T0 * 2, T0 * 2 + 1_000, T0 * 2 + 9_000])
     steps: list[int] = []

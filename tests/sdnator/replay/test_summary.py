@@ -53,7 +53,7 @@ def test_auc_equals_counting_pairs(rows):
 
 
 def test_dropped_packets_are_told_apart():
-    """Attack, an attacker's own harmless packets, and innocent ones."""
+    """Attack, an attacker's own benign packets, and innocent ones."""
     survey = surveyed(CAMERA, CAMERA, PHONE, CAMERA)
     labels = Labels.of([False, True, False, True], ["", "5c:cf:7f:05:f2:c6", "", "5c:cf:7f:05:f2:c6"])
     flight = PacketAccounting(4)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sdnator.replay.packet_accounting import PacketState
-from sdnator.report.plots import ATTACK, BLOCK, DROPPED, HARMLESS, Curve, draw
+from sdnator.report.plots import ATTACK, BENIGN, BLOCK, DROPPED, Curve, draw
 
 
 def _curve(packets: int = 3_000, **changes) -> Curve:
@@ -26,17 +26,17 @@ def _has(png: bytes, colour: str) -> bool:
 
 
 def test_colours_of_what_happened():
-    """Harmless, attack, dropped and blocks each have their colour; what is absent has none."""
+    """Benign, attack, dropped and blocks each have their colour; what is absent has none."""
     attack = np.arange(3_000) > 2_000
     plain = draw([_curve()])
-    assert _has(plain, HARMLESS)
+    assert _has(plain, BENIGN)
     assert not _has(plain, ATTACK)
     assert not _has(plain, DROPPED)
     state = _curve().state.copy()
     state[2_500:] = PacketState.DROPPED
     score = np.where(attack, 9.0, 0.01)
     full = draw([_curve(attack=attack, state=state, score=score, blocks=((80.0, "10.0.0.9"),))])
-    assert all(_has(full, colour) for colour in (HARMLESS, ATTACK, DROPPED, BLOCK))
+    assert all(_has(full, colour) for colour in (BENIGN, ATTACK, DROPPED, BLOCK))
 
 
 def test_two_plots_are_taller_than_one():

@@ -31,7 +31,7 @@ BLOCK = {"address": "10.0.0.9", "time": "12:00", "packet": 5, "reason": "hot", "
         ),
         (
             {"blocks": [BLOCK], "attack_dropped": 5, "attack_after_first_block": 5, "benign_dropped": 3},
-            "1 sender blocked; 100 % of the attack stopped from then on; 3 harmless packets were hit",
+            "1 sender blocked; 100 % of the attack stopped from then on; 3 benign packets were hit",
         ),
         ({"blocks": [BLOCK], "attack_dropped": 0, "attack_after_first_block": 0}, "1 sender blocked"),
     ],

@@ -8,7 +8,7 @@ from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Options
 from due.bridge.service import BridgeService, Settings
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_rights import Rights
-from sdnator.private_files import write_private_json
+from due.private_files import write_private_json
 from sdnator.rights.identities import ADMIN, credential_file, made
 from tests.due.conftest import wait_for
 

@@ -267,6 +267,7 @@ def test_an_engine_goes_on_with_what_it_may_and_tells_of_the_rest(place, tmp_pat
     assert "secret" not in seen
     assert mine.health()["updates"]["denied"] >= 2
     assert "mine has no right to an entry of network.anomaly.kitsune.score" in caplog.text
+    assert "under [[grants]] in sdnator.toml" in caplog.text
     mine.close()
     operator.close()
 

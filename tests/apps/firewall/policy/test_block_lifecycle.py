@@ -9,12 +9,12 @@ from apps.messages import Alert, Confirmation, Decision, Exhibit, Sender, Target
 from tests.apps.firewall.alerts import CAMERA, alert
 
 
-def opened(ledger: BlockLifecycle, at_s: int = 100, offences: int = 0) -> Decision:
-    return opened_for(ledger, alert(at_s), offences)
+def opened(lifecycle: BlockLifecycle, at_s: int = 100, offences: int = 0) -> Decision:
+    return opened_for(lifecycle, alert(at_s), offences)
 
 
-def opened_for(ledger: BlockLifecycle, cause: Alert, offences: int = 0) -> Decision:
-    return ledger.open(
+def opened_for(lifecycle: BlockLifecycle, cause: Alert, offences: int = 0) -> Decision:
+    return lifecycle.open(
         cause.sender.switch,
         Target(kind="mac", address=cause.sender.mac, port=cause.sender.port),
         "hot",
@@ -44,24 +44,24 @@ def test_first_block_lasts_ten_minutes_and_later_ones_longer():
 
 def test_a_block_after_a_lift_is_another_one_in_the_same_moment_too():
     """By hand, while no switch says that time goes on: the lift in the archive must not end the second block."""
-    ledger = BlockLifecycle(Rules())
-    first = opened(ledger)
-    assert ledger.lift(first.id, first.event_time, "by hand") is not None
-    assert opened(ledger).id != first.id
+    lifecycle = BlockLifecycle(Rules())
+    first = opened(lifecycle)
+    assert lifecycle.lift(first.id, first.event_time, "by hand") is not None
+    assert opened(lifecycle).id != first.id
     assert opened(BlockLifecycle(Rules())).id == first.id, "the same in every replay"
 
 
 def test_block_covers_its_station_and_nobody_else():
     """A MAC block is of one port of one switch."""
-    ledger = BlockLifecycle(Rules())
-    opened(ledger)
-    assert ledger.covering(CAMERA) is not None
-    assert ledger.covering(Sender(switch="s1", port=2, mac=CAMERA.mac, ip=CAMERA.ip)) is None
-    assert ledger.covering(Sender(switch="s2", port=1, mac=CAMERA.mac, ip=CAMERA.ip)) is None
+    lifecycle = BlockLifecycle(Rules())
+    opened(lifecycle)
+    assert lifecycle.covering(CAMERA) is not None
+    assert lifecycle.covering(Sender(switch="s1", port=2, mac=CAMERA.mac, ip=CAMERA.ip)) is None
+    assert lifecycle.covering(Sender(switch="s2", port=1, mac=CAMERA.mac, ip=CAMERA.ip)) is None
 
 
-def covering_by_a_look_at_each(ledger: BlockLifecycle, sender: Sender) -> str | None:
-    for block in ledger.blocks.values():
+def covering_by_a_look_at_each(lifecycle: BlockLifecycle, sender: Sender) -> str | None:
+    for block in lifecycle.blocks.values():
         target = block.decision.target
         covered = sender.ip != "" and (
             ipaddress.ip_address(sender.ip) in ipaddress.ip_network(target.address)
@@ -93,71 +93,71 @@ def test_the_oldest_of_several_blocks_covers():
         for n in (1, 3)
         for ip in ("", "10.0.0.1", "10.0.0.3", "fd00::1")
     ]
-    ledger = BlockLifecycle(Rules())
+    lifecycle = BlockLifecycle(Rules())
     kinds = set()
     for at in range(300):
         step = random.random()
         if step < 0.5:
-            ledger.open(random.choice(["s1", "s2", "*"]), random.choice(targets), "", (), at * SECOND)
-        elif ledger.blocks and step < 0.9:
-            ledger.lift(random.choice([*ledger.blocks]), at * SECOND, "by hand")
-        elif ledger.blocks:
-            (decision, *_) = (block.decision for block in ledger.blocks.values())
-            ledger.confirm(confirmation(decision, "failed"))
+            lifecycle.open(random.choice(["s1", "s2", "*"]), random.choice(targets), "", (), at * SECOND)
+        elif lifecycle.blocks and step < 0.9:
+            lifecycle.lift(random.choice([*lifecycle.blocks]), at * SECOND, "by hand")
+        elif lifecycle.blocks:
+            (decision, *_) = (block.decision for block in lifecycle.blocks.values())
+            lifecycle.confirm(confirmation(decision, "failed"))
         for sender in senders:
-            found = ledger.covering(sender)
-            assert (found and found.decision.id) == covering_by_a_look_at_each(ledger, sender)
+            found = lifecycle.covering(sender)
+            assert (found and found.decision.id) == covering_by_a_look_at_each(lifecycle, sender)
             kinds.add(found is not None)
     assert kinds == {True, False}
 
 
 def test_quiet_block_runs_out_into_probation():
     """It is lifted at its expiry, and for ten minutes one anomalous second blocks again."""
-    ledger = BlockLifecycle(Rules())
-    decision = opened(ledger)
-    assert ledger.due(decision.expires - 1) == []
-    (lifted,) = ledger.due(decision.expires)
+    lifecycle = BlockLifecycle(Rules())
+    decision = opened(lifecycle)
+    assert lifecycle.due(decision.expires - 1) == []
+    (lifted,) = lifecycle.due(decision.expires)
     assert (lifted.action, lifted.id) == ("unblock", decision.id)
-    assert ledger.covering(CAMERA) is None
-    assert ledger.on_probation(CAMERA, decision.expires + 599 * SECOND)
-    assert not ledger.on_probation(CAMERA, decision.expires + 600 * SECOND)
+    assert lifecycle.covering(CAMERA) is None
+    assert lifecycle.on_probation(CAMERA, decision.expires + 599 * SECOND)
+    assert not lifecycle.on_probation(CAMERA, decision.expires + 600 * SECOND)
 
 
 def test_probation_that_is_over_takes_no_room():
-    ledger = BlockLifecycle(Rules())
+    lifecycle = BlockLifecycle(Rules())
     for number in range(3):
         target = Target(kind="ip", address=f"10.0.0.{number}")
-        ledger.open("s1", target, "hot", (), number * 1000 * SECOND, seconds=10)
-        ledger.due((number * 1000 + 10) * SECOND)
-    assert list(ledger.probation) == [("s1", "ip", "10.0.0.2")]
+        lifecycle.open("s1", target, "hot", (), number * 1000 * SECOND, seconds=10)
+        lifecycle.due((number * 1000 + 10) * SECOND)
+    assert list(lifecycle.probation) == [("s1", "ip", "10.0.0.2")]
 
 
 def test_block_is_extended_while_the_attack_goes_on():
     """Sixty-one drops a second are more than three times a training rate of twenty."""
-    ledger = BlockLifecycle(Rules())
-    decision = opened(ledger)
-    ledger.count_drops(decision.id, 61 * 600, decision.expires)
-    (extended,) = ledger.due(decision.expires)
+    lifecycle = BlockLifecycle(Rules())
+    decision = opened(lifecycle)
+    lifecycle.count_drops(decision.id, 61 * 600, decision.expires)
+    (extended,) = lifecycle.due(decision.expires)
     assert (extended.action, extended.expires) == ("block", decision.expires + 600 * SECOND)
     assert "still going on" in extended.reason
 
 
 def test_pause_of_the_flood_does_not_end_the_block():
     """The rate counts over a minute: half a minute of silence is a pause."""
-    ledger = BlockLifecycle(Rules())
-    decision = opened(ledger)
+    lifecycle = BlockLifecycle(Rules())
+    decision = opened(lifecycle)
     end = decision.expires
     for before_end, drops in ((120, 0), (60, 6_000), (30, 12_000), (1, 12_000), (0, 12_000)):
-        ledger.count_drops(decision.id, drops, end - before_end * SECOND)
-    assert ledger.due(end)[0].action == "block"
+        lifecycle.count_drops(decision.id, drops, end - before_end * SECOND)
+    assert lifecycle.due(end)[0].action == "block"
 
 
 def test_drops_at_the_training_rate_do_not_extend():
     """A camera that only does its usual work is given another chance."""
-    ledger = BlockLifecycle(Rules())
-    decision = opened(ledger)
-    ledger.count_drops(decision.id, 20 * 600, decision.expires)
-    assert ledger.due(decision.expires)[0].action == "unblock"
+    lifecycle = BlockLifecycle(Rules())
+    decision = opened(lifecycle)
+    lifecycle.count_drops(decision.id, 20 * 600, decision.expires)
+    assert lifecycle.due(decision.expires)[0].action == "unblock"
 
 
 def test_a_block_that_was_asked_for_ends_when_it_says():
@@ -167,49 +167,49 @@ def test_a_block_that_was_asked_for_ends_when_it_says():
     target = Target(kind="mac", address=CAMERA.mac, port=CAMERA.port)
     decision = first.open("*", target, "by hand: ticket 4711", [said], 100 * SECOND, seconds=30)
     restarted.restore([decision])
-    for ledger in (first, restarted):
-        ledger.count_drops(decision.id, 1_000_000, decision.expires)
-        assert ledger.due(decision.expires - 1) == []
-        (lifted,) = ledger.due(decision.expires)
+    for lifecycle in (first, restarted):
+        lifecycle.count_drops(decision.id, 1_000_000, decision.expires)
+        assert lifecycle.due(decision.expires - 1) == []
+        (lifted,) = lifecycle.due(decision.expires)
         assert (lifted.action, lifted.id) == ("unblock", decision.id)
-        assert ledger.blocks == {}
-        assert not ledger.on_probation(CAMERA, decision.expires)
+        assert lifecycle.blocks == {}
+        assert not lifecycle.on_probation(CAMERA, decision.expires)
 
 
 def test_block_refused_by_the_switch_is_not_in_force():
     """What failed does not count as covered: the next alert tries again."""
-    ledger = BlockLifecycle(Rules())
-    made = opened(ledger)
-    ledger.confirm(confirmation(made, "installed"))
-    assert ledger.covering(CAMERA) is not None
-    ledger.confirm(confirmation(made, "failed"))
-    assert ledger.covering(CAMERA) is None
+    lifecycle = BlockLifecycle(Rules())
+    made = opened(lifecycle)
+    lifecycle.confirm(confirmation(made, "installed"))
+    assert lifecycle.covering(CAMERA) is not None
+    lifecycle.confirm(confirmation(made, "failed"))
+    assert lifecycle.covering(CAMERA) is None
 
 
 def test_caps_stop_blocking():
     """Too many decisions a minute, or blocks in force, stop the firewall."""
-    ledger = BlockLifecycle(Rules(max_decisions_per_minute=2))
+    lifecycle = BlockLifecycle(Rules(max_decisions_per_minute=2))
     for second in (100, 101):
-        assert ledger.cap_reached(second * SECOND) is None
-        opened(ledger, second)
-    assert "max_decisions_per_minute" in (ledger.cap_reached(102 * SECOND) or "")
-    assert ledger.cap_reached(161 * SECOND) is None
+        assert lifecycle.cap_reached(second * SECOND) is None
+        opened(lifecycle, second)
+    assert "max_decisions_per_minute" in (lifecycle.cap_reached(102 * SECOND) or "")
+    assert lifecycle.cap_reached(161 * SECOND) is None
     assert "max_blocks" in (BlockLifecycle(Rules(max_blocks=0)).cap_reached(0) or "")
 
 
 def test_dry_run_is_marked():
     """Decisions of a dry run say so, and are never extended."""
-    ledger = BlockLifecycle(Rules(dry_run=True))
-    decision = opened(ledger)
+    lifecycle = BlockLifecycle(Rules(dry_run=True))
+    decision = opened(lifecycle)
     assert decision.dry_run
-    ledger.count_drops(decision.id, 10**6, decision.expires)
-    assert ledger.due(decision.expires)[0].action == "unblock"
+    lifecycle.count_drops(decision.id, 10**6, decision.expires)
+    assert lifecycle.due(decision.expires)[0].action == "unblock"
 
 
 def test_same_decision_has_the_same_id_in_every_replay():
     """Ids follow from switch, target and capture time."""
     assert opened(BlockLifecycle(Rules())).id == opened(BlockLifecycle(Rules())).id
     other = alert(100, Sender(switch="s1", port=1, mac="00:00:00:00:00:01"))
-    ledger = BlockLifecycle(Rules())
-    made = opened_for(ledger, other)
-    assert made.id != opened(ledger).id
+    lifecycle = BlockLifecycle(Rules())
+    made = opened_for(lifecycle, other)
+    assert made.id != opened(lifecycle).id

@@ -20,9 +20,9 @@ SAID = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary
 
 
 def desk(*allowed: str) -> Desk:
-    ledger = BlockLifecycle(Rules())
-    syn = SynDefence(ledger_rules(), (), ledger, AllowList(), KnownSources(10))
-    return Desk(ledger, syn, RateLimits(Rules()), allowed, FalseAlarms(90))
+    lifecycle = BlockLifecycle(Rules())
+    syn = SynDefence(ledger_rules(), (), lifecycle, AllowList(), KnownSources(10))
+    return Desk(lifecycle, syn, RateLimits(Rules()), allowed, FalseAlarms(90))
 
 
 def ledger_rules() -> SynRules:
@@ -110,16 +110,16 @@ def test_wrong_allow_entry_changes_nothing():
 
 def test_panic_lifts_blocks_and_guards():
     """Everything that was not in the settings."""
-    ledger = BlockLifecycle(Rules())
-    syn = SynDefence(ledger_rules(), (), ledger, AllowList(), KnownSources(10))
+    lifecycle = BlockLifecycle(Rules())
+    syn = SynDefence(ledger_rules(), (), lifecycle, AllowList(), KnownSources(10))
     syn.recent.add(batch(*[(1, f"77.0.{n // 256}.{n % 256}", WEB.address, WEB.port) for n in range(600)]))
     syn.conclude(syn.suspect(Suspicion(WEB.address, SAID, NOW, 0)), {})
-    made = Desk(ledger, syn, RateLimits(Rules()), (), FalseAlarms(90))
+    made = Desk(lifecycle, syn, RateLimits(Rules()), (), FalseAlarms(90))
     tell(made, "block", "192.0.2.1")
     decisions, answer = tell(made, "panic")
     assert sorted(each.action for each in decisions) == ["unblock", "unprotect"]
     assert answer.done
-    assert (len(ledger.blocks), syn.guarded) == (0, [])
+    assert (len(lifecycle.blocks), syn.guarded) == (0, [])
 
 
 def test_targets():

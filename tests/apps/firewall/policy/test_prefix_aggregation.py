@@ -37,31 +37,33 @@ def test_who_is_within():
 
 def test_prefix_comes_first_then_its_addresses_are_lifted():
     """No moment without a block; evidence of the latest is kept."""
-    ledger = BlockLifecycle(Rules())
+    lifecycle = BlockLifecycle(Rules())
     for address in hosts("192.0.2.", 130):
         evidence = [Exhibit(key="k", timestamp=1, summary=address)]
-        ledger.open("*", Target(kind="ip", address=address), "why", evidence, NOW)
-    made = list(gather_blocks(ledger, lambda each: {"192.0.2.0/24": list(each)}, NOW))
+        lifecycle.open("*", Target(kind="ip", address=address), "why", evidence, NOW)
+    made = list(gather_blocks(lifecycle, lambda each: {"192.0.2.0/24": list(each)}, NOW))
     assert [each.action for each in made] == ["block"] + ["unblock"] * 130
     assert made[0].target.address == "192.0.2.0/24"
     assert made[0].expires == NOW + 600 * SECOND
     assert "130 addresses" in made[0].reason
     assert made[0].evidence
-    assert [each.decision for each in ledger.blocks.values()] == [made[0]]
-    assert ledger.in_blocked_prefix("192.0.2.99")
-    assert not ledger.in_blocked_prefix("192.0.3.99")
+    assert [each.decision for each in lifecycle.blocks.values()] == [made[0]]
+    assert lifecycle.in_blocked_prefix("192.0.2.99")
+    assert not lifecycle.in_blocked_prefix("192.0.3.99")
 
 
 def test_a_block_that_was_asked_for_outlives_that_of_its_prefix():
     """Whoever lifts the prefix lifts what the firewall decided, not what an operator has."""
-    ledger = BlockLifecycle(Rules())
+    lifecycle = BlockLifecycle(Rules())
     said = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary="block")
-    by_hand = ledger.open("*", Target(kind="ip", address="192.0.2.1"), "by hand", [said], NOW, seconds=36_000)
+    by_hand = lifecycle.open(
+        "*", Target(kind="ip", address="192.0.2.1"), "by hand", [said], NOW, seconds=36_000
+    )
     for address in hosts("192.0.2.", 130)[2:]:
-        ledger.open("*", Target(kind="ip", address=address), "why", (), NOW)
-    made = list(gather_blocks(ledger, lambda each: {"192.0.2.0/24": list(each)}, NOW))
+        lifecycle.open("*", Target(kind="ip", address=address), "why", (), NOW)
+    made = list(gather_blocks(lifecycle, lambda each: {"192.0.2.0/24": list(each)}, NOW))
     assert (len(made), made[0].expires) == (129, NOW + 600 * SECOND)
-    assert by_hand.id in ledger.blocks
+    assert by_hand.id in lifecycle.blocks
 
 
 def test_nothing_to_gather():

@@ -84,7 +84,7 @@ def test_sources_that_saw_the_same_packets_are_not_added_in_full():
 
 
 def test_what_only_supports_never_decides():
-    """However unlike training it looks: a new and harmless thing looks so, too."""
+    """However unlike training it looks: a new and benign thing looks so, too."""
     test = trained()
     assert total(test, *[evidence(50.0, source="scores", supporting=True)] * 9) < test.bound / 2
     assert total(test, evidence(6.0)) == pytest.approx(6.0 + 0.3 * test.bound)

@@ -16,8 +16,8 @@ NOW = 1_000 * SECOND
 
 
 def defence(*guards: TcpService, rules: Rules | None = None, allow: tuple[str, ...] = ()) -> SynDefence:
-    ledger = BlockLifecycle(rules or Rules())
-    return SynDefence(SynRules(), guards, ledger, AllowList.parse(allow), KnownSources(10))
+    lifecycle = BlockLifecycle(rules or Rules())
+    return SynDefence(SynRules(), guards, lifecycle, AllowList.parse(allow), KnownSources(10))
 
 
 def flood(made: SynDefence, sources: int, each: int, now: int = NOW) -> list[Decision]:
@@ -127,7 +127,7 @@ def test_caps_hold_for_floods():
     """Past them nothing is blocked, and it is counted."""
     made = defence(rules=Rules(max_decisions_per_minute=10))
     assert len(flood(made, 100, 6)) == 10
-    assert made._ledger.refused == 90
+    assert made._lifecycle.refused == 90
 
 
 def test_dry_run_marks_guards_and_blocks():

@@ -3,7 +3,6 @@
 import logging
 
 from apps.messages import Decision, Intake, Target
-from apps.p4runtime_ctrl.arrivals import decision_in
 from apps.p4runtime_ctrl.state.history import commands_of, decisions_for
 from due import Item
 
@@ -54,7 +53,7 @@ def test_other_switches_and_all_switches():
 
 def test_what_cannot_be_read_is_left_out(caplog):
     heard = intake()
-    assert heard.read("decision", decision_in, item({"id": 5}, 1)) is None
+    assert heard.read("decision", Decision.from_item, item({"id": 5}, 1)) is None
     assert "(fields): Decision:" in caplog.text
     good = {"id": "c1", "updates": [{"kind": "delete", "table": "t"}]}
     key = "network.p4_command.firewall.s1"

@@ -45,8 +45,8 @@ def shown(changes):
 
 
 def test_stations_come_move_and_go():
-    stations = MacLearning(program(), LEARN)
-    first = stations.learn([report((0xA, 1), (0xB, 2, 7)), report((0xA, 1))])
+    learning = MacLearning(program(), LEARN)
+    first = learning.learn([report((0xA, 1), (0xB, 2, 7)), report((0xA, 1))])
     assert shown(first) == [
         "+dmac[vid=0,eth_dst=00:00:00:00:00:0a]",
         "+smac[vid=0,eth_src=00:00:00:00:00:0a]",
@@ -54,18 +54,18 @@ def test_stations_come_move_and_go():
         "+smac[vid=7,eth_src=00:00:00:00:00:0b]",
     ]
     assert first[1].entry.idle_timeout_ns == 60_000_000_000
-    assert not stations.learn([report((0xA, 1))])
-    assert [text[:5] for text in shown(stations.learn([report((0xA, 3))]))] == ["~dmac", "~smac"]
-    assert (len(stations), stations.moved) == (2, 1)
-    assert not stations.forget(first[0].entry.__class__(table_id=1))
-    assert [text[:5] for text in shown(stations.forget(first[1].entry))] == ["-dmac", "-smac"]
-    assert len(stations) == 1
+    assert not learning.learn([report((0xA, 1))])
+    assert [text[:5] for text in shown(learning.learn([report((0xA, 3))]))] == ["~dmac", "~smac"]
+    assert (len(learning), learning.moved) == (2, 1)
+    assert not learning.forget(first[0].entry.__class__(table_id=1))
+    assert [text[:5] for text in shown(learning.forget(first[1].entry))] == ["-dmac", "-smac"]
+    assert len(learning) == 1
 
 
 def test_the_number_of_stations_is_bounded_and_other_ports_are_ignored():
-    stations = MacLearning(program(), msgspec.structs.replace(LEARN, limit=2))
-    stations.learn([report((1, 1), (2, 9), (3, 2), (4, 3), (5, 1))])
-    assert (len(stations), stations.refused) == (2, 2)
+    learning = MacLearning(program(), msgspec.structs.replace(LEARN, limit=2))
+    learning.learn([report((1, 1), (2, 9), (3, 2), (4, 3), (5, 1))])
+    assert (len(learning), learning.refused) == (2, 2)
 
 
 def test_a_program_without_learning():
@@ -82,7 +82,7 @@ class Learning(Attached):
 
     def digests(self, lists):
         self.switch.learn(lists, self.session)
-        self.known = (len(self.switch.stations), self.switch.stations.moved)
+        self.known = (len(self.switch.mac_learning), self.switch.mac_learning.moved)
 
 
 def test_stations_outlive_switch_and_controller():
@@ -99,10 +99,10 @@ def test_stations_outlive_switch_and_controller():
         held.connection.close()
         heir = Learning(fake.address, DesiredSwitch("s1", program(), lambda: (0, 0), learn=LEARN))
         assert str(heir.until_up()) == "nothing to change"
-        assert len(heir.switch.stations) == 2
+        assert len(heir.switch.mac_learning) == 2
         silent = [entry for entry in fake.entries.values() if entry.idle_timeout_ns]
         assert heir.switch.expire(silent, heir.session) == []
-        assert (len(fake.entries), len(heir.switch.stations)) == (0, 0)
+        assert (len(fake.entries), len(heir.switch.mac_learning)) == (0, 0)
         heir.connection.close()
 
 

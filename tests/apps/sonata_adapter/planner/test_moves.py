@@ -6,7 +6,7 @@ import pytest
 
 from apps.sonata_adapter.control import Control
 from apps.sonata_adapter.planner.placement import SwitchLimits
-from apps.sonata_adapter.planner.rates import Rates
+from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from sdnator.testing.query_traffic import ACK, BASE_US, PSH, TimedFrame, batches, tcp
 from tests.apps.sonata_adapter.query.test_catalogue import expect, same
@@ -125,14 +125,14 @@ def test_little_traffic_moves_nothing():
     ],
 )
 def test_rates_are_over_a_second_and_begin_anew_with_a_counter(totals, expected):
-    rates = Rates()
+    rates = MeasuredRates()
     for packets, time_us in totals:
         rates.note("s1", "q1", {"protocol": 6}, packets, time_us)
     assert rates.of({"protocol": 6}) == expected
 
 
 def test_rates_of_switches_add_up_and_of_several_counters_the_largest_counts():
-    rates = Rates()
+    rates = MeasuredRates()
     for switch, name, packets in (("s1", "q1", 100), ("s1", "q2", 40), ("s2", "q1", 7)):
         rates.note(switch, name, {}, 0, 0)
         rates.note(switch, name, {}, packets, 1_000_000)

@@ -1,6 +1,6 @@
 """Files with secrets are their owner's alone, and one that is right already is left as it is."""
 
-from sdnator.private_files import write_private, write_private_json
+from due.private_files import write_private, write_private_json
 
 
 def test_a_file_that_holds_the_text_is_not_written_again(tmp_path):
