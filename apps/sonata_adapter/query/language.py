@@ -93,7 +93,11 @@ class Gate(msgspec.Struct, frozen=True, tag=True):
     count: int
 
     def text(self) -> str:
-        """As in a query's text."""
+        """Write it as in a query's text.
+
+        Returns:
+            One line.
+        """
         name = self.name if self.key == Field(self.name) else f"{self.name} = {text_of(self.key)}"
         return f"gate {name}: count() >= {self.count} where {text_of(self.condition)}"
 
@@ -178,8 +182,8 @@ class Query(msgspec.Struct, frozen=True):
         Args:
             condition: which packets are counted, for instance `udp.sport == 53`.
             at_least: how many of them open the gate, 1 or more; the last of these is looked at.
-            key: one field, under the name that it has in the first `map` of the query and of all that it is joined
-                with: `dst=ip.dst`.
+            key: one field, such as `dst=ip.dst`, under the name that it has in the first `map` of the query and of all
+                queries that it is joined with.
 
         Returns:
             The query with this gate.
