@@ -90,7 +90,7 @@ COMMANDS = {
     "observe": ("sdnator.cli.due_commands:observe", "Show items as they arrive."),
     "plan": (
         "sdnator.cli.plan_command:plan_command",
-        "Calculate what a pipeline takes: processes, cores, memory, archive, and what limits it.",
+        "Calculate what a pipeline needs: processes, cores, memory, archive, and what limits it.",
     ),
     "program": (
         "sdnator.cli.program_commands:program",
