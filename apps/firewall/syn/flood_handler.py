@@ -24,6 +24,9 @@ from apps.messages import Confirmation, Decision
 from due import Engine, Item, RecordBatch
 
 TELEMETRY: Final = "network.telemetry.firewall"
+_BEFORE_NS: Final = 1_000_000_000
+"""Connections are reset that were answered so long before the window that reports the flood, too: a backlog is full
+within milliseconds, which may be the last ones of the window before."""
 ONE_DIRECTION: Final = 1000
 """Warn about one-way traffic after this many SYNs without a SYN-ACK."""
 
@@ -226,7 +229,9 @@ class FloodHandler:
             decision = self._publish(decision, False)  # noqa: PLW2901 - as it was published
             if decision.action == "protect" and not decision.dry_run:
                 target = decision.target
-                wanted = Wanted(TcpService(target.address, target.port or 0), since=due.suspicion.since)
+                wanted = Wanted(
+                    TcpService(target.address, target.port or 0), since=due.suspicion.since - _BEFORE_NS
+                )
                 self._resets.plan(decision.id, wanted, self._clock())
         if watch.unsure:
             self._examinations.doubt(due, self._clock())

@@ -72,6 +72,18 @@ def test_spoofed_flood_guards_then_resets_what_is_half_open():
     assert desk.service.health()["resets"] == 5
 
 
+def test_a_flood_that_began_just_before_its_window_leaves_nothing_half_open():
+    """A backlog is full within milliseconds: the window that reports the flood may hold none of its connections."""
+    desk = Desk(syn=QUICK)
+    flood(desk, *spoofed())
+    window_us = NOW // 1000 // 200_000 * 200_000
+    answers = [syn_ack(source, 1000, VICTIM, 8, time_us=window_us - 1000) for source in spoofed(5)]
+    desk.hand(SYN_ACKS, records(answers))
+    desk.confirm(desk.decisions[0])
+    desk.tick_until(lambda: desk.written("network.packet_out.firewall.s1"))
+    assert desk.service.health()["resets"] == 5
+
+
 def test_one_source_is_guarded_against_first_and_blocked_when_sure(clock):
     """A guard harms nobody; the block comes with the second look, if the victim is seen to answer."""
     desk = Desk(syn=SynRules(grace_ms=0, patience_ms=LONG_MS))
