@@ -15,7 +15,7 @@ from msgspec import structs
 from apps.evidence import ONE_HOST, Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
-from apps.firewall.policy.rate_limits import limit_of, limit_words, usual_rate_of
+from apps.firewall.policy.rate_limits import limit_of, limit_words, scan_limit_of, usual_rate_of
 from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
 from apps.firewall.policy.sequential_test import LEAST_BOUND, EvidenceSum, SequentialTest
 from apps.firewall.syn.services import TcpService
@@ -33,6 +33,8 @@ _PARTS_SHOWN: Final = 3
 
 Offences = Callable[[Target], int | None]
 """Earlier blocks of a target; None if the archive does not answer."""
+Services = Callable[[str], Collection[int] | None]
+"""TCP ports of an address with a service; None if nobody can know them."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class Decider:
         bindings: whose an address is.
         known: addresses known from handshakes.
         allow: the allow-list of now.
+        services: of hosts, as far as they are known from handshakes.
     """
 
     def __init__(
@@ -73,12 +76,14 @@ class Decider:
         bindings: ArpBindings,
         known: Collection[str],
         allow: Callable[[], AllowList],
+        services: Services = lambda _: None,
     ) -> None:
         self._rules = rules
         self._lifecycle = lifecycle
         self._bindings = bindings
         self._known = known
         self._allow = allow
+        self._services = services
         self._told: OrderedDict[object, int] = OrderedDict()
         """When a refusal about a subject was last reported; the newest is the last."""
         self.test = SequentialTest(rules.false_blocks_per_day)
@@ -219,11 +224,30 @@ class Decider:
     def _for_the_victim(
         self, tally: EvidenceSum, reason: str, total: float, needed: float
     ) -> Proposal | None:
-        """A guard or rate limit against what a sender that cannot be blocked floods its victim with."""
+        """A guard or rate limit against what a sender that cannot be blocked floods its victim with, or scans it by."""
         strongest = max(tally.contributions.values(), key=lambda each: each.nats).latest
-        if strongest.kind != "flood" or not strongest.victims or not strongest.service:
+        if not strongest.victims:
+            return None
+        if strongest.kind == "scan":
+            return self._against_scan(strongest, tally, reason, total, needed)
+        if strongest.kind != "flood" or not strongest.service:
             return None
         return self._remedy(strongest, [strongest], reason, tally, total, needed)
+
+    def _against_scan(
+        self, scan: Evidence, tally: EvidenceSum, reason: str, total: float, needed: float
+    ) -> Proposal | None:
+        """A rate limit of SYNs to the ports where the victim has no service: it harms nobody, whoever scans."""
+        victim = scan.victims[0]
+        sent = [each.latest for each in tally.contributions.values() if victim in each.latest.victims]
+        if not any(each.service.startswith("tcp/") for each in sent):
+            return None
+        ports = self._services(victim)
+        limit = None if ports is None else scan_limit_of(tuple(ports))
+        if limit is None:
+            return None
+        reason = f"{reason}; limited: {limit.words} to {limit.rate:,} packets/s"
+        return Proposal(scan, reason, limit=limit, nats=total, bound=needed, tally=tally)
 
     def _towards(self, evidence: Evidence, tally: EvidenceSum, total: float, bound: float) -> Proposal | None:
         """A victim of senders that cannot be told apart, or whose addresses are forged."""

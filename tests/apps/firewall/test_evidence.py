@@ -172,6 +172,54 @@ def test_a_flood_in_the_name_of_a_stranger_has_its_victim_protected(training_rat
     assert [each.sender for each in made.grounds] == [structs.replace(CAMERA, ip="198.51.100.9")]
 
 
+def scanned(victim="10.0.0.1", service="tcp/8080", **changes):
+    """A scan of many ports, and the one-way traffic that it consists of."""
+    flood = routed(source="one_way", kind="flood", victims=(victim,), service=service, **changes)
+    return structs.replace(flood, nats=1.0), routed(source="contacts", victims=(victim,), **changes)
+
+
+def shake(on, service="10.0.0.1", port=443):
+    said = {"source": "203.0.113.5", "service": service, "port": port, "at": NOW}
+    on.hand("network.handshake.sonata.tcp", said)
+
+
+def test_a_scan_in_the_name_of_a_stranger_is_slowed_down_and_no_service_is_hit():
+    """Whoever sent it: only SYNs to ports where the victim has no service are limited, whoever sends them."""
+    on = desk()
+    shake(on)
+    shake(on, "10.0.0.2", 80)
+    hear(on, *scanned())
+    (made,) = on.decisions
+    assert (made.action, made.target.address) == ("meter", "10.0.0.1")
+    assert made.limit == RateLimit(kind="syn", rate=5, open_ports=(443,))
+    assert "anybody could have forged it; limited: SYNs to ports other than 443 to 5 packets/s" in made.reason
+    assert not on.blocked
+
+
+def test_a_scan_in_the_name_of_a_stranger_is_only_reported_where_nobody_knows_the_services():
+    """Without handshakes a limit might hit clients; of datagrams nothing is known."""
+    for on, heard in ((desk(), scanned()), (desk(), scanned(service="udp/161"))):
+        if heard[0].service.startswith("udp"):
+            shake(on)
+        hear(on, *heard)
+        assert on.decisions == []
+        assert any("anybody could have forged it" in text for text in on.events)
+
+
+def test_who_is_allowed_may_scan():
+    on = desk(rules=Rules(allow=("198.51.100.0/24",)))
+    shake(on)
+    hear(on, *scanned())
+    assert on.decisions == []
+
+
+def test_a_scanner_that_has_proven_its_address_is_blocked():
+    on = desk()
+    shake(on)
+    hear(on, *scanned(forgeable=False))
+    assert on.blocked == ["198.51.100.9"]
+
+
 def test_what_is_allowed_may_flood_its_victim():
     """The allow-list always wins; a rate limit would hit others, too."""
     on = desk(rules=Rules(allow=("198.51.100.0/24",)))
