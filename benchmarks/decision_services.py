@@ -1,6 +1,6 @@
 """Services of generated traffic, as the product knows them: from completed handshakes.
 
-    SYN-ACK of a service ─► half open ─► ACK of the client: the service is known
+SYN-ACK of a service ─► half open ─► ACK of the client: the service is known
 """
 
 import ipaddress

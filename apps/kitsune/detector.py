@@ -223,7 +223,9 @@ class Detector:
                 self.senders.blocked,
             )
             marked = self.fingerprints.add(rows, switch, trained, len(self.behaviour.senders))
-            findings += [each for each in marked if self._is_here(each)]
+            if marked:  # in order of time: what comes first may decide
+                findings += filter(self._is_here, marked)
+                findings.sort(key=lambda finding: finding.time)
         self._evidence += [self._as_evidence(finding) for finding in findings]
         self._follow_drift(rows, scores, trained, findings)
         scored = scores[trained:]

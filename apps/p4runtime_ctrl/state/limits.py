@@ -88,9 +88,7 @@ def _matches(victim: Any, limit: RateLimit, slot: int) -> list[tuple[dict[str, A
         return [(fits | {"protocol": [_TCP, 0xFF]} | ports, _PRIORITY, limit.rate)]
     if limit.kind == "syn":
         syns = fits | {"protocol": [_TCP, 0xFF], "tcp_flags": [_SYN, _SYN | _ACK]}
-        spared = [
-            (syns | {"dport": [port, 0xFFFF]}, _OPEN_PRIORITY, _UNLIMITED) for port in limit.open_ports
-        ]
+        spared = [(syns | {"dport": [port, 0xFFFF]}, _OPEN_PRIORITY, _UNLIMITED) for port in limit.open_ports]
         return [(syns, _PRIORITY, limit.rate), *spared]
     datagrams = fits | {"protocol": [_UDP, 0xFF]}
     if limit.kind == "udp":
