@@ -186,10 +186,12 @@ class Decider:
         """The target to block, and what is to be said about the choice."""
         if self._allow().covers(sender):
             return None, "the sender is on the allow-list"
-        if evidence.role in self._rules.protected_roles:
+        if evidence.role in self._rules.protected_roles and not _is_anothers(evidence):
             return None, f"the sender is a {evidence.role}: it is reported but not blocked"
         if self.test.too_short:
             return None, "training is too short for the budget of false blocks: nobody is blocked"
+        if evidence.forged and evidence.routed:
+            return None, f"{sender.ip} is another's, and everybody behind {sender.mac} could have forged it"
         if target is None:
             behind = f"{evidence.mac_addresses} addresses are behind {sender.mac}"
             return None, f"{behind}, and the frames carry no address"
@@ -198,18 +200,21 @@ class Decider:
         if self._may_be_planted(evidence, sender) and not self._rules.block_unproven_addresses:
             why = f"{target.address} is behind a router and has completed no handshake"
             return None, f"{why}, so anybody could have forged it"
-        return self._unforged(target, sender, forgeable=evidence.forgeable)
+        return self._unforged(target, sender, forgeable=evidence.forgeable, routed=evidence.routed)
 
-    def _unforged(self, target: Target, sender: Sender, *, forgeable: bool) -> tuple[Target | None, str]:
+    def _unforged(
+        self, target: Target, sender: Sender, *, forgeable: bool, routed: bool = False
+    ) -> tuple[Target | None, str]:
         """An address that others can forge is not blocked; the forger is, if it is known for certain."""
         if target.kind != "ip":
             return target, ""
         host = BoundHost.of(sender.port, sender.mac)
         if self._bindings.forged(target.address, host):
-            if self._bindings.is_alone(host):
+            if self._bindings.is_alone(host) and not routed:
                 forger = Target(kind="mac", address=sender.mac, port=sender.port)
                 return forger, f"{target.address} belongs to another, so its forger is blocked"
-            return None, f"{target.address} belongs to another, and its forger shares a port"
+            where = f"is behind {sender.mac}" if routed else "shares a port"
+            return None, f"{target.address} belongs to another, and its forger {where}"
         if forgeable and target.address in self._known and not self._rules.block_known_addresses:
             return None, f"{target.address} is known from handshakes and may be forged"
         return target, ""
@@ -217,9 +222,9 @@ class Decider:
     @staticmethod
     def _may_be_planted(evidence: Evidence, sender: Sender) -> bool:
         """Whether a third party could have sent all this under the address of a sender behind a router."""
-        if not sender.ip or not evidence.forgeable or evidence.forged or evidence.kind == "spoofing":
+        if not sender.ip or not evidence.forgeable or evidence.kind == "spoofing":
             return False
-        return evidence.routed or evidence.mac_addresses > ONE_HOST
+        return evidence.routed or (evidence.mac_addresses > ONE_HOST and not evidence.forged)
 
     def _for_the_victim(
         self, tally: EvidenceSum, reason: str, total: float, needed: float
@@ -315,6 +320,14 @@ def _latest(tally: EvidenceSum, evidence: Evidence) -> Evidence:
         return structs.replace(evidence, sender=tally.subject, address="")
     newest = max(known, key=lambda each: each.event_time)
     return structs.replace(newest, event_time=evidence.event_time, text=evidence.text)
+
+
+def _is_anothers(evidence: Evidence) -> bool:
+    """Whether the role is that of the address's owner, whom the sender imitates.
+
+    Who takes over the address of a gateway or server may be its standby.
+    """
+    return evidence.role == "multicast" and evidence.forged and not evidence.routed
 
 
 def _target_of(evidence: Evidence, sender: Sender) -> Target | None:

@@ -10,8 +10,9 @@ from apps.firewall.policy.rules import Rules
 from apps.messages import RateLimit
 from due import Item
 from tests.apps.firewall.alerts import CAMERA
-from tests.apps.firewall.desk import NOW, Desk, FakeEngine
+from tests.apps.firewall.desk import ARP, NOW, Desk, FakeEngine
 from tests.apps.firewall.policy.test_sequential_test import evidence
+from tests.apps.firewall.rows import arp, records
 
 SECOND = 1_000_000_000
 AT = NOW // SECOND
@@ -127,6 +128,42 @@ def test_the_forger_of_an_address_is_blocked_and_its_owner_is_not():
     on = desk()
     hear(on, evidence(20.0, AT, mac_addresses=9, forged=True))
     assert on.blocked == [CAMERA.mac]
+
+
+def test_the_role_of_a_multicast_speaker_does_not_spare_the_forger_of_its_address():
+    """It is the owner's.  A gateway's spares whoever has its address, which may be its standby."""
+    on = desk()
+    hear(on, evidence(20.0, AT, forged=True, role="multicast"))
+    assert on.blocked == [CAMERA.mac]
+    for spared in (
+        evidence(20.0, AT, role="multicast"),
+        evidence(20.0, AT, forged=True, role="gateway"),
+        evidence(20.0, AT, forged=True, role="dns"),
+    ):
+        on = desk()
+        hear(on, spared)
+        assert not on.blocked
+
+
+def test_a_router_is_not_blocked_for_who_forges_an_inside_address_behind_it():
+    """Everybody there can; nor is the address, which is another's."""
+    for rules in (Rules(), Rules(block_unproven_addresses=True)):
+        on = desk(rules=rules)
+        hear(on, routed(forged=True))
+        assert on.decisions == []
+        assert any("is another's, and everybody behind" in text for text in on.events)
+    on = desk()
+    hear(on, routed(forged=True, kind="flood", victims=("10.0.0.1",), service="tcp/80"))
+    assert [(each.action, each.target.address) for each in on.decisions] == [("protect", "10.0.0.1")]
+
+
+def test_a_router_is_not_blocked_for_an_address_that_arp_has_seen_elsewhere():
+    on = desk()
+    on.hand(ARP, records([arp(0, 1, 0x02_00_00_00_00_07, "10.0.0.7")]))
+    moved = structs.replace(CAMERA, port=3, ip="10.0.0.7")
+    hear(on, evidence(20.0, AT, sender=moved, mac_addresses=200, routed=True, forgeable=False))
+    assert on.decisions == []
+    assert any("belongs to another, and its forger is behind" in text for text in on.events)
 
 
 def test_a_handshake_proves_an_address_behind_a_router():
