@@ -307,9 +307,11 @@ class Ground(Message, frozen=True, kw_only=True):
 
 MOST_GROUNDS: Final = 8
 
-FloodKind = Literal["udp", "udp_from", "udp_to", "tcp", "icmp"]
-"""Datagrams; those from a port, as reflectors send them; those to a port; TCP segments to a port that are no SYNs; and
-echo requests."""
+FloodKind = Literal["udp", "udp_from", "udp_to", "tcp", "syn", "icmp"]
+"""Datagrams; those from a port, as reflectors send them; those to a port; TCP segments to a port that are no SYNs; SYNs
+to all ports but some; and echo requests."""
+MOST_OPEN_PORTS: Final = 16
+"""Ports that a rate limit of SYNs leaves alone."""
 MOST_SPARED: Final = 64
 """Sources that a rate limit names; evidence names no more."""
 
@@ -323,6 +325,8 @@ class RateLimit(Message, frozen=True, kw_only=True):
     kind: FloodKind
     port: Port | None = None
     """The source port of `udp_from`, the destination port of `udp_to` and `tcp`; None for others."""
+    open_ports: Annotated[tuple[Port, ...], Meta(max_length=MOST_OPEN_PORTS)] = ()
+    """Destination ports that `syn` does not limit: services of the victim; empty for others."""
     rate: Annotated[int, Meta(ge=1, le=1 << 31)]
     """Packets per second of all sources together that may pass."""
     spared: Annotated[tuple[Name, ...], Meta(max_length=MOST_SPARED)] = ()
@@ -331,13 +335,15 @@ class RateLimit(Message, frozen=True, kw_only=True):
     """Packets per second."""
 
     def check(self) -> None:
-        """Check that the kind has its port, and the addresses of spared sources.
+        """Check that the kind has its ports, and the addresses of spared sources.
 
         Raises:
             MessageError: it has none, or one too many; or an address is invalid.
         """
-        if (self.port is None) != (self.kind in ("udp", "icmp")):
+        if (self.port is None) != (self.kind in ("udp", "syn", "icmp")):
             raise MessageError("fields", f"rate limit of {self.kind}: port {self.port} does not fit")
+        if self.open_ports and self.kind != "syn":
+            raise MessageError("fields", f"rate limit of {self.kind}: it has no open ports")
         for source in self.spared:
             address_in(source, "rate limit")
 
@@ -349,8 +355,16 @@ class RateLimit(Message, frozen=True, kw_only=True):
             "udp_from": f"UDP from port {self.port}",
             "udp_to": f"UDP to port {self.port}",
             "tcp": f"TCP to port {self.port} but SYNs",
+            "syn": f"SYNs{self._but_open_ports}",
             "icmp": "ICMP echo requests",
         }[self.kind]
+
+    @property
+    def _but_open_ports(self) -> str:
+        if not self.open_ports:
+            return ""
+        ports = ", ".join(map(str, self.open_ports))
+        return f" to ports other than {ports}"
 
 
 class Decision(Message, frozen=True, kw_only=True):

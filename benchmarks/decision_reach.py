@@ -7,8 +7,8 @@ failed to reach anybody, or ever logged in, the attack itself has to show
     ln(day / (T · b))
 
 nats: 5.5 after an hour with the default budget.  A packet weighs one at most, a login a little more.  Not so a claim
-of somebody else's address, nor scores: attacks that show less within five seconds and were mitigated all the same
-count as within reach.
+of somebody else's address, a SYN that no stack sends, nor scores: attacks that show less within five seconds and were
+mitigated all the same count as within reach.
 """
 
 import math

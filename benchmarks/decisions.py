@@ -5,9 +5,9 @@ an hour of training, half an hour of benign traffic, and then, each in a process
 trained state, every attack and every kind of benign novelty; then days of benign traffic.  The same for the rule
 of the paper (block at the first score over the threshold) and the rule of seconds (five anomalous seconds of ten).
 
-    attacks, mitigated        how many, and how many had an effective decision (block, guard) within 5 s
+    attacks, mitigated        how many, and how many had an effective decision (block, guard, rate limit) within 5 s
     median_s_to_decision      capture seconds from the attack's first packet; an attack without any counts as endless
-    stopped_share_median      share of the attack's packets that were dropped or challenged
+    stopped_share_median      share of the attack's packets that were dropped, over a rate limit, or challenged
     innocent_blocks           blocks during attacks of somebody who is not the attacker, the victim included
     novelty_blocks            blocks in benign novelty
     false_blocks_per_day, …_upper95   blocks a day of benign traffic, and the upper end of its 95 % interval
@@ -51,6 +51,7 @@ from benchmarks.data_folder import add_data_option
 from benchmarks.decision_jobs import Jobs
 from benchmarks.decision_reach import SOON_S, missed, unreachable
 from benchmarks.decision_rows import row_of
+from benchmarks.decision_services import services_of
 from benchmarks.decision_traffic.attacks import ATTACKS
 from benchmarks.decision_traffic.network import Network
 from benchmarks.decision_traffic.networks import NETWORKS
@@ -205,7 +206,11 @@ def _network(name: str, chosen: Any, jobs: Jobs) -> tuple[ByRule, ByRule]:
     benign = merge(*network.chunks(0, BENIGN_S + NOVELTY_S + 60))
     trained = DecisionRun(len(benign.between(0, TRAINING_S)), _rules(chosen.rules[0]))
     trained.feed(benign.between(0, TRAINING_S))
-    runs = [DecisionRun(trained.training_packets, _rules(rule), trained.detector) for rule in chosen.rules]
+    services = services_of(benign.between(0, TRAINING_S))
+    runs = [
+        DecisionRun(trained.training_packets, _rules(rule), trained.detector, services)
+        for rule in chosen.rules
+    ]
     seeds = range(1, chosen.seeds + 1)
     attacks, found = jobs.all(
         [
@@ -320,8 +325,8 @@ def _day(rules: Sequence[str], name: str, seed: int) -> Figures:
     """A day of benign traffic after an hour of training."""
     parts = NETWORKS[name](seed).chunks(0, TRAINING_S + 86_400)
     first = next(parts)  # training, an hour
-    detector = detector_for(len(first))
-    runs = [DecisionRun(len(first), _rules(rule), detector) for rule in rules]
+    detector, services = detector_for(len(first)), services_of(first)
+    runs = [DecisionRun(len(first), _rules(rule), detector, services) for rule in rules]
     benign = 0
     for part in chain([first], parts):
         watch(runs, part)
@@ -388,8 +393,8 @@ def _real_benign(chosen: Any) -> Figures:
     if not chosen.data.exists():
         return dict.fromkeys(chosen.rules, f"not run: no data in {chosen.data}")
     benign = merge(*real_network(chosen.data).chunks(0, 3_600))
-    detector = detector_for(REAL_TRAINING)
-    runs = [DecisionRun(REAL_TRAINING, _rules(rule), detector) for rule in chosen.rules]
+    detector, services = detector_for(REAL_TRAINING), services_of(next(benign.batches(REAL_TRAINING)))
+    runs = [DecisionRun(REAL_TRAINING, _rules(rule), detector, services) for rule in chosen.rules]
     watch(runs, benign)
     return {rule: {"packets": len(benign) - REAL_TRAINING} | found for rule, found in _blocks(runs).items()}
 

@@ -28,6 +28,7 @@ from apps.messages import Alert, Decision, Sender, Target
 from benchmarks.decision_blocks import ModelledBlocks
 from benchmarks.decision_jobs import Jobs
 from benchmarks.decision_limits import ModelledLimits
+from benchmarks.decision_services import Services
 from benchmarks.decision_traffic.traffic import Traffic
 from due import RecordBatch
 
@@ -70,11 +71,13 @@ class DecisionRun:
         training_packets: packets of training.
         rules: the firewall's options.
         shared: a detector that several runs listen to (`watch`, `feed_apart`).
+        services: TCP ports by address, as known from handshakes.
     """
 
     training_packets: int
     rules: Rules
     shared: Detector | None = None
+    services: Services = field(default_factory=dict)
     decided: list[DecidedAction] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     heard: list[EvidenceHeard] = field(default_factory=list)
@@ -93,7 +96,7 @@ class DecisionRun:
         self._lifecycle = BlockLifecycle(self.rules)
         # capture times of generated traffic: ARP claims are weighed by the detector
         bindings = ArpBindings(training_s=0, settle_s=3_600, contest_s=60)
-        self.decider = Decider(self.rules, self._lifecycle, bindings, (), AllowList)
+        self.decider = Decider(self.rules, self._lifecycle, bindings, (), AllowList, self._ports_of)
         self._told = False
         self._untold: list[Decision] = []
         """Decisions that the detector does not know of."""
@@ -184,13 +187,20 @@ class DecisionRun:
             victim = proposal.evidence.victims[0]
             made = self._limits.open(victim, proposal.limit, proposal.reason, (), evidence)
             self._meters.decide(made)
-            self.decided += [DecidedAction(evidence.event_time, each.reason, limited=victim) for each in made]
+            self.decided += [
+                DecidedAction(evidence.event_time, each.reason, limited=victim)
+                for each in made
+                if each.action == "meter"
+            ]
             self.decider.settled(proposal)
         elif proposal.target is not None:
             self._block(evidence, proposal.target, proposal.reason)
             self.decider.settled(proposal)
         else:
             self.refused.append(proposal.reason)
+
+    def _ports_of(self, address: str) -> tuple[int, ...] | None:
+        return tuple(self.services.get(address, ())) if self.services else None
 
     def _block(self, cause: Alert | Evidence, target: Target, reason: str) -> None:
         host = "" if cause.sender is None else cause.sender.ip

@@ -122,7 +122,7 @@ class FirewallService:
         self._engine = engine
         self._intake = Intake(log)
         self._settings = settings
-        self._rules = settings.rules
+        rules = settings.rules
         self._known = KnownSources(settings.known_limit, settings.known_days)
         self._lifecycle = BlockLifecycle(settings.rules, known=self._known)
         self._counts = dict.fromkeys(("alerts", "evidence"), 0)
@@ -149,7 +149,7 @@ class FirewallService:
             self._lock,
             lambda: time.monotonic(),  # noqa: PLW0108 - tests set the clock of this module
         )
-        self._syn = self._floods.defence
+        self._syn = syn = self._floods.defence
         self._bindings = ArpBindings(
             training_s=settings.arp_training_s,
             settle_s=settings.arp_settle_s,
@@ -166,7 +166,9 @@ class FirewallService:
         self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
         self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
-            Decider(settings.rules, self._lifecycle, self._bindings, self._known, lambda: self._desk.allow),
+            Decider(
+                rules, self._lifecycle, self._bindings, self._known, lambda: self._desk.allow, syn.ports_of
+            ),
             self._lifecycle,
             self._syn,
             self._limits,

@@ -15,6 +15,7 @@ from apps.kitsune.accused import LEAST_NATS, Accused
 from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode
 from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS
 from apps.kitsune.behaviour.findings import Finding
+from apps.kitsune.behaviour.fingerprints import SynFingerprints
 from apps.kitsune.behaviour.native import NativeBehaviour
 from apps.kitsune.behaviour.rows import parts_of
 from apps.kitsune.drift import BLOCK_S, TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
@@ -142,6 +143,7 @@ class Detector:
         self._room = RowRoom()
         self.senders = Senders(kernel)
         self.behaviour = NativeBehaviour(settings.fm_grace + settings.ad_grace + 1, kernel)
+        self.fingerprints = SynFingerprints()
         self.victims = VictimRates(kernel)
         self._evidence: list[Evidence] = []
         self._tail: deque[npt.NDArray[np.float64]] = deque()
@@ -220,6 +222,10 @@ class Detector:
                 threshold,
                 self.senders.blocked,
             )
+            marked = self.fingerprints.add(rows, switch, trained, len(self.behaviour.senders))
+            if marked:  # in order of time: what comes first may decide
+                findings += filter(self._is_here, marked)
+                findings.sort(key=lambda finding: finding.time)
         self._evidence += [self._as_evidence(finding) for finding in findings]
         self._follow_drift(rows, scores, trained, findings)
         scored = scores[trained:]
@@ -279,6 +285,11 @@ class Detector:
         chosen = slice(trained, None) if benign is None else benign & (np.arange(len(scores)) >= trained)
         self.drift_changed |= self.drift.add(scores[chosen], rows.seconds[chosen])
 
+    def _is_here(self, finding: Finding) -> bool:
+        """Whether the sender is in this network: of those behind a router the Internet is full."""
+        sender = finding.sender
+        return sender is not None and not self.senders.roles.is_routed(sender[2], parts_of(sender[3]))
+
     def _as_evidence(self, finding: Finding) -> Evidence:
         rate = training_rate = 0.0
         proven = forged = False
@@ -310,6 +321,7 @@ class Detector:
         return {
             "senders": self.senders.to_state(),
             "behaviour": self.behaviour.to_state() if self._knows_behaviour else None,
+            "fingerprints": self.fingerprints.to_state(),
             "victims": self.victims.to_state(),
             "benign": None if benign is None else benign.to_state(),
             "trained_at_us": self._trained_at_us,
@@ -336,6 +348,8 @@ class Detector:
             self._knows_behaviour = bool(notes.get("behaviour"))
             if self._knows_behaviour:
                 self.behaviour = NativeBehaviour.restored(notes["behaviour"], self._kernel)
+            # a model of an earlier version has not counted SYNs: they are no more than its packets
+            self.fingerprints.restore(notes.get("fingerprints", (self.model.training_packets, 0)))
             self.victims = VictimRates.from_state(notes.get("victims", ()), self._kernel)
             if notes.get("drift"):
                 self.drift = Drift.from_state(notes["drift"])

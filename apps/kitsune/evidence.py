@@ -27,6 +27,7 @@ KINDS: Final[dict[Statistic, Kind]] = {
     "strangers": "flood",
     "scores": "unlike_training",
     "threshold": "unlike_training",
+    "fingerprint": "scan",
 }
 _SOURCES: Final = {**dict.fromkeys(CONTACTS, "contacts"), "callbacks": "logins"}
 """Statistics that are one source: views of the same packets; and what only counts on top of another."""
@@ -163,6 +164,10 @@ _TEXTS: Final[dict[Statistic, Callable[[_Told], str]]] = {
         f"the packets of {told.who} are unlike those of training ({told.finding.total:.0f} nats {told.within})"
     ),
     "threshold": lambda told: f"a packet of {told.who} scored {told.finding.count:.3g}",
+    "fingerprint": lambda told: (
+        f"{told.who} sent {told.counted('SYNs')} with the destination's address as sequence number, as Mirai does,"
+        f" to {told.service} {told.within}; {told.usual}"
+    ),
 }
 
 

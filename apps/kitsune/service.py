@@ -55,7 +55,7 @@ CAPABILITIES = (
 _USED: Final = {
     name: PACKET_COLUMNS[name]
     for name in (
-        *("time_us", "arrival", "port", "quoted", "tcp_flags", "icmp6_type"),
+        *("time_us", "arrival", "port", "quoted", "tcp_flags", "tcp_seq", "icmp6_type"),
         *(name for name, _, _ in PACKET_FIELDS if name != "time"),
     )
 }

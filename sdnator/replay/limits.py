@@ -19,7 +19,7 @@ from sdnator.capture.captures import Capture
 from sdnator.replay.guards import batches
 
 _SECOND_US: Final = 1_000_000
-_SYN: Final = 0x02
+_SYN, _ACK = 0x02, 0x10
 _HALF: Final = 64
 _NEVER: Final = np.iinfo(np.int64).max
 
@@ -93,6 +93,9 @@ def matches(columns: Mapping[str, Any], victim: str, limit: RateLimit) -> NDArra
         mine &= columns[kind] == echo
     elif limit.kind == "tcp":
         mine &= (columns["tcp_dport"] == limit.port) & (columns["tcp_flags"] & _SYN == 0)
+    elif limit.kind == "syn":
+        mine &= (columns["tcp_dport"] >= 0) & (columns["tcp_flags"] & (_SYN | _ACK) == _SYN)
+        mine &= ~np.isin(columns["tcp_dport"], limit.open_ports)
     elif limit.kind == "udp":
         mine &= columns["udp_sport"] >= 0
     else:

@@ -41,6 +41,21 @@ def through_router(row):
     return row
 
 
+def test_a_bot_is_blocked_at_its_first_probe():
+    """No stack begins a connection with the destination's address; a telnet client's SYN leads to nothing."""
+    rows = training()
+    run = DecisionRun(len(rows), Rules())
+    run.feed(traffic(rows))
+    client = through_router(packet(1_210, HOST, UNSEEN, 50_000, 23, SYN) | {"tcp_seq": 4_711})
+    run.feed(traffic([client]))
+    assert not run.decided
+    probe = through_router(packet(1_220, ATTACKER, UNSEEN, 50_000, 23, SYN) | {"tcp_seq": UNSEEN})
+    run.feed(traffic([probe]))
+    (decided,) = run.decided
+    assert (decided.target.kind, decided.target.port) == ("mac", ATTACKER & 0xFF)
+    assert "as Mirai does" in decided.reason
+
+
 @pytest.mark.parametrize(
     ("name", "steals_mac"),
     [(HOST, False), (HOST, True), (OUTSIDE[0], False), (UNSEEN, False)],

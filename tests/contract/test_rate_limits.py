@@ -70,6 +70,41 @@ def test_the_burst_passes_and_the_rest_is_counted(target, limited):
     assert (counted(controller, over), counted(controller, limit)) == (4, 9)
 
 
+def segment(number, port, flags=0x02):
+    """A TCP segment to the victim, by default a SYN."""
+    head = bytes.fromhex("45000028") + number.to_bytes(2, "big") + bytes.fromhex("000040060000")
+    ends = (0x0A000001).to_bytes(4, "big") + VICTIM.to_bytes(4, "big")
+    ports = (40_000).to_bytes(2, "big") + port.to_bytes(2, "big")
+    return _ETHERNET + head + ends + ports + bytes(8) + bytes([0x50, flags]) + bytes(6)
+
+
+def test_syns_to_open_ports_pass_whatever_the_limit_of_others_is(target, bare):
+    """As the controller limits a scan: open ports come first, with a meter that nothing exceeds."""
+    target.drain()
+    config = program_config(PROGRAM.with_suffix(""))
+    bare.set_pipeline(config)
+    names = EntryBuilder(config.p4info)
+    syns = {"is_ipv4": (1, 1), "dst": (VICTIM, ADDRESS), "protocol": (6, 0xFF), "tcp_flags": (0x02, 0x12)}
+    limit = names.entry("ingress.limit", syns, "ingress.limit_rate", [SLOT], priority=9)
+    web = {"dport": (443, 0xFFFF)}
+    is_open = names.entry("ingress.limit", syns | web, "ingress.limit_rate", [SLOT], priority=10)
+    meter = is_open.table_entry.meter_config
+    meter.cir = meter.cburst = meter.pir = meter.pburst = 1 << 31
+    over = names.entry("ingress.limit_over", {"slot": SLOT}, "ingress.drop_over")
+    bare.write(
+        insert(names.entry("ingress.forward_port", {"ingress_port": 1}, "ingress.to_port", [2])),
+        insert(over),
+        insert(is_open),
+        insert(metered(limit, 2)),
+    )
+    scan = [segment(number, 1_000 + number) for number in range(6)]
+    clients = [segment(10 + number, 443) for number in range(6)]
+    others = [segment(20, 1_003, flags=0x10), segment(21, 1_004, flags=0x12)]
+    target.inject(1, *scan, *clients, *others)
+    assert target.sent(2, 10) == [*scan[:2], *clients, *others]
+    assert counted(bare, over) == 4
+
+
 def test_a_spared_source_has_its_own_burst_beyond_the_limit(target, limited):
     controller, over, _ = limited
     target.inject(1, *[frame(number) for number in range(6)])

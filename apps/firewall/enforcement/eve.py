@@ -226,7 +226,7 @@ def _service(service: str) -> Event:
 
 def _limited(limit: RateLimit) -> Event:
     """The packets of a rate limit as Suricata's fields."""
-    proto = "UDP" if limit.kind.startswith("udp") else limit.kind.upper()
+    proto = {"udp_from": "udp", "udp_to": "udp", "syn": "tcp"}.get(limit.kind, limit.kind).upper()
     port = "src_port" if limit.kind == "udp_from" else "dest_port"
     return {"proto": proto} | ({} if limit.port is None else {port: limit.port})
 

@@ -15,7 +15,7 @@ from msgspec import structs
 from apps.evidence import ONE_HOST, Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
-from apps.firewall.policy.rate_limits import limit_of, limit_words, usual_rate_of
+from apps.firewall.policy.rate_limits import limit_of, limit_words, scan_limit_of, usual_rate_of
 from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
 from apps.firewall.policy.sequential_test import LEAST_BOUND, EvidenceSum, SequentialTest
 from apps.firewall.syn.services import TcpService
@@ -33,6 +33,8 @@ _PARTS_SHOWN: Final = 3
 
 Offences = Callable[[Target], int | None]
 """Earlier blocks of a target; None if the archive does not answer."""
+Services = Callable[[str], Collection[int] | None]
+"""TCP ports of an address with a service; None if nobody can know them."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class Decider:
         bindings: whose an address is.
         known: addresses known from handshakes.
         allow: the allow-list of now.
+        services: of hosts, as far as they are known from handshakes.
     """
 
     def __init__(
@@ -73,12 +76,14 @@ class Decider:
         bindings: ArpBindings,
         known: Collection[str],
         allow: Callable[[], AllowList],
+        services: Services = lambda _: None,
     ) -> None:
         self._rules = rules
         self._lifecycle = lifecycle
         self._bindings = bindings
         self._known = known
         self._allow = allow
+        self._services = services
         self._told: OrderedDict[object, int] = OrderedDict()
         """When a refusal about a subject was last reported; the newest is the last."""
         self.test = SequentialTest(rules.false_blocks_per_day)
@@ -181,10 +186,12 @@ class Decider:
         """The target to block, and what is to be said about the choice."""
         if self._allow().covers(sender):
             return None, "the sender is on the allow-list"
-        if evidence.role in self._rules.protected_roles:
+        if evidence.role in self._rules.protected_roles and not _is_anothers(evidence):
             return None, f"the sender is a {evidence.role}: it is reported but not blocked"
         if self.test.too_short:
             return None, "training is too short for the budget of false blocks: nobody is blocked"
+        if evidence.forged and evidence.routed:
+            return None, f"{sender.ip} is another's, and everybody behind {sender.mac} could have forged it"
         if target is None:
             behind = f"{evidence.mac_addresses} addresses are behind {sender.mac}"
             return None, f"{behind}, and the frames carry no address"
@@ -193,18 +200,21 @@ class Decider:
         if self._may_be_planted(evidence, sender) and not self._rules.block_unproven_addresses:
             why = f"{target.address} is behind a router and has completed no handshake"
             return None, f"{why}, so anybody could have forged it"
-        return self._unforged(target, sender, forgeable=evidence.forgeable)
+        return self._unforged(target, sender, forgeable=evidence.forgeable, routed=evidence.routed)
 
-    def _unforged(self, target: Target, sender: Sender, *, forgeable: bool) -> tuple[Target | None, str]:
+    def _unforged(
+        self, target: Target, sender: Sender, *, forgeable: bool, routed: bool = False
+    ) -> tuple[Target | None, str]:
         """An address that others can forge is not blocked; the forger is, if it is known for certain."""
         if target.kind != "ip":
             return target, ""
         host = BoundHost.of(sender.port, sender.mac)
         if self._bindings.forged(target.address, host):
-            if self._bindings.is_alone(host):
+            if self._bindings.is_alone(host) and not routed:
                 forger = Target(kind="mac", address=sender.mac, port=sender.port)
                 return forger, f"{target.address} belongs to another, so its forger is blocked"
-            return None, f"{target.address} belongs to another, and its forger shares a port"
+            where = f"is behind {sender.mac}" if routed else "shares a port"
+            return None, f"{target.address} belongs to another, and its forger {where}"
         if forgeable and target.address in self._known and not self._rules.block_known_addresses:
             return None, f"{target.address} is known from handshakes and may be forged"
         return target, ""
@@ -212,18 +222,37 @@ class Decider:
     @staticmethod
     def _may_be_planted(evidence: Evidence, sender: Sender) -> bool:
         """Whether a third party could have sent all this under the address of a sender behind a router."""
-        if not sender.ip or not evidence.forgeable or evidence.forged or evidence.kind == "spoofing":
+        if not sender.ip or not evidence.forgeable or evidence.kind == "spoofing":
             return False
-        return evidence.routed or evidence.mac_addresses > ONE_HOST
+        return evidence.routed or (evidence.mac_addresses > ONE_HOST and not evidence.forged)
 
     def _for_the_victim(
         self, tally: EvidenceSum, reason: str, total: float, needed: float
     ) -> Proposal | None:
-        """A guard or rate limit against what a sender that cannot be blocked floods its victim with."""
+        """A guard or rate limit against what a sender that cannot be blocked floods its victim with, or scans it by."""
         strongest = max(tally.contributions.values(), key=lambda each: each.nats).latest
-        if strongest.kind != "flood" or not strongest.victims or not strongest.service:
+        if not strongest.victims:
+            return None
+        if strongest.kind == "scan":
+            return self._against_scan(strongest, tally, reason, total, needed)
+        if strongest.kind != "flood" or not strongest.service:
             return None
         return self._remedy(strongest, [strongest], reason, tally, total, needed)
+
+    def _against_scan(
+        self, scan: Evidence, tally: EvidenceSum, reason: str, total: float, needed: float
+    ) -> Proposal | None:
+        """A rate limit of SYNs to the ports where the victim has no service: it harms nobody, whoever scans."""
+        victim = scan.victims[0]
+        sent = [each.latest for each in tally.contributions.values() if victim in each.latest.victims]
+        if not any(each.service.startswith("tcp/") for each in sent):
+            return None
+        ports = self._services(victim)
+        limit = None if ports is None else scan_limit_of(tuple(ports))
+        if limit is None:
+            return None
+        reason = f"{reason}; limited: {limit.words} to {limit.rate:,} packets/s"
+        return Proposal(scan, reason, limit=limit, nats=total, bound=needed, tally=tally)
 
     def _towards(self, evidence: Evidence, tally: EvidenceSum, total: float, bound: float) -> Proposal | None:
         """A victim of senders that cannot be told apart, or whose addresses are forged."""
@@ -291,6 +320,14 @@ def _latest(tally: EvidenceSum, evidence: Evidence) -> Evidence:
         return structs.replace(evidence, sender=tally.subject, address="")
     newest = max(known, key=lambda each: each.event_time)
     return structs.replace(newest, event_time=evidence.event_time, text=evidence.text)
+
+
+def _is_anothers(evidence: Evidence) -> bool:
+    """Whether the role is that of the address's owner, whom the sender imitates.
+
+    Who takes over the address of a gateway or server may be its standby.
+    """
+    return evidence.role == "multicast" and evidence.forged and not evidence.routed
 
 
 def _target_of(evidence: Evidence, sender: Sender) -> Target | None:

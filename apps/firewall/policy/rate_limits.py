@@ -1,6 +1,7 @@
 """Rate limits towards victims: which, how tight, and how long they last.  Pure; times are capture time in ns.
 
     flood of packets whose sources are forged, countless or innocent ─► rate limit of just these packets
+    scan of a victim's ports in a name that anybody can forge ─► rate limit of SYNs to ports without a service
     it drops as much as half of what it lets pass ─► it goes on; else it is lifted when its time is over
 
 The rate is what training saw of such packets from sources that cannot be named, with a margin; the busiest sources of
@@ -18,13 +19,15 @@ from msgspec import structs
 from apps.evidence import Evidence
 from apps.firewall.policy.block_lifecycle import MINUTE, NOTICES, SECOND, OperatorNotice, decision_id
 from apps.firewall.policy.rules import Rules
-from apps.messages import Confirmation, Decision, Exhibit, FloodKind, RateLimit, Target
+from apps.messages import MOST_OPEN_PORTS, Confirmation, Decision, Exhibit, FloodKind, RateLimit, Target
 
 EVERY_SWITCH: Final = "*"
 MARGIN: Final = 2.0
 """A limit is this many times what training saw ..."""
 LEAST_RATE: Final = 20
 """... and never below this many packets a second: a page asks for tens of names."""
+SCAN_RATE: Final = 5
+"""SYNs a second to ports without a service: who has just started one gets through, and makes it known."""
 MOST_LIMITS: Final = 256
 """Rate limits in force at a time: the switch program has room for as many."""
 GOING_ON_SHARE: Final = 0.5
@@ -54,6 +57,20 @@ def limit_of(pieces: Sequence[Evidence]) -> RateLimit | None:
         spared=spared,
         spared_rate=_rate(usual_rate_of(best)),
     )
+
+
+def scan_limit_of(open_ports: Sequence[int]) -> RateLimit | None:
+    """The rate limit that slows down a scan of a victim's TCP ports and none of its clients.
+
+    Args:
+        open_ports: ports of its services.
+
+    Returns:
+        None if there are too many for the switch program.
+    """
+    if len(open_ports) > MOST_OPEN_PORTS:
+        return None
+    return RateLimit(kind="syn", rate=SCAN_RATE, open_ports=tuple(sorted(open_ports)))
 
 
 def usual_rate_of(evidence: Evidence) -> float:
@@ -119,17 +136,21 @@ class RateLimits:
     def open(
         self, victim: str, limit: RateLimit, reason: str, exhibits: Iterable[Exhibit], cause: Evidence
     ) -> list[Decision]:
-        """Limit what comes to a victim; nothing if that is limited already, which then lasts longer."""
-        now = cause.event_time
-        for each in self.standing.values():
-            held = each.decision.limit
-            same = held is not None and (held.kind, held.port) == (limit.kind, limit.port)
-            if same and each.decision.target.address == victim:
-                each.heard = now
+        """Limit what comes to a victim; nothing if that is limited already, which then lasts longer.
+
+        A limit that would hit a service which was not known yet is lifted, and the new one comes after it.
+        """
+        now, lifted = cause.event_time, list[Decision]()
+        former = self._held(victim, limit)
+        if former is not None:
+            held = former.decision.limit
+            if held is None or set(limit.open_ports) <= set(held.open_ports):
+                former.heard = now
                 return []
+            lifted = [self._lifted(former, now, f"{victim} has another service")]
         if len(self.standing) >= MOST_LIMITS:
             self._refuse(victim, now)
-            return []
+            return lifted
         target = Target(kind="ip", address=victim)
         decision = Decision(
             id=decision_id(f"{EVERY_SWITCH} {limit.words}", target, now),
@@ -145,7 +166,16 @@ class RateLimits:
             limit=limit,
         )
         self.standing[decision.id] = StandingLimit(decision, deque([(now, 0)]))
-        return [decision]
+        return [*lifted, decision]
+
+    def _held(self, victim: str, limit: RateLimit) -> StandingLimit | None:
+        """The limit in force for packets of this kind towards a victim."""
+        for each in self.standing.values():
+            held = each.decision.limit
+            same = held is not None and (held.kind, held.port) == (limit.kind, limit.port)
+            if same and each.decision.target.address == victim:
+                return each
+        return None
 
     def _refuse(self, victim: str, now: int) -> None:
         self.refused += 1

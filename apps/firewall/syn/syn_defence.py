@@ -141,6 +141,12 @@ class SynDefence:
             del self.services[next(iter(self.services))]
         self._finished.append((at, source, service))
 
+    def ports_of(self, address: str) -> tuple[int, ...] | None:
+        """Ports of a host's services, as known from handshakes; None if no handshake of anybody has been seen."""
+        if not self.services:
+            return None
+        return tuple(service.port for service in self.services if service.address == address)
+
     def conclude(
         self, watch: Watch, offences: Mapping[str, int] | None, *, sure: bool = True
     ) -> list[Decision]:

@@ -10,6 +10,8 @@
     scores                 of a sender: how far Kitsune's scores lie over those of training
     threshold              a packet at or above Kitsune's threshold, without weight: for the rule of the paper
 
+`fingerprints` adds SYNs that only scanners send.
+
 Pure.  Each statistic has a `Baseline`; what is above it is weighed in nats, and a finding says what has been
 added since the last one about the same subject.
 """

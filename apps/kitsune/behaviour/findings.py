@@ -26,6 +26,7 @@ Statistic = Literal[
     "strangers",
     "scores",
     "threshold",
+    "fingerprint",
 ]
 HALF_LIFE_S: Final = 600.0
 """Seconds after which half of a finding is forgotten if nothing is added."""

@@ -2,7 +2,8 @@
 
 limit_over     its slot: drops and counts what is over it
 limit_spared   its slot and a source: a rate of its own, for each source that the decision names
-limit          the packets and their meter; where they come from a port, later fragments too, which have no ports
+limit          the packets and their meter; where they come from a port, later fragments too, which have no ports;
+               before a limit of SYNs, open ports with a meter that nothing exceeds
 """
 
 import ipaddress
@@ -22,8 +23,11 @@ SLOTS: Final = 256
 _PRIORITY: Final = 1_000
 _FRAGMENTS: Final = 1
 """Plus the slot, so that two limits of one victim have an entry each."""
+_OPEN_PRIORITY: Final = _PRIORITY + 1
+_UNLIMITED: Final = 1 << 31
+"""Packets a second of an open port."""
 _TCP, _UDP, _ICMP, _ICMPV6 = 6, 17, 1, 58
-_SYN: Final = 0x02
+_SYN, _ACK = 0x02, 0x10
 _ECHO, _ECHO_V6 = 8, 128
 _LATER: Final = 2
 
@@ -44,7 +48,7 @@ def limit_entries(
     over = program.entry(_named(kind, OVER, {"slot": slot}, "drop_over"))
     spared = [_spared(program, kind, slot, source, limit) for source in limit.spared]
     limits = []
-    for match, priority in reversed(_matches(victim, limit, slot)):
+    for match, priority, rate in reversed(_matches(victim, limit, slot)):
         entry = program.entry(
             TableUpdate(
                 kind=kind,
@@ -55,7 +59,7 @@ def limit_entries(
                 priority=priority,
             )
         )
-        limits.append(_metered(entry, kind, limit.rate))
+        limits.append(_metered(entry, kind, rate))
     return [over, *spared, *limits]
 
 
@@ -71,22 +75,27 @@ def lifting(program: ProgramInfo, target: Target, limit: RateLimit, slot: int) -
     ]
 
 
-def _matches(victim: Any, limit: RateLimit, slot: int) -> list[tuple[dict[str, Any], int]]:
-    """Matches and priorities, the limit itself first."""
+def _matches(victim: Any, limit: RateLimit, slot: int) -> list[tuple[dict[str, Any], int, int]]:
+    """Matches, priorities and rates, the limit itself first."""
     fits: dict[str, Any] = {"is_ipv4": [int(victim.version == 4), 1]}
     if victim.prefixlen:
         fits["dst"] = [str(victim.network_address), str(victim.netmask)]
     if limit.kind == "icmp":
         echo = (_ICMP, _ECHO) if victim.version == 4 else (_ICMPV6, _ECHO_V6)
-        return [(fits | {"protocol": [echo[0], 0xFF], "icmp_type": [echo[1], 0xFF]}, _PRIORITY)]
+        return [(fits | {"protocol": [echo[0], 0xFF], "icmp_type": [echo[1], 0xFF]}, _PRIORITY, limit.rate)]
     if limit.kind == "tcp":
         ports = {"dport": [limit.port, 0xFFFF], "tcp_flags": [0, _SYN]}
-        return [(fits | {"protocol": [_TCP, 0xFF]} | ports, _PRIORITY)]
+        return [(fits | {"protocol": [_TCP, 0xFF]} | ports, _PRIORITY, limit.rate)]
+    if limit.kind == "syn":
+        syns = fits | {"protocol": [_TCP, 0xFF], "tcp_flags": [_SYN, _SYN | _ACK]}
+        spared = [(syns | {"dport": [port, 0xFFFF]}, _OPEN_PRIORITY, _UNLIMITED) for port in limit.open_ports]
+        return [(syns, _PRIORITY, limit.rate), *spared]
     datagrams = fits | {"protocol": [_UDP, 0xFF]}
     if limit.kind == "udp":
-        return [(datagrams, _PRIORITY)]
+        return [(datagrams, _PRIORITY, limit.rate)]
     port = {"sport" if limit.kind == "udp_from" else "dport": [limit.port, 0xFFFF]}
-    return [(datagrams | port, _PRIORITY), (datagrams | {"fragment": [_LATER, 0x3]}, _FRAGMENTS + slot)]
+    fragments = datagrams | {"fragment": [_LATER, 0x3]}
+    return [(datagrams | port, _PRIORITY, limit.rate), (fragments, _FRAGMENTS + slot, limit.rate)]
 
 
 def _spared(program: ProgramInfo, kind: Any, slot: int, source: str, limit: RateLimit) -> Any:

@@ -10,8 +10,9 @@ from apps.firewall.policy.rules import Rules
 from apps.messages import RateLimit
 from due import Item
 from tests.apps.firewall.alerts import CAMERA
-from tests.apps.firewall.desk import NOW, Desk, FakeEngine
+from tests.apps.firewall.desk import ARP, NOW, Desk, FakeEngine
 from tests.apps.firewall.policy.test_sequential_test import evidence
+from tests.apps.firewall.rows import arp, records
 
 SECOND = 1_000_000_000
 AT = NOW // SECOND
@@ -129,6 +130,42 @@ def test_the_forger_of_an_address_is_blocked_and_its_owner_is_not():
     assert on.blocked == [CAMERA.mac]
 
 
+def test_the_role_of_a_multicast_speaker_does_not_spare_the_forger_of_its_address():
+    """It is the owner's.  A gateway's spares whoever has its address, which may be its standby."""
+    on = desk()
+    hear(on, evidence(20.0, AT, forged=True, role="multicast"))
+    assert on.blocked == [CAMERA.mac]
+    for spared in (
+        evidence(20.0, AT, role="multicast"),
+        evidence(20.0, AT, forged=True, role="gateway"),
+        evidence(20.0, AT, forged=True, role="dns"),
+    ):
+        on = desk()
+        hear(on, spared)
+        assert not on.blocked
+
+
+def test_a_router_is_not_blocked_for_who_forges_an_inside_address_behind_it():
+    """Everybody there can; nor is the address, which is another's."""
+    for rules in (Rules(), Rules(block_unproven_addresses=True)):
+        on = desk(rules=rules)
+        hear(on, routed(forged=True))
+        assert on.decisions == []
+        assert any("is another's, and everybody behind" in text for text in on.events)
+    on = desk()
+    hear(on, routed(forged=True, kind="flood", victims=("10.0.0.1",), service="tcp/80"))
+    assert [(each.action, each.target.address) for each in on.decisions] == [("protect", "10.0.0.1")]
+
+
+def test_a_router_is_not_blocked_for_an_address_that_arp_has_seen_elsewhere():
+    on = desk()
+    on.hand(ARP, records([arp(0, 1, 0x02_00_00_00_00_07, "10.0.0.7")]))
+    moved = structs.replace(CAMERA, port=3, ip="10.0.0.7")
+    hear(on, evidence(20.0, AT, sender=moved, mac_addresses=200, routed=True, forgeable=False))
+    assert on.decisions == []
+    assert any("belongs to another, and its forger is behind" in text for text in on.events)
+
+
 def test_a_handshake_proves_an_address_behind_a_router():
     on = desk()
     hear(on, evidence(20.0, AT, mac_addresses=9, training_rate=5.0, forgeable=False))
@@ -170,6 +207,54 @@ def test_a_flood_in_the_name_of_a_stranger_has_its_victim_protected(training_rat
     assert (made.action, made.target.address) == ("meter", "10.0.0.1")
     assert made.limit == RateLimit(kind="udp_to", port=5060, rate=200, spared=("192.0.2.7",), spared_rate=200)
     assert [each.sender for each in made.grounds] == [structs.replace(CAMERA, ip="198.51.100.9")]
+
+
+def scanned(victim="10.0.0.1", service="tcp/8080", **changes):
+    """A scan of many ports, and the one-way traffic that it consists of."""
+    flood = routed(source="one_way", kind="flood", victims=(victim,), service=service, **changes)
+    return structs.replace(flood, nats=1.0), routed(source="contacts", victims=(victim,), **changes)
+
+
+def shake(on, service="10.0.0.1", port=443):
+    said = {"source": "203.0.113.5", "service": service, "port": port, "at": NOW}
+    on.hand("network.handshake.sonata.tcp", said)
+
+
+def test_a_scan_in_the_name_of_a_stranger_is_slowed_down_and_no_service_is_hit():
+    """Whoever sent it: only SYNs to ports where the victim has no service are limited, whoever sends them."""
+    on = desk()
+    shake(on)
+    shake(on, "10.0.0.2", 80)
+    hear(on, *scanned())
+    (made,) = on.decisions
+    assert (made.action, made.target.address) == ("meter", "10.0.0.1")
+    assert made.limit == RateLimit(kind="syn", rate=5, open_ports=(443,))
+    assert "anybody could have forged it; limited: SYNs to ports other than 443 to 5 packets/s" in made.reason
+    assert not on.blocked
+
+
+def test_a_scan_in_the_name_of_a_stranger_is_only_reported_where_nobody_knows_the_services():
+    """Without handshakes a limit might hit clients; of datagrams nothing is known."""
+    for on, heard in ((desk(), scanned()), (desk(), scanned(service="udp/161"))):
+        if heard[0].service.startswith("udp"):
+            shake(on)
+        hear(on, *heard)
+        assert on.decisions == []
+        assert any("anybody could have forged it" in text for text in on.events)
+
+
+def test_who_is_allowed_may_scan():
+    on = desk(rules=Rules(allow=("198.51.100.0/24",)))
+    shake(on)
+    hear(on, *scanned())
+    assert on.decisions == []
+
+
+def test_a_scanner_that_has_proven_its_address_is_blocked():
+    on = desk()
+    shake(on)
+    hear(on, *scanned(forgeable=False))
+    assert on.blocked == ["198.51.100.9"]
 
 
 def test_what_is_allowed_may_flood_its_victim():

@@ -22,7 +22,7 @@ from apps.firewall.enforcement.eve import (
 from apps.firewall.incidents.incident_book import IncidentBook
 from apps.firewall.policy.block_lifecycle import OperatorNotice
 from apps.incidents import Incident
-from apps.messages import Decision, Target
+from apps.messages import Decision, RateLimit, Target
 from tests.apps.firewall.incidents import samples
 
 KINDS = {str: "string", int: "integer", dict: "object", list: "array", bool: "boolean"}
@@ -56,6 +56,20 @@ def decision(**changes) -> Decision:
         "expires": 0,
     }
     return Decision(**(fields | changes))
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [
+        ({"kind": "udp_from", "port": 53}, {"proto": "UDP", "src_port": 53}),
+        ({"kind": "tcp", "port": 443}, {"proto": "TCP", "dest_port": 443}),
+        ({"kind": "syn", "open_ports": (443,)}, {"proto": "TCP"}),
+        ({"kind": "icmp"}, {"proto": "ICMP"}),
+    ],
+)
+def test_the_packets_of_a_rate_limit_have_protocol_and_port(limit, said):
+    event = decision_event(decision(action="meter", limit=RateLimit(rate=5, **limit)))
+    assert {name: event[name] for name in ("proto", "src_port", "dest_port") if name in event} == said
 
 
 def life() -> list[Incident]:

@@ -6,12 +6,14 @@ from msgspec import structs
 from apps.firewall.policy.rate_limits import (
     LEAST_RATE,
     MOST_LIMITS,
+    SCAN_RATE,
     RateLimits,
     limit_of,
     limit_words,
+    scan_limit_of,
 )
 from apps.firewall.policy.rules import Rules
-from apps.messages import Confirmation, MessageError, RateLimit
+from apps.messages import MOST_OPEN_PORTS, Confirmation, MessageError, RateLimit
 from tests.apps.firewall.policy.test_sequential_test import evidence
 
 SECOND = 1_000_000_000
@@ -75,6 +77,29 @@ def test_more_evidence_sets_no_second_limit_but_other_packets_have_one_of_their_
     assert other.id != first.id
 
 
+def test_a_scan_is_slowed_down_where_the_victim_has_no_service():
+    limit = scan_limit_of((443, 22))
+    assert limit == RateLimit(kind="syn", rate=SCAN_RATE, open_ports=(22, 443))
+    assert limit.words == "SYNs to ports other than 22, 443"
+    assert scan_limit_of(()).words == "SYNs"
+    assert scan_limit_of(range(MOST_OPEN_PORTS + 1)) is None
+
+
+def test_a_service_that_came_to_be_known_is_left_alone_from_then_on():
+    """The limit that would hit it is lifted; one that knows fewer services changes nothing."""
+    limits = RateLimits(Rules())
+
+    def scanned(at, *ports):
+        return limits.open(VICTIM, scan_limit_of(ports), "a scan", (), flood("", at))
+
+    (first,) = scanned(AT, 22)
+    lifted, second = scanned(AT + 1, 22, 80)
+    assert (lifted.id, lifted.action, second.action) == (first.id, "unmeter", "meter")
+    assert second.limit.open_ports == (22, 80)
+    assert not scanned(AT + 2, 80)
+    assert list(limits.standing) == [second.id]
+
+
 def test_it_is_lifted_when_its_time_is_over():
     limits = RateLimits(Rules(limit_s=30))
     (made,) = opened(limits)
@@ -132,7 +157,14 @@ def test_people_lift_it_by_id_or_victim_and_a_restart_keeps_it():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"kind": "udp_from"}, {"kind": "icmp", "port": 1}, {"kind": "udp", "spared": ("x",)}, {"rate": 0}],
+    [
+        {"kind": "udp_from"},
+        {"kind": "icmp", "port": 1},
+        {"kind": "syn", "port": 1},
+        {"kind": "udp", "open_ports": (22,)},
+        {"kind": "udp", "spared": ("x",)},
+        {"rate": 0},
+    ],
 )
 def test_a_limit_that_cannot_be_is_refused(wrong):
     with pytest.raises(MessageError):

@@ -36,6 +36,7 @@ def handles(order):
         ({"kind": "udp_to", "port": 123}, "protocol=17,dport=123"),
         ({"kind": "udp", "port": None}, "protocol=17"),
         ({"kind": "tcp", "port": 443}, "protocol=6,dport=443,tcp_flags=0&0x2"),
+        ({"kind": "syn", "port": None, "open_ports": (22,)}, "protocol=6,tcp_flags=2&0x12"),
         ({"kind": "icmp", "port": None}, "protocol=1,icmp_type=8"),
     ],
 )
@@ -60,6 +61,18 @@ def test_all_parts_are_there_before_the_limit_and_go_after_it():
     lifted = orders.of_decision(decision("unmeter", spared=("192.0.2.53",), spared_rate=60))
     assert handles(lifted) == handles(made)[::-1]
     assert lifted.main.entry.match == made.main.entry.match
+
+
+def test_open_ports_come_before_a_limit_of_syns_and_have_a_meter_that_nothing_exceeds():
+    orders = book()
+    scanned = {"kind": "syn", "port": None, "open_ports": (22, 443)}
+    made = orders.of_decision(decision(**scanned))
+    found = handles(made)
+    assert [each.rpartition("@")[2] for each in found[1:]] == ["1001", "1001", "1000"]
+    assert {"dport=22" in each for each in found[1:3]} == {True, False}
+    rates = [each.entry.meter_config.pir for each in made.changes]
+    assert rates == [0, 1 << 31, 1 << 31, 40]
+    assert handles(orders.of_decision(decision("unmeter", **scanned))) == found[::-1]
 
 
 def test_slots_are_kept_freed_and_end():

@@ -1,0 +1,101 @@
+"""SYNs that no TCP stack sends: their sequence number is the address of their destination.  Pure.
+
+Stacks choose the first sequence number by chance (RFC 6528), so that it is the destination's address once in 2^32 SYNs.
+Mirai's scanner, and those made from it, send no others: they know the answers to their probes by it.  Training saw n
+SYNs, k of which were like that, so another training is expected to see k + n / 2^32.  Among m senders, one weighs
+
+    ln(m / (k + n / 2^32))
+
+nats, as what exceeds everybody's highest count does by its rarity (`baseline`); and the next one as much again.
+
+Source: Antonakakis et al., Understanding the Mirai Botnet, USENIX Security 2017, section 3.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any, Final
+
+import numpy as np
+
+from apps.kitsune.behaviour.baseline import SlidingSums
+from apps.kitsune.behaviour.contacts import TCP
+from apps.kitsune.behaviour.findings import HALF_LIFE_S, MOST_NATS, Finding, FoundSoFar
+from apps.kitsune.behaviour.rows import SenderId
+from apps.kitsune.kernel import Columns
+
+NUMBERS: Final = 1 << 32
+"""Sequence numbers that a stack chooses from."""
+MOST_AT_A_TIME: Final = 256
+"""Such SYNs of a batch that are looked at: a few decide."""
+_FIN, _SYN, _RST, _ACK = 0x01, 0x02, 0x04, 0x10
+_NAMES: Final = ("port", "eth_src", "ip_src_lo", "ip_dst_lo", "tcp_dport", "arrival")
+
+
+class SynFingerprints:
+    """Finds scanners by the sequence numbers of their SYNs; IPv4 only, as they are."""
+
+    def __init__(self) -> None:
+        self.syns = 0
+        """Of training."""
+        self.marked = 0
+        """Those of them that had their destination's address."""
+        self._sums = SlidingSums((HALF_LIFE_S,))
+        self._found = FoundSoFar()
+
+    def add(self, batch: Columns, switch: str, trained: int, senders: int) -> list[Finding]:
+        """Takes a batch of which the first `trained` packets were training.
+
+        Args:
+            batch: packet columns; without `tcp_seq` nothing is found.
+            switch: where they were seen.
+            trained: packets at the beginning that belong to training.
+            senders: how many training has seen.
+
+        Returns:
+            What is worth a message.
+        """
+        if "tcp_seq" not in batch:
+            return []
+        marked = (batch["tcp_seq"] == batch["ip_dst_lo"]) & (batch["tcp_sport"] >= 0)
+        if not trained and not marked.any():
+            return []
+        flags = batch["tcp_flags"] & (_FIN | _SYN | _RST | _ACK)
+        opening = (batch["tcp_sport"] >= 0) & (flags == _SYN) & (batch["quoted"] == 0)
+        marked &= opening & (batch["ip_version"] == 4)
+        self.syns += int(np.count_nonzero(opening[:trained]))
+        self.marked += int(np.count_nonzero(marked[:trained]))
+        rows = (np.flatnonzero(marked[trained:]) + trained)[:MOST_AT_A_TIME]
+        return self._findings(batch, rows, switch, self._nats(senders)) if len(rows) else []
+
+    def _nats(self, senders: int) -> float:
+        expected = self.marked + max(1, self.syns) / NUMBERS
+        return max(0.0, math.log(max(1, senders) / expected))
+
+    def _findings(self, batch: Columns, rows: Any, switch: str, nats: float) -> list[Finding]:
+        found: list[Finding] = []
+        columns = (batch[name][rows].tolist() for name in _NAMES)
+        times = (batch["time_us"][rows] / 1e6).tolist()
+        for time, port, mac, source, target, dport, arrival in zip(times, *columns, strict=True):
+            sender: SenderId = (switch, port, mac, source)
+            (count,) = self._sums.add(sender, time)
+            total = min(nats * count, MOST_NATS)
+            added = self._found.added(sender, total, time)
+            if added:
+                seen = (added, total, count, HALF_LIFE_S, float(self.marked), self._sums.begun[0])
+                found.append(Finding("fingerprint", sender, target, TCP | dport, *seen, time, arrival))
+        return found
+
+    def to_state(self) -> list[int]:
+        """Plain values for the model file."""
+        return [self.syns, self.marked]
+
+    def restore(self, state: Iterable[Any]) -> None:
+        """The inverse of `to_state`.
+
+        Raises:
+            TypeError, ValueError: the state is not one.
+        """
+        syns, marked = map(int, state)
+        if not 0 <= marked <= syns:
+            raise ValueError(f"{marked} of {syns} SYNs had their destination's address")
+        self.syns, self.marked = syns, marked

@@ -1,0 +1,152 @@
+"""SYNs with their destination's address as sequence number are a scanner's; what no stack does weighs at once."""
+
+import math
+
+import numpy as np
+import pytest
+
+from apps.kitsune.behaviour.fingerprints import MOST_AT_A_TIME, NUMBERS, SynFingerprints
+from apps.kitsune.detector import Detector, DetectorSettings
+from apps.kitsune.model_file import load_model
+from tests.apps.kitsune.behaviour.test_behaviour import (
+    ACK,
+    HOST,
+    SERVER,
+    SYN,
+    SYN_ACK,
+    batch,
+    handshake,
+    packet,
+)  # fmt: skip
+
+SENDERS = 40
+SYNS = 5_000
+FAR = 0x5DB8D822
+
+
+def marked(at=1.0, target=FAR, **changes):
+    return packet(at, HOST, target, 1_024, 23, SYN) | {"tcp_seq": target} | changes
+
+
+def trained(syns=SYNS, infected=0):
+    fingerprints = SynFingerprints()
+    rows = [packet(0.0, HOST, SERVER, 30_000 + n, 80, SYN) | {"tcp_seq": n + 1} for n in range(syns)]
+    rows += [marked(0.0) for _ in range(infected)]
+    assert not fingerprints.add(batch(rows), "s1", len(rows), SENDERS)
+    return fingerprints
+
+
+def of_training(*more):
+    """A detector that has seen a host talk to a server for ten minutes, and more."""
+    rows = [row for at in range(0, 600, 10) for row in handshake(at, HOST, SERVER, 30_000 + at, 80)]
+    rows += more
+    detector = Detector(DetectorSettings(fm_grace=50, ad_grace=len(rows) - 51))
+    detector.process(batch(rows), "s1")
+    return detector
+
+
+def said(detector):
+    """The one piece of evidence about the sequence number."""
+    (evidence,) = [each for each in detector.take_evidence() if each.source == "fingerprint"]
+    return evidence
+
+
+def found(fingerprints, *rows):
+    return fingerprints.add(batch(rows), "s1", 0, SENDERS)
+
+
+def test_one_weighs_what_chance_makes_of_all_syns_of_a_training():
+    (finding,) = found(trained(), marked())
+    assert finding.nats == pytest.approx(math.log(SENDERS / (SYNS / NUMBERS)))
+    assert finding.sender == ("s1", HOST & 0xFF, HOST, HOST)
+    assert (finding.victim, finding.count, finding.usual) == (FAR, 1, 0)
+
+
+def test_the_next_one_weighs_as_much_until_there_is_enough():
+    fingerprints = trained()
+    rows = [marked(n / 100, FAR + n) for n in range(20)]
+    nats = [each.nats for each in found(fingerprints, *rows)]
+    assert nats[0] == pytest.approx(nats[1], rel=1e-3)
+    assert sum(nats) == pytest.approx(50.0, rel=1e-3)
+
+
+def test_a_training_with_an_infected_host_makes_it_weigh_less():
+    assert found(trained(infected=2), marked())[0].nats == pytest.approx(math.log(SENDERS / 2), rel=1e-3)
+    assert not found(trained(infected=2 * SENDERS), marked())
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        marked(tcp_seq=FAR + 1),
+        marked(tcp_flags=SYN_ACK),
+        marked(tcp_flags=ACK),
+        marked(quoted=1),
+        marked(ip_version=6),
+        packet(1.0, HOST, FAR, udp_sport=5, udp_dport=53) | {"tcp_seq": FAR},
+        packet(1.0, HOST, SERVER, arp_op=1),
+    ],
+)
+def test_what_is_no_such_syn_is_nothing(row):
+    assert not found(trained(), row)
+
+
+def test_packets_without_sequence_numbers_give_nothing():
+    columns = {name: column for name, column in batch([marked()]).items() if name != "tcp_seq"}
+    assert not trained().add(columns, "s1", 0, SENDERS)
+
+
+def test_random_numbers_are_hardly_ever_addresses():
+    random = np.random.default_rng(1)
+    rows = batch([marked() for _ in range(1_000)])
+    columns = dict(rows.items()) | {"tcp_seq": random.integers(0, NUMBERS, 1_000).astype(np.uint32)}
+    assert not trained().add(columns, "s1", 0, SENDERS)
+
+
+def test_a_flood_of_them_costs_a_bounded_time():
+    rows = [packet(1.0, n, FAR, 1_024, 23, SYN) | {"tcp_seq": FAR} for n in range(1, MOST_AT_A_TIME + 50)]
+    assert len(found(trained(), *rows)) == MOST_AT_A_TIME
+
+
+def test_it_is_kept_with_the_model(tmp_path):
+    """Also by one that was saved before SYNs were counted: as many as packets then."""
+    detector = of_training()
+    detector.save(tmp_path / "model.npz")
+    model = load_model(tmp_path / "model.npz")
+    again = Detector(model=model)
+    for each in (detector, again):
+        each.process(batch([marked(700.0)]), "s1")
+    first, second = said(detector), said(again)
+    assert first.nats == pytest.approx(second.nats)
+    assert "sent 1 SYN with the destination's address as sequence number" in first.text
+    del model.notes["fingerprints"]
+    former = Detector(model=model)
+    former.process(batch([marked(700.0)]), "s1")
+    assert first.nats > said(former).nats > 10
+
+
+def test_it_is_told_in_order_of_time():
+    """The port's other findings of a batch do not come first."""
+    detector = of_training()
+    scan = [packet(700 + n / 100, HOST, FAR + n, 1_024, 80, SYN) for n in range(50)]
+    detector.process(batch([marked(699.0), *scan, packet(705, HOST, SERVER, arp_op=1)]), "s1")
+    heard = detector.take_evidence()
+    assert {"fingerprint", "contacts"} <= {each.source for each in heard}
+    times = [each.event_time for each in heard]
+    assert times == sorted(times)
+
+
+def test_who_is_behind_a_router_is_not_told_of():
+    """The Internet is full of them, and anybody there can send in their name."""
+    router = {"eth_src": SERVER, "port": 9}
+    outside = [packet(599, 0x08000000 + n, HOST, 80, 40_000, ACK) | router for n in range(9)]
+    detector = of_training(*outside)
+    probe = packet(700.0, 0x08090909, HOST, 1_024, 23, SYN) | router | {"tcp_seq": HOST}
+    detector.process(batch([probe]), "s1")
+    assert "fingerprint" not in {each.source for each in detector.take_evidence()}
+
+
+@pytest.mark.parametrize("state", [[1], [1, 2], ["a", 0], [-1, 0], None])
+def test_a_damaged_state_is_refused(state):
+    with pytest.raises((TypeError, ValueError)):
+        SynFingerprints().restore(state)
