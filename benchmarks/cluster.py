@@ -4,6 +4,9 @@
     kafka     three brokers                                      cluster_kafka.py
     bridge    two sites with servers and Coordinators of their   cluster_bridge.py
               own, joined by 10 Mb/s with 50 ms each way
+    shards    instances of Kitsune that divide two switches      cluster_shards.py
+    plan      what `sdnator plan` predicts, against a run with   cluster_plan.py
+              two and four switches; needs root
 
 Servers are killed, frozen, or killed together with a producer right after its `flush`, while a reliable stream is
 written and read; the bridge's link is cut, and the bridge killed.
@@ -13,12 +16,15 @@ median of the reader's longest pauses, where the primary, or the broker that lea
 `kafka_msgs_per_s`: messages of 100 bytes on a reliable path; `kafka_vs_raw`: the same against confluent-kafka alone,
 with frames of 100.  `bridge_lost`: reliable items acknowledged at the one site and never delivered at the other;
 `bridge_uncounted`: best-effort items that were missing there and not counted as gaps, or the other way round.
+`shard_scores_equal`: the largest difference of a packet's score from that of an undisturbed run.  `plan_error`: of the
+cores that were predicted.
 
 A part that cannot run on this machine says why in `NAME_missing`, one that broke in `NAME_failed`.  Exit code: 1 where
 a part broke, something was lost, or something best-effort was missing and not counted.
 """
 
 import importlib
+import os
 import sys
 import time
 import traceback
@@ -28,9 +34,17 @@ from typing import Any
 from benchmarks.cluster_stage import PartMissing
 from benchmarks.measure import arguments, machine, table, write_json
 
-PARTS: Mapping[str, float] = {"sentinel": 420.0, "kafka": 600.0, "bridge": 420.0}
+PARTS: Mapping[str, float] = {
+    "sentinel": 420.0,
+    "kafka": 600.0,
+    "bridge": 420.0,
+    "shards": 180.0,
+    "plan": 0.0,
+}
 """Modules `benchmarks.cluster_NAME`, and after how many seconds no further round begins."""
 NONE_LOST = ("sentinel_acknowledged_lost", "kafka_acknowledged_lost", "bridge_lost", "bridge_uncounted")
+MOST_DIFFERENCE = 1e-12
+"""Of a score."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -48,14 +62,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures |= found
         write_json(options.json, figures)  # what there is, should the next part be ended
     table(["figure", "value"], _flat(figures))
-    return int(any(figures.get(name) for name in (*NONE_LOST, *(f"{part}_failed" for part in PARTS))))
+    broken = any(figures.get(name) for name in (*NONE_LOST, *(f"{part}_failed" for part in PARTS)))
+    return int(broken or figures.get("shard_scores_equal", 0.0) > MOST_DIFFERENCE)
 
 
 def _run(name: str, rounds: int, scale: float) -> dict[str, Any]:
     began = time.monotonic()
     try:
         part = importlib.import_module(f"benchmarks.cluster_{name}")
-        found = part.figures(rounds, scale, began + PARTS[name])
+        found = _plan(part, scale) if name == "plan" else part.figures(rounds, scale, began + PARTS[name])
     except (PartMissing, ModuleNotFoundError) as error:
         print(f"{name}: {error}", file=sys.stderr, flush=True)
         return {f"{name}_missing": str(error)}
@@ -63,6 +78,12 @@ def _run(name: str, rounds: int, scale: float) -> dict[str, Any]:
         traceback.print_exc()
         return {f"{name}_failed": f"{type(error).__name__}: {error}"}
     return {**found, f"{name}_seconds": time.monotonic() - began}
+
+
+def _plan(part: Any, scale: float) -> dict[str, Any]:
+    if os.geteuid() != 0:
+        raise PartMissing("needs root, for the interfaces of the switches")
+    return dict(part.figures_of(part.PPS, scale * part.SECONDS))
 
 
 def _flat(figures: Mapping[str, Any], before: str = "") -> list[tuple[str, Any]]:

@@ -29,6 +29,7 @@ from benchmarks.measure import machine, table, write_json
 MODULES = (
     # first, for the others run while its builds are made
     "benchmarks.hostile_native",
+    "benchmarks.hostile_checkpoints",
     "benchmarks.hostile_due",
     "benchmarks.hostile_messages",
     "benchmarks.hostile_queries",

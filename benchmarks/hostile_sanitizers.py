@@ -33,7 +33,7 @@ _FLAGS = (
 )
 _KERNEL = ("-ffp-contract=off", "-fno-builtin-pow")
 _SWITCH = ("-std=gnu11", "-x", "c", "-")
-_BUILDS = "HOSTILE_BUILDS"
+BUILDS = "HOSTILE_BUILDS"
 _QUARANTINE_MB = 16
 """Freed memory that the sanitizer keeps from being used again; its own 256 MB look like a leak until they are full."""
 _LIBRARIES = ("libasan.so", "libubsan.so")
@@ -53,7 +53,7 @@ def environment(folder: Path) -> dict[str, str]:
     return {
         "LD_PRELOAD": " ".join(paths),
         "ASAN_OPTIONS": f"detect_leaks=0:abort_on_error=1:handle_segv=1:quarantine_size_mb={_QUARANTINE_MB}",
-        _BUILDS: str(folder),
+        BUILDS: str(folder),
     }
 
 
@@ -93,7 +93,7 @@ def _built(arguments: tuple[str, ...], text: bytes, folder: Path) -> Path:
 def _loaded(arguments: tuple[str, ...], text: bytes) -> Path:
     """One that was built before: the compiler does not run beside the sanitizers' libraries."""
     os.environ.pop("LD_PRELOAD", None)
-    return _built(arguments, text, Path(os.environ[_BUILDS]))
+    return _built(arguments, text, Path(os.environ[BUILDS]))
 
 
 def _kernel_arguments() -> tuple[str, ...]:

@@ -115,7 +115,8 @@ def run(
         interests: declared to the Coordinator.
         capabilities: declared to the Coordinator.
         argv: command line without the program's name; None takes that of the process.
-        instances: "standby", "shared" or "sharded", unless --instances says otherwise.
+        instances: "standby", "shared" or "sharded", unless --instances, or a field `instances` of the settings, says
+            otherwise.
 
     Returns:
         The exit code: 0, 1 or 2 as above.
@@ -133,7 +134,7 @@ def run(
         status = _status_server(arguments) if arguments.metrics else None
         engine = Engine(_options(arguments))
         engine.when_failed = _end_soon
-        chosen_instances = arguments.instances or instances
+        chosen_instances = arguments.instances or getattr(chosen, "instances", instances)
         roles = PRODUCER | CONSUMER
         engine.init(app_id, roles, interests=interests, capabilities=capabilities, instances=chosen_instances)
     except (DueError, OSError) as error:

@@ -519,7 +519,7 @@ static void prefetch_packet(const AfterImage *self, const Names *names)
 /* Grows with every change of the interface, so that a library left over from before is noticed. */
 int32_t kitsune_kernel_version(void)
 {
-    return 6;
+    return 7;
 }
 
 AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon)
@@ -607,3 +607,5 @@ void afterimage_counts(const AfterImage *self, uint64_t *out)
     out[2] = self->evicted_idle;
     out[3] = self->evicted_full;
 }
+
+#include "afterimage_dump.h"

@@ -583,3 +583,5 @@ int behaviour_add(Behaviour *b, const Row *rows, long n, long first, long last, 
 }
 
 #include "ledger_store.h"
+
+#include "behaviour_dump.h"

@@ -15,7 +15,7 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 6
+VERSION: Final = 7
 """Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
@@ -139,6 +139,18 @@ _LEDGERS: Final = (
     """
 )
 
+_DUMPS: Final = """
+    long afterimage_dump(AfterImage *, uint8_t *out, long room);
+    int afterimage_load(AfterImage *, const uint8_t *in, long size);
+    long behaviour_dump(Behaviour *, uint8_t *out, long room);
+    int behaviour_load(Behaviour *, const uint8_t *in, long size, int32_t switches);
+    long senders_dump(Senders *, uint8_t *out, long room);
+    int senders_load(Senders *, const uint8_t *in, long size, int32_t switches);
+    long senders_kept(const Senders *, int32_t *out, long room);
+    long victims_dump(Victims *, uint8_t *out, long room);
+    int victims_load(Victims *, const uint8_t *in, long size);
+    """
+
 _DECLARATIONS: Final = (
     "typedef struct {"
     + "".join(f"const {c_type} *{name};" for name, c_type, _ in PACKET_FIELDS)
@@ -202,7 +214,7 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel:
         KernelMissing: it cannot be loaded.
     """
     ffi = cffi.FFI()
-    ffi.cdef(_DECLARATIONS + _LEDGERS)
+    ffi.cdef(_DECLARATIONS + _LEDGERS + _DUMPS)
     try:
         lib: Any = ffi.dlopen(str(path))
         if lib.kitsune_kernel_version() == VERSION:

@@ -14,6 +14,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -61,20 +62,11 @@ def save_model(path: Path, network: KitNet, notes: dict[str, Any]) -> None:
             f"{path}: the model has seen {network.trained} of {network.training_packets} training packets; "
             "nothing was saved. Train on a longer capture or lower fm_grace and ad_grace"
         )
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "width": network.width,
-        "lambdas": list(LAMBDAS),
-        "fm_grace": network.fm_grace,
-        "ad_grace": network.ad_grace,
-        "max_ae": network.max_ae,
-        "feature_map": network.feature_map,
-        "notes": notes,
+    header = {"format": FORMAT, "version": VERSION, **network_header(network), "notes": notes}
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+        **network_arrays(network),
     }
-    arrays = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
-    for layer_name, layer in (("ensemble", network.ensemble), ("output", network.output)):
-        arrays |= {f"{layer_name}_{name}": getattr(layer, name) for name in _ARRAYS}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     partial = path.with_name(f"{path.name}.{os.getpid()}.part")
@@ -125,7 +117,7 @@ def load_model(path: Path, *, clip: float = 0.0, kernel: Kernel | None = None) -
         ) from error
     header = _header(path, arrays)
     try:
-        network = _network(header, arrays, clip, kernel)
+        network = network_in(header, arrays, clip, kernel)
         return Model(network, dict(header["notes"]))
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise NotAModelError(
@@ -150,9 +142,43 @@ def _header(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Any]:
     return dict(header)
 
 
-def _network(
-    header: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], clip: float, kernel: Kernel | None
+def network_header(network: KitNet) -> dict[str, Any]:
+    """What a file says of a network beside its numbers, fit for JSON."""
+    return {
+        "width": network.width,
+        "lambdas": list(LAMBDAS),
+        "fm_grace": network.fm_grace,
+        "ad_grace": network.ad_grace,
+        "max_ae": network.max_ae,
+        "feature_map": network.feature_map,
+    }
+
+
+def network_arrays(network: KitNet) -> dict[str, npt.NDArray[np.float64]]:
+    """The numbers of both layers by name; none before the feature map is learnt."""
+    layers = {"ensemble": network.ensemble, "output": network.output}
+    return {
+        f"{layer_name}_{name}": getattr(layer, name)
+        for layer_name, layer in layers.items()
+        if layer is not None
+        for name in _ARRAYS
+    }
+
+
+def network_in(
+    header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], clip: float, kernel: Kernel | None
 ) -> KitNet:
+    """The trained network that `network_header` and `network_arrays` describe.
+
+    Args:
+        header: of the file.
+        arrays: by name.
+        clip: limit of scaled inputs, 0 for none.
+        kernel: None loads the one that was built.
+
+    Raises:
+        KeyError, TypeError, ValueError, IndexError: they describe none.
+    """
     if header["lambdas"] != list(LAMBDAS) or header["width"] != WIDTH:
         raise ValueError(f"features: {header['width']} with scales {header['lambdas']}")
     feature_map = header["feature_map"]
@@ -173,7 +199,7 @@ def _network(
     return network
 
 
-def _layer(arrays: dict[str, npt.NDArray[Any]], name: str, groups: list[list[int]]) -> Layer:
+def _layer(arrays: Mapping[str, npt.NDArray[Any]], name: str, groups: list[list[int]]) -> Layer:
     expected = Layer.fresh(groups)
     values = {}
     for part in _ARRAYS:

@@ -586,3 +586,5 @@ int senders_blocks(Senders *s, const uint64_t *rows, long n)
 {
     return take_blocks(&s->blocked, rows, n);
 }
+
+#include "senders_dump.h"

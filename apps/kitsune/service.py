@@ -1,28 +1,35 @@
 """Kitsune as an app: receives packet batches, writes scores and alerts.
 
 One instance is active, others stand by: the statistics of a packet depend on all packets before it,
-so instances cannot share one stream without changing scores.
+so instances cannot share one stream without changing scores.  With `instances = "sharded"` every switch has a detector
+of its own, and the instances divide the switches: `sharded.py`.
 """
 
+import importlib
 import logging
 import sys
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 import numpy as np
 
 import due.service
 from apps.evidence import DRIFT, EVIDENCE, TRAINING, DriftState, PortTraining, TrainingState
+from apps.kitsune.blocked import Blocked
+from apps.kitsune.checkpoint import dump, load
 from apps.kitsune.detector import Detector, DetectorSettings, Scored
 from apps.kitsune.kept_model import KeptModel, trained_for
 from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
 from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder, late, order_in
+from apps.kitsune.packed_arrays import CheckpointError
+from apps.kitsune.plain_values import Kinds, built, read, restore
 from apps.kitsune.successor import Comparison, Successor
 from apps.kitsune.top_talkers import TalkerTable
 from apps.kitsune.training_progress import TrainingProgress
@@ -61,10 +68,28 @@ _USED: Final = {
 }
 """The columns of packets that Kitsune reads."""
 _MOST_SWITCHES: Final = 256
+_MOST_CHECKPOINT_S: Final = 3600.0
 _SECOND: Final = 1_000_000_000
 _SECOND_US: Final = 1_000_000
 _STEP_US: Final = 86_400_000_000
 """A longer step of capture time is accepted only after several packets agree."""
+
+_KEPT: Final[Kinds] = {
+    "_told": bool,
+    "_arrived": dict[str, int],
+    "_is_open": bool,
+    "_packets": int,
+    "_alerts": int,
+    "_found": int,
+    "_training_step": int,
+}
+_KEPT_OF_TIME: Final[Kinds] = {"now": int | None, "doubted": int, "_doubt": int | None, "_agreed": int}
+_KEPT_OF_PROGRESS: Final[Kinds] = {
+    "packets": int,
+    "ports": Counter[tuple[str, int]],
+    "_samples": deque[tuple[int, int]],
+}
+"""What a checkpoint holds of the service, of `SteadyTime` and of `TrainingProgress`."""
 
 _log = logging.getLogger("kitsune")
 
@@ -101,18 +126,37 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
     empty: none; `load_model` and `save_model` apply. `sdnator up` sets it."""
     keep_for: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
     """Switches and their ports, to compare `keep_model` with. `sdnator up` sets it."""
+    instances: Literal["standby", "sharded"] = "standby"
+    """`standby`: one detector for all switches, one instance works and the others wait; `sharded`: one detector for each
+    switch, the instances divide the switches, and a switch moves with its detector."""
+    checkpoint_seconds: float = 30.0
+    """Sharded: seconds between two checkpoints of a detector in Data Archives; packets since the last one are scored
+    again after an instance has died."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.checkpoint_seconds <= _MOST_CHECKPOINT_S:
+            raise ValueError(
+                f"checkpoint_seconds={self.checkpoint_seconds}: must be greater than 0, and {_MOST_CHECKPOINT_S:g} at most"
+            )
 
 
 class KitsuneService:
-    """Scores each batch on arrival; a slow batch causes back-pressure, and nothing is dropped."""
+    """Scores each batch on arrival; a slow batch causes back-pressure, and nothing is dropped.
 
-    def __init__(self, engine: Engine, settings: Settings) -> None:
+    Args:
+        engine: initialised.
+        settings: all options.
+        detector: that of a checkpoint; None: as the settings say.
+    """
+
+    def __init__(self, engine: Engine, settings: Settings, detector: Detector | None = None) -> None:
         self._engine = engine
         self._settings = settings
         self._kernel = load_kernel()
         self._belongs = trained_for(settings, settings.keep_for)
         self._kept = KeptModel(Path(settings.keep_model), self._belongs) if settings.keep_model else None
-        self._detector = self._first_detector()
+        self._detector = detector or self._first_detector()
         self._successor: Successor | None = None
         """The model that trains beside the one in use."""
         self._told = self._detector.model.is_trained
@@ -139,8 +183,8 @@ class KitsuneService:
         observe, reading = self._engine.observe, self._intake.reading
         self._subscriptions = [
             observe(BLOCKS).subscribe(reading(BLOCKS, Decision.from_item, self._on_decision)),
-            observe(PACKETS).subscribe(reading(PACKETS, packets_in, self._score)),
-            observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self._on_tick)),
+            observe(PACKETS).subscribe(reading(PACKETS, packets_in, self.score)),
+            observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self.hear_tick)),
             observe(ORDERS).subscribe(reading(ORDERS, order_in, self._on_order)),
         ]
         if self._kept is not None:
@@ -149,6 +193,47 @@ class KitsuneService:
     def ready(self) -> dict[str, str]:
         """For the ready line: what happened to the kept model."""
         return {"model": self._kept.text} if self._kept is not None else {}
+
+    def checkpoint(self) -> bytes:
+        """The detector and what is kept beside it; `continued` is the inverse."""
+        following = next(self._numbers)
+        self._numbers = count(following)
+        return dump(self._detector, [following, *read(self._kept_beside())])
+
+    @classmethod
+    def continued(cls, engine: Engine, settings: Settings, data: bytes) -> "KitsuneService":
+        """A service that goes on where a checkpoint was made.
+
+        Args:
+            engine: initialised.
+            settings: all options.
+            data: what `checkpoint` returned, from anywhere.
+
+        Raises:
+            CheckpointError: it is none, or belongs to other settings or another version.
+        """
+        detector, beside = load(data, settings, load_kernel())
+        self = cls(engine, settings, detector)
+        try:
+            following, *values = beside
+            restore(self._kept_beside(), values)
+            self._numbers = count(built(following, int))
+        except (TypeError, ValueError) as error:
+            raise CheckpointError(f"a damaged checkpoint: {error}") from error
+        return self
+
+    def block(self, blocked: Blocked) -> None:
+        """From now on heed these blocks; whoever keeps them may change them."""
+        self._detector.senders.blocked = blocked
+
+    def save_model(self) -> None:
+        """Write the model to where it is kept, if there is one."""
+        with self._lock:
+            self._save()
+
+    def _kept_beside(self) -> list[tuple[object, Kinds]]:
+        """What a checkpoint holds besides the detector."""
+        return [(self, _KEPT), (self._time, _KEPT_OF_TIME), (self._progress, _KEPT_OF_PROGRESS)]
 
     def _first_detector(self) -> Detector:
         settings = self._settings
@@ -293,7 +378,8 @@ class KitsuneService:
         with self._lock:
             self._detector.senders.blocked.decide(decision)
 
-    def _score(self, item: Item, batch: RecordBatch) -> None:
+    def score(self, item: Item, batch: RecordBatch) -> None:
+        """Packets of a switch."""
         if not len(batch):
             return
         switch = item.key.split(".")[3]
@@ -323,8 +409,8 @@ class KitsuneService:
                     self._take_over(found)
                     self._tell_training(event_time)
 
-    def _on_tick(self, _: Item, tick: ClockTick) -> None:
-        """Close the open second where capture time has left it, and no packet of it is under way."""
+    def hear_tick(self, _: Item, tick: ClockTick) -> None:
+        """The time of a switch: close the open second where capture time has left it, and no packet of it is under way."""
         with self._lock:
             if tick.switch in self._arrived:
                 self._ticks[tick.switch] = tick
@@ -450,11 +536,20 @@ class KitsuneService:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the app until SIGTERM or SIGINT."""
     try:
-        return due.service.run("kitsune", KitsuneService, Settings, INTERESTS, CAPABILITIES, argv)
+        return due.service.run("kitsune", _service, Settings, INTERESTS, CAPABILITIES, argv)
     except ModelFileError as error:
         print(f"kitsune: {error}", file=sys.stderr)
         return 2
 
 
+def _service(engine: Engine, settings: Settings) -> due.service.Service:
+    if settings.instances == "sharded":
+        from apps.kitsune.sharded import ShardedKitsune
+
+        return ShardedKitsune(engine, settings)
+    return KitsuneService(engine, settings)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    # not as `__main__`: `sharded` imports this module
+    sys.exit(importlib.import_module("apps.kitsune.service").main())

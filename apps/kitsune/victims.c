@@ -276,3 +276,5 @@ long victims_sources(const Victims *v, uint64_t *out, long room)
     }
     return count;
 }
+
+#include "victims_dump.h"

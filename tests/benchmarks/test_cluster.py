@@ -42,6 +42,28 @@ def test_a_loss_ends_with_1(monkeypatch, tmp_path, name):
         assert (code, figures[name], figures["failover_ms_p50"]) == (int(lost > 0), lost, {"bridge": 1.0})
 
 
+@pytest.mark.parametrize(("difference", "code"), [(0.0, 0), (1e-12, 0), (1e-9, 1), (float("inf"), 1)])
+def test_another_score_ends_with_1(monkeypatch, tmp_path, difference, code):
+    part = SimpleNamespace(figures=lambda *_: {"shard_scores_equal": difference})
+    assert _run(monkeypatch, tmp_path, part)[0] == code
+
+
+def test_the_plan_needs_root(monkeypatch, tmp_path):
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    assert cluster.main(["--only", "plan", "--json", str(tmp_path / "f.json")]) == 0
+    assert "root" in json.loads((tmp_path / "f.json").read_text())["plan_missing"]
+
+
+def test_the_plan_is_measured_with_its_own_load(monkeypatch, tmp_path):
+    part = SimpleNamespace(
+        figures_of=lambda pps, seconds: {"plan_error": pps + seconds}, PPS=1.0, SECONDS=4.0
+    )
+    monkeypatch.setitem(sys.modules, "benchmarks.cluster_plan", part)
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    cluster.main(["--only", "plan", "--scale", "0.5", "--json", str(tmp_path / "f.json")])
+    assert json.loads((tmp_path / "f.json").read_text())["plan_error"] == 3.0
+
+
 def test_kafka_without_its_jars_is_missing(monkeypatch, tmp_path):
     def no_java() -> None:
         raise KafkaMissing("Kafka needs Java")

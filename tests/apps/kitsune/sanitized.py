@@ -11,10 +11,14 @@ import numpy as np
 
 from apps.kitsune.afterimage import WIDTH, AfterImage, Mode
 from apps.kitsune.behaviour.native import NativeBehaviour
+from apps.kitsune.checkpoint import MARK, VERSION, dump, load
+from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import PACKET_FIELDS, ROW_FIELDS, ColumnError, Kernel, load_kernel
 from apps.kitsune.kitnet import KitNet, Layer
+from apps.kitsune.packed_arrays import CheckpointError, pack, unpack
 from apps.kitsune.senders import Senders
 from apps.kitsune.victims import VictimRates
+from tests.apps.kitsune.random_traffic import traffic
 
 EDGES = (0, 1, -1, 4, 6, 255, 65_535, 65_536, 2**31 - 1, -(2**31), 2**32 - 1, 2**48, 2**63 - 1, -(2**63))
 TIMES = (0.0, -1.0, 1e-300, 1e9, -1e18, float(2**63), 1.8e308, math.inf, -math.inf, math.nan)
@@ -125,6 +129,32 @@ def network(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
             raise AssertionError("an index out of range was taken")
 
 
+def checkpoints(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
+    """What is loaded from damaged bytes is refused, or works."""
+    options = DetectorSettings(
+        fm_grace=30, ad_grace=90, calibration_packets=60, threshold=0.05, max_streams=12, max_links=9
+    )
+    for _ in range(rounds):
+        detector = Detector(options, kernel=kernel)
+        for step in range(int(random.integers(1, 6))):
+            detector.process(traffic(random, 60, 30.0 * step), f"s{step % 2}")
+            detector.take_evidence()
+        header, arrays = unpack(dump(detector), MARK, VERSION)
+        for _ in range(20):
+            name = str(random.choice(["afterimage", "senders", "behaviour", "victims"]))
+            raw = arrays[name].copy()
+            for _ in range(int(random.integers(0, 4))):
+                at, width = int(random.integers(len(raw))), int(random.choice([1, 4, 8]))
+                word = (int(random.choice(EDGES)) & (1 << 64) - 1).to_bytes(8, "little")[:width]
+                raw[at : at + width] = np.frombuffer(word, np.uint8)[: len(raw) - at]
+            try:
+                moved, _ = load(pack(MARK, VERSION, header, {**arrays, name: raw}), options, kernel)
+            except CheckpointError:
+                continue
+            moved.process(traffic(random, 60, 200.0), "s1")
+            dump(moved)
+
+
 def main() -> None:
     library, seed, rounds = sys.argv[1:]
     kernel = load_kernel(Path(library))
@@ -133,6 +163,7 @@ def main() -> None:
         features(kernel, random, int(rounds))
         network(kernel, random, int(rounds))
         ledgers(kernel, random, int(rounds))
+        checkpoints(kernel, random, int(rounds) // 2)
     print("clean")
 
 
