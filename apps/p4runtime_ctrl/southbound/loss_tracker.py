@@ -86,10 +86,14 @@ class LossTracker:
         arrival: NDArray[np.uint64],
         time_us: NDArray[np.int64],
     ) -> None:
-        self.passed(time_us)
         numbers = sequence[sequence != 0].astype(np.int64)
-        if not len(numbers):
-            return
+        if len(numbers):
+            self._count(source, numbers)
+            self.arrival = int(arrival[-1])
+        # last: whoever reads the time, and then the number, takes no packet for handed on that is not
+        self.passed(time_us)
+
+    def _count(self, source: Source, numbers: NDArray[np.int64]) -> None:
         # after a break in both streams a lower first number means that the switch restarted
         first = self._highest if self._highest and not self._passed else int(numbers[0]) - 1
         before = self._passed.get(source, first)
@@ -101,7 +105,6 @@ class LossTracker:
             self._begin_anew()
             start = int(begin)
         self._pass(source, numbers[start:])
-        self.arrival = int(arrival[-1])
 
     def _begin_anew(self) -> None:
         """A switch that counts from 1 again: the numbers before the first to arrive are lost, too."""

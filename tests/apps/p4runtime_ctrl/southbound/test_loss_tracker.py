@@ -77,3 +77,19 @@ def test_digests_without_a_number_are_no_gap():
     note(progress, [0, 3, 0], "digests")
     note(progress, [4])
     assert (progress.lost, progress.restarts, progress.reported) == (0, 0, 6)
+
+
+def test_the_time_is_never_ahead_of_the_arrival_number():
+    """Kitsune closes a second once the time has left it and all packets up to that number are scored."""
+    seen = []
+
+    class Watched(LossTracker):
+        def __setattr__(self, name, value):
+            super().__setattr__(name, value)
+            if name == "time_us" and value:
+                seen.append((value, self.arrival))
+
+    progress = Watched()
+    for numbers in ([1, 2], [3], [7, 8]):
+        note(progress, numbers, "digests")
+    assert seen == [(2, 2), (3, 3), (8, 8)]
