@@ -93,3 +93,21 @@ def test_the_time_is_never_ahead_of_the_arrival_number():
     for numbers in ([1, 2], [3], [7, 8]):
         note(progress, numbers, "digests")
     assert seen == [(2, 2), (3, 3), (8, 8)]
+
+
+@pytest.mark.parametrize(
+    ("lists", "newest"),
+    [
+        ([("digests", [1, 2, 5]), ("packets", [3, 4])], 5),
+        ([("packets", [3]), ("digests", [1, 2, 4])], 4),
+        ([("digests", [(1 << 32) - 2, (1 << 32) - 1]), ("digests", [1, 2]), ("packets", [(1 << 32) - 1])], 2),
+        ([("digests", [(1 << 31) + 9])], (1 << 31) + 9),
+        ([("digests", [900]), ("digests", [1, 2])], 2),  # the switch counts from 1 again
+    ],
+)
+def test_the_arrival_number_is_the_newest_of_both_streams(lists, newest):
+    """A copy of an earlier frame may come after digests: what Kitsune has scored last is the newest."""
+    progress = LossTracker()
+    for source, numbers in lists:
+        note(progress, numbers, source)
+    assert progress.arrival == newest
