@@ -5,6 +5,7 @@
 `default_pps` is `sdnator replay CAPTURE --no-mitigate` with no other option, first frame to last score, training
 included; `blocking_pps` the same with blocking, and with the dry run before it; `packet_in_pps` with packet-ins.
 `kept_pps` is the default with `--keep`, which archives packets and scores, too: `archived_bytes_per_packet`.
+`detector_vs_kernel` is in batches of 1,024 packets; `detector_vs_kernel_handed_over` in the largest of the loop, of 8,192.
 `best_pps` is the best round.  Rounds take turns; figures are medians (`kept` and packet-ins: of the first round alone).
 `--long` adds a capture of 764,137 packets.
 """
@@ -38,6 +39,8 @@ LONG_PACKETS = 764_137
 """Of the published Mirai capture."""
 BENIGN_SHARE = 0.45
 PACKETS_A_SECOND = 28
+HANDED_OVER = 8_192
+"""Packets of the largest batch that the controller hands over in a replay: four full lists of digests."""
 ROUNDS = 3
 
 
@@ -83,6 +86,13 @@ def one_round(
 def batches_of(capture: Path) -> list[Batch]:
     """The capture's packets by the parser of frames, which the loop does not use by default."""
     return list(CaptureSource(capture))
+
+
+def joined(batches: Sequence[Batch], packets: int) -> list[Batch]:
+    """The same packets in batches of so many."""
+    columns = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    firsts = range(0, len(columns["length"]), packets)
+    return [{name: column[at : at + packets] for name, column in columns.items()} for at in firsts]
 
 
 def settings(options: ReplayOptions) -> Settings:
@@ -163,6 +173,9 @@ def measured(capture: Path, rounds: int) -> dict[str, Any]:
         "archived_bytes_per_packet": found["kept"][0]["archived_bytes_per_packet"],
         "scores_equal": scores_equal(batches, result, options),
         **detector_vs_kernel(batches, options, rounds),
+        "detector_vs_kernel_handed_over": detector_vs_kernel(joined(batches, HANDED_OVER), options, rounds)[
+            "detector_vs_kernel"
+        ],
     }
 
 
