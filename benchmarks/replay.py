@@ -4,8 +4,10 @@
 
 `default_pps` is `sdnator replay CAPTURE --no-mitigate` with no other option, first frame to last score, training
 included; `blocking_pps` the same with blocking, and with the dry run before it; `packet_in_pps` with packet-ins.
-`best_pps` is the best round.  Rounds take turns; figures are medians (packet-ins, which take longest: of the first
-round alone).  `--long` adds a capture of 764,137 packets.
+`kept_pps` is the default with `--keep`, which archives packets and scores, too: `archived_bytes_per_packet`.
+`detector_vs_kernel` is in batches of 1,024 packets; `detector_vs_kernel_handed_over` in the largest of the loop, of 8,192.
+`best_pps` is the best round.  Rounds take turns; figures are medians (`kept` and packet-ins: of the first round alone).
+`--long` adds a capture of 764,137 packets.
 """
 
 import statistics
@@ -37,6 +39,8 @@ LONG_PACKETS = 764_137
 """Of the published Mirai capture."""
 BENIGN_SHARE = 0.45
 PACKETS_A_SECOND = 28
+HANDED_OVER = 8_192
+"""Packets of the largest batch that the controller hands over in a replay: four full lists of digests."""
 ROUNDS = 3
 
 
@@ -51,19 +55,21 @@ def capture_of(folder: Path, packets: int) -> Path:
     return path
 
 
-def one_round(capture: Path, options: ReplayOptions, *, mitigate: bool) -> tuple[dict[str, Any], PassResult]:
-    """Figures of one replay, and its result."""
+def one_round(
+    capture: Path, options: ReplayOptions, *, mitigate: bool, kept: bool = False
+) -> tuple[dict[str, Any], PassResult]:
+    """Figures of one replay, and its result; `kept`: with `--keep`."""
     surveyed, _ = run.prepare(capture, None, options)
-    with tempfile.TemporaryDirectory(prefix="sdnator-bench-") as kept, ProcessMeter() as meter:
+    with tempfile.TemporaryDirectory(prefix="sdnator-bench-") as folder, ProcessMeter() as meter:
         outcome = run.run(
             surveyed,
             None,
-            replace(options, keep=Path(kept)),
+            replace(options, keep=Path(folder) if kept else None),
             mitigate=mitigate,
             both=False,
             progress=lambda _: meter.look,
         )
-        archived = sum(each.stat().st_size for each in Path(kept).glob("*/archive.db*"))
+        archived = sum(each.stat().st_size for each in Path(folder).glob("*/archive.db*"))
     figures, packets = run.figures(outcome), surveyed.packets
     # a dry run that goes first is part of what blocking costs
     seconds = sum(each.seconds for each in (outcome.dry_run, outcome.blocking) if each is not None)
@@ -80,6 +86,13 @@ def one_round(capture: Path, options: ReplayOptions, *, mitigate: bool) -> tuple
 def batches_of(capture: Path) -> list[Batch]:
     """The capture's packets by the parser of frames, which the loop does not use by default."""
     return list(CaptureSource(capture))
+
+
+def joined(batches: Sequence[Batch], packets: int) -> list[Batch]:
+    """The same packets in batches of so many."""
+    columns = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    firsts = range(0, len(columns["length"]), packets)
+    return [{name: column[at : at + packets] for name, column in columns.items()} for at in firsts]
 
 
 def settings(options: ReplayOptions) -> Settings:
@@ -134,15 +147,16 @@ def measured(capture: Path, rounds: int) -> dict[str, Any]:
     ways = {
         "default": (options, False),
         "blocking": (options, True),
+        "kept": (options, False),
         "packet_in": (replace(options, telemetry="packet-in"), False),
     }
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in ways}
     result = None
     for number in range(rounds):
         for name, (chosen, mitigate) in ways.items():
-            if number and name == "packet_in":
+            if number and name in ("kept", "packet_in"):
                 continue
-            figures, passed = one_round(capture, chosen, mitigate=mitigate)
+            figures, passed = one_round(capture, chosen, mitigate=mitigate, kept=name == "kept")
             found[name].append(figures)
             result = passed if name == "default" else result
     assert result is not None
@@ -156,9 +170,12 @@ def measured(capture: Path, rounds: int) -> dict[str, Any]:
         "cpu_us_per_packet": _medians([each["cpu_us_per_packet"] for each in default]),
         "start_cpu_s": statistics.median(each["start_cpu_s"] for each in default),
         "rss_mb": _medians([each["rss_mb"] for each in default]),
-        "archived_bytes_per_packet": statistics.median(each["archived_bytes_per_packet"] for each in default),
+        "archived_bytes_per_packet": found["kept"][0]["archived_bytes_per_packet"],
         "scores_equal": scores_equal(batches, result, options),
         **detector_vs_kernel(batches, options, rounds),
+        "detector_vs_kernel_handed_over": detector_vs_kernel(joined(batches, HANDED_OVER), options, rounds)[
+            "detector_vs_kernel"
+        ],
     }
 
 

@@ -36,7 +36,7 @@ from apps.kitsune.training_progress import TrainingProgress
 from apps.messages import Alert, Answer, Decision, Intake, Message, Name, Number, Time, sender_of
 from apps.packets import PACKET_COLUMNS, SteadyTime, read_columns
 from apps.talkers import TALKERS
-from due import NO_WAIT, Capability, Engine, Interest, Item, RecordBatch
+from due import NO_WAIT, PUB_ONLY, Capability, Engine, Interest, Item, RecordBatch
 
 PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
 BLOCKS: Final = "network.block.firewall.*"
@@ -126,6 +126,8 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
     empty: none; `load_model` and `save_model` apply. `sdnator up` sets it."""
     keep_for: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
     """Switches and their ports, to compare `keep_model` with. `sdnator up` sets it."""
+    archive_scores: bool = True
+    """Archive the score of each packet; False: scores are published only. Alerts and evidence are archived either way."""
     instances: Literal["standby", "sharded"] = "standby"
     """`standby`: one detector for all switches, one instance works and the others wait; `sharded`: one detector for each
     switch, the instances divide the switches, and a switch moves with its detector."""
@@ -153,6 +155,7 @@ class KitsuneService:
     def __init__(self, engine: Engine, settings: Settings, detector: Detector | None = None) -> None:
         self._engine = engine
         self._settings = settings
+        self._score_flags = [NO_WAIT] if settings.archive_scores else [NO_WAIT, PUB_ONLY]
         self._kernel = load_kernel()
         self._belongs = trained_for(settings, settings.keep_for)
         self._kept = KeptModel(Path(settings.keep_model), self._belongs) if settings.keep_model else None
@@ -397,7 +400,8 @@ class KitsuneService:
             # evidence rests on training: what ends it comes first, at the time of its last packet
             self._tell_training(int(batch["time_us"][trained - 1]) * 1_000 if trained else event_time)
             self._write_evidence()
-            self._engine.write(SCORE, self._summary(batch, switch, scored), [NO_WAIT], event_time=event_time)
+            summary = self._summary(batch, switch, scored)
+            self._engine.write(SCORE, summary, self._score_flags, event_time=event_time)
             self._write_alerts(alerts)
             self._tell_talkers(batch, switch)
             self._tell_drift(event_time)

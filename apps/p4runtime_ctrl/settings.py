@@ -74,6 +74,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Restore decisions and commands from Data Archives at the start."""
     restore_since: int = 0
     """... only those written after this time (ns since the epoch)."""
+    archive_packets: bool = True
+    """Archive headers, frames and reports of the switch that apps want; False: they are published only, which costs less
+    where nobody will read them again."""
     guard: GuardSettings = GuardSettings()
 
     def by_digest(self, switch: SwitchSettings) -> bool:

@@ -280,7 +280,8 @@ class SwitchWorker:
         self._put(partial(self._expire, idle))
 
     def _publish(self, key: str, value: Any, event_time: int) -> None:
-        self._engine.write(key, value, [NO_WAIT], event_time=event_time or None)
+        flags = [NO_WAIT] if self._settings.archive_packets else [NO_WAIT, PUB_ONLY]
+        self._engine.write(key, value, flags, event_time=event_time or None)
 
     def _publish_counters(self, counters: RecordBatch) -> None:
         key = f"network.telemetry_counters.p4runtime_ctrl.{self.name}"

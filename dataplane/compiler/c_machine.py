@@ -1,5 +1,6 @@
 """The generated-C back end: c_code's unit behind the interface of machine.Machine."""
 
+import secrets
 import struct
 import weakref
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from dataplane.compiler.c_build import compiled_library
 from dataplane.compiler.c_code import generate
 from dataplane.compiler.c_statements import key_places, table_words, words
 from dataplane.compiler.machine import BatchResult, Digest, FrameSlices, KeyPlace, Replicas, Rule
+from dataplane.compiler.samples import Samples
 from dataplane.errors import DataplaneError
 from dataplane.v1model.tree import ArraySpec, Node, Program, TableNode, TableSpec
 
@@ -25,6 +27,7 @@ uint64_t dp_run(void *h, uint32_t port, uint32_t count, const char *data, const 
                 const uint64_t *times, uint8_t *verdicts);
 const uint8_t *dp_output(void *h);
 uint64_t dp_marks(void *h, const uint64_t **to);
+uint64_t dp_samples(void *h, uint32_t id, uint64_t seed, uint8_t *to, uint64_t *ends, uint64_t *hashes);
 void dp_statistics(void *h, uint64_t *to);
 void dp_out_of_range(void *h, uint64_t *to);
 void dp_ports(void *h, const char *exists);
@@ -240,6 +243,8 @@ class CMachine:
         }
         self._digests = {number: spec.name for number, spec in program.digests.items()}
         self._arrays = m.array_names(program)
+        self._seed = secrets.randbits(64)
+        """Of hashes, so that nobody can choose samples that meet."""
 
     def _know_actions(self, program: Program, node: Node) -> None:
         table = self.tables.get(node.name)
@@ -277,14 +282,27 @@ class CMachine:
         if not records:
             return BatchResult(verdicts=verdicts)
         kinds, slices = self._sorted_out(records)
-        reported = slices.of(kinds == _OUT_DIGEST)
-        samples = {name: reported.to(number).frames() for number, name in self._digests.items()}
+        reported = np.bincount(slices.ports[kinds == _OUT_DIGEST])
         return BatchResult(
             outputs=slices.of(kinds == _OUT_PORT),
             packet_ins=slices.of(kinds == _OUT_CPU).frames(),
-            samples={name: found for name, found in samples.items() if found},
+            samples={
+                self._digests[number]: self._samples(number, int(reported[number]), len(records))
+                for number in np.flatnonzero(reported).tolist()
+            },
             verdicts=verdicts,
         )
+
+    def _samples(self, number: int, count: int, room: int) -> Samples:
+        """The last run's samples of a digest."""
+        ffi, data = self._native.ffi, np.empty(room, np.uint8)
+        ends, hashes = np.empty(count, np.int64), np.empty(count, np.uint64)
+        places = ffi.from_buffer("uint8_t[]", data), *self._words(ends, hashes)
+        self._native.lib.dp_samples(self._native.handle, number, self._seed, *places)
+        return Samples(data[: int(ends[-1])].data, ends, hashes)
+
+    def _words(self, *arrays: NDArray[Any]) -> list[Any]:
+        return [self._native.ffi.from_buffer("uint64_t[]", array) for array in arrays]
 
     def _places(self, lengths: NDArray[np.uint32], times_us: NDArray[np.int64]) -> tuple[Any, Any]:
         """Both as C sees them; the arrays have to live as long."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataplane.compiler import samples
+from dataplane.compiler.samples import Samples
 from dataplane.v1model.tree import Program
 
 Replicas = tuple[tuple[int, int], ...]
@@ -67,7 +68,7 @@ class BatchResult:
     packet_ins: list[bytes] = field(default_factory=list)
     """Payloads as sent to the CPU port: the packet_in header in front, then the frame."""
     digests: list[Digest] = field(default_factory=list)
-    samples: Mapping[str, list[bytes]] = field(default_factory=dict)
+    samples: Mapping[str, Samples] = field(default_factory=dict)
     """In place of `digests`, of a block of frames: by name, in order."""
     verdicts: bytes = b""
     """One byte per frame: bit 0 it made a packet-in, bit 1 it left through a port."""

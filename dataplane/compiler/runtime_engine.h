@@ -308,6 +308,40 @@ u64 dp_marks(void *h, const u64 **to) {
     *to = ((machine *)h)->marks;
     return ((machine *)h)->marks_used;
 }
+INLINE u64 mixed(u64 a, u64 b) {
+    u128 product = (u128)a * b;
+    return (u64)product ^ (u64)(product >> 64);
+}
+static u64 sample_hash(u64 seed, const u8 *sample, u64 size) {
+    u64 h = seed ^ size, a, b;
+    for (; size >= 16; size -= 16, sample += 16) {
+        memcpy(&a, sample, 8);
+        memcpy(&b, sample + 8, 8);
+        h = mixed(h ^ a, b ^ 0x9E3779B97F4A7C15ull) ^ (h << 1 | h >> 63);
+    }
+    u8 rest[16] = {0};
+    memcpy(rest, sample, size);
+    memcpy(&a, rest, 8);
+    memcpy(&b, rest + 8, 8);
+    return mixed(h ^ a, b ^ 0xA0761D6478BD642Full) ^ (h << 1 | h >> 63);
+}
+/* The last run's samples of one digest, end to end; of each where it ends, and a hash.  There is room for all that was
+ * put out, and for as many samples as there are marks.  Returns how many there are. */
+u64 dp_samples(void *h, u32 id, u64 seed, u8 *to, u64 *ends, u64 *hashes) {
+    machine *m = h;
+    u64 count = 0, end = 0;
+    for (u64 i = 0; i < m->marks_used; i++) {
+        const u8 *at = m->out + m->marks[i];
+        u32 head[4];
+        memcpy(head, at, 16);
+        if (head[0] != OUT_DIGEST || head[1] != id) continue;
+        memcpy(to + end, at + 16, head[2]);
+        end += head[2];
+        ends[count] = end;
+        hashes[count++] = sample_hash(seed, at + 16, head[2]);
+    }
+    return count;
+}
 void dp_statistics(void *h, u64 *to) { memcpy(to, ((machine *)h)->stats, sizeof ((machine *)h)->stats); }
 void dp_out_of_range(void *h, u64 *to) { memcpy(to, ((machine *)h)->out_of_range, sizeof ((machine *)h)->out_of_range); }
 void dp_ports(void *h, const u8 *exists) { memcpy(((machine *)h)->ports, exists, 512); }

@@ -7,9 +7,49 @@ The back ends write samples so at once: of a list of hundreds with thirty member
 joining is left to do (runtime_types.h has the same in C).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 _MOST_BYTES = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Samples of one digest end to end: objects of who looks at them only."""
+
+    data: bytes | memoryview
+    ends: NDArray[np.int64]
+    """Where each ends."""
+    hashes: NDArray[np.uint64]
+    """Of equal samples equal."""
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @classmethod
+    def of(cls, samples: Sequence[bytes]) -> Self:
+        """Of single ones."""
+        ends = np.cumsum(np.fromiter(map(len, samples), np.int64, len(samples)))
+        hashes = np.fromiter(map(hash, samples), np.int64, len(samples)).view(np.uint64)
+        return cls(b"".join(samples), ends, hashes)
+
+    def each(self) -> list[bytes]:
+        """One by one."""
+        data, ends = bytes(self.data), self.ends.tolist()
+        return [data[begin:end] for begin, end in zip([0, *ends], ends, strict=False)]
+
+    def part(self, first: int, end: int) -> "Samples":
+        """Those from one number up to another."""
+        if first == 0 and end == len(self):
+            return self
+        begin = int(self.ends[first - 1]) if first else 0
+        ends = self.ends[first:end] - begin
+        stop = begin + int(ends[-1]) if len(ends) else begin
+        return Samples(memoryview(self.data)[begin:stop], ends, self.hashes[first:end])
 
 
 def varint(value: int) -> bytes:

@@ -8,16 +8,20 @@ Lists are written as protobuf bytes directly, for the reason given in packet_io.
 from the switch as they travel (compiler/samples.py).  Pure but for the
 time stamp of a list: times are arguments.  The packet loop fills lists while controllers acknowledge and
 configure in threads of their own, so one lock is held for each of these.
+
+Samples of a block stay end to end while none of them is suppressed: without an ack time-out, and with different hashes.
 """
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from dataplane.compiler.machine import Digest
-from dataplane.compiler.samples import varint
+from dataplane.compiler.samples import Samples, varint
 from dataplane.p4runtime.schema import BoundDigest, Schema
 from dataplane.p4runtime.status import Exists, InvalidArgument, MissingEntity
 from dataplane.p4runtime.table_entities import DELETE, INSERT, Undo
@@ -35,6 +39,9 @@ class _Stream:
     digest: BoundDigest
     config: Any
     buffer: dict[bytes, None] = field(default_factory=dict)
+    """What waits, ..."""
+    parts: list[Samples] = field(default_factory=list)
+    """... or this, of which no two are equal; one of both is empty."""
     since_ns: int = 0
     cache: dict[int, tuple[int, tuple[bytes, ...]]] = field(default_factory=dict)
     cached: set[bytes] = field(default_factory=set)
@@ -46,6 +53,28 @@ class _Stream:
             return 1
         size: int = self.config.max_list_size
         return min(size, MAX_LIST) if size > 0 else MAX_LIST
+
+    @property
+    def waiting(self) -> int:
+        """Samples that wait."""
+        return len(self.buffer) or sum(map(len, self.parts))
+
+    def take_whole(self, samples: Samples) -> bool:
+        """Take samples as they are, if none of them may be suppressed."""
+        if self.config.ack_timeout_ns or self.cached or self.buffer:
+            return False
+        hashes = np.concatenate([part.hashes for part in (*self.parts, samples)])
+        hashes.sort()
+        if (hashes[1:] == hashes[:-1]).any():
+            return False
+        self.parts.append(samples)
+        return True
+
+    def divide(self) -> None:
+        """What waits in pieces waits sample by sample from now on."""
+        for part in self.parts:
+            self.buffer.update(dict.fromkeys(part.each()))
+        self.parts.clear()
 
 
 class DigestLists:
@@ -81,9 +110,8 @@ class DigestLists:
                 del self._by_name[digest.name]
             else:
                 stream = old or _Stream(digest, None)
-                self._by_name[digest.name] = _Stream(
-                    digest, _copy(config), stream.buffer, stream.since_ns, stream.cache, stream.cached
-                )
+                stream.divide()
+                self._by_name[digest.name] = replace(stream, config=_copy(config))
 
         def undo() -> None:
             with self._lock:
@@ -128,6 +156,7 @@ class DigestLists:
                 if stream is None:
                     self.unconfigured += 1
                     continue
+                stream.divide()
                 sample, buffer = digest.sample, stream.buffer
                 if sample in buffer or sample in stream.cached:
                     self.suppressed += 1
@@ -139,7 +168,7 @@ class DigestLists:
                     ready.append(self._list(stream, now_ns))
         return ready
 
-    def add_samples(self, name: str, samples: Sequence[bytes], now_ns: int) -> list[bytes]:
+    def add_samples(self, name: str, samples: Samples, now_ns: int) -> list[bytes]:
         """As `add`, of one digest."""
         with self._lock:
             stream = self._by_name.get(name)
@@ -149,20 +178,24 @@ class DigestLists:
             ready, first = list[bytes](), 0
             while first < len(samples):
                 # so many at most fill the list
-                piece = samples[first : first + stream.list_size - len(stream.buffer)]
-                first += len(piece)
-                ready += self._fill(stream, piece, now_ns)
+                end = min(first + max(0, stream.list_size - stream.waiting), len(samples))
+                ready += self._fill(stream, samples.part(first, end), now_ns)
+                first = end
             return ready
 
-    def _fill(self, stream: _Stream, samples: Sequence[bytes], now_ns: int) -> list[bytes]:
-        fresh, before = dict.fromkeys(samples), len(stream.buffer)
-        for known in stream.cached.intersection(fresh):
-            del fresh[known]
-        stream.buffer.update(fresh)
-        self.suppressed += len(samples) - (len(stream.buffer) - before)
+    def _fill(self, stream: _Stream, samples: Samples, now_ns: int) -> list[bytes]:
+        before = stream.waiting
+        if not stream.take_whole(samples):
+            stream.divide()
+            fresh = dict.fromkeys(samples.each())
+            for known in stream.cached.intersection(fresh):
+                del fresh[known]
+            stream.buffer.update(fresh)
+        now = stream.waiting
+        self.suppressed += len(samples) - (now - before)
         if not before:
             stream.since_ns = now_ns
-        return [self._list(stream, now_ns)] if len(stream.buffer) >= stream.list_size else []
+        return [self._list(stream, now_ns)] if now >= stream.list_size else []
 
     def due(self, now_ns: int) -> list[bytes]:
         """Lists whose time-out has passed; also forgets what was not acknowledged in time."""
@@ -170,14 +203,14 @@ class DigestLists:
         with self._lock:
             for stream in self._by_name.values():
                 self._forget(stream, now_ns - stream.config.ack_timeout_ns)
-                if stream.buffer and now_ns - stream.since_ns >= stream.config.max_timeout_ns:
+                if stream.waiting and now_ns - stream.since_ns >= stream.config.max_timeout_ns:
                     ready.append(self._list(stream, now_ns))
         return ready
 
     def next_due_ns(self) -> int | None:
         """When the next list will be due, on the clock of `add`; None = nothing waits."""
         with self._lock:
-            times = [s.since_ns + s.config.max_timeout_ns for s in self._by_name.values() if s.buffer]
+            times = [s.since_ns + s.config.max_timeout_ns for s in self._by_name.values() if s.waiting]
         return min(times, default=None)
 
     def acknowledge(self, digest_id: int, list_id: int) -> None:
@@ -201,6 +234,10 @@ class DigestLists:
 
     def _list(self, stream: _Stream, now_ns: int) -> bytes:
         self._list_id += 1
+        if stream.parts:
+            parts = [part.data for part in stream.parts]
+            stream.parts.clear()
+            return encode_list(stream.digest, self._list_id, parts, self._wall_ns())
         samples = tuple(stream.buffer)
         stream.buffer.clear()
         if stream.config.ack_timeout_ns:
@@ -212,8 +249,10 @@ class DigestLists:
         return encode_list(stream.digest, self._list_id, samples, self._wall_ns())
 
 
-def encode_list(digest: BoundDigest, list_id: int, samples: Iterable[bytes], stamp_ns: int) -> bytes:
-    """A StreamMessageResponse with a DigestList of samples."""
+def encode_list(
+    digest: BoundDigest, list_id: int, samples: Iterable[bytes | memoryview], stamp_ns: int
+) -> bytes:
+    """A StreamMessageResponse with a DigestList of samples, each of them alone or several end to end."""
     head = b"".join((b"\x08", varint(digest.id), b"\x10", varint(list_id)))
     body = b"".join((head, *samples, b"\x20", varint(stamp_ns)))
     return b"".join((b"\x1a", varint(len(body)), body))

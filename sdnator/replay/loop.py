@@ -241,6 +241,7 @@ class ReplayPass:
                 first=partial(self._join, engine),
                 kitsune=options.kitsune,
                 queries=options.queries,
+                keeps_archive=options.keep is not None,
                 firewall=_firewall(mitigate=self._result.mitigate, queries=options.queries),
             )
             with ReplayPipeline(plan) as pipeline:

@@ -71,6 +71,8 @@ class PipelinePlan:
     """How headers come from the switch: packet-in, or digest."""
     queries: bool = True
     """Run the Sonata adapter."""
+    keeps_archive: bool = True
+    """Archive packets and scores, too; False: only what apps read back and what the replay reports."""
     kitsune: Mapping[str, Any] = field(default_factory=dict)
     firewall: Mapping[str, Any] = field(default_factory=dict)
 
@@ -127,7 +129,7 @@ class ReplayPipeline(WholeOrNone):
             self._plan.first(self)
         settings = {
             "p4runtime_ctrl": self._controller_settings(),
-            "kitsune": self._plan.kitsune,
+            "kitsune": {"archive_scores": self._plan.keeps_archive, **self._plan.kitsune},
             _ADAPTER: self._adapter_settings(),
             "firewall": self._firewall_settings(),
         }
@@ -197,6 +199,7 @@ class ReplayPipeline(WholeOrNone):
             "program": str(program.bmv2_json),
             "p4info": str(program.p4info),
             "telemetry": self._plan.telemetry,
+            "archive_packets": self._plan.keeps_archive,
             "tls_ca": self._security.ca,
             "tls_certificate": self._security.certificate,
             "tls_key": self._security.key,

@@ -244,6 +244,8 @@ class Connection:
             self._patience = None
 
     def _acknowledge(self, digest: Any) -> None:
+        if not self._address.remembers and digest.digest_id in self._pipeline.digests_of_frames:
+            return
         request = p4runtime.StreamMessageRequest()
         request.digest_ack.digest_id = digest.digest_id
         request.digest_ack.list_id = digest.list_id

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from apps.p4runtime_ctrl.errors import P4InfoError
 from apps.p4runtime_ctrl.southbound.capture_times import CaptureTimes
+from apps.p4runtime_ctrl.southbound.digest_columns import DigestColumns
 from apps.p4runtime_ctrl.southbound.digest_rows import read_lists
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
@@ -21,7 +22,7 @@ from apps.p4runtime_ctrl.telemetry.coverage import uncovered
 from apps.packets import PACKET_COLUMNS
 from due import RecordBatch
 
-_DIGEST: Final = "frame_digest_t"
+FRAME_DIGEST: Final = "frame_digest_t"
 _NEEDED: Final = frozenset(
     ("queries", "crossed", "overflow", "fragment", "timestamp", "arrival", "sequence", "ingress_port", "vid",
      "ethertype", "length", "eth_src", "eth_dst", "src", "dst", "protocol", "l4_valid", "quoted",
@@ -72,12 +73,13 @@ class DigestReader:
     def __init__(
         self, program: ProgramInfo, base_us: int, progress: LossTracker, times: CaptureTimes | None = None
     ) -> None:
-        fields = program.digest(_DIGEST)
+        fields = program.digest(FRAME_DIGEST)
         missing = sorted(_NEEDED - {name for name, _ in fields})
         if missing:
-            raise P4InfoError(f"digest {_DIGEST} of the program lacks {', '.join(missing)}")
-        self.digest_id = program.digest_id(_DIGEST)
+            raise P4InfoError(f"digest {FRAME_DIGEST} of the program lacks {', '.join(missing)}")
+        self.digest_id = program.digest_id(FRAME_DIGEST)
         self._layout = RowLayout(fields)
+        self._columns = DigestColumns.of(self._layout)
         self._base_us = base_us
         self._times = times
         self._progress = progress
@@ -86,16 +88,23 @@ class DigestReader:
         """Columns of all frames in the lists, in order."""
         found, malformed = read_lists(self._layout, lists)
         self._progress.malformed += malformed
-        columns = _columns(found, self._base_us)
+        if self._columns is not None:
+            columns, covered = self._columns.read(found, self._base_us)
+        else:
+            columns, covered = columns_of(found, self._base_us), ~uncovered(found)
         if self._times is not None:
             columns["time_us"] = self._times.of(columns["arrival"])
         self._progress.digests(columns["sequence"], columns["arrival"], columns["time_us"])
-        return DigestReports(
-            columns, found["queries"], found["crossed"], found["overflow"], ~uncovered(found)
-        )
+        return DigestReports(columns, found["queries"], found["crossed"], found["overflow"], covered)
 
 
-def _columns(found: NDArray[Any], base_us: int) -> dict[str, NDArray[Any]]:
+def columns_of(found: NDArray[Any], base_us: int) -> dict[str, NDArray[Any]]:
+    """What `DigestColumns` reads, without a library.
+
+    Args:
+        found: records of the digest's layout.
+        base_us: added to their times.
+    """
     ethertype = found["ethertype"].astype(np.uint16)
     given = {
         "sequence": found["sequence"],

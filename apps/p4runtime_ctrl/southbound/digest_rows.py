@@ -24,6 +24,8 @@ _DECLARATIONS: Final = """
 long digest_samples(const uint8_t *data, long size);
 long digest_rows(const uint8_t *data, long size, const int32_t *widths, long fields, long row_bytes,
                  uint8_t *rows, long room);
+typedef struct { int32_t at, width; } DigestField;
+void digest_columns(const uint8_t *rows, long n, long row_bytes, const DigestField *fields, int64_t base_us, uint8_t *to);
 """
 _DIGEST: Final = 0x1A
 _LIST_PARTS: Final = (0x08, 0x10)
@@ -141,8 +143,14 @@ def read_lists(layout: RowLayout, lists: Sequence[Any]) -> tuple[NDArray[Any], i
     """Rows of digest lists, in order, and how many samples were left out as malformed."""
     read = [sound_rows(layout, each) for each in lists]
     malformed = sum(bad for _, bad in read)
-    found = read[0][0] if len(read) == 1 else np.concatenate([rows for rows, _ in read] or [layout.array([])])
+    found = read[0][0] if len(read) == 1 else _joined(layout, [rows for rows, _ in read])
     sound = in_time(found)
     if sound.all():
         return found, malformed
     return found[sound], malformed + int(np.count_nonzero(~sound))
+
+
+def _joined(layout: RowLayout, read: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Rows one behind the other, as bytes: numpy would turn each number of each row to the machine's order."""
+    rows: NDArray[Any] = np.concatenate([each.view(np.uint8) for each in read] or [np.empty(0, np.uint8)])
+    return rows.view(layout.dtype)

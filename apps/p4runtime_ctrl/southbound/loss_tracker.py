@@ -39,6 +39,7 @@ class LossTracker:
         """Capture time of the newest frame seen."""
         self.expected: frozenset[Source] = frozenset(("packet",))
         """Expected streams."""
+        self._arrived = False
         self._clock = SteadyTime(_STEP_US)
         self._lost = 0
         self._passed: dict[Source, int] = {}
@@ -86,10 +87,19 @@ class LossTracker:
         arrival: NDArray[np.uint64],
         time_us: NDArray[np.int64],
     ) -> None:
-        self.passed(time_us)
         numbers = sequence[sequence != 0].astype(np.int64)
-        if not len(numbers):
-            return
+        if len(numbers):
+            self._count(source, numbers)
+            self._arrive(int(arrival[-1]))
+        # last: whoever reads the time, and then the number, takes no packet for handed on that is not
+        self.passed(time_us)
+
+    def _arrive(self, arrival: int) -> None:
+        """The newest of both streams: a copy may come after digests of later frames."""
+        if not self._arrived or (arrival - self.arrival) % _WRAP < _HALF:
+            self.arrival, self._arrived = arrival, True
+
+    def _count(self, source: Source, numbers: NDArray[np.int64]) -> None:
         # after a break in both streams a lower first number means that the switch restarted
         first = self._highest if self._highest and not self._passed else int(numbers[0]) - 1
         before = self._passed.get(source, first)
@@ -101,12 +111,12 @@ class LossTracker:
             self._begin_anew()
             start = int(begin)
         self._pass(source, numbers[start:])
-        self.arrival = int(arrival[-1])
 
     def _begin_anew(self) -> None:
         """A switch that counts from 1 again: the numbers before the first to arrive are lost, too."""
         self._settle(everything=True)
         self.restarts += 1
+        self._arrived = False
         self._passed.clear()
         self._highest = 0
 

@@ -51,6 +51,23 @@ class PacketRows:
         """The chosen rows; a copy only if others are left out."""
         return self if chosen.all() else self.only(chosen)
 
+    def split(self, number: int) -> "tuple[PacketRows, PacketRows]":
+        """Of rows in order: those up to a number, and those behind it; nothing is copied."""
+        place = int(np.searchsorted(self.sequence, number, side="right"))
+        return self.only(slice(0, place)), self.only(slice(place, None))
+
+    def replaced(self, places: NDArray[np.intp], others: "PacketRows") -> "PacketRows":
+        """A copy with other rows at some places."""
+        found = PacketRows(
+            {name: column.copy() for name, column in self.columns.items()},
+            self.queries.copy(),
+            self.whole.copy(),
+        )
+        for name, column in found.columns.items():
+            column[places] = others.columns[name]
+        found.queries[places], found.whole[places] = others.queries, others.whole
+        return found
+
     def matching(self, bit: int) -> RecordBatch:
         """The records that meet a request."""
         rows = has_bit(self.queries, bit)
@@ -126,7 +143,7 @@ class SequenceMerger:
 
     def _follow(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
         self._passed[stream] = int(rows.sequence[-1])
-        rows = rows.where(rows.sequence > self._told)
+        _, rows = rows.split(self._told)
         held = self._held[stream]
         self._held[stream] = rows if held is None else _joined(held, rows)
         return self._tell(self._decided()) if len(self) <= _LONGEST else self.flush()
@@ -148,9 +165,8 @@ class SequenceMerger:
         for stream, rows in self._held.items():
             if rows is None:
                 continue
-            ripe = rows.sequence <= end
-            self._held[stream] = None if ripe.all() else rows.only(~ripe)
-            chosen[stream] = rows.where(ripe)
+            chosen[stream], rest = rows.split(end)
+            self._held[stream] = rest if len(rest) else None
         self._told = max(self._told, min(end, max(self._passed.values())))
         chosen = {stream: rows for stream, rows in chosen.items() if len(rows)}
         self.copies += len(chosen.get("packet", ()))
@@ -158,6 +174,9 @@ class SequenceMerger:
 
     def _merged(self, packet: PacketRows, digest: PacketRows) -> PacketRows:
         known, numbers = packet.sequence, digest.sequence
+        places = np.searchsorted(numbers, known)
+        if (numbers[np.minimum(places, len(numbers) - 1)] == known).all():
+            return digest.replaced(places, packet)  # as usual: what is copied is reported, too
         place = np.minimum(np.searchsorted(known, numbers), len(known) - 1)
         rows = _joined(packet, digest.where(known[place] != numbers))
         return rows.only(np.argsort(rows.sequence, kind="stable"))

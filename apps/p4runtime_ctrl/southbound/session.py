@@ -8,6 +8,7 @@ import queue
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import grpc
@@ -15,6 +16,7 @@ from google.protobuf.message import DecodeError
 
 from apps.p4runtime_ctrl.errors import Malformed, NotPrimary, P4InfoError, SwitchError, Unreachable
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.southbound.digest_in import FRAME_DIGEST
 from apps.p4runtime_ctrl.state.desired_state import Change, check_entry
 from apps.p4runtime_ctrl.state.desired_switch import UpdateOutcome
 from p4rt import ChannelSecurity, InsecureChannel, P4RuntimeStub, open_channel, p4runtime, status
@@ -56,6 +58,13 @@ class CompiledProgram:
         data = self.config + self.p4info.SerializeToString(deterministic=True)
         return int.from_bytes(hashlib.sha256(data).digest()[:8], "big") >> 1
 
+    @cached_property
+    def digests_of_frames(self) -> frozenset[int]:
+        """Ids of the digests that are numbered."""
+        return frozenset(
+            each.preamble.id for each in self.p4info.digests if each.preamble.name == FRAME_DIGEST
+        )
+
 
 @dataclass(frozen=True)
 class Address:
@@ -73,6 +82,8 @@ class Address:
     cpu_port: int = 510
     timeout_s: float = 5.0
     security: ChannelSecurity | None = None
+    remembers: bool = True
+    """It is to remember digests of frames until they are acknowledged, though no two of these are equal: all numbered."""
 
     def channel(self) -> grpc.Channel:
         """A channel of its own.  Raises P4InfoError where the settings do not say how it is secured."""
@@ -108,6 +119,7 @@ def address_of(settings: Settings, mine: SwitchSettings) -> Address:
         cpu_port=settings.cpu_port,
         timeout_s=settings.timeout_s,
         security=security,
+        remembers=mine.target != "embedded",
     )
 
 
@@ -273,7 +285,8 @@ class P4RuntimeSession:
         config = update.entity.digest_entry.config
         config.max_timeout_ns = _DIGEST_WAITS_NS
         config.max_list_size = _DIGEST_LIST
-        config.ack_timeout_ns = _DIGEST_ACK_NS
+        remembered = self._address.remembers or digest_id not in self._pipeline.digests_of_frames
+        config.ack_timeout_ns = _DIGEST_ACK_NS if remembered else 0
         return self._write_updates([update])[0]
 
     def _write_updates(self, updates: list[Any]) -> list[UpdateOutcome]:

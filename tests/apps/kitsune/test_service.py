@@ -120,6 +120,24 @@ def test_scores_and_alerts_of_a_stream(server, controller, tmp_path):
         process.communicate()
 
 
+def test_scores_are_published_only_where_the_settings_say_so(server, controller, tmp_path):
+    process = start(server, tmp_path, archive_scores=False)
+    try:
+        assert json.loads(process.stdout.readline())["app"] == "kitsune"
+        scores = []
+        controller.observe(SCORE).subscribe(lambda item: scores.append(item.value))
+        wait_for(lambda: controller.wanted(KEY))
+        controller.write(KEY, blank(10), [NO_WAIT])
+        wait_for(lambda: sum(item["count"] for item in scores) == 10)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(DEADLINE_S) == 0
+        assert not controller.get(SCORE)
+        assert controller.get(TRAINING_KEY), "what is told of training is archived"
+    finally:
+        process.kill()
+        process.communicate()
+
+
 @pytest.mark.parametrize(
     ("settings", "text"),
     [({"no_such_option": 1}, "no_such_option"), ({"load_model": "/nowhere/model.npz"}, "no such model")],

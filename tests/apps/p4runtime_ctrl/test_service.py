@@ -76,6 +76,21 @@ def test_the_state_of_a_silent_switch_is_repeated_and_archived_once(stage):
     assert len(engine.get(STATE)) == archived
 
 
+@pytest.mark.parametrize("archive_packets", [True, False])
+def test_packets_are_archived_unless_the_settings_say_otherwise_and_states_always(stage, archive_packets):
+    controller = stage.controller(archive_packets=archive_packets)
+    engine = stage.engine("listener")
+    heard = Heard(engine, PACKETS, STATE)
+    wait_for(lambda: any("packets" in value["telemetry"] for value in heard.values("switch")), why=stage.log)
+    feed = stage.feed()
+    feed.send(range(100), [60] * 100, [frame(1)] * 100)
+    wait_for(lambda: len(heard.arrivals()) == 100, why=stage.log)
+    feed.close()
+    assert "ended with exit code 0" in end(controller)
+    assert sum(len(item.value) for item in engine.get(PACKETS)) == (100 if archive_packets else 0)
+    assert engine.get(STATE)
+
+
 def test_packets_are_copied_only_while_somebody_wants_them(stage):
     stage.controller()
     engine = stage.engine("listener")

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataplane.compiler.machine import Digest
+from dataplane.compiler.samples import Samples
 from dataplane.compiler.samples import encode as sample
 from dataplane.p4runtime.bytestrings import encode
 from dataplane.p4runtime.digests import DigestLists, encode_list
@@ -156,6 +157,27 @@ def test_a_controller_that_acknowledges_nothing_does_not_fill_the_memory():
         assert firsts(made.add(samples(0, 1, 2), 0)) == [[0, 1, 2]]
 
 
+@given(st.lists(st.tuples(st.lists(st.integers(0, 9), max_size=12), st.sampled_from([0, SECOND]))))
+def test_samples_of_a_block_outlive_other_configurations(steps):
+    """The same lists, whatever the configuration is changed to while samples wait."""
+    single, block = lists(size=5), lists(size=5)
+    for number, (values, ack) in enumerate(steps):
+        found = samples(*values)
+        ready = single.add(found, number)
+        assert block.add_samples("note", Samples.of([each.sample for each in found]), number) == ready
+        for made in (single, block):
+            made.write(p4runtime.Update.MODIFY, entry(size=5, ack=ack))
+        assert (block.suppressed, block.next_due_ns()) == (single.suppressed, single.next_due_ns())
+        assert block.due(number) == single.due(number)
+
+
+def test_different_samples_of_one_hash_are_different():
+    made, alike = lists(size=3), Samples.of([sample((value, 0)) for value in (1, 2, 3)])
+    alike.hashes[:] = 7
+    assert firsts(made.add_samples("note", alike, 0)) == [[1, 2, 3]]
+    assert made.suppressed == 0
+
+
 @given(st.lists(st.lists(st.integers(0, 9), max_size=12)), st.integers(1, 5), st.sampled_from([0, SECOND]))
 def test_samples_of_a_block_are_taken_in_as_digests_one_by_one(batches, size, ack):
     """The same lists at the same time, and as many suppressed, whatever is acknowledged meanwhile."""
@@ -163,7 +185,7 @@ def test_samples_of_a_block_are_taken_in_as_digests_one_by_one(batches, size, ac
     for number, values in enumerate(batches):
         found = samples(*values)
         ready = single.add(found, number)
-        assert block.add_samples("note", [each.sample for each in found], number) == ready
+        assert block.add_samples("note", Samples.of([each.sample for each in found]), number) == ready
         assert (block.suppressed, block.next_due_ns()) == (single.suppressed, single.next_due_ns())
         if number % 3 == 0:
             for made in (single, block):

@@ -220,3 +220,20 @@ def test_a_new_stream_wins_though_the_wall_clock_was_set_back(monkeypatch):
     past = time.time_ns() - 3600 * 10**9
     monkeypatch.setattr("apps.p4runtime_ctrl.southbound.connection.time.time_ns", lambda: past)
     assert connection._usual_id() > before
+
+
+@pytest.mark.parametrize("remembers", [True, False])
+def test_digests_of_frames_are_numbered_and_need_not_be_remembered(switch, remembers):
+    """Others may repeat: the switch keeps those back until they are acknowledged."""
+    listener = Listener()
+    address = Address(switch.address, 1, 1, security=INSECURE, remembers=remembers)
+    connection = Connection(address, pipeline(), listener)
+    connection.open()
+    listener.until(lambda: listener.sessions)
+    listener.sessions[0].ensure_digests()
+    connection.close()
+    digests = pipeline().p4info.digests
+    forgotten = [
+        each.preamble.name for each in digests if not switch.digests[each.preamble.id].config.ack_timeout_ns
+    ]
+    assert forgotten == ([] if remembers else ["frame_digest_t"])

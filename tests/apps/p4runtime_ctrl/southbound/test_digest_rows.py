@@ -92,3 +92,11 @@ def test_times_that_no_clock_shows_are_left_out():
     found, malformed = read_lists(LAYOUT, [digest_list(late), digest_list(late[:1])])
     assert (len(found), malformed) == (3, 1)
     assert found["timestamp"].astype(np.int64).tolist() == [1, 1 << 40, 1]
+
+
+def test_rows_of_several_lists_are_laid_out_as_those_of_one():
+    alone = digest_list([[b"\1", b"\2", b"\3", b"\4"]])
+    found, malformed = read_lists(LAYOUT, [alone, alone, digest_list([])])
+    assert (found.dtype, malformed) == (LAYOUT.dtype, 0)
+    assert found.tobytes() == 2 * sound_rows(LAYOUT, alone)[0].tobytes()
+    assert read_lists(LAYOUT, [])[0].dtype == LAYOUT.dtype

@@ -77,3 +77,37 @@ def test_digests_without_a_number_are_no_gap():
     note(progress, [0, 3, 0], "digests")
     note(progress, [4])
     assert (progress.lost, progress.restarts, progress.reported) == (0, 0, 6)
+
+
+def test_the_time_is_never_ahead_of_the_arrival_number():
+    """Kitsune closes a second once the time has left it and all packets up to that number are scored."""
+    seen = []
+
+    class Watched(LossTracker):
+        def __setattr__(self, name, value):
+            super().__setattr__(name, value)
+            if name == "time_us" and value:
+                seen.append((value, self.arrival))
+
+    progress = Watched()
+    for numbers in ([1, 2], [3], [7, 8]):
+        note(progress, numbers, "digests")
+    assert seen == [(2, 2), (3, 3), (8, 8)]
+
+
+@pytest.mark.parametrize(
+    ("lists", "newest"),
+    [
+        ([("digests", [1, 2, 5]), ("packets", [3, 4])], 5),
+        ([("packets", [3]), ("digests", [1, 2, 4])], 4),
+        ([("digests", [(1 << 32) - 2, (1 << 32) - 1]), ("digests", [1, 2]), ("packets", [(1 << 32) - 1])], 2),
+        ([("digests", [(1 << 31) + 9])], (1 << 31) + 9),
+        ([("digests", [900]), ("digests", [1, 2])], 2),  # the switch counts from 1 again
+    ],
+)
+def test_the_arrival_number_is_the_newest_of_both_streams(lists, newest):
+    """A copy of an earlier frame may come after digests: what Kitsune has scored last is the newest."""
+    progress = LossTracker()
+    for source, numbers in lists:
+        note(progress, numbers, source)
+    assert progress.arrival == newest

@@ -2,6 +2,7 @@
 
 import subprocess
 
+import msgspec
 import pytest
 
 from apps.p4runtime_ctrl.errors import P4InfoError
@@ -65,6 +66,14 @@ def test_who_shows_none_gets_nowhere(target, certificate, with_ca):
 def settings(**options):
     switch = SwitchSettings(name="s1", address="127.0.0.1:1", insecure=options.pop("insecure", False))
     return Settings(switches=(switch,), program="", p4info="", **options), switch
+
+
+@pytest.mark.parametrize("target", ["embedded", "bmv2", ""])
+def test_the_embedded_switch_forgets_digests_of_frames(target):
+    chosen, switch = settings(insecure=True)
+    assert address_of(chosen, msgspec.structs.replace(switch, target=target)).remembers == (
+        target != "embedded"
+    )
 
 
 def test_a_missing_file_is_named():
