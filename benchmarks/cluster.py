@@ -4,6 +4,7 @@
     kafka     three brokers                                      cluster_kafka.py
     bridge    two sites with servers and Coordinators of their   cluster_bridge.py
               own, joined by 10 Mb/s with 50 ms each way
+    spark     Kafka, HDFS and a Spark cluster of two workers     cluster_spark.py
 
 Servers are killed, frozen, or killed together with a producer right after its `flush`, while a reliable stream is
 written and read; the bridge's link is cut, and the bridge killed.
@@ -13,6 +14,8 @@ median of the reader's longest pauses, where the primary, or the broker that lea
 `kafka_msgs_per_s`: messages of 100 bytes on a reliable path; `kafka_vs_raw`: the same against confluent-kafka alone,
 with frames of 100.  `bridge_lost`: reliable items acknowledged at the one site and never delivered at the other;
 `bridge_uncounted`: best-effort items that were missing there and not counted as gaps, or the other way round.
+`spark_equal_queries`: queries whose results on the cluster are those of the host engine, though a worker was killed;
+`spark_speedup_2_workers`: packets a second with two of them, by those with one.
 
 A part that cannot run on this machine says why in `NAME_missing`, one that broke in `NAME_failed`.  Exit code: 1 where
 a part broke, something was lost, or something best-effort was missing and not counted.
@@ -28,7 +31,7 @@ from typing import Any
 from benchmarks.cluster_stage import PartMissing
 from benchmarks.measure import arguments, machine, table, write_json
 
-PARTS: Mapping[str, float] = {"sentinel": 420.0, "kafka": 600.0, "bridge": 420.0}
+PARTS: Mapping[str, float] = {"sentinel": 420.0, "kafka": 600.0, "bridge": 420.0, "spark": 300.0}
 """Modules `benchmarks.cluster_NAME`, and after how many seconds no further round begins."""
 NONE_LOST = ("sentinel_acknowledged_lost", "kafka_acknowledged_lost", "bridge_lost", "bridge_uncounted")
 
