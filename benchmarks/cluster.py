@@ -7,6 +7,7 @@
     shards    instances of Kitsune that divide two switches      cluster_shards.py
     plan      what `sdnator plan` predicts, against a run with   cluster_plan.py
               two and four switches; needs root
+    spark     Kafka, HDFS and a Spark cluster of two workers     cluster_spark.py
 
 Servers are killed, frozen, or killed together with a producer right after its `flush`, while a reliable stream is
 written and read; the bridge's link is cut, and the bridge killed.
@@ -18,6 +19,8 @@ with frames of 100.  `bridge_lost`: reliable items acknowledged at the one site 
 `bridge_uncounted`: best-effort items that were missing there and not counted as gaps, or the other way round.
 `shard_scores_equal`: the largest difference of a packet's score from that of an undisturbed run.  `plan_error`: of the
 cores that were predicted.
+`spark_equal_queries`: queries whose results on the cluster are those of the host engine, though a worker was killed;
+`spark_speedup_2_workers`: packets a second with two of them, by those with one.
 
 A part that cannot run on this machine says why in `NAME_missing`, one that broke in `NAME_failed`.  Exit code: 1 where
 a part broke, something was lost, or something best-effort was missing and not counted.
@@ -39,6 +42,7 @@ PARTS: Mapping[str, float] = {
     "kafka": 600.0,
     "bridge": 420.0,
     "shards": 180.0,
+    "spark": 300.0,
     "plan": 0.0,
 }
 """Modules `benchmarks.cluster_NAME`, and after how many seconds no further round begins."""

@@ -48,6 +48,8 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Day of the measurement, as in 2026-11-25."""
     note: str = ""
     """What makes these figures better or worse than others."""
+    reference_us: float = 0.0
+    """CPU that the reference work took on this machine then; 0: not measured."""
     error: float | None = None
     """Largest relative difference between a prediction and a measurement; None: never compared."""
     rates: tuple[float, ...]

@@ -101,6 +101,8 @@ def one_switch(pipeline: MeasuredPipeline, schedule: Schedule, train: int, tell:
         raise PipelineError(
             f"this machine cannot carry {schedule.rates[0]:,.0f} packets a second now: stop what else runs here"
         )
+    reference_us = carried[-1].reference_us
+    idle, carried = idle.at(reference_us), [each.at(reference_us) for each in carried]
     note = "" if len(carried) == len(schedule.rates) else f"{rate:,.0f} packets a second were too many"
     costs = replace(_costs(idle, carried, pipeline), note=note)
     return _with_more(costs, idle, carried, pipeline, schedule, tell) if schedule.more else costs
@@ -122,6 +124,7 @@ def _costs(idle: LoadPhase, phases: Sequence[LoadPhase], pipeline: MeasuredPipel
         machine=processor(),
         cores=os.cpu_count() or 1,
         measured=dt.datetime.now(dt.UTC).strftime(_DAY),
+        reference_us=phases[-1].reference_us,
         rates=tuple(phase.sent / phase.load_s for phase in phases),
         processes=processes,
         updates_in=_per_packet(phases, idle, "updates_in"),
@@ -157,10 +160,10 @@ def _with_more(
     rate, before = schedule.rates[place], phases[place]
     tell(f"the same with {len(_QUERIES)} more queries")
     with _readers(pipeline, 1, _QUERIES):
-        queries = pipeline.loaded(rate, schedule.seconds)
+        queries = pipeline.loaded(rate, schedule.seconds).at(costs.reference_us)
     tell(f"the same with {_CONSUMERS} more consumers")
     with _readers(pipeline, _CONSUMERS, (_SCORES,)):
-        consumers = pipeline.loaded(rate, schedule.seconds)
+        consumers = pipeline.loaded(rate, schedule.seconds).at(costs.reference_us)
     processes = {
         name: replace(
             cost,
@@ -217,7 +220,8 @@ def _with_switches(
     costs: Costs, begun: Mapping[str, float], pipeline: MeasuredPipeline, schedule: Schedule
 ) -> Costs:
     """What further switches cost that forward nothing; `begun` is the memory of one with one switch, when it began."""
-    mib, idle, further = pipeline.mib(), pipeline.idle(schedule.seconds), pipeline.switches - 1
+    mib, further = pipeline.mib(), pipeline.switches - 1
+    idle = pipeline.idle(schedule.seconds).at(costs.reference_us)
 
     def more(name: str, cost: ProcessCost) -> ProcessCost:
         if cost.per_switch:

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,6 +20,7 @@ from sdnator.capture.interfaces import VethPair
 from sdnator.errors import PipelineError
 from sdnator.northbound import ask
 from sdnator.plan.processes import Usage, usages
+from sdnator.plan.reference_work import ReferenceWork
 from sdnator.plan.steady_load import SteadyLoad
 from sdnator.up import running
 
@@ -54,6 +55,19 @@ class LoadPhase:
     """Bytes that the archive has grown by."""
     updates_in: int
     updates_out: int
+    reference_us: float = 0.0
+    """CPU that the reference work took meanwhile; 0: not measured."""
+
+    def at(self, reference_us: float) -> "LoadPhase":
+        """The same on a machine as fast as it was when the reference work took this long."""
+        if not (self.reference_us and reference_us):
+            return self
+        speed = reference_us / self.reference_us
+        return replace(
+            self,
+            cpu_s={name: each * speed for name, each in self.cpu_s.items()},
+            reference_us=reference_us,
+        )
 
 
 @dataclass(frozen=True)
@@ -153,20 +167,22 @@ class MeasuredPipeline:
     def idle(self, seconds: float) -> LoadPhase:
         """What is used without packets."""
         before = self._moment()
-        time.sleep(seconds)
-        return self._phase(before)
+        with ReferenceWork() as reference:
+            time.sleep(seconds)
+        return self._phase(before, reference_us=reference.us)
 
     def loaded(self, pps: float, seconds: float) -> LoadPhase:
         """What is used for so many packets a second at each switch, until they are scored."""
         before, sent, scored = self._moment(), self._load.sent, self._scored()
-        took = self._load.send(pps, seconds)
+        with ReferenceWork() as reference:
+            took = self._load.send(pps, seconds)
         sent = self._load.sent - sent
         deadline = time.monotonic() + _SCORED_S
         while (missing := scored + _WHOLE * sent - self._scored()) > 0 and time.monotonic() < deadline:
             time.sleep(_SETTLE_S / 4)
         time.sleep(_SETTLE_S)
         carried = missing <= 0 and took <= _LATE * seconds
-        return self._phase(before, load_s=took, sent=sent, carried=carried)
+        return self._phase(before, load_s=took, sent=sent, carried=carried, reference_us=reference.us)
 
     def mib(self) -> dict[str, float]:
         """Memory by name of processes, of all of them together."""

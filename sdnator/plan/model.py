@@ -2,10 +2,11 @@
 
     cores = idle + packets x cost of one in a long list + batches x cost of a batch x (1 - cores)
 
-A packet costs less where more come at once, since batches are larger.  A batch belongs to one switch, so what batches
-cost is measured at one switch, at the rate of one.  What comes while a process is busy waits, and is taken with what
-comes after it: the last factor.  So a busy process needs less for a packet, and is full when packets alone fill it.
-Between two measured rates cores are interpolated; beyond the highest, a packet costs what it costs there.
+A packet costs less where more come at once, since batches are larger.  What one more packet costs in a batch that
+comes anyway is the difference of two measured rates; the rest is what the batches cost.  A batch belongs to one
+switch, so it is measured at one switch, at the rate of one.  What comes while a process is busy waits, and is taken
+with what comes after it: the last factor.  So a busy process needs less for a packet, and is full when packets alone
+fill it.  Between two measured rates cores are interpolated; beyond the highest, a packet costs what it costs there.
 """
 
 import math
@@ -123,6 +124,20 @@ def at_rate(rates: Sequence[float], per_packet: Sequence[float], rate: float) ->
     return rate * per_packet[-1]
 
 
+def in_long_lists(rates: Sequence[float], per_packet: Sequence[float]) -> float:
+    """What one more packet costs where many come at once: between the two highest rates, where both were measured.
+
+    Args:
+        rates: at which costs were measured, ascending.
+        per_packet: what a packet cost at each of them, batches included.
+    """
+    if len(per_packet) < 2:
+        return min(per_packet, default=0.0)
+    (low, below), (high, above) = list(zip(rates, per_packet, strict=True))[-2:]
+    slope = (high * above - low * below) / (high - low)
+    return min(max(0.0, slope), *per_packet)
+
+
 def bottleneck(demand: PipelineDemand, costs: Costs) -> Bottleneck:
     """The process, or the archive, that uses the largest share of its limit."""
     found = {name: _each(cost, demand, costs.rates, demand.pps) for name, cost in costs.processes.items()}
@@ -144,7 +159,7 @@ def _each(cost: ProcessCost, demand: PipelineDemand, rates: Sequence[float], pps
     switches = 1 if cost.per_switch else demand.switches
     rate = _rate(demand, pps)
     one = at_rate(rates, cost.us_per_packet, rate) / 1e6
-    packets = min(one, rate * min(cost.us_per_packet, default=0.0) / 1e6)
+    packets = min(one, rate * in_long_lists(rates, cost.us_per_packet) / 1e6)
     busy = cost.idle_cores + one
     # of those batches that find the process idle; measured were those that did
     batches = (one - packets) / (1 - busy) if busy < 1 else 0.0

@@ -25,19 +25,17 @@ from queue import Empty, SimpleQueue
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.host.columns import PacketColumns
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine
-from apps.sonata_adapter.host.shards import parts_of, shard_rows, union
+from apps.sonata_adapter.host.spark_pieces import pieces_of, results_of
 from apps.sonata_adapter.query.dataflow import TupleStream, compile_query
 from apps.sonata_adapter.query.language import Query
 from apps.sonata_adapter.results import Captured, QueryResult
 from due import RecordBatch
 from due.codec import decode_value, encode_value
 
-SHARDS: Final = 4
 _HEARTBEAT: Final = ""
 """In place of a query: carries the current capture time."""
 _PIECE: Final = "array<struct<query:string, shard:int, time:bigint, packets:binary>>"
@@ -275,28 +273,18 @@ def split_batch(
     windows = (batch["time_us"] - base_us) // length_us
     for text in queries:
         query = msgspec.json.decode(text, type=Query)
-        rows: dict[int, list[np.ndarray]] = {}
-        for part in parts_of(query):
-            for shard, mine in shard_rows(part, packets, SHARDS).items():
-                rows.setdefault(shard, []).append(mine)
-        for shard, found in rows.items():
-            together = union(found)
-            for number in np.unique(windows[together]).tolist():
-                piece = batch.take(together[windows[together] == number])
-                pieces.append((text, shard, int(piece["time_us"].max()), encode_value(piece)))
+        pieces += [
+            (text, piece.shard, piece.newest_us, encode_value(piece.packets))
+            for piece in pieces_of(query, batch, packets, windows)
+        ]
     return pieces
 
 
 def run_window(text: str, pieces: list[bytes], base_us: int, limit: int) -> list[str]:
     """On a worker: results of one query in one window, for the keys of one shard."""
-    batches = [decode_value(bytes(piece)) for piece in pieces]
-    columns = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0].columns}
-    order = np.argsort(columns["arrival"], kind="stable")
-    engine = HostEngine(limit=limit, base_us=base_us)
-    engine.add(msgspec.json.decode(text, type=Query))
-    whole = RecordBatch({name: column[order] for name, column in columns.items()})
-    outputs = [*engine.process(whole), *engine.finish()]
-    return [msgspec.json.encode(each).decode() for each in outputs if isinstance(each, QueryResult)]
+    query = msgspec.json.decode(text, type=Query)
+    found = results_of(query, [decode_value(bytes(piece)) for piece in pieces], base_us, limit)
+    return [msgspec.json.encode(each).decode() for each in found]
 
 
 def require_spark() -> None:

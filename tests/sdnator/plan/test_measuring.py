@@ -11,6 +11,7 @@ from sdnator.errors import PipelineError
 from sdnator.plan.measure import Schedule, _more_cpu, one_switch, over_idle, processor
 from sdnator.plan.measured_pipeline import LoadPhase, archive_bytes, configuration
 from sdnator.plan.processes import usages
+from sdnator.plan.reference_work import ReferenceWork, work
 
 BUSY = """
 import os, sys
@@ -86,6 +87,24 @@ def test_what_is_idle_is_no_cost_of_packets():
     assert over_idle(busy, idle, "kitsune") == pytest.approx(3)
     assert over_idle(busy, idle, "switch") == pytest.approx(0.5)
     assert over_idle(idle, idle, "kitsune") == 0
+
+
+def test_phases_are_compared_at_one_speed():
+    """What took 6 s of CPU while the reference work took 1.2 ms takes less where that takes 1 ms."""
+    phase = LoadPhase(
+        elapsed_s=10, cpu_s={"kitsune": 6.0}, archived=7, updates_in=8, updates_out=9, reference_us=1200.0
+    )
+    found = phase.at(1000.0)
+    assert found.cpu_s == {"kitsune": pytest.approx(5)}
+    assert (found.archived, found.reference_us) == (7, 1000)
+    assert phase.at(0.0) is phase
+
+
+def test_the_reference_work_is_done_at_once_and_measured():
+    assert work() == work()
+    with ReferenceWork() as reference:
+        pass
+    assert reference.us > 0
 
 
 def test_rates_are_measured_from_the_lowest():

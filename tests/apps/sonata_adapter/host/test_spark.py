@@ -11,13 +11,13 @@ from apps.sonata_adapter.host.columns import PacketColumns
 from apps.sonata_adapter.host.engine import HostEngine
 from apps.sonata_adapter.host.shards import parts_of, shard_rows, union
 from apps.sonata_adapter.host.spark import (
-    SHARDS,
     SparkMissing,
     require_spark,
     run_window,
     spark_session,
     split_batch,
 )
+from apps.sonata_adapter.host.spark_pieces import SHARDS
 from apps.sonata_adapter.keys import QUERY_PREFIX, request_of
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.query.catalogue import CATALOGUE

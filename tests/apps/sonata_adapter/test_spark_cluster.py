@@ -1,0 +1,151 @@
+"""Spark reads Kafka itself, on two workers that share no folder, and finds what the host engine finds."""
+
+import importlib.util
+import re
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from apps.sonata_adapter.errors import InvalidRequest
+from apps.sonata_adapter.host.spark import SparkMissing
+from apps.sonata_adapter.host.spark_jars import kafka_connector_jars
+from apps.sonata_adapter.query.catalogue import CATALOGUE
+from apps.sonata_adapter.spark_service import Settings, checkpoint, kafka_address, packets_key, requests
+from due.errors import InvalidOption
+from sdnator.errors import PipelineError
+from sdnator.testing.kafka_servers import KafkaMissing
+from sdnator.testing.query_traffic import BASE_US, mixed
+from sdnator.testing.spark_stage import SparkStage, texts, truth
+from sdnator.testing.waiting import wait_for
+from tests.requirements import missing
+
+ROOT = Path(__file__).resolve().parents[3]
+BASES = {"s1": BASE_US + 300_000, "s2": BASE_US - 7_123_456}
+
+
+@pytest.fixture
+def stage(tmp_path):
+    for module in ("pyspark", "pyarrow", "confluent_kafka"):
+        if importlib.util.find_spec(module) is None:
+            missing(f"{module} is not installed: pip install 'sdnator[arrow,kafka,spark]'")
+    try:
+        with SparkStage(tmp_path) as made:
+            yield made
+    except (KafkaMissing, SparkMissing) as reason:
+        missing(str(reason))
+    except PipelineError as error:
+        pytest.fail(str(error))
+
+
+@pytest.mark.timeout(1800)
+def test_a_worker_is_killed_and_the_results_are_those_of_the_host_engine(stage):
+    """The whole catalogue over the packets of two switches, half of them behind the death of a worker."""
+    traffic = {"s1": mixed(CATALOGUE, seconds=18), "s2": mixed(["ddos", "syn_flood"], seconds=18, seed=2)}
+    found = stage.results()
+    controller = stage.controller()
+    for switch, base_us in BASES.items():
+        controller.state(switch, base_us)
+    parts = {
+        switch: [
+            0,
+            *(sum(frame.time_us < BASE_US + at for frame in frames) for at in (9_000_000, 30_000_000)),
+        ]
+        for switch, frames in traffic.items()
+    }
+    for switch, (first, half, _) in parts.items():
+        controller.write(switch, traffic[switch][first:half], first)
+    apps = [stage.app(every_s=0.2)]
+
+    def tell(seconds):
+        """As the controller does once a second."""
+        apps[-1].check()
+        for switch, base_us in BASES.items():
+            controller.state(switch, base_us, BASE_US + seconds * 1_000_000)
+        time.sleep(0.5)
+        return len(found)
+
+    wait_for(lambda: tell(9), 600, lambda: log(stage))
+    stage.cluster.kill_worker(0)
+    for switch, (_, half, end) in parts.items():
+        controller.write(switch, traffic[switch][half:end], half)
+    wanted = truth(traffic, BASES)
+    wait_for(lambda: tell(60) >= len(wanted), 900, lambda: log(stage))
+    assert stage.cluster.alive() <= 1
+    assert len({text.partition(" ")[0] for text in wanted}) >= 8
+    assert texts(found) == wanted
+    # another driver goes on where the checkpoint says
+    apps[-1].stop()
+    later = [
+        frame._replace(time_us=frame.time_us + 70_000_000)
+        for frame in mixed(["ddos", "port_scan"], seconds=6)
+    ]
+    controller.write("s1", later, len(traffic["s1"]))
+    apps.append(stage.app(every_s=0.2))
+    wanted = truth({**traffic, "s1": [*traffic["s1"], *later]}, BASES)
+    assert len(found) < len(wanted)
+    wait_for(lambda: tell(130) >= len(wanted), 600, lambda: log(stage))
+    assert texts(found) == wanted
+
+
+def log(stage):
+    return (stage.folder / "apps.sonata_adapter.spark_service.log").read_text(errors="replace")[-3000:]
+
+
+def test_a_cluster_needs_a_place_that_all_machines_reach():
+    """A folder of this machine would be lost to a worker elsewhere."""
+    with pytest.raises(InvalidOption, match="hdfs://HOST:PORT"):
+        checkpoint(Settings(spark_master="spark://h:7077", checkpoint="/var/lib/spark"), "/state/spark")
+    assert checkpoint(Settings(spark_master="spark://h:7077", checkpoint="hdfs://n:9000/s/"), "/x") == (
+        "hdfs://n:9000/s"
+    )
+    assert checkpoint(Settings(), "/state/spark") == "/state/spark"
+
+
+@pytest.mark.parametrize(
+    ("queries", "text"),
+    [
+        ((), "there are none"),
+        (("nothing",), "there is no query nothing"),
+        (("network.traffic_capture.sonata.dns",), "name one query"),
+    ],
+)
+def test_what_spark_cannot_run_is_said(queries, text):
+    with pytest.raises(InvalidRequest, match=text):
+        requests(queries)
+
+
+def test_the_settings_of_the_documentation_can_be_read():
+    text = (ROOT / "docs" / "sonata.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"`spark\.json`:\n\n```json\n(.*?)```", text, re.DOTALL)
+    settings = msgspec.json.decode(block, type=Settings)
+    assert [request.name for request in requests(settings.queries).values()] == ["ddos", "syn_flood"]
+    assert checkpoint(settings, "") == settings.checkpoint
+
+
+def test_packets_come_from_kafka_alone():
+    with pytest.raises(InvalidOption, match="kafka://HOST:PORT"):
+        kafka_address("redis://127.0.0.1:6379")
+    assert kafka_address("kafka://h:9092/lab").namespace == "lab"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "network.packets.p4runtime_ctrl",
+        "network.counts.p4runtime_ctrl.*.all",
+        "network.packets.kitsune.*.all",
+    ],
+)
+def test_other_items_are_no_packets(key):
+    with pytest.raises(InvalidOption, match=r"network\.packets\.p4runtime_ctrl"):
+        packets_key(key)
+    assert packets_key("network.frames.p4runtime_ctrl.s1.all") == "network.frames.p4runtime_ctrl.s1.all"
+
+
+def test_jars_without_the_source_are_no_use(tmp_path):
+    if importlib.util.find_spec("pyspark") is None:
+        missing("pyspark is not installed: pip install 'sdnator[spark]'")
+    with pytest.raises(SparkMissing, match="spark-sql-kafka"):
+        kafka_connector_jars(str(tmp_path))
