@@ -14,7 +14,7 @@ SECOND = 1_000_000_000
 CONFIRMED = "network.confirmation.p4runtime_ctrl"
 EVIDENCE = "network.evidence.kitsune"
 SENDERS = 200
-BOUND = 9_000
+BOUND = 7_500
 """Bytes."""
 
 
