@@ -49,6 +49,8 @@ def one_line(text: str) -> str:
         One line without control characters, of 300 characters at most.
     """
     shown = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+    if shown.isprintable():
+        return shown  # the same text, not a copy: many are kept
     return "".join(char if char.isprintable() else f"\\x{ord(char):02x}" for char in shown)
 
 

@@ -10,6 +10,7 @@ from msgspec import Meta
 
 from apps.enforcement import EnforcementReport
 from apps.evidence import TrainingState
+from apps.firewall.evidence.shared import shared_text
 from apps.firewall.syn.recent_syns import SYN_COLUMNS
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_ack_buffer import ANSWER_COLUMNS
@@ -138,4 +139,4 @@ def arps_in(item: Item) -> RecordBatch:
 def evidence_of(item: Item, summary: str) -> Exhibit:
     """The item as evidence of a decision."""
     at = min(max(0, item.timestamp), LATEST_NS)
-    return Exhibit(key=item.key, timestamp=at, summary=summary[:_MOST_SUMMARY])
+    return Exhibit(key=shared_text(item.key), timestamp=at, summary=summary[:_MOST_SUMMARY])

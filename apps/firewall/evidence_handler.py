@@ -11,6 +11,7 @@ from apps.firewall.enforcement.announcer import Announcer
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import OFFENCES_READ, Archive
 from apps.firewall.evidence.exhibits import Exhibits
+from apps.firewall.evidence.shared import shared_sender
 from apps.firewall.incidents.incident_reports import IncidentReports
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider, Proposal
@@ -71,6 +72,7 @@ class EvidenceHandler:
 
     def alert(self, item: Item, alert: Alert) -> None:
         """A sender had an anomalous second."""
+        alert = structs.replace(alert, sender=shared_sender(alert.sender))
         self._incidents.alert(alert)
         self._exhibits.add(alert.sender, evidence_of(item, alert.reason), alert.event_time)
         if self._lifecycle.covering(alert.sender) is not None:
@@ -85,7 +87,9 @@ class EvidenceHandler:
     def evidence(self, item: Item, evidence: Evidence) -> None:
         """There is evidence against a sender, or for protecting a victim."""
         if evidence.sender is not None:
-            self._exhibits.add(evidence.sender, evidence_of(item, evidence.text), evidence.event_time)
+            sender = shared_sender(evidence.sender)
+            evidence = structs.replace(evidence, sender=sender)
+            self._exhibits.add(sender, evidence_of(item, evidence.text), evidence.event_time)
         at = evidence.event_time
         placed = self._lessons.weighed(self.decider.test.placed(evidence), item.app_id)
         self._lessons.note(placed, item.app_id)

@@ -506,7 +506,8 @@ class FirewallService:
 
     def _on_confirmation(self, item: Item, confirmation: Confirmation) -> None:
         with self._lock:
-            if self._enforcers.confirmed(item.app_id, confirmation):
+            followed = self._enforcers.follows(confirmation, self._lifecycle.blocks)
+            if followed and self._enforcers.confirmed(item.app_id, confirmation):
                 self._lifecycle.confirm(confirmation)
                 self._limits.confirm(confirmation)
             self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))

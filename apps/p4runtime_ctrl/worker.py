@@ -31,7 +31,7 @@ from apps.p4runtime_ctrl.state.block_counters import BlockCounters
 from apps.p4runtime_ctrl.state.decision_ends import DecisionEnds
 from apps.p4runtime_ctrl.state.desired_state import check_entry
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
-from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
+from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, as_remembered, commands_of, decisions_for
 from apps.p4runtime_ctrl.state.live_clock import LiveClock
 from apps.p4runtime_ctrl.state.mac_learning import DIGEST
 from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
@@ -160,7 +160,7 @@ class SwitchWorker:
         """Queue a decision; a switch that sees copies only carries none out: a counter would claim a stop."""
         if self._mine.mirror:
             return
-        self._recent.append(decision)
+        self._recent.append(as_remembered(decision))
         self._urgent.append(decision)
         self._put(self._decide)
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from apps.messages import Alert, Decision, MessageError, Target
+from apps.messages import Alert, Decision, MessageError, Target, one_line
 from tests.apps.firewall.alerts import alert
 
 
@@ -27,3 +27,10 @@ def test_unknown_action_is_refused():
     )  # fmt: skip
     with pytest.raises(MessageError, match="action"):
         Decision.from_value(decision.to_value() | {"action": "explode"})
+
+
+def test_a_line_fit_for_a_log_is_no_copy() -> None:
+    """Texts are kept in many places, and most have nothing that must not be shown."""
+    text = f"sends to {len('hosts')} times more hosts"
+    assert one_line(text) is text
+    assert one_line("a\nb\x1b") == "a\\x0ab\\x1b"

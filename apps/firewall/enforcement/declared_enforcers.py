@@ -1,7 +1,7 @@
 """Where each block is in force: what every declared enforcer has confirmed and counted, and how they are."""
 
 from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Container, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -12,11 +12,15 @@ from apps.messages import Confirmation, State, one_line
 from due import Engine
 
 _REMEMBERED: Final = 65_536
+"""Decisions that have not ended everywhere."""
+_ENDED: Final = 1_024
+"""Decisions whose drop counters may still come, though they have ended."""
 _MOST_WATCHED: Final = 1_000
 _STANDING: Final = ("installed", "exists")
+_COMMANDED: Final = ("insert", "modify", "delete")
 
 
-@dataclass
+@dataclass(slots=True)
 class _Places:
     states: dict[str, State] = field(default_factory=dict)
     """By place."""
@@ -39,11 +43,28 @@ class DeclaredEnforcers:
         self._problems: dict[str, str] = {}
         self._enforcers = frozenset(enforcers)
         self._known: OrderedDict[str, _Places] = OrderedDict()
+        self._ended: OrderedDict[str, None] = OrderedDict()
+
+    def __contains__(self, decision: object) -> bool:
+        """Whether any enforcer has confirmed this decision, or counts its packets, and it has not ended."""
+        return decision in self._known
+
+    def __len__(self) -> int:
+        return len(self._known)
 
     @property
     def elsewhere(self) -> bool:
         """Whether anything but switches carries blocks out."""
         return bool(self._enforcers - {SWITCHES})
+
+    def follows(self, said: Confirmation, blocks: Container[str]) -> bool:
+        """Whether an answer is about a decision: commands are answered under the same key.
+
+        Args:
+            said: the answer.
+            blocks: ids of blocks in force; those of prefixes are carried out as commands.
+        """
+        return said.action not in _COMMANDED or said.id in blocks or said.id in self._known
 
     def confirmed(self, enforcer: str, said: Confirmation) -> bool:
         """Note an answer.
@@ -66,10 +87,11 @@ class DeclaredEnforcers:
             return True
         if enforcer != SWITCHES and said.state == "expired":
             return False
-        if not self.elsewhere:
-            return True
         stands = any(state in _STANDING for state in places.states.values())
-        return not stands and places.answered >= self._enforcers
+        over = not stands and (not self.elsewhere or places.answered >= self._enforcers)
+        if over:
+            self._end(said.id)
+        return over or not self.elsewhere
 
     def in_force(self, decision: str) -> tuple[str, ...]:
         """Places in which a decision is in force, such as `nftables gateway`."""
@@ -80,6 +102,8 @@ class DeclaredEnforcers:
 
     def count(self, decision: str, enforcer: str, place: str, packets: int) -> int:
         """Note a drop counter; returns the sum over all places."""
+        if decision in self._ended:
+            return packets
         places = self._of(decision)
         name = place_text(enforcer, place)
         if name in places.packets or len(places.packets) < MOST_PLACES:
@@ -110,7 +134,14 @@ class DeclaredEnforcers:
             "enforcers_failing": sum(bool(each) for each in self._problems.values()),
         }
 
+    def _end(self, decision: str) -> None:
+        del self._known[decision]
+        self._ended[decision] = None
+        if len(self._ended) > _ENDED:
+            self._ended.popitem(last=False)
+
     def _of(self, decision: str) -> _Places:
+        self._ended.pop(decision, None)
         places = self._known.setdefault(decision, _Places())
         self._known.move_to_end(decision)
         if len(self._known) > _REMEMBERED:

@@ -1,6 +1,6 @@
 """The last pieces of evidence against each sender, for the decisions that cite them.  Pure."""
 
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from typing import Final
 
 from apps.messages import Exhibit, Sender
@@ -16,7 +16,7 @@ class Exhibits:
     """Bounded in three ways: pieces of a sender, senders, and time."""
 
     def __init__(self) -> None:
-        self._by_sender: OrderedDict[Sender, tuple[deque[Exhibit], int]] = OrderedDict()
+        self._by_sender: OrderedDict[Sender, tuple[tuple[Exhibit, ...], int]] = OrderedDict()
         """And the capture time of the last piece; the sender heard of last is the last."""
 
     def __len__(self) -> int:
@@ -24,16 +24,15 @@ class Exhibits:
 
     def add(self, sender: Sender, exhibit: Exhibit, now: int) -> None:
         """Keep a piece against a sender, heard of at a capture time, ns."""
-        pieces, last = self._by_sender.pop(sender, (deque(maxlen=EVIDENCE_KEPT), now))
-        pieces.append(exhibit)
-        self._by_sender[sender] = pieces, max(last, now)
+        pieces, last = self._by_sender.pop(sender, ((), now))
+        self._by_sender[sender] = (*pieces[1 - EVIDENCE_KEPT :], exhibit), max(last, now)
         while len(self) > SENDERS_KEPT or self._oldest() < now - EVIDENCE_HELD_S * _SECOND:
             self._by_sender.popitem(last=False)
 
     def of(self, sender: Sender) -> tuple[Exhibit, ...]:
         """The pieces against a sender, the oldest first."""
         pieces, _ = self._by_sender.get(sender, ((), 0))
-        return tuple(pieces)
+        return pieces
 
     def _oldest(self) -> int:
         return next(iter(self._by_sender.values()))[1]

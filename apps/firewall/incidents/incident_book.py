@@ -135,7 +135,7 @@ class IncidentBook:
             text=one_line(alert.reason),
             event_time=alert.event_time,
         )
-        found.evidence.append(piece)
+        found.note(piece)
         self._know(found, keys)
         return self._told(found, "more", now, may_open=True)
 
@@ -296,7 +296,7 @@ class IncidentBook:
             found.services = {one.service} if one.service else set()
             found.count_packets("before the restart", one.packets, one.first_packet)
             found.peak, found.decided = one.peak_nats, (one.nats, one.bound)
-            found.evidence.extend(one.evidence)
+            found.note(*one.evidence)
             for action in one.actions:
                 self._act(found, action.decision or "alert", action)
             self._open[one.id] = found
@@ -395,7 +395,7 @@ class IncidentBook:
             found.weigh(kind, 1.0)
             source = exhibit.key.rpartition(".")[2]
             text = one_line(exhibit.summary)
-            found.evidence.append(
+            found.note(
                 Contribution(source=source[:256], kind=kind, text=text, event_time=decision.event_time)
             )
         self._know(found, (key,))

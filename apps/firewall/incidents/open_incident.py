@@ -4,7 +4,7 @@ The book (`incident_book.py`) decides what belongs to it; here is what it holds,
 """
 
 import hashlib
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -98,7 +98,8 @@ class OpenIncident:
     peak: float = 0.0
     decided: tuple[float, float] | None = None
     """Sum and bound at the last decision."""
-    evidence: deque[Contribution] = field(default_factory=lambda: deque(maxlen=MOST_CONTRIBUTIONS))
+    evidence: tuple[Contribution, ...] = ()
+    """The newest pieces, the newest last."""
     actions: OrderedDict[str, IncidentAction] = field(default_factory=OrderedDict)
     """By the decision's id."""
     past: Counter[Remedy] = field(default_factory=Counter)
@@ -138,7 +139,11 @@ class OpenIncident:
         if evidence.service and len(self.services) < MOST_SOURCES:
             self.services.add(evidence.service)
         self.count_packets(evidence.source, evidence.packets, evidence.first_packet)
-        self.evidence.append(piece)
+        self.note(piece)
+
+    def note(self, *pieces: Contribution) -> None:
+        """Keep pieces among the newest."""
+        self.evidence = (*self.evidence, *pieces)[-MOST_CONTRIBUTIONS:]
 
     def weigh(self, kind: Kind, nats: float) -> None:
         """Add to the weight of a kind."""
@@ -192,7 +197,7 @@ class OpenIncident:
         self.peak = max(self.peak, other.peak)
         self.decided = self.decided or other.decided
         newest = sorted((*other.evidence, *self.evidence), key=lambda piece: piece.event_time)
-        self.evidence.extend(newest[-MOST_CONTRIBUTIONS:])
+        self.note(*newest)
         for name, action in other.actions.items():
             self.act(name, action)
         other.joined = self.id
@@ -243,7 +248,7 @@ class OpenIncident:
             bound=bound,
             peak_nats=self.peak,
             contributions=strongest.largest(),
-            evidence=tuple(self.evidence),
+            evidence=self.evidence,
             actions=tuple(self.actions.values())[-MOST_ACTIONS:],
             action_count=len(self.actions),
             cost=self.cost(),

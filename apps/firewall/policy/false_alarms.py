@@ -15,6 +15,7 @@ from typing import Final
 from msgspec import structs
 
 from apps.evidence import Evidence
+from apps.firewall.evidence.shared import shared_text
 from apps.messages import MOST_GROUNDS, Decision, FalseAlarm, Ground, Sender
 
 WEIGHT: Final = 0.1
@@ -53,7 +54,7 @@ def ground_of(evidence: Evidence, app: str) -> Ground:
         by_victim = evidence.sender is None or not service or evidence.kind == "spoofing"
         victim = evidence.victims[0] if evidence.victims and by_victim else ""
     return Ground(
-        source=f"{app}.{evidence.source}",
+        source=shared_text(f"{app}.{evidence.source}"),
         sender=evidence.sender,
         victim=victim,
         service=service,

@@ -22,6 +22,7 @@ from typing import Final
 from msgspec import structs
 
 from apps.evidence import Evidence, TrainingState
+from apps.firewall.evidence.shared import shared_text
 from apps.messages import Sender
 
 DAY_S: Final = 86_400.0
@@ -64,14 +65,12 @@ class SourceNats:
         return self.nats * math.exp2(-max(0, now - self.time) / _SECOND / HALF_LIFE_S)
 
 
-@dataclass
+@dataclass(slots=True)
 class EvidenceSum:
     """All evidence about one subject."""
 
     subject: Subject
     contributions: dict[str, SourceNats] = field(default_factory=dict)
-    first: Evidence | None = None
-    """The first evidence since the sum was last near zero."""
 
     def total(self, now: int, bound: float) -> float:
         """The sum in nats at a capture time, ns."""
@@ -138,7 +137,7 @@ class SequentialTest:
         self._sweep(evidence.event_time)
         if evidence.sender is not None and evidence.sender.ip:
             self._place(evidence.sender, evidence.event_time)
-        subject, source = self._subject_of(evidence), f"{app}.{evidence.source}"
+        subject, source = self._subject_of(evidence), shared_text(f"{app}.{evidence.source}")
         now = evidence.event_time
         tally = self._tallies.get(subject)
         if tally is None:
@@ -146,8 +145,6 @@ class SequentialTest:
                 self._tallies.popitem(last=False)
             tally = self._tallies[subject] = EvidenceSum(subject)
         self._tallies.move_to_end(subject)
-        if tally.first is None or tally.total(now, self.bound) < 0.5:
-            tally.first = evidence
         former = tally.contributions.get(source)
         nats = evidence.nats
         if former is not None:

@@ -15,6 +15,7 @@ from itertools import islice
 from typing import Any
 
 from apps.firewall.evidence.known_sources import KnownSources
+from apps.firewall.evidence.shared import shared_text
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle, decision_id
 from apps.firewall.policy.prefix_aggregation import Network, any_within, crowded_prefixes
 from apps.firewall.policy.rules import AllowList
@@ -91,7 +92,7 @@ class SynDefence:
         self._lifecycle = lifecycle
         self.allow = allow
         self._guarded: dict[TcpService, Decision] = {}
-        self.services: dict[TcpService, None] = {}
+        self.services: dict[TcpService, TcpService] = {}
         """Known from handshakes; the most recent last."""
         self.recent = RecentSyns(rules.sample)
         self._finished: deque[tuple[int, str, TcpService]] = deque(maxlen=rules.sample)
@@ -134,9 +135,10 @@ class SynDefence:
 
     def handshake(self, source: str, service: TcpService, at: int) -> None:
         """A source has completed a handshake with a service."""
+        source = shared_text(source)
         self.known.learn(source, at)
-        self.services.pop(service, None)
-        self.services[service] = None
+        service = self.services.pop(service, service)
+        self.services[service] = service
         if len(self.services) > SERVICES_LEARNT:
             del self.services[next(iter(self.services))]
         self._finished.append((at, source, service))

@@ -17,7 +17,7 @@ from apps.p4runtime_ctrl.state.limits import LimitKey
 _KINDS: Final = {"insert": INSERT, "modify": MODIFY, "delete": DELETE}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Owner:
     """The decision or command behind an entry, for confirmations."""
 

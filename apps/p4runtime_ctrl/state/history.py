@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from msgspec import structs
+
 from apps.messages import Decision, Intake, TableCommand
 from apps.standing_decisions import STANDING, in_force
 from due import Item
@@ -21,7 +23,7 @@ def decisions_for(
     Args:
         switch: its name.
         archived: items of decisions; of these, those written after `since`.
-        recent: decisions heard live, which the archive need not have yet.
+        recent: decisions heard live, `as_remembered`, which the archive need not have yet.
         since: ns since the epoch.
         intake: counts what cannot be read.
     """
@@ -29,10 +31,20 @@ def decisions_for(
         (item for item in archived if item.timestamp > since),
         key=lambda item: (item.timestamp, item.sequence),
     )
-    found = [decision for item in items if (decision := intake.read("decision", Decision.from_item, item))]
+    archived_ones = (intake.read("decision", Decision.from_item, item) for item in items)
+    found = [as_remembered(decision) for decision in archived_ones if decision is not None]
     heard = [each for each in [*found, *recent] if not each.dry_run]
     lifts = [each for each in heard if each.action not in STANDING]  # of what this controller may still hold
     return [each for each in [*lifts, *in_force(heard)] if is_for(each, switch)]
+
+
+def as_remembered(decision: Decision) -> Decision:
+    """What an entry is made of: without what led to the decision, which is most of it.
+
+    Args:
+        decision: as it was heard.
+    """
+    return structs.replace(decision, reason="", evidence=(), grounds=())
 
 
 def is_for(decision: Decision, switch: str) -> bool:

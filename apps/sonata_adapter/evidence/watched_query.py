@@ -4,6 +4,7 @@ Time is capture time, microseconds.
 """
 
 import math
+from collections import OrderedDict
 from itertools import count
 from typing import Final
 
@@ -25,13 +26,19 @@ _RUNGS: Final = (5.0, 30.0)
 _KNOWN_RUNG: Final = 5.0
 """The same for the quietest of the hosts that training knows."""
 _MOST_SUBJECTS: Final = 65_536
+_HELD_US: Final = 14 * HALF_LIFE_US
+"""After so long without more, nothing worth a message is left of the most that can have been said."""
 
 
 class SaidSoFar:
     """What was said about each subject, fading with time."""
 
     def __init__(self) -> None:
-        self._said: dict[tuple[str, ...], tuple[float, int]] = {}
+        self._said: OrderedDict[tuple[str, ...], tuple[float, int]] = OrderedDict()
+        """The one spoken of last is the last."""
+
+    def __len__(self) -> int:
+        return len(self._said)
 
     def added(self, subject: tuple[str, ...], nats: float, at_us: int) -> float:
         """The part that is new, if it is worth a message; else 0."""
@@ -39,10 +46,14 @@ class SaidSoFar:
         faded = former * math.exp2(-max(0, at_us - then_us) / HALF_LIFE_US)
         if nats - faded < LEAST_NATS:
             return 0.0
-        if subject not in self._said and len(self._said) >= _MOST_SUBJECTS:
-            del self._said[next(iter(self._said))]
         self._said[subject] = (nats, at_us)
+        self._said.move_to_end(subject)
+        while len(self._said) > _MOST_SUBJECTS or self._oldest_us() < at_us - _HELD_US:
+            self._said.popitem(last=False)
         return nats - faded
+
+    def _oldest_us(self) -> int:
+        return next(iter(self._said.values()))[1]
 
 
 class WatchedQuery(LearntQuery[Evidence]):

@@ -28,17 +28,22 @@ _Connection = tuple[int, int, int, int, int, int]
 class Handshakes:
     """Follows handshakes over batches in the order of capture time; memory bounded.
 
-    `limit` is how many half-open handshakes are remembered; beyond it the oldest is forgotten and
-    counted in `forgotten`.
+    A half-open handshake is forgotten when it is too old to be completed.  `limit` is how many are remembered at a
+    time; beyond it the oldest is forgotten and counted in `forgotten`.
     """
 
     def __init__(self, *, limit: int = DEFAULT_OPEN) -> None:
         self._limit = limit
         self._open: OrderedDict[_Connection, tuple[int, int]] = OrderedDict()
+        """By connection: the server's sequence number, and when it answered; the last answer is the last."""
         self.completed = 0
         self.forgotten = 0
         self.wrong = 0
         """ACKs towards half-open connections that do not acknowledge the server's number."""
+
+    def __len__(self) -> int:
+        """How many handshakes are half-open."""
+        return len(self._open)
 
     def process(self, batch: RecordBatch) -> list[Handshake]:
         """Handshakes that the batch completes, in order."""
@@ -73,6 +78,8 @@ class Handshakes:
         while len(self._open) > self._limit:
             self._open.popitem(last=False)
             self.forgotten += 1
+        while next(iter(self._open.values()))[1] < at - _AGE_US:
+            self._open.popitem(last=False)
 
     def _acknowledged(self, connection: _Connection, acknowledged: int, at: int) -> bool:
         half = self._open.get(connection)

@@ -9,6 +9,7 @@ waited for.  The waits are shorter if results are due sooner: `patience`.
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from due import RecordBatch
 
@@ -61,7 +62,7 @@ class Merger:
         self._heard = 0.0
         self._newest_us: int | None = None
         self._released = -1
-        self._seen = np.full(_REMEMBERED, -1, dtype=np.int64)
+        self._numbers: NDArray[np.int64] | None = None
         self.twice = 0
         """Packets that arrived on more than one stream."""
         self.disordered = 0
@@ -144,15 +145,23 @@ class Merger:
             self._wait(whole.take(order[~ready]))
         order, ordered = order[ready], ordered[ready]
         place = ordered & (_REMEMBERED - 1)
-        fresh = np.concatenate(([True], ordered[1:] != ordered[:-1])) & (self._seen[place] != ordered)
+        seen = self._seen
+        fresh = np.concatenate(([True], ordered[1:] != ordered[:-1])) & (seen[place] != ordered)
         self.twice += int((~fresh).sum())
         order, ordered = order[fresh], ordered[fresh]
         if not len(order):
             return None
-        self._seen[place[fresh]] = ordered
+        seen[place[fresh]] = ordered
         self.disordered += int((ordered < self._released).sum())
         self._released = max(self._released, int(ordered[-1]))
         return whole.take(order)
+
+    @property
+    def _seen(self) -> NDArray[np.int64]:
+        """The last numbers that were released; 8 MiB, which a switch without such packets does not need."""
+        if self._numbers is None:
+            self._numbers = np.full(_REMEMBERED, -1, dtype=np.int64)
+        return self._numbers
 
 
 def _joined(batches: list[RecordBatch]) -> RecordBatch:

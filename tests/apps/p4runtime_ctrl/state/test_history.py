@@ -2,8 +2,10 @@
 
 import logging
 
-from apps.messages import Decision, Intake, Target
-from apps.p4runtime_ctrl.state.history import commands_of, decisions_for
+from msgspec import structs
+
+from apps.messages import Decision, Exhibit, Ground, Intake, Target
+from apps.p4runtime_ctrl.state.history import as_remembered, commands_of, decisions_for
 from due import Item
 
 
@@ -35,6 +37,18 @@ def test_order_identity_and_age():
     recent = [decision(3), decision(9)]
     found = decisions_for("s1", archived, recent, since=96, intake=intake())
     assert [each.id for each in found] == ["d3", "d2", "d1", "d0", "d9"]
+
+
+def test_what_led_to_a_decision_is_not_kept_with_it():
+    """Ten thousand decisions are remembered, and their evidence is most of what they weigh."""
+    exhibits = (Exhibit(key="network.evidence.kitsune.ports", timestamp=1, summary="700 ports"),)
+    plain = decision(3)
+    heard = structs.replace(
+        plain, reason="700 ports", evidence=exhibits, grounds=(Ground(source="kitsune.ports", nats=9.0),)
+    )
+    assert as_remembered(heard) == plain
+    archived = [item(heard.to_value(), 50), item(decision(4).to_value(), 51)]
+    assert decisions_for("s1", archived, [as_remembered(heard)], 0, intake()) == [plain, decision(4)]
 
 
 def test_what_was_lifted_does_not_come_back():

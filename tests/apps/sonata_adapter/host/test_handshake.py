@@ -50,3 +50,16 @@ def test_memory_is_bounded():
     ]
     shakes.process(batch_of(flood))
     assert shakes.forgotten == 40
+
+
+def test_what_is_too_old_to_be_completed_takes_no_memory():
+    """Servers answer for hours, and some clients never come back: only those of the last 30 s are remembered."""
+    shakes = Handshakes()
+    answers = [
+        TimedFrame(BASE_US + n * 1_000_000, 60, tcp(SERVER, f"10.9.0.{n}", 443, 4000, SYN | ACK, seq=1))
+        for n in range(100)
+    ]
+    shakes.process(batch_of(answers))
+    assert (len(shakes), shakes.forgotten) == (31, 0)
+    late = TimedFrame(BASE_US + 100_000_000, 60, tcp("10.9.0.90", SERVER, 4000, 443, ACK, ack=2))
+    assert len(shakes.process(batch_of([late]))) == 1

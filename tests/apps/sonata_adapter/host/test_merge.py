@@ -1,5 +1,7 @@
 """Streams of one switch become one, in the order of arrival, each packet once."""
 
+import tracemalloc
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -95,3 +97,16 @@ def test_short_windows_do_not_wait_long():
         out += numbers(merger.put("a", batch([number]), now))
     assert out == list(range(20))
     assert merger.horizon_us(now) == 19_000
+
+
+def test_a_merger_without_packets_takes_next_to_no_memory():
+    """Each switch has one for frames, which few queries want."""
+    tracemalloc.start()
+    try:
+        merger = Merger()
+        merger.expect({"a"})
+        assert tracemalloc.get_traced_memory()[0] < 100_000
+        assert numbers(merger.put("a", batch([1, 2]), 0.0)) == [1, 2]
+        assert numbers(merger.put("a", batch([2, 3]), 0.0)) == [3]
+    finally:
+        tracemalloc.stop()
