@@ -62,7 +62,10 @@ setup(
             ],
             depends=[
                 *(f"apps/kitsune/afterimage_{part}.h" for part in ("keys", "pool", "state", "dump")),
-                *(f"apps/kitsune/{part}_dump.h" for part in ("state", "ledger", "senders", "victims", "behaviour")),
+                *(
+                    f"apps/kitsune/{part}_dump.h"
+                    for part in ("state", "ledger", "senders", "victims", "behaviour")
+                ),
                 *(
                     f"apps/kitsune/ledger_{part}.h"
                     for part in ("table", "rows", "counter", "behaviour", "found", "ahead", "store")
