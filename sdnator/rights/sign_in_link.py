@@ -4,8 +4,6 @@ import hmac
 import secrets
 from pathlib import Path
 
-from due.private_files import write_private
-
 FILE = "dashboard.link"
 PATH = "/link/"
 _LONGEST = 256
@@ -19,6 +17,8 @@ def new_link(state: Path, page: str) -> str:
         page: URL of the page, with a slash at its end.
     """
     secret = secrets.token_urlsafe(24)
+    from due.private_files import write_private  # the commands load nothing heavy
+
     write_private(state / FILE, secret + "\n")
     return f"{page.rstrip('/')}{PATH}{secret}"
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from due.private_files import write_private_json
 from sdnator.errors import BadInput, PipelineError
 from sdnator.northbound import without_user
 from sdnator.redaction import redacted_values
@@ -142,6 +141,8 @@ def _lock(descriptor: int, folder: Path) -> None:
 
 def write(folder: Path, running: Running) -> None:
     """Replace the run file.  Raises OSError."""
+    from due.private_files import write_private_json  # the commands load nothing heavy
+
     write_private_json(folder / "run.json", asdict(running))
 
 

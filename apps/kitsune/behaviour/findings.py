@@ -4,7 +4,6 @@ sliding sums ──► Baseline ──nats──► FoundSoFar ──what is new
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
@@ -70,31 +69,26 @@ class Finding(msgspec.Struct, frozen=True):
     """Alone it proves nothing: a conversation that both sides want, or a sender that training knows."""
 
 
-@dataclass(slots=True)
-class _Reported:
-    nats: float
-    time: float
-
-
 class FoundSoFar:
     """What was reported about each subject, fading with time."""
 
     def __init__(self) -> None:
-        self._reported: dict[Any, _Reported] = {}
+        self._reported: dict[Any, tuple[float, float]] = {}
+        """By subject the nats that were reported, and when, seconds."""
 
     def added(self, subject: Any, nats: float, time: float) -> float:
         """The part that is new, if it is worth a message; else 0."""
         former = self._reported.get(subject)
         faded = 0.0
         if former is not None:
-            faded = former.nats * 0.5 ** (max(0.0, time - former.time) / HALF_LIFE_S)
+            faded = former[0] * 0.5 ** (max(0.0, time - former[1]) / HALF_LIFE_S)
         nats = min(nats, MOST_NATS)
         least = LEAST_SHARE * faded if faded > DECIDING_NATS else LEAST_STEP
         if nats < LEAST_NATS or nats - faded < least:
             return 0.0
         if former is None and len(self._reported) >= KEPT:
             del self._reported[next(iter(self._reported))]
-        self._reported[subject] = _Reported(nats, time)
+        self._reported[subject] = (nats, time)
         return nats - faded
 
 

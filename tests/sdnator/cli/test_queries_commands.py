@@ -126,7 +126,8 @@ def test_explain_draws_the_plan():
     assert "stage 0" in run("explain", "ddos")
     assert "no running adapter was asked" in run("explain", "ddos")
     assert json.loads(run("explain", "ddos", "--json"))["in_switch"]
-    assert "only copies, because" in run("explain", "network.traffic_query.sonata.zorro:similar=3")
+    assert "passed the gate" in run("explain", "network.traffic_query.sonata.zorro:similar=3")
+    assert "only copies, because" in run("explain", "arp_scan")
 
 
 def test_add_registers_and_run_uses_it(tmp_path):

@@ -40,6 +40,7 @@ def test_a_plan_beside_others_changes_nothing():
     control.want([KEY])
     before = control.plan
     answer = plan_answer("network.traffic_query.sonata.zorro", control, CATALOGUE)
-    assert (answer["state"], answer["in_switch"], answer["others"]) == ("possible", False, 1)
-    assert any("does not read payloads" in each["why"] for each in answer["operators"])
+    assert (answer["state"], answer["in_switch"], answer["others"]) == ("possible", True, 1)
+    assert {each["place"] for each in answer["operators"]} == {"switch", "host"}
+    assert any("passed the gate" in each["why"] for each in answer["operators"])
     assert control.plan is before
