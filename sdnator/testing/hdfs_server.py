@@ -10,7 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from apps.sonata_adapter.host.spark_jars import maven_jars
+from apps.sonata_adapter.host.maven_jars import MavenMissing, maven_jars
+from apps.sonata_adapter.host.spark import SparkMissing
 from sdnator.errors import PipelineError
 from sdnator.testing.ports import free_port
 from sdnator.testing.spark_cluster import QUICK_JVM
@@ -82,9 +83,12 @@ class HdfsServer:
 
 def _jars() -> list[Path]:
     """Hadoop's servers with what they need."""
-    servers = maven_jars("org.apache.hadoop", "hadoop-client-minicluster", HADOOP_VERSION)
-    # the program comes from Hadoop's own tests
-    asserting = maven_jars("org.junit.jupiter", "junit-jupiter-api", _JUNIT_VERSION)
+    try:
+        servers = maven_jars("org.apache.hadoop", "hadoop-client-minicluster", HADOOP_VERSION)
+        # the program comes from Hadoop's own tests
+        asserting = maven_jars("org.junit.jupiter", "junit-jupiter-api", _JUNIT_VERSION)
+    except MavenMissing as error:
+        raise SparkMissing(str(error)) from None
     return [*sorted(servers.glob("*.jar")), *sorted(asserting.glob("*.jar"))]
 
 

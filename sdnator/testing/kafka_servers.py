@@ -4,7 +4,6 @@ The jars are those of `$KAFKA_HOME/libs`; without it, Maven copies them once int
 """
 
 import base64
-import fcntl
 import os
 import secrets
 import shutil
@@ -20,13 +19,13 @@ from urllib.parse import urlencode
 from confluent_kafka import KafkaException
 from confluent_kafka.admin import AdminClient
 
+from apps.sonata_adapter.host.maven_jars import MavenMissing, maven_jars
 from due.drivers.kafka_names import parse_kafka_url
 from due.private_files import write_private
 from sdnator.rights.certificates import CA, CertificateFolder
 from sdnator.testing.ports import free_port
 
 KAFKA_VERSION = "3.9.1"
-_COPY_SECONDS = 600
 _START_SECONDS = 120
 _STOP_SECONDS = 20
 _HEAP = "-Xmx256m"
@@ -34,14 +33,6 @@ _QUICK_START = ("-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xshare:auto")
 _ADMIN = "admin"
 _BROKER = "broker"
 _LOGIN = "org.apache.kafka.common.security"
-_POM = """<project xmlns="http://maven.apache.org/POM/4.0.0">
-  <modelVersion>4.0.0</modelVersion>
-  <groupId>org.sdnator</groupId><artifactId>kafka-for-tests</artifactId><version>1</version>
-  <dependencies><dependency>
-    <groupId>org.apache.kafka</groupId><artifactId>kafka_2.13</artifactId><version>{version}</version>
-  </dependency></dependencies>
-</project>
-"""
 
 
 class KafkaMissing(RuntimeError):
@@ -61,39 +52,10 @@ def kafka_jars() -> Path:
         raise KafkaMissing("Kafka needs Java (on Debian: openjdk-17-jre-headless)")
     if os.environ.get("KAFKA_HOME"):
         return Path(os.environ["KAFKA_HOME"]) / "libs"
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = cache / "sdnator" / f"kafka-{KAFKA_VERSION}"
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # two test workers copy once
-        if not (folder / "complete").exists():
-            _copy_jars(folder)
-            (folder / "complete").touch()
-    return folder / "libs"
-
-
-def _copy_jars(folder: Path) -> None:
-    maven = shutil.which("mvn")
-    if maven is None:
-        raise KafkaMissing("Kafka's jars are copied by Maven (on Debian: maven), or set $KAFKA_HOME")
-    (folder / "pom.xml").write_text(_POM.format(version=KAFKA_VERSION))
-    copied = subprocess.run(
-        [
-            maven,
-            "--quiet",
-            "--batch-mode",
-            "dependency:copy-dependencies",
-            "-DincludeScope=runtime",
-            f"-DoutputDirectory={folder / 'libs'}",
-        ],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=_COPY_SECONDS,
-        check=False,
-    )
-    if copied.returncode != 0:
-        raise KafkaMissing(f"Maven could not copy Kafka's jars: {(copied.stdout + copied.stderr)[-500:]}")
+    try:
+        return maven_jars("org.apache.kafka", "kafka_2.13", KAFKA_VERSION, name="kafka")
+    except MavenMissing as error:
+        raise KafkaMissing(f"{error}; or set $KAFKA_HOME") from None
 
 
 class KafkaServers:

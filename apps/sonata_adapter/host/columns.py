@@ -229,6 +229,10 @@ class PacketColumns:
         frames = self._frames(None)
         return np.zeros(self._size, dtype=np.bool_) if frames is None else frames.payload_contains(pattern)
 
+    def marks(self, name: str) -> NDArray[np.bool_] | None:
+        """A column of the batch that says yes or no of each packet; None: the batch has none of this name."""
+        return self._raw(name) if name in self._batch else None
+
     def _raw(self, name: str) -> Part:
         column = self._batch[name]
         return column if self._rows is None else column[self._rows]

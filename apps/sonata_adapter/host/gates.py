@@ -53,7 +53,7 @@ class GateOperator:
         numbers = self._number(rows, key)
         opened = np.where(numbers < 0, _OPEN, self._opened.data[numbers])
         kept = (opened < 0) | ((opened > 0) & (opened <= rows.origin + 1))
-        marked = _marked(rows)
+        marked = rows.marks(PASSED)
         if marked is not None:
             kept |= marked
         return rows if kept.all() else rows.at(np.flatnonzero(kept))
@@ -69,7 +69,7 @@ class GateOperator:
         self._opened.data[self._new] = _OPEN
         self._new = self._new[:0]
         rows: PacketColumns = filtered(packets, self._conditions)  # type: ignore[assignment]
-        marked = _marked(rows) if len(rows) else None
+        marked = rows.marks(PASSED)
         if marked is not None:
             rows = rows.at(np.flatnonzero(~marked))
         if not len(rows):
@@ -110,8 +110,3 @@ def split_by_payload(
 def with_passed(batch: RecordBatch, *, passed: bool) -> RecordBatch:
     """The batch, marked as packets that have passed their gate in the switch, or not."""
     return RecordBatch({**batch, PASSED: np.full(len(batch), passed)})
-
-
-def _marked(rows: PacketColumns) -> NDArray[np.bool_] | None:
-    batch = rows.batch
-    return np.asarray(batch[PASSED], dtype=np.bool_) if PASSED in batch else None
