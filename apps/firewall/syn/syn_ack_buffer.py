@@ -30,6 +30,9 @@ _HALF: Final = 64
 _CONFIRMED_WITHIN_S: Final = 30.0
 _JOBS: Final = 1024
 _LOOK_S: Final = 0.1
+_LATE_S: Final = 1.0
+"""Copies of answers from before the rule may come so long after its confirmation: they take another way, and one that
+shares a block with a later one counts as having come with it."""
 _REMEMBERED: Final = 65_536
 _FRAMES: Final = 512
 """Most frames in one item."""
@@ -157,7 +160,7 @@ class SynAckBuffer:
         """Connections to reset now; `sparing` returns the clients to spare."""
         found: list[HalfOpen] = []
         for job in list(self._jobs.values()):
-            last = job.confirmed + self._after_s
+            last = job.confirmed + _LATE_S + self._after_s
             if not job.confirmed:
                 if now - job.decided > _CONFIRMED_WITHIN_S:
                     self._wait_out(job, "no switch confirmed the rule in time")
