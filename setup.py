@@ -61,7 +61,10 @@ setup(
                 for part in ("afterimage", "kitnet", "behaviour", "senders", "victims")
             ],
             depends=[
-                *(f"apps/kitsune/afterimage_{part}.h" for part in ("keys", "pool", "state", "dump")),
+                *(
+                    f"apps/kitsune/afterimage_{part}.h"
+                    for part in ("keys", "pool", "state", "damping", "hubs", "dump")
+                ),
                 *(
                     f"apps/kitsune/{part}_dump.h"
                     for part in ("state", "ledger", "senders", "victims", "behaviour")

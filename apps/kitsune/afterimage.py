@@ -82,8 +82,8 @@ class AfterImage:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Streams and links held, streams dropped for age, cells dropped for lack of room."""
-        names = ("streams", "links", "forgotten_idle", "forgotten_full")
+        """Streams and links held, streams dropped for age, cells dropped for lack of room, logs of hubs."""
+        names = ("streams", "links", "forgotten_idle", "forgotten_full", "hub_logs")
         return dict(zip(names, self._engine.counts(), strict=True))
 
 
@@ -140,8 +140,7 @@ class _KernelEngine:
         if failed:
             raise MemoryError("AfterImage: no memory for another stream or link; use mode='bounded'")
 
-    def counts(self) -> tuple[int, int, int, int]:
-        numbers = np.zeros(4, dtype=np.uint64)
+    def counts(self) -> tuple[int, ...]:
+        numbers = np.zeros(5, dtype=np.uint64)
         self._kernel.lib.afterimage_counts(self._state, self._kernel.pointer("uint64_t", numbers))
-        streams, links, idle, full = (int(number) for number in numbers)
-        return streams, links, idle, full
+        return tuple(int(number) for number in numbers)

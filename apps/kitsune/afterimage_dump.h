@@ -108,8 +108,11 @@ static void dump_pool(Dump *dump, Loading *loading, Pool *pool, DumpCell cell)
 
 /* ---- streams */
 
-static void dump_log(Dump *dump, const AfterImage *self, Stream *s)
+static void dump_log(Dump *dump, Loading *loading, int32_t at)
 {
+    const AfterImage *self = loading->self;
+    Table *table = loading->table;
+    Stream *s = &table->stream[at];
     uint64_t logged_so_far = s->logged, room = s->log_room;
     DUMP(dump, logged_so_far);
     DUMP(dump, room);
@@ -122,6 +125,7 @@ static void dump_log(Dump *dump, const AfterImage *self, Stream *s)
         dump_check(dump, !self->bounded || room <= LOG_KEPT);
         dump_check(dump, room <= 16 || logged_so_far > room / 2);
         dump_check(dump, logged_so_far < UINT64_MAX / 2 && kept <= (dump->size - dump->at) / offsetof(Event, zero));
+        dump_check(dump, !self->bounded || !room || table->logs < table->most_logs);
         if (dump->failed || !room)
             return;
         if (!(s->log = calloc(room, sizeof *s->log))) {
@@ -130,6 +134,8 @@ static void dump_log(Dump *dump, const AfterImage *self, Stream *s)
         }
         s->log_room = room;
         s->logged = logged_so_far;
+        if (self->bounded)
+            table->logging[table->logs++] = at;
     }
     for (uint64_t number = logged_so_far - kept; number < logged_so_far; number++)
         dump_bytes(dump, logged(s, number), offsetof(Event, zero));
@@ -145,7 +151,7 @@ static uint32_t dump_stream(Dump *dump, Loading *loading, int32_t at)
         s->first_link = s->last_link = s->first_hub_link = s->self_link = NONE;
         dump_check(dump, s->key.length < KEY_BYTES && (s->hub == 0 || s->hub == 1));
     }
-    dump_log(dump, loading->self, s);
+    dump_log(dump, loading, at);
     dump_check(dump, s->hub || !s->logged);
     return dump->failed ? 0 : hash_key(&s->key);
 }

@@ -52,6 +52,8 @@ typedef struct {
     Pool streams, links;
     Stream *stream; /* the cells of `streams` */
     Link *link;
+    int32_t *logging; /* bounded mode: streams with a log, at most `most_logs` */
+    int32_t logs, most_logs;
 } Table;
 
 typedef struct {
@@ -162,12 +164,26 @@ static void forget_link(Table *table, int32_t at)
     pool_give_back(&table->links, at);
 }
 
+static void forget_log(Table *table, int32_t at)
+{
+    Stream *s = &table->stream[at];
+    if (!s->log)
+        return;
+    free(s->log);
+    s->log = NULL;
+    s->logged = s->log_room = 0;
+    for (int32_t n = 0; n < table->logs; n++)
+        if (table->logging[n] == at) {
+            table->logging[n] = table->logging[--table->logs];
+            return;
+        }
+}
+
 static void forget_stream(Table *table, int32_t at)
 {
     while (table->stream[at].first_link != NONE)
         forget_link(table, table->stream[at].first_link);
-    free(table->stream[at].log);
-    table->stream[at].log = NULL;
+    forget_log(table, at);
     pool_give_back(&table->streams, at);
 }
 

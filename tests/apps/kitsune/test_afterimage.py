@@ -172,11 +172,28 @@ def test_bounded_hubs_of_kernel_and_twin_are_equal(hosts, busy):
 @pytest.mark.parametrize(("hosts", "busy"), [(40, 3), (400, 2), (60, 60)])
 def test_bounded_mode_is_close_to_reference_mode(hosts, busy):
     batch = hubs(4000, 2, hosts, busy, back=0)
-    exact, close = features(batch), features(batch, mode="bounded")
+    assert are_close(features(batch), features(batch, mode="bounded"))
+
+
+def are_close(exact, close):
+    """But for covariance and correlation, in which small numbers are left of large ones."""
     covariance = np.zeros(WIDTH, dtype=bool)
     for start in (*range(15, 50, 7), *range(65, 100, 7)):
         covariance[start + 5 : start + 7] = True
-    assert np.allclose(exact[:, ~covariance], close[:, ~covariance], rtol=1e-6, atol=1e-3)
+    return np.allclose(exact[:, ~covariance], close[:, ~covariance], rtol=1e-6, atol=1e-3)
+
+
+def test_logs_of_hubs_are_bounded():
+    """The peers of hubs that have been silent for longest catch up in one step, as in the twin."""
+    batch = hubs(4000, 2, 40, 40, back=0)
+    kernel, twin = AfterImage("bounded", max_streams=2000), PythonAfterImage("bounded", max_streams=2000)
+    found = kernel.update(batch)
+    assert np.array_equal(found, twin.update(batch))
+    assert kernel.counts == twin.counts
+    assert 2 * 12 < kernel.counts["hub_logs"] <= 2 * 16
+    unbounded = AfterImage("bounded")
+    assert are_close(unbounded.update(batch), found)
+    assert unbounded.counts["hub_logs"] > 60
 
 
 def test_concatenated_keys_collide_as_published():

@@ -27,6 +27,8 @@ from tests.naive.kitsune.text_keys import TextKeys, text_keys
 
 HUB_DEGREE: Final = 8
 HUBS_ASKED: Final = 32
+STREAMS_PER_LOG: Final = 128
+LEAST_LOGS: Final = 16
 SET_BACK_S: Final = 60.0
 """A packet older than the newest by this much means that the clock was set back."""
 _FORGET_AT_ONCE: Final = 3
@@ -39,6 +41,8 @@ class BoundedTable(StatisticsTable):
         super().__init__()
         self._max_streams, self._max_links, self._horizon = max_streams, max_links, horizon
         self._order = 0
+        self.logging: dict[DampedStream, None] = {}
+        self._most_logs = max(max_streams // STREAMS_PER_LOG, LEAST_LOGS)
 
     def begin(self, time: float) -> None:
         self._order += 1
@@ -98,6 +102,12 @@ class BoundedTable(StatisticsTable):
         if not stream.is_hub:
             super().tell_peers(stream, residual, time)
             return
+        if not stream.log:
+            if len(self.logging) == self._most_logs:
+                silent = sorted(self.logging, key=lambda hub: hub.log[-1][0])
+                for hub in silent[: self._most_logs // 4]:
+                    self._end_log(hub)
+            self.logging[stream] = None
         stream.logged += 1
         stream.log.append((self._order, time, residual))
         if time > stream.spoken:
@@ -122,7 +132,21 @@ class BoundedTable(StatisticsTable):
                 end.spoken = end.last
                 _become_hub(end)
 
+    def _end_log(self, hub: DampedStream) -> None:
+        """All peers catch up with a hub, which begins a new log with its next packet."""
+        for link in hub.links:
+            near = link.side(hub)
+            if link.ends[0] is link.ends[1]:
+                continue
+            if link.seen[near] != hub.logged:
+                _account(link, near)
+            link.seen[near] = 0
+        hub.logged = 0
+        hub.log.clear()
+        del self.logging[hub]
+
     def _forget_stream(self, stream: DampedStream) -> None:
+        self.logging.pop(stream, None)
         for link in list(stream.links):
             self._forget_link(link)
         del self.streams[stream.key]
@@ -204,12 +228,13 @@ class PythonEngine:
         )
         return [value for group in groups for scale in group for value in scale]
 
-    def counts(self) -> tuple[int, int, int, int]:
-        """Streams, links, streams dropped for age, cells dropped for lack of room."""
+    def counts(self) -> tuple[int, int, int, int, int]:
+        """Streams, links, streams dropped for age, cells dropped for lack of room, logs."""
         streams, links = sum(len(t.streams) for t in self._tables), sum(len(t.links) for t in self._tables)
         return (
             streams,
             links,
             sum(table.forgotten_idle for table in self._tables),
             sum(table.forgotten_full for table in self._tables),
+            sum(len(table.logging) for table in self._tables if isinstance(table, BoundedTable)),
         )
