@@ -63,8 +63,7 @@ _BASELINE: Final[Kinds] = {
     "exceeded": float,
     "rarity": float,
 }
-_FINGERPRINTS: Final[Kinds] = {"syns": int, "marked": int}
-_SUMS: Final[Kinds] = {"_events": dict[_Sender, tuple[list[float], list[float]]]}
+_FINGERPRINTS: Final[Kinds] = {"syns": int, "marked": int, "_times": OrderedDict[_Sender, list[float]]}
 _FOUND: Final[Kinds] = {"_reported": dict[_Sender, tuple[float, float]]}
 _ACCUSED: Final[Kinds] = {"_until": OrderedDict[int, float]}
 _CALIBRATION: Final[Kinds] = {"_count": int, "_begun": float}
@@ -92,7 +91,6 @@ def parts(detector: Detector) -> Iterator[tuple[Any, Kinds]]:
         yield counter, _COUNTER
         yield counter.baseline, _BASELINE
     yield detector.fingerprints, _FINGERPRINTS
-    yield detector.fingerprints._sums, _SUMS
     yield detector.fingerprints._found, _FOUND
     yield detector.accused, _ACCUSED
     yield detector.calibration, _CALIBRATION

@@ -91,6 +91,12 @@ class FoundSoFar:
         self._reported[subject] = (nats, time)
         return nats - faded
 
+    def until(self, subject: Any, nats: float) -> float:
+        """Until when so many nats about a subject, `MOST_NATS` at least, are not worth another message; seconds."""
+        former, time = self._reported.get(subject, (0.0, 0.0))
+        half_lives = math.log2(max(1.0, former * (1 + LEAST_SHARE) / max(nats, MOST_NATS)))
+        return time + half_lives * HALF_LIFE_S
+
 
 class SeenCount(NamedTuple):
     """What a count adds: the part of a finding that comes from its statistic."""

@@ -12,12 +12,13 @@ Source: Antonakakis et al., Understanding the Mirai Botnet, USENIX Security 2017
 """
 
 import math
+from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
 
-from apps.kitsune.behaviour.baseline import SlidingSums
+from apps.kitsune.behaviour.baseline import FORGOTTEN_AT_A_TIME, MOST_EVENTS, MOST_SUBJECTS
 from apps.kitsune.behaviour.contacts import TCP
 from apps.kitsune.behaviour.findings import HALF_LIFE_S, MOST_NATS, Finding, FoundSoFar
 from apps.kitsune.behaviour.rows import SenderId
@@ -39,8 +40,15 @@ class SynFingerprints:
         """Of training."""
         self.marked = 0
         """Those of them that had their destination's address."""
-        self._sums = SlidingSums((HALF_LIFE_S,))
+        self._times: OrderedDict[SenderId, list[float]] = OrderedDict()
+        """Capture times of such SYNs, seconds: the last ones of each sender, who was heard last at the end."""
+        self._settled: dict[SenderId, float] = {}
+        """Until when nothing about a sender can be worth a message, seconds: everything was said a moment ago."""
         self._found = FoundSoFar()
+
+    def __len__(self) -> int:
+        """Senders of such SYNs that are remembered."""
+        return len(self._times)
 
     def add(self, batch: Columns, switch: str, trained: int, senders: int) -> list[Finding]:
         """Takes a batch of which the first `trained` packets were training.
@@ -75,15 +83,42 @@ class SynFingerprints:
         found: list[Finding] = []
         columns = (batch[name][rows].tolist() for name in _NAMES)
         times = (batch["time_us"][rows] / 1e6).tolist()
+        settled = self._settled
         for time, port, mac, source, target, dport, arrival in zip(times, *columns, strict=True):
             sender: SenderId = (switch, port, mac, source)
-            (count,) = self._sums.add(sender, time)
+            if time < settled.get(sender, 0.0):
+                _append(self._times[sender], time)
+                continue
+            count, begun = self._counted(sender, time)
             total = min(nats * count, MOST_NATS)
             added = self._found.added(sender, total, time)
+            if total == MOST_NATS:
+                settled[sender] = self._found.until(sender, MOST_NATS)
             if added:
-                seen = (added, total, count, HALF_LIFE_S, float(self.marked), self._sums.begun[0])
+                seen = (added, total, float(count), HALF_LIFE_S, float(self.marked), begun)
                 found.append(Finding("fingerprint", sender, target, TCP | dport, *seen, time, arrival))
         return found
+
+    def _counted(self, sender: SenderId, time: float) -> tuple[int, float]:
+        """Adds a SYN: how many there were in the last ten minutes, and the time of the first."""
+        self._forget_silent(time)
+        times = self._times.setdefault(sender, [])
+        self._times.move_to_end(sender)
+        _append(times, time)
+        within = [each for each in times if each >= time - HALF_LIFE_S]
+        return len(within), min(within)
+
+    def _forget_silent(self, time: float) -> None:
+        """Who was silent for ten minutes, a few at a time, and who is one too many."""
+        for _ in range(FORGOTTEN_AT_A_TIME):
+            oldest = next(iter(self._times), None)
+            if oldest is None:
+                return
+            times = self._times[oldest]
+            if times[-1] >= time - HALF_LIFE_S and len(self._times) < MOST_SUBJECTS:
+                return
+            del self._times[oldest]
+            self._settled.pop(oldest, None)
 
     def to_state(self) -> list[int]:
         """Plain values for the model file."""
@@ -99,3 +134,9 @@ class SynFingerprints:
         if not 0 <= marked <= syns:
             raise ValueError(f"{marked} of {syns} SYNs had their destination's address")
         self.syns, self.marked = syns, marked
+
+
+def _append(times: list[float], time: float) -> None:
+    times.append(time)
+    if len(times) > MOST_EVENTS:
+        del times[: MOST_EVENTS // 4]

@@ -150,3 +150,23 @@ def test_who_is_behind_a_router_is_not_told_of():
 def test_a_damaged_state_is_refused(state):
     with pytest.raises((TypeError, ValueError)):
         SynFingerprints().restore(state)
+
+
+def test_who_was_reported_with_all_there_is_is_reported_again_when_that_has_faded():
+    """In between SYNs are only counted: no finding could come of them."""
+    fingerprints = trained()
+    times = np.arange(0.0, 400.0, 0.5).tolist()
+    findings = [each for time in times for each in found(fingerprints, marked(time))]
+    said = [(each.time, each.count) for each in findings if each.total == pytest.approx(50.0)]
+    (first, _), (again, counted), *_ = said
+    assert again - first == pytest.approx(600 * math.log2(1.15), abs=0.51)
+    assert counted == 2 * (again - findings[0].time) + 1
+
+
+def test_who_falls_silent_is_forgotten():
+    fingerprints = trained()
+    for sender in range(20):
+        found(fingerprints, marked(1.0 + sender, ip_src_lo=sender))
+    for later in range(24):
+        found(fingerprints, marked(1_000.0 + 700 * later, ip_src_lo=100 + later))
+    assert len(fingerprints) == 1
