@@ -203,7 +203,7 @@ def _slow(folder: Path, delivery: str, count: int, delay_us: int) -> Figures:
 
         until(flushed)
         held_back = producer.lines()[-1]["held_back"]
-        time.sleep(1.0)  # a reader that the server has dropped comes back: only then can it hear of its gap
+        _wait_for_silence(consumer)  # a reader that the server has dropped comes back: only then can it hear of its gap
         producer.tell()
         consumer.wait(lambda line: line.get("newest") == count)
         end = consumer.finish()
@@ -229,10 +229,14 @@ def _received_all(consumer: ChildProgram, count: int) -> dict[str, float]:
 
 
 def _settled(consumer: ChildProgram) -> dict[str, float]:
-    """When nothing more comes for two seconds."""
+    _wait_for_silence(consumer)
+    return consumer.finish()
+
+
+def _wait_for_silence(consumer: ChildProgram) -> None:
+    """Until nothing more has come for two seconds."""
     while time.monotonic() - consumer.lines()[-1]["at"] < 2.0:
         time.sleep(0.1)
-    return consumer.finish()
 
 
 def _sums(end: dict[str, float], sent: int) -> Figures:
