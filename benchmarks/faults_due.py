@@ -203,7 +203,9 @@ def _slow(folder: Path, delivery: str, count: int, delay_us: int) -> Figures:
 
         until(flushed)
         held_back = producer.lines()[-1]["held_back"]
-        _wait_for_silence(consumer)  # a reader that the server has dropped comes back: only then can it hear of its gap
+        _wait_for_silence(
+            consumer
+        )  # a reader that the server has dropped comes back: only then can it hear of its gap
         producer.tell()
         consumer.wait(lambda line: line.get("newest") == count)
         end = consumer.finish()

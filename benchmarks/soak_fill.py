@@ -2,7 +2,7 @@
 
     office traffic, until Kitsune is trained ──► host 0 ⇄ host 1 ⇄ host 2 ⇄ … ──► a soak run with full tables
 
-Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest to take the newest:
+Half of them ask twice, and nothing answers the second request: contacts in vain are kept, too.  Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest to take the newest:
 memory that grows from then on is a leak.
 """
 
@@ -17,6 +17,8 @@ PAIRS: Final = round(2.1 * MOST_CONTACTS)
 """Contacts are kept in two generations, each up to its cap.  AfterImage's tables, and those of senders and
 conversations, are smaller: a pair brings a stream to each of four tables, a link to each of two, and a sender.  Pairs
 without a host in common would leave links at half of their cap, because a link ends with either of its streams."""
+UNANSWERED: Final = round(1.05 * MOST_CONTACTS)
+"""Of their requests."""
 TRAINED: Final = 70_000
 """Frames of the office before: 55,000 of training, the rest is scored."""
 CAPS: Final = {"streams": 4 * MAX_STREAMS, "links": 2 * MAX_LINKS}
@@ -27,17 +29,18 @@ _TOGETHER: Final = 64
 _ADDRESSES: Final = 100 << 24 | 64 << 16
 """100.64.0.0/10 (RFC 6598), where nobody in the office traffic is."""
 _MACS: Final = 0x02_66_00_000000
-_PORT, _UDP, _LIFE = 20_000, 17, 64
+_PORT, _SILENT_PORT, _UDP, _LIFE = 20_000, 20_001, 17, 64
 _PAYLOAD: Final = bytes(32)
 _IP = struct.Struct("!BBHHHBBHII")
 _PORTS = struct.Struct("!HHHH")
 
 
-def fill_frames(pairs: int = PAIRS) -> Iterator[tuple[int, bytes]]:
+def fill_frames(pairs: int = PAIRS, unanswered: int = UNANSWERED) -> Iterator[tuple[int, bytes]]:
     """Frames, and the end that each is sent into: 0 that of the office, 1 that of the Internet.
 
     Args:
         pairs: of neighbours in the chain.
+        unanswered: requests without an answer, by the first hosts.
     """
     for first in range(0, pairs, _TOGETHER):
         askers = range(first, min(first + _TOGETHER, pairs))
@@ -45,6 +48,8 @@ def fill_frames(pairs: int = PAIRS) -> Iterator[tuple[int, bytes]]:
             yield number % 2, _frame(number, number + 1)
         for number in askers:
             yield (number + 1) % 2, _frame(number + 1, number)
+        for number in range(first, min(first + _TOGETHER, pairs, unanswered)):
+            yield number % 2, _frame(number, number + 1, _SILENT_PORT)
 
 
 def fullness(health: Mapping[str, Any]) -> dict[str, dict[str, int]]:
@@ -53,7 +58,7 @@ def fullness(health: Mapping[str, Any]) -> dict[str, dict[str, int]]:
     return {name: {"entries": int(told.get(name, 0)), "cap": cap} for name, cap in CAPS.items()}
 
 
-def _frame(sender: int, receiver: int) -> bytes:
+def _frame(sender: int, receiver: int, port: int = _PORT) -> bytes:
     """A UDP datagram from one host to another, by their numbers."""
     length = _PORTS.size + len(_PAYLOAD)
     ends = _ADDRESSES + sender, _ADDRESSES + receiver
@@ -61,7 +66,7 @@ def _frame(sender: int, receiver: int) -> bytes:
     checksum = ~(sum(struct.unpack("!10H", header)) % 0xFFFF) & 0xFFFF
     header = header[:10] + checksum.to_bytes(2, "big") + header[12:]
     macs = _mac(receiver) + _mac(sender)
-    made: bytes = macs + b"\x08\x00" + header + _PORTS.pack(_PORT, _PORT, length, 0) + _PAYLOAD
+    made: bytes = macs + b"\x08\x00" + header + _PORTS.pack(port, port, length, 0) + _PAYLOAD
     return made
 
 

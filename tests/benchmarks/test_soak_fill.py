@@ -9,8 +9,8 @@ from apps.packets import read_frames
 from benchmarks.soak_fill import PAIRS, fill_frames, fullness
 
 
-def packets(pairs):
-    sides, frames = zip(*fill_frames(pairs), strict=True)
+def packets(pairs, unanswered=0):
+    sides, frames = zip(*fill_frames(pairs, unanswered), strict=True)
     numbers = np.arange(len(frames))
     return read_frames(
         frames,
@@ -30,6 +30,14 @@ def test_each_host_asks_the_next_one_through_the_switch_and_is_answered():
     assert sorted(asked) == sorted([*up, *((b, a) for a, b in up)])
     assert all(asked.index(pair) < asked.index(pair[::-1]) for pair in up)
     assert ((columns["ip_src_lo"] - first) % 2 + 1).tolist() == columns["port"].tolist()
+
+
+def test_the_first_hosts_ask_twice_and_wait_in_vain_the_second_time():
+    columns = packets(130, 70)
+    silent = columns["udp_dport"] != columns["udp_dport"][0]
+    asked = list(zip(columns["ip_src_lo"].tolist(), columns["ip_dst_lo"].tolist(), strict=True))
+    again = [pair for pair, at in zip(asked, silent, strict=True) if at]
+    assert again == [(asked[0][0] + number, asked[0][0] + number + 1) for number in range(70)]
 
 
 def test_headers_are_valid():
