@@ -36,6 +36,9 @@ class Feed(Protocol):
     def verdicts(self) -> bytes:
         """The switch's verdicts on the next frames, in order; none on an interface."""
 
+    def fileno(self) -> int:
+        """Readable when verdicts wait."""
+
     def close(self) -> None:
         """No more frames."""
 
@@ -88,6 +91,10 @@ class WireFeed:
     def verdicts(self) -> bytes:
         """None: an interface gives no verdicts."""
         return b""
+
+    def fileno(self) -> int:
+        """Of the socket: the interface's own frames."""
+        return self._socket.fileno()
 
     def close(self) -> None:
         self._socket.close()

@@ -226,6 +226,22 @@ def replay(
             show_default="65536 while nothing can be blocked, otherwise 128",
         ),
     ] = None,
+    reaction: Annotated[
+        float,
+        typer.Option(
+            help="Capture seconds from the packet that makes a block due until it drops packets.",
+            min=0.001,
+            max=60.0,
+            metavar="SECONDS",
+        ),
+    ] = 0.5,
+    reproducible: Annotated[
+        bool,
+        typer.Option(
+            "--reproducible",
+            help="Behind the first block send nothing later than the reaction time behind the oldest undecided packet.",
+        ),
+    ] = False,
     telemetry: Annotated[
         str | None,
         typer.Option(
@@ -266,6 +282,8 @@ def replay(
             model=model,
             pace=pace,
             window=window,
+            reaction=reaction,
+            reproducible=reproducible,
             telemetry=telemetry,
             report=report,
             keep=keep,

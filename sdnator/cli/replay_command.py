@@ -21,7 +21,8 @@ from sdnator.datasets.names import named_capture
 from sdnator.errors import BadInput
 from sdnator.plurals import counted
 from sdnator.replay import run as replay_run
-from sdnator.replay.loop import ReplayOptions, Telemetry
+from sdnator.replay.laps import LEAST_REACTION_S, MOST_REACTION_S
+from sdnator.replay.loop import REPRODUCIBLE_WINDOW, ReplayOptions, Telemetry
 from sdnator.replay.packet_accounting import PacketAccounting
 from sdnator.report.writer import check_folder
 
@@ -49,6 +50,8 @@ class ReplayRequest:
     ad_grace: int | None
     pace: str
     window: int | None = None
+    reaction: float = 0.5
+    reproducible: bool = False
     telemetry: str | None = None
     queries: bool = True
     model: Path | None = None
@@ -76,11 +79,26 @@ def options_of(request: ReplayRequest) -> ReplayOptions:
         ad_grace=ad_grace,
         pace=_pace(request.pace),
         window=request.window,
+        reaction_ns=_reaction(request),
+        reproducible=request.reproducible,
         telemetry=_telemetry(request.telemetry),
         queries=request.queries,
         model=request.model,
         keep=request.keep,
     )
+
+
+def _reaction(request: ReplayRequest) -> int:
+    """The reaction time, ns; raises BadInput."""
+    if not LEAST_REACTION_S <= request.reaction <= MOST_REACTION_S:
+        raise BadInput(
+            f"--reaction {request.reaction:g}: give {LEAST_REACTION_S:g} to {MOST_REACTION_S:g} capture seconds"
+        )
+    if request.reproducible and request.window is not None and request.window < REPRODUCIBLE_WINDOW:
+        raise BadInput(
+            f"--window {request.window}: with --reproducible give at least {REPRODUCIBLE_WINDOW}, or leave it out"
+        )
+    return round(request.reaction * 1e9)
 
 
 def _check_model(request: ReplayRequest) -> None:
@@ -258,6 +276,11 @@ def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     )
     yield "scored", f"{found['packets_scored']:,}, {found['training_packets']:,} of them for training"
     yield "dropped", f"{found['packets_dropped']:,}"
+    if found["blocks"]:
+        yield (
+            "passed in flight",
+            f"{found['passed_in_flight']:,} of blocked senders, before their block took effect",
+        )
     yield "not copied", f"{found['packets_not_copied']:,}"
     if found["packets_limited"]:
         yield "of these over limits", f"{found['packets_limited']:,}"

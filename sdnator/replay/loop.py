@@ -5,13 +5,14 @@
                  └────────────────────────────────────────────────┘
 
 The feeder keeps a bounded number of packets in flight, counted by scored + dropped, so that no queue
-of the loop can overflow and the loop's delay, in packets, is small and known.  A replay may be a hundred times as fast
-as its capture.  So that time to block says nothing about that, and neither the window nor the machine decides, it does
-not run further than half a second of capture time ahead of the oldest packet in flight, of evidence that is being
-judged, or of a decision that is on its way.  On a quiet network that takes long, so it does so only where a dry run of
-the capture has shown that something may be decided, if there was one.
+of the loop can overflow.  A replay may be a hundred times as fast as its capture.  So that time to block says nothing
+about that, and neither the window nor the machine decides, it goes in laps of the reaction time (`laps.py`): the next
+lap is sent once the packets of this one are scored, their evidence is judged, and the switch has confirmed what was
+decided.  On a quiet network that takes long, so it does so only where a dry run of the capture has shown that something
+may be decided, if there was one (`quiet_stretches.py`).
 """
 
+import select
 import tempfile
 import time
 from collections.abc import Callable
@@ -31,17 +32,17 @@ from sdnator.capture.interfaces import Feed
 from sdnator.errors import PipelineError
 from sdnator.incidents.incident_rows import newest_of_each, with_counters
 from sdnator.replay.drop_counters import DropCounters
+from sdnator.replay.laps import REACTION_NS, Laps
 from sdnator.replay.loop_observer import (
     CONFIRM_SECONDS,
     JUDGING,
-    REACTION_NS,
     REPORTS,
     SUSPICIONS,
     LoopObserver,
 )
 from sdnator.replay.packet_accounting import PacketAccounting, PacketState
 from sdnator.replay.pipeline import SWITCH_NAME, PipelinePlan, ReplayPipeline
-from sdnator.replay.quiet_stretches import QuietStretches
+from sdnator.replay.quiet_stretches import STOPPING, QuietStretches, Sign
 from sdnator.replay.readiness import QueriesReady
 from sdnator.replay.survey import Survey
 
@@ -64,6 +65,8 @@ ASK_SECONDS = 0.003
 """Without verdicts: seconds of silence after which drop counters are read."""
 WIRE_WINDOW = 16
 """Most packets in flight into a real interface: BMv2's capture ring has 32 slots, the kernel drops the rest."""
+REPRODUCIBLE_WINDOW = 16
+"""Packets of a lap with `--reproducible`, whatever `--window` says: as many as every switch takes."""
 POLL_SECONDS = 0.002
 LOOK_SECONDS = 0.1
 DEATH_SECONDS = 5.0
@@ -113,6 +116,10 @@ class ReplayOptions:
     """Capture seconds a wall second; None = as fast as the loop goes."""
     window: int | None = None
     """Most packets in flight; None = many while nothing can be blocked, else few."""
+    reaction_ns: int = REACTION_NS
+    """Capture time that may pass from a packet to a remedy for it."""
+    reproducible: bool = False
+    """Trust nothing that the dry run foretells behind the first block, and make laps that no window changes."""
     telemetry: Telemetry | None = None
     """How headers come from the switch; None = by digest where the switch sends them in lists."""
     queries: bool = True
@@ -128,6 +135,12 @@ class ReplayOptions:
             (FREE_WINDOW[self.headers] if free else BLOCKING_WINDOW) if self.window is None else self.window
         )
         return window if self.switch == "embedded" else min(window, WIRE_WINDOW)
+
+    @property
+    def lap_packets(self) -> int:
+        """Most packets of a lap."""
+        limit = self.in_flight_limit(free=False)
+        return min(REPRODUCIBLE_WINDOW if self.reproducible else BLOCKING_WINDOW, limit)
 
     @property
     def unhindered(self) -> bool:
@@ -167,8 +180,10 @@ class PassResult:
     alerts: list[Alert] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     """Blocks and guards, and their ends, in the order of deciding."""
-    signs: list[int] = field(default_factory=list)
-    """Capture times (ns) of what may lead to a decision: alerts, evidence, results of queries, decisions."""
+    signs: list[Sign] = field(default_factory=list)
+    """What may lead to a decision: evidence, results of queries, decisions."""
+    overtaken: int = 0
+    """Decisions that came while packets were sent freely: they took effect later than they should have."""
     handshakes: list[tuple[int, str]] = field(default_factory=list)
     """Capture time (ns) and source of each completed handshake that a query has found."""
     confirmations: list[Confirmation] = field(default_factory=list)
@@ -178,6 +193,8 @@ class PassResult:
     """Wall time (monotonic) at which watched packets were sent."""
     confirmed_at: list[float] = field(default_factory=list)
     """Wall time of each confirmation."""
+    confirmed_sent: list[int] = field(default_factory=list)
+    """Packets sent by the time of each confirmation."""
 
     def last_incidents(self) -> list[Incident]:
         """Incidents as last reported, with the last counters of the switch, in the order of their begin."""
@@ -197,6 +214,7 @@ class ReplayPass:
         mitigate: False = the firewall decides but nothing is installed.
         watch: indices of packets whose time of sending matters.
         dry_run: an earlier pass of the same capture without mitigation, if there was one.
+        foresees: whether the dry run may foretell what happens behind the first block.
     """
 
     def __init__(
@@ -207,6 +225,7 @@ class ReplayPass:
         mitigate: bool,
         watch: frozenset[int],
         dry_run: PassResult | None = None,
+        foresees: bool = True,
     ) -> None:
         self._survey = survey
         self._options = options
@@ -217,7 +236,9 @@ class ReplayPass:
             by_digest=options.headers == "digest",
         )
         self._result = PassResult(flight, mitigate)
-        self._quiet = None if dry_run is None else _quiet_stretches(survey, dry_run)
+        self._quiet = None if dry_run is None else _quiet_stretches(survey, dry_run, foresees=foresees)
+        self._laps = Laps(survey.time_ns, options.reaction_ns, options.lap_packets)
+        self._lap_end = 0
         self._observer = LoopObserver(self._result, self._quiet)
         self._drops: DropCounters | None = None
         self._looked = 0.0
@@ -274,7 +295,7 @@ class ReplayPass:
                 stack.callback(feed.close)
                 if not pipeline.gives_verdicts:
                     self._drops = stack.enter_context(pipeline.drop_counters())
-                self._feed(pipeline, feed, progress)
+                self._feed(pipeline, engine, feed, progress)
                 self._result.seconds = time.monotonic() - started
                 self._end(pipeline, engine)
                 if not pipeline.gives_verdicts:
@@ -308,12 +329,12 @@ class ReplayPass:
                 )
             time.sleep(0.05)
 
-    def _feed(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
+    def _feed(self, pipeline: ReplayPipeline, engine: Engine, feed: Feed, progress: Progress | None) -> None:
         flight = self._result.flight
         begun = time.monotonic()
         with CaptureBlocks(self._survey.path, self._survey.frames()) as capture:
             while flight.sent < self._survey.packets:
-                room = self._wait_for_room(pipeline, feed, progress)
+                room = self._wait_for_room(pipeline, engine, feed, progress)
                 block = capture.take(self._keep_pace(pipeline, progress, begun, min(room, CHUNK)))
                 self._look(pipeline, progress)
                 # Counted first: a verdict or score may come back before `send` returns.
@@ -329,7 +350,7 @@ class ReplayPass:
         """Let capture time pass after the last packet, and wait for what is decided by it."""
         self._await_quiet(pipeline)  # what the last packets lead to comes first
         end = int(self._survey.time_ns.max()) + AFTER_END_NS
-        engine.write(f"network.clock.replay.{SWITCH_NAME}", {"event_time": end}, [NO_WAIT])
+        self._write_clock(engine, end)
         deadline = time.monotonic() + CONFIRM_SECONDS
         with self._observer.moved:
             while self._observer.switch.get("event_time", 0) < end and time.monotonic() < deadline:
@@ -396,32 +417,28 @@ class ReplayPass:
             if progress is not None:
                 progress(self._result.flight, self._observer.blocks)
 
-    def _wait_for_room(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> int:
+    def _wait_for_room(
+        self, pipeline: ReplayPipeline, engine: Engine, feed: Feed, progress: Progress | None
+    ) -> int:
         sent = self._result.flight.sent
-        free = self._free_until(sent) - sent
-        limit = self._options.in_flight_limit(free=free > 0)
-        share = max(1, limit // SHARE)
+        if sent < self._lap_end:
+            return self._lap_end - sent  # the rest of a lap that came in parts
+        with self._observer.moved:
+            free = self._free_until(sent) - sent
         if free > 0:
+            limit = self._options.in_flight_limit(free=True)
+            share = max(1, limit // SHARE)
             self._await(pipeline, feed, progress, lambda flight: flight.in_flight <= limit - share)
-            # behind the last free packet another window holds
-            return min(limit - self._result.flight.in_flight, free)
-        next_ns = int(self._survey.time_ns[sent])
-        # fewer packets than that wait until none is in flight: a lap costs the same for one packet as for a hundred
-        enough_ns = int(self._survey.time_ns[sent : sent + share].max())
-        self._await(
-            pipeline,
-            feed,
-            progress,
-            lambda flight: (
-                flight.in_flight <= limit - share
-                and (not flight.in_flight or enough_ns <= self._horizon(next_ns))
-                and not self._observer.is_judging()
-                and not self._observer.is_ahead(next_ns)
-            ),
-        )
-        room = limit - self._result.flight.in_flight
-        late = self._survey.time_ns[sent : sent + room] > self._horizon(next_ns)
-        return max(1, int(late.argmax())) if late.any() else room
+            with self._observer.moved:
+                free = self._free_until(sent) - sent  # something may have come meanwhile
+                self._observer.is_free = free > 0
+                if free > 0:
+                    return min(limit - self._result.flight.in_flight, free)
+        self._await(pipeline, feed, progress, self._is_settled)
+        end_ns = self._pass_ends(pipeline, engine, int(self._survey.time_ns[sent]))
+        self._observer.is_free = False
+        self._lap_end = self._laps.end(sent, end_ns)
+        return self._lap_end - sent
 
     def _free_until(self, sent: int) -> int:
         """Index of the first packet, from that of `sent` on, that may meet a decision."""
@@ -431,10 +448,33 @@ class ReplayPass:
             return self._options.training_packets
         return sent if self._quiet is None else self._quiet.end(sent)
 
-    def _horizon(self, next_ns: int) -> int:
-        """Capture time up to which packets may be sent, ns: a remedy for the oldest in flight could be in force by then."""
-        oldest = self._result.flight.oldest_in_flight
-        return REACTION_NS + (next_ns if oldest is None else int(self._survey.time_ns[oldest]))
+    def _is_settled(self, flight: PacketAccounting) -> bool:
+        """Whether everything that was sent is scored and judged, and what was decided is in force."""
+        return not flight.in_flight and not self._observer.is_judging() and not self._observer.is_deciding()
+
+    def _pass_ends(self, pipeline: ReplayPipeline, engine: Engine, next_ns: int) -> int | None:
+        """Blocks that end before the next packet end at their time, whenever that packet comes.
+
+        Returns:
+            Capture time of the next end, ns; None if nothing in force ends.
+        """
+        while True:
+            with self._observer.moved:
+                end = self._observer.next_end()
+                if end is None or end > next_ns:
+                    return end
+            self._write_clock(engine, -(-end // 1_000) * 1_000)  # the switch's clock counts microseconds
+            deadline = time.monotonic() + CONFIRM_SECONDS
+            with self._observer.moved:
+                while self._observer.next_end() == end or self._observer.is_deciding():
+                    if time.monotonic() > deadline:
+                        self._observer.give_up_end(end)
+                        break
+                    pipeline.check()
+                    self._observer.moved.wait(LOOK_SECONDS)
+
+    def _write_clock(self, engine: Engine, time_ns: int) -> None:
+        engine.write(f"network.clock.replay.{SWITCH_NAME}", {"event_time": time_ns}, [NO_WAIT])
 
     def _drain(self, pipeline: ReplayPipeline, feed: Feed, progress: Progress | None) -> None:
         self._await(pipeline, feed, progress, lambda flight: flight.in_flight == 0)
@@ -455,7 +495,12 @@ class ReplayPass:
                 if done(flight):
                     return
                 # scores wake us, verdicts do not
-                self._observer.moved.wait(POLL_SECONDS if flight.judged < flight.sent else LOOK_SECONDS)
+                judging = pipeline.gives_verdicts and flight.judged < flight.sent
+                if not judging:
+                    waiting = not pipeline.gives_verdicts and flight.in_flight
+                    self._observer.moved.wait(POLL_SECONDS if waiting else LOOK_SECONDS)
+            if judging:
+                select.select((feed,), (), (), POLL_SECONDS)
             now = time.monotonic()
             if flight.decided != last:
                 last, since = flight.decided, now
@@ -485,10 +530,10 @@ class ReplayPass:
                 flight.settle()
 
 
-def _quiet_stretches(survey: Survey, dry_run: PassResult) -> QuietStretches:
+def _quiet_stretches(survey: Survey, dry_run: PassResult, *, foresees: bool) -> QuietStretches:
     """What the dry run tells about the pass after it."""
-    decided = min((decision.event_time for decision in dry_run.decisions), default=None)
-    return QuietStretches(survey.time_ns, dry_run.signs, decided)
+    stopping = (decision.event_time for decision in dry_run.decisions if decision.action in STOPPING)
+    return QuietStretches(survey.time_ns, dry_run.signs, min(stopping, default=None), foresees=foresees)
 
 
 def _firewall(*, mitigate: bool, queries: bool) -> dict[str, Any]:

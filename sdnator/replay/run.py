@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,10 +14,11 @@ from sdnator.capture.labels import Labels, LabelsError, read_labels
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import as_json
 from sdnator.replay.guards import WouldChallenge, would_challenge
+from sdnator.replay.laps import REACTION_NS
 from sdnator.replay.limits import LimitedPackets, limited_packets
 from sdnator.replay.loop import PassResult, Progress, ReplayOptions, ReplayPass, wall_seconds_to_block
-from sdnator.replay.loop_observer import REACTION_NS
 from sdnator.replay.packet_accounting import PacketState
+from sdnator.replay.passed_in_flight import InFlight
 from sdnator.replay.quiet_stretches import laps
 from sdnator.replay.summary import attack_figures, auc, block_rows
 from sdnator.replay.survey import Survey, survey
@@ -41,6 +43,8 @@ class ReplayOutcome:
     """What the guards of the reported pass would have done."""
     limited: LimitedPackets
     """What its rate limits did."""
+    reaction_ns: int = REACTION_NS
+    """Capture time that could pass from a packet to a remedy for it."""
 
     @property
     def reported(self) -> PassResult:
@@ -95,14 +99,28 @@ def run(
     if labels is not None and bool(labels.attack.any()):
         watch = frozenset({int(np.argmax(labels.attack))})
 
-    def one_pass(title: str, *, mitigating: bool, seen: PassResult | None = None) -> PassResult:
-        replay = ReplayPass(surveyed, options, mitigate=mitigating, watch=watch, dry_run=seen)
+    def one_pass(
+        title: str, *, mitigating: bool, seen: PassResult | None = None, foresees: bool = False
+    ) -> PassResult:
+        replay = ReplayPass(
+            surveyed, options, mitigate=mitigating, watch=watch, dry_run=seen, foresees=foresees
+        )
         return replay.run(progress(title) if progress is not None else None)
 
     first = both or not mitigate or _looks_ahead(surveyed, options)
+    foresees = first and not options.reproducible and options.unhindered
     dry_run = one_pass("dry run", mitigating=False) if first else None
-    blocking = one_pass("with blocking", mitigating=True, seen=dry_run) if mitigate else None
+    blocking = (
+        one_pass("with blocking", mitigating=True, seen=dry_run, foresees=foresees) if mitigate else None
+    )
     notes = surveyed.notes()
+    if blocking is not None and blocking.overtaken and foresees:
+        notes.append(
+            f"the dry run foretold wrongly where nothing is decided: {blocking.overtaken} decisions would have taken "
+            "effect late, so the pass with blocking was made again, held back from the first block on"
+        )
+        _set_aside(options)
+        blocking = one_pass("with blocking, again", mitigating=True, seen=dry_run)
     if options.model is not None:
         notes.append(f"no training in this replay: the model is {options.model}")
     if options.switch != "embedded":
@@ -119,14 +137,29 @@ def run(
         )
     limited = limited_packets(surveyed.path, surveyed.packets, reported.decisions)
     return ReplayOutcome(
-        surveyed, labels, dry_run, blocking, notes, time.monotonic() - begun, challenged, limited
+        surveyed,
+        labels,
+        dry_run,
+        blocking,
+        notes,
+        time.monotonic() - begun,
+        challenged,
+        limited,
+        options.reaction_ns,
     )
+
+
+def _set_aside(options: ReplayOptions) -> None:
+    """What a pass left that does not count, out of the way of the pass that does."""
+    if options.keep is not None:
+        with suppress(OSError):  # there is one from an earlier replay
+            (options.keep / "with-blocking").rename(options.keep / "with-blocking-discarded")
 
 
 def _looks_ahead(surveyed: Survey, options: ReplayOptions) -> bool:
     """Whether a dry run before the pass with blocking pays."""
     tested = surveyed.time_ns[options.training_packets :]
-    return options.unhindered and laps(tested, REACTION_NS) >= MANY_LAPS
+    return options.unhindered and laps(tested, options.reaction_ns) >= MANY_LAPS
 
 
 def figures(outcome: ReplayOutcome) -> dict[str, Any]:
@@ -134,9 +167,13 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
     result = outcome.reported
     flight = result.flight
     trained, scored = flight.count(PacketState.TRAIN), flight.count(PacketState.SCORED)
-    blocks = block_rows(outcome.survey, result.decisions, result.confirmations, flight.first_arrival)
     incidents = result.last_incidents()
     dropped = flight.state == PacketState.DROPPED
+    sent = result.confirmed_sent
+    in_flight = InFlight(outcome.survey, result.decisions, result.confirmations, sent, dropped)
+    blocks = block_rows(
+        outcome.survey, result.decisions, result.confirmations, flight.first_arrival, in_flight
+    )
     challenged = outcome.challenged.packets & ~dropped
     limited = outcome.limited.seen & dropped
     first_attack = None
@@ -161,6 +198,8 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "packets_dropped": flight.count(PacketState.DROPPED) - result.uncounted_drops,
         "packets_limited": int(limited.sum()),
         "packets_would_be_limited": int(outcome.limited.would.sum()),
+        "passed_in_flight": int(in_flight.packets.sum()),
+        "reaction_s": outcome.reaction_ns / 1e9,
         "packets_not_copied": flight.count(PacketState.NOT_COPIED),
         "packets_would_be_challenged": int(challenged.sum()),
         "packets_lost": max(flight.in_flight + result.uncounted_drops, result.lost_on_the_way),

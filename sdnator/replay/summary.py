@@ -11,6 +11,7 @@ from scipy.stats import rankdata
 from apps.messages import Confirmation, Decision
 from sdnator.capture.labels import Labels
 from sdnator.replay.packet_accounting import PacketAccounting, PacketState
+from sdnator.replay.passed_in_flight import InFlight
 from sdnator.replay.survey import Survey
 
 
@@ -49,6 +50,7 @@ def block_rows(
     decisions: Sequence[Decision],
     confirmations: Sequence[Confirmation],
     first_arrival: int = 0,
+    in_flight: InFlight | None = None,
 ) -> list[dict[str, Any]]:
     """One row for each block that the switch installed, in the order of installing.
 
@@ -71,9 +73,19 @@ def block_rows(
                 "decided": decision.event_time / 1e9,
                 "packet": packet,
                 "handle": confirmation.handle,
+                **_in_flight_of(decision.id, in_flight),
             }
         )
     return rows
+
+
+def _in_flight_of(decision_id: str, in_flight: InFlight | None) -> dict[str, int]:
+    if in_flight is None:
+        return {}
+    return {
+        "in_flight": in_flight.of_all[decision_id],
+        "passed_in_flight": in_flight.of_sender[decision_id],
+    }
 
 
 def attack_figures(

@@ -13,21 +13,25 @@ from sdnator.replay.survey import Survey
 SECOND = 1_000_000_000
 HOUR = np.arange(3_600) * SECOND
 """A packet a second."""
+OVERTAKEN = 11
+"""A replay with so much training meets a decision where the dry run foretold none."""
 
 
 @pytest.fixture
 def passes(monkeypatch):
-    """Titles of the passes that were made, and whether each knew a dry run."""
+    """Titles of the passes that were made, and whether each knew a dry run, and trusted it behind the first block."""
     made = []
 
     class Pass:
-        def __init__(self, survey, _options, *, mitigate, watch, dry_run):
+        def __init__(self, survey, options, *, mitigate, watch, dry_run, foresees):
             del watch
             self.result = PassResult(PacketAccounting(survey.packets), mitigate)
+            self.result.overtaken = int(foresees and options.fm_grace == OVERTAKEN)
             self.knows = dry_run is not None
+            self.foresees = foresees
 
         def run(self, title):
-            made.append((title, self.knows))
+            made.append((title, self.knows, self.foresees) if self.foresees else (title, self.knows))
             return self.result
 
     monkeypatch.setattr(run, "ReplayPass", Pass)
@@ -39,7 +43,7 @@ def replayed(time_ns, *, mitigate=True, both=False, **options):
     surveyed = Survey(
         Path("some.pcap"), time_ns, nothing.astype(np.uint64), nothing, 0, None, nothing, nothing, plain=True
     )
-    chosen = ReplayOptions(fm_grace=10, ad_grace=90, **options)
+    chosen = ReplayOptions(**{"fm_grace": 10, "ad_grace": 90, **options})
     return run.run(surveyed, None, chosen, mitigate=mitigate, both=both, progress=lambda title: title)
 
 
@@ -47,7 +51,7 @@ def test_long_capture_gets_a_dry_run_first_which_the_other_pass_knows(passes):
     """Whether it is wanted for labels and report or not; the figures are those of the pass with blocking."""
     for both in (True, False):
         outcome = replayed(HOUR, both=both)
-        assert passes == [("dry run", False), ("with blocking", True)]
+        assert passes == [("dry run", False), ("with blocking", True, True)]
         assert (outcome.dry_run.mitigate, outcome.reported.mitigate) == (False, True)
         passes.clear()
 
@@ -64,6 +68,22 @@ def test_long_capture_gets_a_dry_run_first_which_the_other_pass_knows(passes):
 def test_no_dry_run_where_it_would_take_longer_than_it_saves(passes, time_ns, options):
     replayed(time_ns, **options)
     assert passes == [("with blocking", False)]
+
+
+def test_a_pass_that_ran_past_a_decision_is_made_again_without_looking_ahead(passes):
+    outcome = replayed(HOUR, fm_grace=OVERTAKEN)
+    assert passes == [
+        ("dry run", False),
+        ("with blocking", True, True),
+        ("with blocking, again", True),
+    ]
+    assert outcome.blocking.overtaken == 0
+    assert any("foretold wrongly" in note for note in outcome.notes)
+
+
+def test_reproducible_replay_trusts_no_dry_run_behind_the_first_block(passes):
+    replayed(HOUR, fm_grace=OVERTAKEN, reproducible=True)
+    assert passes == [("dry run", False), ("with blocking", True)]
 
 
 def test_dry_run_alone_is_all_of_a_replay_that_blocks_nothing(passes):
