@@ -57,6 +57,10 @@ FREE_WINDOW = {"digest": 65_536, "packet-in": 1_024}
 """Most packets in flight while nothing can be blocked, by the way in which headers come."""
 BLOCKING_WINDOW = 128
 """Most packets in flight while a block may take effect, unless `--window` says otherwise."""
+LAP_LINGER_MS = 0.2
+"""How long the controller waits for more headers in a pass with laps ..."""
+FREE_LINGER_MS = 2.0
+"""... and in a pass without."""
 STALL_SECONDS = 90.0
 """Seconds without any result after which the loop has failed."""
 SETTLE_SECONDS = 0.5
@@ -259,6 +263,7 @@ class ReplayPass:
                 base_us=self._survey.base_us,
                 times_us=self._survey.time_ns // 1_000,
                 telemetry=options.headers,
+                linger_ms=LAP_LINGER_MS if self._result.mitigate else FREE_LINGER_MS,
                 first=partial(self._join, engine),
                 kitsune=options.kitsune,
                 queries=options.queries,

@@ -69,6 +69,8 @@ class PipelinePlan:
     so a consumer that must not miss any registers its interests here."""
     telemetry: str = "packet-in"
     """How headers come from the switch: packet-in, or digest."""
+    linger_ms: float = 2.0
+    """How long the controller waits for more headers when it has some: in laps, none come."""
     queries: bool = True
     """Run the Sonata adapter."""
     keeps_archive: bool = True
@@ -200,6 +202,7 @@ class ReplayPipeline(WholeOrNone):
             "p4info": str(program.p4info),
             "telemetry": self._plan.telemetry,
             "archive_packets": self._plan.keeps_archive,
+            "linger_ms": self._plan.linger_ms,
             "tls_ca": self._security.ca,
             "tls_certificate": self._security.certificate,
             "tls_key": self._security.key,

@@ -25,7 +25,7 @@ EVIDENCE_AFTER_NS: Final = 1_000_000_000
 """... and which is judged at its own time."""
 COUNTED_NS: Final = 75_000_000_000
 """And before the end of a block: whether it is extended depends on the drops of its last minute."""
-HOLD_NS: Final = 30_000_000_000
+HOLD_NS: Final = 5_000_000_000
 """How long the first sign that was not foretold holds a pass back."""
 STOPPING: Final = ("block", "meter")
 """Actions of decisions that drop packets."""

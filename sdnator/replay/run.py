@@ -13,6 +13,7 @@ from sdnator.capture.captures import CaptureError
 from sdnator.capture.labels import Labels, LabelsError, read_labels
 from sdnator.errors import BadInput
 from sdnator.incidents.incident_rows import as_json
+from sdnator.plurals import counted
 from sdnator.replay.guards import WouldChallenge, would_challenge
 from sdnator.replay.laps import REACTION_NS
 from sdnator.replay.limits import LimitedPackets, limited_packets
@@ -45,6 +46,13 @@ class ReplayOutcome:
     """What its rate limits did."""
     reaction_ns: int = REACTION_NS
     """Capture time that could pass from a packet to a remedy for it."""
+    discarded: tuple[PassResult, ...] = ()
+    """Passes with mitigation that do not count."""
+
+    @property
+    def passes(self) -> list[PassResult]:
+        """All passes, in their order."""
+        return [each for each in (self.dry_run, *self.discarded, self.blocking) if each is not None]
 
     @property
     def reported(self) -> PassResult:
@@ -89,7 +97,7 @@ def run(
     """Run one pass, or two: first a dry run, then with blocking.
 
     Two if `both` are wanted, or if the dry run saves more time than it takes, because it shows where the pass with
-    blocking has to keep up.
+    blocking has to keep up.  Where it was wrong about that, the pass with blocking is made again.
 
     Raises:
         PipelineError: a part failed.
@@ -108,19 +116,21 @@ def run(
         return replay.run(progress(title) if progress is not None else None)
 
     first = both or not mitigate or _looks_ahead(surveyed, options)
-    foresees = first and not options.reproducible and options.unhindered
     dry_run = one_pass("dry run", mitigating=False) if first else None
-    blocking = (
-        one_pass("with blocking", mitigating=True, seen=dry_run, foresees=foresees) if mitigate else None
-    )
     notes = surveyed.notes()
-    if blocking is not None and blocking.overtaken and foresees:
+    blocking, discarded = None, list[PassResult]()
+    trusts = _trusts(dry_run, options) if mitigate else []
+    for place, (seen, foresees) in enumerate(trusts):
+        title = "with blocking" if not place else f"again, {place + 1}"
+        blocking = one_pass(title, mitigating=True, seen=seen, foresees=foresees)
+        if not blocking.overtaken or place + 1 == len(trusts):
+            break
         notes.append(
-            f"the dry run foretold wrongly where nothing is decided: {blocking.overtaken} decisions would have taken "
-            "effect late, so the pass with blocking was made again, held back from the first block on"
+            f"the dry run foretold wrongly where nothing is decided, and {counted(blocking.overtaken, 'decision')} took "
+            "effect late: the pass with blocking was made again, and held packets back more often"
         )
+        discarded.append(blocking)
         _set_aside(options)
-        blocking = one_pass("with blocking, again", mitigating=True, seen=dry_run)
     if options.model is not None:
         notes.append(f"no training in this replay: the model is {options.model}")
     if options.switch != "embedded":
@@ -146,7 +156,19 @@ def run(
         challenged,
         limited,
         options.reaction_ns,
+        tuple(discarded),
     )
+
+
+def _trusts(dry_run: PassResult | None, options: ReplayOptions) -> list[tuple[PassResult | None, bool]]:
+    """What a pass with blocking believes of the dry run, and the one after it if that was wrong.
+
+    Returns:
+        The dry run or None, and whether it foretells anything behind the first block.
+    """
+    foresees = options.unhindered and not options.reproducible
+    found: list[tuple[PassResult | None, bool]] = [] if dry_run is None else [(dry_run, False)]
+    return [*([(dry_run, True)] if found and foresees else []), *found, (None, False)]
 
 
 def _set_aside(options: ReplayOptions) -> None:

@@ -14,7 +14,9 @@ SECOND = 1_000_000_000
 HOUR = np.arange(3_600) * SECOND
 """A packet a second."""
 OVERTAKEN = 11
-"""A replay with so much training meets a decision where the dry run foretold none."""
+"""A replay with so much training meets a decision where the dry run foretold none, behind the first block ..."""
+OVERTAKEN_EARLY = 12
+"""... or before it."""
 
 
 @pytest.fixture
@@ -26,7 +28,8 @@ def passes(monkeypatch):
         def __init__(self, survey, options, *, mitigate, watch, dry_run, foresees):
             del watch
             self.result = PassResult(PacketAccounting(survey.packets), mitigate)
-            self.result.overtaken = int(foresees and options.fm_grace == OVERTAKEN)
+            late = {OVERTAKEN: foresees, OVERTAKEN_EARLY: dry_run is not None}
+            self.result.overtaken = int(mitigate and late.get(options.fm_grace, False))
             self.knows = dry_run is not None
             self.foresees = foresees
 
@@ -70,19 +73,21 @@ def test_no_dry_run_where_it_would_take_longer_than_it_saves(passes, time_ns, op
     assert passes == [("with blocking", False)]
 
 
-def test_a_pass_that_ran_past_a_decision_is_made_again_without_looking_ahead(passes):
+def test_a_pass_that_ran_past_a_decision_is_made_again_with_less_trust(passes):
+    """First in what is foretold behind the first block, then in all of the dry run."""
     outcome = replayed(HOUR, fm_grace=OVERTAKEN)
-    assert passes == [
-        ("dry run", False),
-        ("with blocking", True, True),
-        ("with blocking, again", True),
-    ]
-    assert outcome.blocking.overtaken == 0
-    assert any("foretold wrongly" in note for note in outcome.notes)
+    assert passes == [("dry run", False), ("with blocking", True, True), ("again, 2", True)]
+    assert [each.overtaken for each in outcome.passes] == [0, 1, 0]
+    assert outcome.reported is outcome.passes[-1]
+    assert sum("foretold wrongly" in note for note in outcome.notes) == 1
+    passes.clear()
+    outcome = replayed(HOUR, fm_grace=OVERTAKEN_EARLY)
+    assert passes[1:] == [("with blocking", True, True), ("again, 2", True), ("again, 3", False)]
+    assert [each.overtaken for each in outcome.passes] == [0, 1, 1, 0]
 
 
 def test_reproducible_replay_trusts_no_dry_run_behind_the_first_block(passes):
-    replayed(HOUR, fm_grace=OVERTAKEN, reproducible=True)
+    replayed(HOUR, reproducible=True)
     assert passes == [("dry run", False), ("with blocking", True)]
 
 
