@@ -13,6 +13,7 @@ from sdnator import training
 from sdnator.datasets.names import NamedCapture, named_capture
 from sdnator.errors import BadInput
 from sdnator.replay import run
+from sdnator.replay.laps import LEAST_REACTION_S, MOST_REACTION_S, REACTION_NS
 from sdnator.replay.loop import Progress, ReplayOptions, Telemetry
 from sdnator.replay.packet_accounting import PacketAccounting
 from sdnator.report.writer import check_folder
@@ -61,6 +62,8 @@ def replay_capture(
     pace: float | None = None,
     telemetry: Telemetry | None = None,
     queries: bool = True,
+    reaction: float = REACTION_NS / 1e9,
+    reproducible: bool = False,
     report: str | Path | None = None,
     keep: str | Path | None = None,
     progress: OnProgress | None = None,
@@ -80,6 +83,8 @@ def replay_capture(
         pace: capture seconds per wall second; None replays as fast as the pipeline goes.
         telemetry: "packet-in" or "digest", the way headers come from the switch; None takes digests.
         queries: False runs Kitsune alone, without the Sonata adapter and the defence against SYN floods.
+        reaction: capture seconds, 0.001 to 60, from the packet that makes a block due until the block is in force.
+        reproducible: True drops the same packets in every replay, and takes longer.
         report: folder for the HTML report; None writes none.
         keep: folder for the logs of all parts and the archive; None deletes them.
         progress: called from time to time with the title of the pass, the packets done and the packets in the capture.
@@ -97,6 +102,8 @@ def replay_capture(
         raise BadInput(f"pace={pace}: give None, or capture seconds per wall second between 0 and 1,000,000")
     if telemetry not in (None, "packet-in", "digest"):
         raise BadInput(f'telemetry={telemetry!r}: give None, "packet-in" or "digest"')
+    if not LEAST_REACTION_S <= reaction <= MOST_REACTION_S:
+        raise BadInput(f"reaction={reaction}: give {LEAST_REACTION_S:g} to {MOST_REACTION_S:g} capture seconds")
     if report is not None:
         check_folder(report)
     options = ReplayOptions(
@@ -105,6 +112,8 @@ def replay_capture(
         pace=pace,
         telemetry=telemetry,
         queries=queries,
+        reaction_ns=round(reaction * 1e9),
+        reproducible=reproducible,
         keep=Path(keep) if keep is not None else None,
     )
     surveyed, read = run.prepare(found.capture, found.labels, options)

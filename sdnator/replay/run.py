@@ -221,6 +221,7 @@ def figures(outcome: ReplayOutcome) -> dict[str, Any]:
         "packets_limited": int(limited.sum()),
         "packets_would_be_limited": int(outcome.limited.would.sum()),
         "passed_in_flight": int(in_flight.packets.sum()),
+        "most_in_flight": max(in_flight.of_all.values(), default=0),
         "reaction_s": outcome.reaction_ns / 1e9,
         "packets_not_copied": flight.count(PacketState.NOT_COPIED),
         "packets_would_be_challenged": int(challenged.sum()),

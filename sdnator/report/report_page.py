@@ -157,7 +157,18 @@ def _explanation(summary: Mapping[str, Any]) -> str:
         f"<p>Each dot is a packet, with the anomaly score that Kitsune gave it; packets at or above the dashed "
         f"line, the threshold, are anomalous. {both if summary.get('mitigation') else ''}"
         "Packets that the switch drops are not scored and are drawn below the scale. "
+        f"{_passed_in_flight(summary)}"
         "Answers of an attack's victims count as benign.</p>"
+    )
+
+
+def _passed_in_flight(summary: Mapping[str, Any]) -> str:
+    if not summary.get("blocks") or "passed_in_flight" not in summary:
+        return ""
+    return (
+        f"{_count(int(summary['passed_in_flight']), 'packet')} of blocked senders passed in flight: they came after "
+        f"the one that made a block due, and before it took effect ({summary['reaction_s']:g} s of capture time at "
+        f"most); {_count(int(summary['most_in_flight']), 'packet')} of all senders at most were on their way then. "
     )
 
 

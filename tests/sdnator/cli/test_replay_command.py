@@ -7,6 +7,7 @@ import pytest
 from sdnator.cli import replay_command
 from sdnator.cli.replay_command import ReplayRequest, check_switch, options_of, show
 from sdnator.errors import BadInput
+from sdnator.replay.loop import ReplayOptions
 
 FOUND = {
     "packets_in": 76_000,
@@ -46,6 +47,10 @@ def request(**changes):
         ({"pace": "fast"}, "--pace fast: give max, or a multiple of real time"),
         ({"pace": "0x"}, "--pace 0x: give max"),
         ({"pace": "nan"}, "--pace nan: give max"),
+        ({"reaction": 0.0}, "--reaction 0: give 0.001 to 60 capture seconds"),
+        ({"reaction": 61.0}, "--reaction 61: give 0.001 to 60 capture seconds"),
+        ({"reaction": float("nan")}, "--reaction nan: give 0.001 to 60 capture seconds"),
+        ({"reproducible": True, "window": 15}, "--window 15: with --reproducible give at least 16"),
         ({"telemetry": "netflow"}, "--telemetry netflow: give packet-in or digest"),
         ({"switch": "somewhere"}, "--switch somewhere: give embedded, bmv2 or HOST:PORT, or unix:/PATH"),
         ({"switch": ":9559"}, "--switch :9559: give embedded, bmv2 or HOST:PORT, or unix:/PATH"),
@@ -75,6 +80,12 @@ def test_bmv2_is_refused_where_it_cannot_run(monkeypatch, installed, user, words
 def test_any_p4runtime_switch_will_do_with_a_way_into_it():
     options = options_of(request(switch="192.0.2.1:9559", insecure=True, inject="veth0", pace="10x"))
     assert (options.switch, options.inject, options.pace) == ("192.0.2.1:9559", "veth0", 10.0)
+
+
+def test_reaction_time_is_capture_time():
+    options = options_of(request(reaction=1.5, reproducible=True, window=16))
+    assert (options.reaction_ns, options.reproducible) == (1_500_000_000, True)
+    assert options_of(request()).reaction_ns == ReplayOptions.reaction_ns
 
 
 def test_training_is_shared_between_both_phases_unless_both_are_given():

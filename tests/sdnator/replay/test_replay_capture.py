@@ -25,6 +25,7 @@ def capture(tmp_path_factory):
         ({"pace": 0.0}, "pace=0.0"),
         ({"pace": float("nan")}, "pace=nan"),
         ({"telemetry": "sflow"}, "packet-in"),
+        ({"reaction": 0.0}, "reaction=0.0: give 0.001 to 60"),
         ({"train": 10_000_000}, "packets, but training alone needs 10,000,001"),
     ],
 )

@@ -93,3 +93,13 @@ def test_figures_and_tiles():
         "8.5",
     ):
         assert text in page
+
+
+def test_caption_says_what_passed_in_flight():
+    """Where something was blocked."""
+    block = dict.fromkeys(BLOCK, "x") | {"packet": 3}
+    summary = {"blocks": [block], "passed_in_flight": 36, "most_in_flight": 1_075, "reaction_s": 0.5}
+    page = _page(summary=summary)
+    assert "36 packets of blocked senders passed in flight" in page
+    assert "(0.5 s of capture time at most); 1,075 packets of all senders at most" in page
+    assert "in flight:" not in _page(summary=summary | {"blocks": []})
