@@ -219,6 +219,7 @@ class ReplayPass:
         watch: indices of packets whose time of sending matters.
         dry_run: an earlier pass of the same capture without mitigation, if there was one.
         foresees: whether the dry run may foretell what happens behind the first block.
+        gives_up: end it with the first decision that was overtaken: it will be made again.
     """
 
     def __init__(
@@ -230,8 +231,10 @@ class ReplayPass:
         watch: frozenset[int],
         dry_run: PassResult | None = None,
         foresees: bool = True,
+        gives_up: bool = False,
     ) -> None:
         self._survey = survey
+        self._gives_up = gives_up
         self._options = options
         self._watch = watch
         flight = PacketAccounting(
@@ -338,7 +341,7 @@ class ReplayPass:
         flight = self._result.flight
         begun = time.monotonic()
         with CaptureBlocks(self._survey.path, self._survey.frames()) as capture:
-            while flight.sent < self._survey.packets:
+            while flight.sent < self._survey.packets and not (self._gives_up and self._result.overtaken):
                 room = self._wait_for_room(pipeline, engine, feed, progress)
                 block = capture.take(self._keep_pace(pipeline, progress, begun, min(room, CHUNK)))
                 self._look(pipeline, progress)

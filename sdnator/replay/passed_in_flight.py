@@ -62,12 +62,15 @@ class InFlight:
 
 def _sent_by(survey: Survey, target: Target) -> NDArray[np.bool_]:
     """Which packets come from a block's target."""
+    found: NDArray[np.bool_]
     if target.kind == "mac":
-        return survey.eth_src == np.uint64(int(target.address.replace(":", ""), 16))
+        found = survey.eth_src == np.uint64(int(target.address.replace(":", ""), 16))
+        return found
     network = ipaddress.ip_network(target.address)
     if network.version == 4:
         mask = np.uint32(int(network.netmask))
-        return (survey.ipv4_src & mask) == np.uint32(int(network.network_address))
+        found = (survey.ipv4_src & mask) == np.uint32(int(network.network_address))
+        return found
     return _sent_by_ipv6(survey, int(network.network_address), int(network.netmask))
 
 

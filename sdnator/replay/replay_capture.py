@@ -103,7 +103,9 @@ def replay_capture(
     if telemetry not in (None, "packet-in", "digest"):
         raise BadInput(f'telemetry={telemetry!r}: give None, "packet-in" or "digest"')
     if not LEAST_REACTION_S <= reaction <= MOST_REACTION_S:
-        raise BadInput(f"reaction={reaction}: give {LEAST_REACTION_S:g} to {MOST_REACTION_S:g} capture seconds")
+        raise BadInput(
+            f"reaction={reaction}: give {LEAST_REACTION_S:g} to {MOST_REACTION_S:g} capture seconds"
+        )
     if report is not None:
         check_folder(report)
     options = ReplayOptions(

@@ -108,10 +108,21 @@ def run(
         watch = frozenset({int(np.argmax(labels.attack))})
 
     def one_pass(
-        title: str, *, mitigating: bool, seen: PassResult | None = None, foresees: bool = False
+        title: str,
+        *,
+        mitigating: bool,
+        seen: PassResult | None = None,
+        foresees: bool = False,
+        gives_up: bool = False,
     ) -> PassResult:
         replay = ReplayPass(
-            surveyed, options, mitigate=mitigating, watch=watch, dry_run=seen, foresees=foresees
+            surveyed,
+            options,
+            mitigate=mitigating,
+            watch=watch,
+            dry_run=seen,
+            foresees=foresees,
+            gives_up=gives_up,
         )
         return replay.run(progress(title) if progress is not None else None)
 
@@ -122,12 +133,13 @@ def run(
     trusts = _trusts(dry_run, options) if mitigate else []
     for place, (seen, foresees) in enumerate(trusts):
         title = "with blocking" if not place else f"again, {place + 1}"
-        blocking = one_pass(title, mitigating=True, seen=seen, foresees=foresees)
-        if not blocking.overtaken or place + 1 == len(trusts):
+        is_last = place + 1 == len(trusts)
+        blocking = one_pass(title, mitigating=True, seen=seen, foresees=foresees, gives_up=not is_last)
+        if is_last or not blocking.overtaken:
             break
         notes.append(
-            f"the dry run foretold wrongly where nothing is decided, and {counted(blocking.overtaken, 'decision')} took "
-            "effect late: the pass with blocking was made again, and held packets back more often"
+            f"the dry run foretold wrongly where nothing is decided, and {counted(blocking.overtaken, 'decision')} would "
+            "have taken effect late: the pass with blocking was made again, and held packets back more often"
         )
         discarded.append(blocking)
         _set_aside(options)

@@ -16,6 +16,7 @@ FOUND = {
     "packets_scored": 75_000,
     "training_packets": 55_001,
     "packets_dropped": 900,
+    "passed_in_flight": 36,
     "packets_not_copied": 100,
     "packets_lost": 0,
     "alerts": 7,

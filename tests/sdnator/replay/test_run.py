@@ -25,8 +25,9 @@ def passes(monkeypatch):
     made = []
 
     class Pass:
-        def __init__(self, survey, options, *, mitigate, watch, dry_run, foresees):
+        def __init__(self, survey, options, *, mitigate, watch, dry_run, foresees, gives_up):
             del watch
+            assert gives_up == (mitigate and dry_run is not None)
             self.result = PassResult(PacketAccounting(survey.packets), mitigate)
             late = {OVERTAKEN: foresees, OVERTAKEN_EARLY: dry_run is not None}
             self.result.overtaken = int(mitigate and late.get(options.fm_grace, False))
