@@ -229,7 +229,7 @@ def replay(
     reaction: Annotated[
         float,
         typer.Option(
-            help="Capture seconds from the packet that makes a block due until it drops packets.",
+            help="Most capture seconds from the packet that makes a block due to the first that it drops.",
             min=0.001,
             max=60.0,
             metavar="SECONDS",

@@ -117,6 +117,7 @@ def test_summary_of_a_labelled_replay_with_its_blocks(capsys):
     told = " ".join(capsys.readouterr().out.split())
     assert "1.2 s of capture time after the first attack packet" in told
     assert "900 of 950 attack packets after the first block" in told
+    assert "36 of blocked senders, before their block took effect" in told
     assert "0.9877 (Kitsune alone)" in told
     assert "blocked 02:00:00:00:00:01 at packet 56,000 (block[s1]) score 9.1" in told
     assert told.endswith("report: out/index.html")
