@@ -26,7 +26,7 @@ EVIDENCE_AFTER_NS: Final = 1_000_000_000
 COUNTED_NS: Final = 75_000_000_000
 """And before the end of a block: whether it is extended depends on the drops of its last minute."""
 HOLD_NS: Final = 5_000_000_000
-"""How long the first sign that was not foretold holds a pass back."""
+"""How long a sign that was not foretold holds a pass back; a decision that comes nevertheless makes it worthless."""
 STOPPING: Final = ("block", "meter")
 """Actions of decisions that drop packets."""
 ENDING: Final = ("unblock", "unmeter")
@@ -113,7 +113,6 @@ class QuietStretches:
         self._decided: list[int] = []
         self._over = False
         self._surprised = False
-        self._hold_ns = HOLD_NS
         self._held_until = -1
         self._begins, self._ends = self._spans()
 
@@ -136,8 +135,7 @@ class QuietStretches:
             return index
         if self._surprised:
             self._surprised = False
-            self._held_until = int(self._time_ns[index]) + self._hold_ns
-            self._hold_ns *= 2
+            self._held_until = int(self._time_ns[index]) + HOLD_NS
         limit = min(index + _SLICE, len(self._time_ns) if self._decided else self._behind)
         loud = self._is_loud(self._time_ns[index:limit])
         return index + int(loud.argmax()) if loud.any() else limit
