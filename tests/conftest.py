@@ -1,6 +1,7 @@
 """Fixtures for all tests, how workers share them, and the promise that the suite leaves no process behind."""
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,10 @@ WHOLE_PIPELINES = ("tests/end_to_end/", "tests/test_docs.py")
 """Each of these tests keeps both cores of a small machine busy with processes, and some of them measure."""
 ONE_SWITCH = "tests/p4/"
 """These files share a compiled switch."""
+
+# container images set it: then each of the many hundred processes that tests start would compile the product again
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 if not IN_CI:  # there hypothesis is patient of itself, and tries the same examples each time
