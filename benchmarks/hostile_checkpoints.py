@@ -22,7 +22,7 @@ from benchmarks.hostile_target import DecoderTarget
 from due import RecordBatch
 
 SANITIZED = True
-_LEDGERS = ("afterimage", "behaviour", "senders", "victims")
+_TRACKERS = ("afterimage", "behaviour", "senders", "victims")
 _SETTINGS = DetectorSettings(
     fm_grace=100,
     ad_grace=200,
@@ -88,19 +88,19 @@ def _whole(data: bytes) -> None:
 
 
 def _state(data: bytes) -> None:
-    """The first byte says of which dump and which ledger, the others are its state."""
+    """The first byte says of which dump and which tracker, the others are its state."""
     if not data:
         return
-    header, arrays = _unpacked()[data[0] // len(_LEDGERS) % len(_STAGES)]
-    name = _LEDGERS[data[0] % len(_LEDGERS)]
+    header, arrays = _unpacked()[data[0] // len(_TRACKERS) % len(_STAGES)]
+    name = _TRACKERS[data[0] % len(_TRACKERS)]
     _whole(pack(MARK, VERSION, header, {**arrays, name: np.frombuffer(data[1:], np.uint8)}))
 
 
 def _states() -> tuple[bytes, ...]:
     return tuple(
-        bytes([stage * len(_LEDGERS) + number]) + arrays[name].tobytes()
+        bytes([stage * len(_TRACKERS) + number]) + arrays[name].tobytes()
         for stage, (_, arrays) in enumerate(_unpacked())
-        for number, name in enumerate(_LEDGERS)
+        for number, name in enumerate(_TRACKERS)
     )
 
 

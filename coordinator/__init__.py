@@ -4,7 +4,7 @@ registrations, heartbeats ─► service ─► admission ─► registry ─►
                                 │                       │ ▲
                                 │                       │ └─ matching, selection, sharding
                                 │                       └──► views ─► api, metrics   checkpoint, events ─► archive
-                                └── leadership: of several Coordinators one is active
+                                └── active_standby: of several Coordinators one is active
 
 `service`, `api`, `checkpoint`, `readers` and `retention` do the I/O.  All state is soft: it is rebuilt from heartbeats
 and the newest checkpoint while data keeps flowing.

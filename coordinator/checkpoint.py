@@ -1,6 +1,6 @@
 """What a Coordinator archives for its successor: the instances, which were active, and the epochs.
 
-    leading ──changes──► due.checkpoint.coordinator ──► archive ──newest──► the next Coordinator
+    active ──changes──► due.checkpoint.coordinator ──► archive ──newest──► the next Coordinator
 
 It is only a hint: a remembered instance counts from its first heartbeat, which then need not be
 answered with a question; the former active instance is preferred if it is alive; epochs never fall. The newest is the

@@ -37,9 +37,9 @@ class _Snapshot(Collector):
     def collect(self) -> Iterator[Metric]:
         """The families."""
         yield GaugeMetricFamily(
-            "sdnator_coordinator_leading",
+            "sdnator_coordinator_active",
             "1 if this Coordinator is the active one",
-            value=float(self._health["leading"]),
+            value=float(self._health["active"]),
         )
         for name, text in _COUNTERS.items():
             yield CounterMetricFamily(f"sdnator_coordinator_{name}", text, value=float(self._health[name]))

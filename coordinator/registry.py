@@ -151,7 +151,7 @@ class Registry:
         version: int = 1,
     ) -> None:
         self.coordinator = coordinator
-        self.leading = False
+        self.active = False
         self.matched = Matched()
         self.failovers = 0
         self.changes = 0
@@ -167,7 +167,7 @@ class Registry:
         self._version = version
         self._heard: float | None = None
         self._looked: float | None = None
-        self._led_since: float | None = None
+        self._active_since: float | None = None
         self._dirty = False
         self._answers: dict[str, None] = {}
         self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
@@ -188,7 +188,7 @@ class Registry:
                 self._note("returned", message.app_id, message.instance_id)
             known.registration, known.seen, known.gone = message, now, None
         self._dirty = True
-        if self.leading:
+        if self.active:
             self._answer(message.app_id)
 
     def beat(self, message: Heartbeat, now: float) -> None:
@@ -219,7 +219,7 @@ class Registry:
         claims = (number for number in (message.version, *message.held.values()) if number <= _MOST_CLAIMED)
         self._version = max(self._version, *claims, 0)
         app.unsettled = True
-        if self.leading and (app.sent is None or app.sent.version != message.version):
+        if self.active and (app.sent is None or app.sent.version != message.version):
             self._answer(message.app_id)
 
     def recall(self, checkpoint: Checkpoint) -> None:
@@ -253,23 +253,23 @@ class Registry:
             if not app.instances and name not in self._answers:
                 self._remember_epoch(name, app.epoch)
                 del self._apps[name]
-        if self.leading and self._led_since is None:
-            self._led_since = now
+        if self.active and self._active_since is None:
+            self._active_since = now
 
-    def lead(self) -> None:
-        """This Coordinator leads from now on; active instances stay active."""
-        self.leading = True
+    def activate(self) -> None:
+        """This Coordinator is active from now on; active instances stay active."""
+        self.active = True
         for name, app in self._apps.items():
             if app.active:
-                # known from when this Coordinator led before; what a heartbeat says comes first
+                # known from when this Coordinator was active before; what a heartbeat says comes first
                 self._preferred[name] = app.active
             app.active = ""
         self._dirty = True
 
-    def follow(self) -> None:
-        """Another Coordinator leads: only listen."""
-        self.leading = False
-        self._led_since = None
+    def stand_by(self) -> None:
+        """This Coordinator is a standby: only listen."""
+        self.active = False
+        self._active_since = None
         for app in self._apps.values():
             app.shards = ShardTable()
 
@@ -277,10 +277,10 @@ class Registry:
 
     def outgoing(self) -> list[Assignments]:
         """Assignments to send now: answers, and changes since the last call."""
-        for app in self._apps.values() if self.leading else ():
+        for app in self._apps.values() if self.active else ():
             # before anything is said: what an instance has and is not told of, it takes for withdrawn
             self._settle_shards(app)
-        if self._dirty and self.leading:
+        if self._dirty and self.active:
             self._dirty = False
             self.changes += 1
             self._elect()
@@ -289,7 +289,7 @@ class Registry:
         for name in self._answers:
             app = self._app(name)
             messages.append(
-                app.sent if self.leading and app.sent is not None else self._question(name, app.epoch)
+                app.sent if self.active and app.sent is not None else self._question(name, app.epoch)
             )
         self._answers.clear()
         return messages
@@ -416,10 +416,10 @@ class Registry:
         """Divide the shards of a sharded app among its instances."""
         if not app.unsettled or not app.sharded:
             return
-        now, since = self._looked, self._led_since
-        leading_s = now - since if now is not None and since is not None else 0.0
+        now, since = self._looked, self._active_since
+        active_s = now - since if now is not None and since is not None else 0.0
         members = {one.registration.instance_id: one.beat for one in app.alive if one.beat is not None}
-        unheard = len(members) < len(app.alive) or leading_s < max(map(self._timeout, app.alive))
+        unheard = len(members) < len(app.alive) or active_s < max(map(self._timeout, app.alive))
         app.unsettled = unheard
         if app.shards.settle(members, self._version + 1, unknown=unheard):
             self._dirty = True

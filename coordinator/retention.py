@@ -1,4 +1,4 @@
-"""Keeping the archive within an age and a size: the leading Coordinator prunes it now and then."""
+"""Keeping the archive within an age and a size: the active Coordinator prunes it now and then."""
 
 import logging
 import threading

@@ -1,7 +1,7 @@
 """The Coordinator: registers apps, matches interests with capabilities, and assigns rates.
 
     due.registration.*, due.heartbeat.* ──► Registry ──► due.assignment.<app>
-    due.leader.coordinator ◄──────────────► Leadership
+    due.leader.coordinator ◄──────────────► ActiveStandby
     HTTP on loopback ──► api.py ──► views of the registry, the archive, live data
     Retention ──► Data Archives, where a limit of age or size is set
     Checkpoints ◄──► Data Archives: what the next Coordinator may know from its start
@@ -19,10 +19,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from coordinator.active_standby import ActiveStandby, Claim
 from coordinator.admission import Admission
 from coordinator.api import Api, Northbound
 from coordinator.checkpoint import Checkpoints
-from coordinator.leadership import Claim, Leadership
 from coordinator.readers import ArchiveReaders
 from coordinator.registry import Checkpoint, Registry
 from coordinator.retention import Retention
@@ -46,7 +46,8 @@ INTERESTS = (
 CAPABILITIES = (Capability("due.event.coordinator", archive="always", index=True),)
 
 EVENTS = "due.event.coordinator"
-_LEADER = "due.leader.coordinator"
+_CLAIM = "due.leader.coordinator"
+"""The name that version 0.1 gave it: during an upgrade, Coordinators of both versions hear each other."""
 _HEALTH_BYTES = 256 << 10
 
 log = logging.getLogger("coordinator")
@@ -77,7 +78,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """An instance is unresponsive after this many missed heartbeats."""
     forget_s: float = 300.0
     """Seconds after which an instance that has ended is no longer listed."""
-    leader_interval_s: float = 0.2
+    announce_interval_s: float = 0.2
     """Seconds between announcements; an active Coordinator silent for three of them is replaced."""
 
     retain_s: float = 0.0
@@ -111,8 +112,8 @@ class CoordinatorService:
             version=started // 1_000_000,
         )
         self._admission = Admission(self._registry)
-        self._leadership = Leadership(
-            engine.instance_id, started, time.monotonic(), interval=settings.leader_interval_s
+        self._standing = ActiveStandby(
+            engine.instance_id, started, time.monotonic(), interval=settings.announce_interval_s
         )
         self._judge_from = 0.0
         counts = ("registrations", "heartbeats", "misunderstood", "assignments_sent", "health_refused")
@@ -122,7 +123,7 @@ class CoordinatorService:
         self._checkpoints = Checkpoints(engine)
         self._retention = Retention(
             lambda: open_archive(default_archive(engine.options)),
-            lambda: self._leadership.leading,
+            lambda: self._standing.active,
             age_s=settings.retain_s,
             max_bytes=settings.retain_bytes,
             every_s=settings.retain_every_s,
@@ -133,7 +134,7 @@ class CoordinatorService:
         for key, handler in (
             (f"{REGISTRATION}.*", self._registered),
             (f"{HEARTBEAT}.*", self._beat),
-            (_LEADER, self._claimed),
+            (_CLAIM, self._claimed),
             ("due.health.*", self._healthy),
         ):
             self._engine.observe(key).subscribe(handler)
@@ -157,30 +158,30 @@ class CoordinatorService:
             self._judge_from = now + LONGEST_S
             return
         with self._lock:
-            led = self._leadership.leading
-            claim = self._leadership.tick(now)
+            was_active = self._standing.active
+            claim = self._standing.tick(now)
             if now >= self._judge_from:
                 self._registry.expire(now)
-            self._obey(led)
+            self._obey(was_active)
             messages = self._registry.outgoing()
-            leading = self._leadership.leading
-            # wait while nobody leads: the future leader writes them, and the others would repeat them
-            events = self._registry.events() if leading or self._leadership.leader else []
+            active = self._standing.active
+            # wait while none is active: the next active one writes them, and the others would repeat them
+            events = self._registry.events() if active or self._standing.active_instance else []
         if claim is not None:
-            self._write(_LEADER, msgspec.to_builtins(claim))
+            self._write(_CLAIM, msgspec.to_builtins(claim))
         for message in messages:
             self._write(f"{ASSIGNMENT}.{message.app_id}", message.to_value())
         self._counts["assignments_sent"] += len(messages)
-        for event in events if leading else ():
+        for event in events if active else ():
             log.info("%s %s %s %s", event.app_id, event.instance_id, event.kind, event.detail)
             self._engine.write(EVENTS, event.to_value())
-        if leading:
+        if active:
             self._checkpoints.write(self._registry.changes, self._checkpoint, now)
 
     def stop(self) -> None:
-        """Stop serving; a last announcement lets another Coordinator lead at once."""
-        if self._leadership.leading:
-            self._write(_LEADER, msgspec.to_builtins(self._leadership.resigned()))
+        """Stop serving; a last announcement lets another Coordinator take over at once."""
+        if self._standing.active:
+            self._write(_CLAIM, msgspec.to_builtins(self._standing.resigned()))
         if self._api is not None:
             self._api.stop()
         self._retention.stop()
@@ -192,8 +193,8 @@ class CoordinatorService:
             for _, state in self._registry.instances():
                 states[state.value] = states.get(state.value, 0) + 1
             return {
-                "leading": self._leadership.leading,
-                "leader": self._leadership.leader,
+                "active": self._standing.active,
+                "active_instance": self._standing.active_instance,
                 "instances": states,
                 "failovers": self._registry.failovers,
                 "http": self._api.url if self._api is not None else "",
@@ -237,17 +238,17 @@ class CoordinatorService:
         if self._settings.address_file:
             write_private(Path(self._settings.address_file), self._api.url_with_token)
 
-    def _obey(self, led: bool) -> None:
-        """Apply a change of leadership to the registry."""
-        leading = self._leadership.leading
-        if leading and not self._registry.leading:
+    def _obey(self, was_active: bool) -> None:
+        """Tell the registry whether this Coordinator is active."""
+        active = self._standing.active
+        if active and not self._registry.active:
             log.info("this Coordinator is active")
-            self._registry.lead()
-        elif not leading and self._registry.leading:
-            self._registry.follow()
-        if led and not leading:
-            leader = self._leadership.leader or "not yet known"
-            log.warning("another Coordinator (%s) is active: this one is a standby", leader)
+            self._registry.activate()
+        elif not active and self._registry.active:
+            self._registry.stand_by()
+        if was_active and not active:
+            other = self._standing.active_instance or "not yet known"
+            log.warning("another Coordinator (%s) is active: this one is a standby", other)
 
     def _recall(self, checkpoint: Checkpoint) -> None:
         with self._lock:
@@ -278,12 +279,13 @@ class CoordinatorService:
         if claim is None:
             return
         with self._lock:
-            leader, led = self._leadership.leader, self._leadership.leading
-            self._leadership.heard(claim, time.monotonic())
-            self._obey(led)
-            if self._leadership.leader != leader and not led:
+            known, was_active = self._standing.active_instance, self._standing.active
+            self._standing.heard(claim, time.monotonic())
+            self._obey(was_active)
+            if self._standing.active_instance != known and not was_active:
                 log.warning(
-                    "another Coordinator (%s) is active: this one is a standby", self._leadership.leader
+                    "another Coordinator (%s) is active: this one is a standby",
+                    self._standing.active_instance,
                 )
 
     def _healthy(self, item: Item) -> None:

@@ -1,6 +1,7 @@
 """Fixtures for all tests, how workers share them, and the promise that the suite leaves no process behind."""
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,21 @@ WHOLE_PIPELINES = ("tests/end_to_end/", "tests/test_docs.py")
 """Each of these tests keeps both cores of a small machine busy with processes, and some of them measure."""
 ONE_SWITCH = "tests/p4/"
 """These files share a compiled switch."""
+LONG = (
+    "tests/apps/sonata_adapter/test_spark_cluster.py",
+    "tests/apps/sonata_adapter/test_alone.py",
+    "tests/apps/enforcers/test_contract.py",
+    "tests/due/faults/",
+    "tests/benchmarks/test_cluster_bridge.py",
+    "tests/examples/test_flow_exporters.py",
+    "tests/examples/test_manufacturing_kills.py",
+    "tests/test_wheel.py",
+)
+"""Half a minute or more each: begun early, so that no worker is left alone with one in the end."""
+
+# container images set it: then each of the many hundred processes that tests start would compile the product again
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 if not IN_CI:  # there hypothesis is patient of itself, and tries the same examples each time
@@ -22,9 +38,11 @@ if not IN_CI:  # there hypothesis is patient of itself, and tries the same examp
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The longest piece first: one worker is busy with it while the others take all the rest."""
+    """The longest piece first: one worker is busy with it while the others take all the rest, long files first."""
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_PIPELINES))
+        items.sort(
+            key=lambda item: (not item.nodeid.startswith(WHOLE_PIPELINES), not item.nodeid.startswith(LONG))
+        )
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -170,7 +170,7 @@ def exported():
     """Names of all metrics that the Coordinator's API, the engine and each app export."""
     told = (*coordinator_metrics._COUNTERS, *coordinator_metrics._SIZES)
     registry, counters = Registry("here"), dict.fromkeys(told, 0)
-    text, _ = coordinator_metrics.render(registry, {"leading": True, **counters}, 0.0)
+    text, _ = coordinator_metrics.render(registry, {"active": True, **counters}, 0.0)
     names = set(re.findall(r"^# TYPE (\S+)", text.decode(), re.MULTILINE))
     names |= {f"{name}_total" for name in names}
     names |= set(re.findall(r"^# TYPE (\S+)", part_metrics((), {}), re.MULTILINE))

@@ -1,6 +1,6 @@
 """A detector as bytes, and back: whatever packets follow, scores, alerts and evidence are those it would have given.
 
-    Detector ──► kernel: statistics and ledgers │ network as in a model file │ what Python keeps ──► packed arrays
+    Detector ──► kernel: statistics and trackers │ network as in a model file │ what Python keeps ──► packed arrays
 
 At any point of a stream: while the feature map is learnt, while the autoencoders train, afterwards.  Blocks in force are
 no part of it: the firewall says which there are.  A checkpoint belongs to the settings under which it was made, and to
@@ -19,8 +19,8 @@ from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.detector_parts import parts
 from apps.kitsune.drift import Drift, DriftReading
 from apps.kitsune.kernel import Kernel
+from apps.kitsune.kernel_rows import SwitchNumbers
 from apps.kitsune.kitnet import KitNet
-from apps.kitsune.ledger import SwitchNumbers
 from apps.kitsune.model_file import network_arrays, network_header, network_in
 from apps.kitsune.packed_arrays import CheckpointError, pack, unpack
 from apps.kitsune.plain_values import SubjectName, built, plain, read, restore
@@ -34,7 +34,7 @@ _DEPENDS_ON: Final = (
     "calibration_packets",
 )
 """Settings that a checkpoint belongs to."""
-_LEDGERS: Final = ("afterimage", "senders", "behaviour", "victims")
+_TRACKERS: Final = ("afterimage", "senders", "behaviour", "victims")
 _MAPPER: Final = ("_sum", "_residual", "_squares", "_products")
 _MOST_SWITCHES: Final = 65_535
 _ROLES: Final = ("dns", "dhcp", "multicast")
@@ -53,7 +53,7 @@ def dump(detector: Detector, beside: Any = None) -> bytes:
         At most as long as the settings' limits of streams and links allow.
     """
     network = detector.model
-    arrays: dict[str, npt.NDArray[Any]] = {name: _dumped(detector, name) for name in _LEDGERS}
+    arrays: dict[str, npt.NDArray[Any]] = {name: _dumped(detector, name) for name in _TRACKERS}
     arrays |= network_arrays(network)
     if not network.feature_map:
         arrays |= {f"mapper{name}": getattr(network._mapper, name) for name in _MAPPER}
@@ -125,12 +125,12 @@ def _check_settings(found: dict[str, Any], settings: DetectorSettings) -> None:
 
 
 def _handles(detector: Detector) -> dict[str, tuple[Any, Any]]:
-    """By ledger its library and its state in C."""
+    """By tracker its library and its state in C."""
     engine = detector.afterimage._engine
     found = {"afterimage": (engine._kernel.lib, engine._state)}
-    for name in _LEDGERS[1:]:
-        ledger = getattr(detector, name)
-        found[name] = (ledger._kernel.lib, ledger._state)
+    for name in _TRACKERS[1:]:
+        tracker = getattr(detector, name)
+        found[name] = (tracker._kernel.lib, tracker._state)
     return found
 
 
@@ -162,7 +162,7 @@ def _restore_kernel(
 
 
 def _renumber(detector: Detector) -> int:
-    """Make the numbers of switches those of the checkpoint; returns how many both ledgers know."""
+    """Make the numbers of switches those of the checkpoint; returns how many both trackers know."""
     known = []
     for numbers in (detector.senders._switches, detector.behaviour._switches):
         _check_names(numbers)

@@ -21,8 +21,8 @@ from apps.kitsune.behaviour.rows import parts_of
 from apps.kitsune.drift import BLOCK_S, TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
 from apps.kitsune.evidence import evidence_of
 from apps.kitsune.kernel import Columns, Kernel, load_kernel
+from apps.kitsune.kernel_rows import KernelRows, RowRoom
 from apps.kitsune.kitnet import KitNet
-from apps.kitsune.ledger import KernelRows, RowRoom
 from apps.kitsune.model_file import Model, NotAModelError, save_model
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.reasons import Explanation, explanations, reason

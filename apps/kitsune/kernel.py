@@ -1,4 +1,4 @@
-"""Loads the C kernel: features, autoencoders and ledgers of packets."""
+"""Loads the C kernel: features, autoencoders and trackers of packets."""
 
 import functools
 from collections.abc import Mapping
@@ -55,9 +55,9 @@ ROW_FIELDS: Final[tuple[tuple[str, str, str], ...]] = (
     ("tcp_flags", "uint8_t", "u1"),
     ("icmp6_type", "int32_t", "i4"),
 )
-"""Columns that the ledgers read, in the order of `PacketRows` in C, which begins with those of `Columns`."""
+"""Columns that the trackers read, in the order of `PacketRows` in C, which begins with those of `Columns`."""
 
-_LEDGERS: Final = (
+_TRACKERS: Final = (
     "typedef struct {"
     + "".join(f"const {c_type} *{name};" for name, c_type, _ in ROW_FIELDS)
     + """} PacketRows;
@@ -214,7 +214,7 @@ def load_kernel(path: Path = _LIBRARY) -> Kernel:
         KernelMissing: it cannot be loaded.
     """
     ffi = cffi.FFI()
-    ffi.cdef(_DECLARATIONS + _LEDGERS + _DUMPS)
+    ffi.cdef(_DECLARATIONS + _TRACKERS + _DUMPS)
     try:
         lib: Any = ffi.dlopen(str(path))
         if lib.kitsune_kernel_version() == VERSION:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from apps.kitsune.blocked import Blocked
 from apps.kitsune.kernel import Columns, Kernel, load_kernel
-from apps.kitsune.ledger import SwitchNumbers, check, rows_of, seed
+from apps.kitsune.kernel_rows import SwitchNumbers, check, rows_of, seed
 from apps.kitsune.roles import Roles
 
 ANOMALOUS_PACKETS: Final = 3

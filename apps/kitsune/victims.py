@@ -15,7 +15,7 @@ import numpy as np
 from apps.evidence import MOST_USUAL
 from apps.kitsune.behaviour.rows import address_of, parts_of
 from apps.kitsune.kernel import Columns, Kernel, load_kernel
-from apps.kitsune.ledger import check, rows_of, seed
+from apps.kitsune.kernel_rows import check, rows_of, seed
 
 MOST_KINDS: Final = 65_536
 """Pairs of host and kind that are remembered of training, and within a second."""

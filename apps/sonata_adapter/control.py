@@ -75,7 +75,7 @@ class _Lane:
         """Packets by stream."""
 
 
-class _Station:
+class _SwitchState:
     """The state kept for one switch."""
 
     def __init__(self, name: str, engine: Callable[[], WindowEngine], base_us: int) -> None:
@@ -118,7 +118,7 @@ class Control:
         self._engine = partial(engine, limit=keys_limit, lateness_us=lateness_us)
         # what comes through a gate is little
         self._gate_engine = partial(HostEngine, limit=keys_limit, lateness_us=lateness_us)
-        self._stations: dict[str, _Station] = {}
+        self._switches: dict[str, _SwitchState] = {}
         self._refinement = Refinement()
         self._moves = Moves()
         self._rates = MeasuredRates()
@@ -167,8 +167,8 @@ class Control:
     @property
     def now_us(self) -> int | None:
         """Capture time reached by the switches' clocks and packets."""
-        heard = [station.clock.heard_us for station in self._stations.values()]
-        heard += [lane.host.watermark_us for station in self._stations.values() for lane in station.lanes]
+        heard = [state.clock.heard_us for state in self._switches.values()]
+        heard += [lane.host.watermark_us for state in self._switches.values() for lane in state.lanes]
         return max((each for each in heard if each is not None), default=None)
 
     def want(self, keys: Iterable[str], own: Iterable[QueryRequest] = ()) -> ControllerUpdates:
@@ -186,10 +186,10 @@ class Control:
     def refine(self) -> ControllerUpdates | None:
         """Changes because prefixes crossed the threshold or no longer do; None: no changes."""
         crossed: dict[str, set[str]] = {}
-        for station in self._stations.values():
-            for identity, report in station.reports.items():
+        for state in self._switches.values():
+            for identity, report in state.reports.items():
                 if isinstance(report, Crossings):
-                    crossed.setdefault(identity, set()).update(report.crossed(station.clock.heard_us))
+                    crossed.setdefault(identity, set()).update(report.crossed(state.clock.heard_us))
         return self._planned() if self._refinement.note(crossed) else None
 
     def measured(self, switch: str, counters: Mapping[int, int], now_us: int) -> None:
@@ -227,27 +227,27 @@ class Control:
 
     def _count_copies(self) -> None:
         self._rates.keep(map(stream, (*self.plan.entries, *(copy.bit for copy in self.plan.copies))))
-        for station in self._stations.values():
-            now_us = station.clock.heard_us
+        for state in self._switches.values():
+            now_us = state.clock.heard_us
             for copy in self.plan.copies if now_us is not None else ():
-                lane = station.frames if copy.payload else station.headers
+                lane = state.frames if copy.payload else state.headers
                 packets = lane.brought.get(stream(copy.bit), 0)
-                self._rates.note(station.name, stream(copy.bit), copy.match, packets, now_us or 0)
+                self._rates.note(state.name, stream(copy.bit), copy.match, packets, now_us or 0)
 
     def _since_zero(self) -> dict[str, int | None]:
         """For each switch the capture time since its clock zero."""
         return {
-            name: None if station.clock.heard_us is None else station.clock.heard_us - station.base_us
-            for name, station in self._stations.items()
+            name: None if state.clock.heard_us is None else state.clock.heard_us - state.base_us
+            for name, state in self._switches.items()
         }
 
     def _surely_us(self, request: QueryRequest, now: float) -> dict[str, int]:
         """For each switch the capture time at which a count that is asked for now will be in force."""
         found = {}
         for name, heard_us in self._since_zero().items():
-            rate = max(1.0, self._stations[name].clock.rate)
+            rate = max(1.0, self._switches[name].clock.rate)
             margin_us = max(request.query.window_us, round(_IN_FORCE_S * rate * 1e6))
-            idle_us = round(self._stations[name].clock.idle_s(now) * rate * 1e6)
+            idle_us = round(self._switches[name].clock.idle_s(now) * rate * 1e6)
             found[name] = 0 if heard_us is None else heard_us + idle_us + margin_us
         return found
 
@@ -258,39 +258,39 @@ class Control:
 
     def switch(self, name: str, base_us: int) -> bool:
         """Note a switch; returns whether it is new."""
-        new = name not in self._stations
-        station = self._station(name, base_us)
-        station.base_us = base_us
-        for lane in station.lanes:
+        new = name not in self._switches
+        state = self._switch_state(name, base_us)
+        state.base_us = base_us
+        for lane in state.lanes:
             lane.host.base_us = base_us
         return new
 
     def packets(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
         """Copied packets of one of the sources, at `now` (seconds of any clock)."""
-        station = self._station(switch)
+        state = self._switch_state(switch)
         written: list[Written] = []
-        for lane in station.lanes:
+        for lane in state.lanes:
             if name in lane.names:
                 lane.brought[name] = lane.brought.get(name, 0) + len(batch)
                 mine = with_passed(batch, passed=name == lane.opens) if lane.opens else batch
-                written += self._processed(station, lane, lane.merger.put(name, mine, now), now)
+                written += self._processed(state, lane, lane.merger.put(name, mine, now), now)
         return written
 
     def busy(self, switch: str, now: float) -> None:
         """Note that packets of a switch could not be processed until `now`, so earlier silence means nothing."""
-        for lane in self._station(switch).lanes:
+        for lane in self._switch_state(switch).lanes:
             lane.merger.busy(now)
 
     def digests(self, switch: str, name: str, batch: RecordBatch) -> list[Written]:
         """Reports of counting stages."""
-        station = self._station(switch)
+        state = self._switch_state(switch)
         bit = int(name[1:])
         written: list[Written] = []
         if len(batch):
-            station.clock.hear(int(batch["time_us"].max()))
+            state.clock.hear(int(batch["time_us"].max()))
         for found in self.plan.queries:
-            if any(entry.bit == bit for entry in found.entries) and found.identity in station.reports:
-                written += self._addressed(station, station.reports[found.identity].take(bit, batch))
+            if any(entry.bit == bit for entry in found.entries) and found.identity in state.reports:
+                written += self._addressed(state, state.reports[found.identity].take(bit, batch))
         return written
 
     def counts(self, switch: str, name: str, batch: RecordBatch, now: float) -> list[Written]:
@@ -298,21 +298,21 @@ class Control:
 
         Their times move no clock: a report that was asked for carries the time that was asked about.
         """
-        station = self._station(switch)
+        state = self._switch_state(switch)
         bit = int(name[1:])
         written: list[Written] = []
-        for identity, report in station.reports.items():
+        for identity, report in state.reports.items():
             if isinstance(report, Differences) and self.plan.of(identity).entries[0].bit == bit:
-                written += self._addressed(station, report.counted(batch, now))
+                written += self._addressed(state, report.counted(batch, now))
         return written
 
     def reads(self, now: float) -> dict[str, list[CellRead]]:
         """Requests for cells of windows that have ended, by switch."""
         found: dict[str, list[CellRead]] = {}
-        for name, station in self._stations.items():
-            station.clock.look(now)
-            for counts in station.asking:
-                found.setdefault(name, []).extend(counts.due(station.clock, now))
+        for name, state in self._switches.items():
+            state.clock.look(now)
+            for counts in state.asking:
+                found.setdefault(name, []).extend(counts.due(state.clock, now))
         return {name: reads for name, reads in found.items() if reads}
 
     def last_reads(self, now: float) -> dict[str, list[CellRead]]:
@@ -321,68 +321,68 @@ class Control:
         Call it repeatedly while `waits_for_cells`.
         """
         found = {
-            name: [read for counts in station.asking for read in counts.finish(now)]
-            for name, station in self._stations.items()
+            name: [read for counts in state.asking for read in counts.finish(now)]
+            for name, state in self._switches.items()
         }
         return {name: reads for name, reads in found.items() if reads}
 
     def waits_for_cells(self, now: float) -> bool:
         """Whether an answer is outstanding."""
-        return any(counts.waits(now) for station in self._stations.values() for counts in station.asking)
+        return any(counts.waits(now) for state in self._switches.values() for counts in state.asking)
 
     @property
     def needs_cells(self) -> bool:
         """Whether such answers are expected."""
-        return any(station.asking for station in self._stations.values())
+        return any(state.asking for state in self._switches.values())
 
     def cells(self, switch: str, numbers: Sequence[int], counts: Sequence[int]) -> list[Written]:
         """Process answers: the count for each request."""
-        station = self._station(switch)
+        state = self._switch_state(switch)
         written: list[Written] = []
         for number, counted in zip(numbers, counts, strict=True):
-            for each in station.asking:
+            for each in state.asking:
                 if each.waits_for(number):
-                    written += self._addressed(station, each.answer(number, counted, station.clock))
+                    written += self._addressed(state, each.answer(number, counted, state.clock))
         return written
 
     def tick(self, now: float) -> list[Written]:
         """Release packets and results that have waited long enough."""
         written: list[Written] = []
-        for station in self._stations.values():
-            for counts in station.asking:
-                written += self._addressed(station, counts.expire(station.clock, now))
-            for lane in station.lanes:
-                written += self._processed(station, lane, lane.merger.release(now), now)
-                heard_us = station.clock.heard_us
+        for state in self._switches.values():
+            for counts in state.asking:
+                written += self._addressed(state, counts.expire(state.clock, now))
+            for lane in state.lanes:
+                written += self._processed(state, lane, lane.merger.release(now), now)
+                heard_us = state.clock.heard_us
                 if heard_us is not None and lane.merger.is_quiet(now):
-                    written += self._addressed(station, lane.host.advance(heard_us))
+                    written += self._addressed(state, lane.host.advance(heard_us))
         return written
 
     def advance(self, switch: str, now_us: int) -> None:
         """Note that a switch's capture time has reached `now_us`, even without packets."""
-        self._station(switch).clock.hear(now_us)
+        self._switch_state(switch).clock.hear(now_us)
 
     def finish(self) -> list[Written]:
         """No more packets will come."""
         written: list[Written] = []
-        for station in self._stations.values():
-            for counts in station.asking:
-                written += self._addressed(station, counts.flush())
-            for lane in station.lanes:
-                written += self._processed(station, lane, lane.merger.flush(), None)
-                written += self._addressed(station, lane.host.finish())
+        for state in self._switches.values():
+            for counts in state.asking:
+                written += self._addressed(state, counts.flush())
+            for lane in state.lanes:
+                written += self._processed(state, lane, lane.merger.flush(), None)
+                written += self._addressed(state, lane.host.finish())
         return written
 
     def close(self) -> None:
         """Release the resources of the engines."""
-        for station in self._stations.values():
-            for lane in station.lanes:
+        for state in self._switches.values():
+            for lane in state.lanes:
                 lane.host.close()
 
     def health(self) -> dict[str, Any]:
         """Counters for people."""
-        stations = self._stations.values()
-        lanes = [lane for station in stations for lane in station.lanes]
+        states = self._switches.values()
+        lanes = [lane for state in states for lane in state.lanes]
         return {
             "queries": {
                 self._moves.owner(one.identity): "switch" if one.in_switch else f"host: {one.reason}"
@@ -396,9 +396,9 @@ class Control:
             "late": sum(lane.host.late for lane in lanes),
             "disordered": sum(lane.merger.disordered for lane in lanes),
             "without_payload": sum(lane.host.without_payload for lane in lanes),
-            "reports": sum(report.tuples for station in stations for report in station.reports.values()),
-            "late_reads": sum(each.missed for station in stations for each in station.asking),
-            "open_windows": sum(each.open for station in stations for each in station.asking),
+            "reports": sum(report.tuples for state in states for report in state.reports.values()),
+            "late_reads": sum(each.missed for state in states for each in state.asking),
+            "open_windows": sum(each.open for state in states for each in state.asking),
             "keys": sum(map(len, self._keys.values())),
             "refused": len(self._refused),
         }
@@ -420,9 +420,7 @@ class Control:
     def came(self, one: QueryPlan) -> dict[str, int]:
         """What has come from the switches for a query of the plan since it is there: totals."""
         reports = [
-            station.reports[one.identity]
-            for station in self._stations.values()
-            if one.identity in station.reports
+            state.reports[one.identity] for state in self._switches.values() if one.identity in state.reports
         ]
         reported = sum(each.tuples for each in reports)
         tuples = self._tuples(one)
@@ -439,19 +437,19 @@ class Control:
     def _tuples(self, one: QueryPlan) -> int:
         """Tuples that reached the host for a query, from all switches."""
         found = 0
-        for station in self._stations.values():
-            if one.identity in station.gated:
-                found += sum(station.gated[one.identity].brought.values())
+        for state in self._switches.values():
+            if one.identity in state.gated:
+                found += sum(state.gated[one.identity].brought.values())
                 continue
-            lane = station.frames if one.payload else station.headers
+            lane = state.frames if one.payload else state.headers
             found += sum(lane.brought.get(stream(copy.bit), 0) for copy in one.copies)
-            if one.identity in station.reports:
-                found += station.reports[one.identity].tuples
+            if one.identity in state.reports:
+                found += state.reports[one.identity].tuples
         return found
 
     def _overflow(self, one: QueryPlan) -> int:
         """Those of them that were sent because a key had no cell."""
-        reports = [station.reports.get(one.identity) for station in self._stations.values()]
+        reports = [state.reports.get(one.identity) for state in self._switches.values()]
         return sum(
             each.overflow
             for each in reports
@@ -478,17 +476,17 @@ class Control:
                 outputs.setdefault(request.identity, set()).add(request.output)
         return requests, outputs, refused
 
-    def _station(self, name: str, base_us: int = 0) -> _Station:
-        station = self._stations.get(name)
-        if station is None:
-            station = self._stations[name] = _Station(name, self._engine, base_us)
-            self._refit(station, {})
-        return station
+    def _switch_state(self, name: str, base_us: int = 0) -> _SwitchState:
+        state = self._switches.get(name)
+        if state is None:
+            state = self._switches[name] = _SwitchState(name, self._engine, base_us)
+            self._refit(state, {})
+        return state
 
     def _planned(self) -> ControllerUpdates:
         """Compute the plan again and apply it."""
         before, old = self.plan, self._requests
-        clocks = {name: station.clock.heard_us for name, station in self._stations.items()}
+        clocks = {name: state.clock.heard_us for name, state in self._switches.items()}
         self._generation = 1 + self._generation % 255
         while True:
             counts = self._refinement.planned(
@@ -505,22 +503,22 @@ class Control:
         self._outputs = {
             count: self._keys[self._moves.owner(owner)] for count, owner in counts.owners.items()
         }
-        for station in self._stations.values():
-            self._refit(station, old)
+        for state in self._switches.values():
+            self._refit(state, old)
         return ControllerUpdates(
             withdraw=withdrawn(before, self.plan),
             updates=updates(before, self.plan),
             offer=offered(before, self.plan),
         )
 
-    def _refit(self, station: _Station, old: Mapping[str, QueryRequest]) -> None:
+    def _refit(self, state: _SwitchState, old: Mapping[str, QueryRequest]) -> None:
         """Adapt a switch's operators to the plan."""
-        self._refit_gates(station)
-        for lane in (station.headers, station.frames):
+        self._refit_gates(state)
+        for lane in (state.headers, state.frames):
             mine = [
                 one
                 for one in self.plan.queries
-                if not one.in_switch and one.payload == (lane is station.frames)
+                if not one.in_switch and one.payload == (lane is state.frames)
             ]
             host = {one.identity for one in mine}
             for identity in old.keys() - host:
@@ -535,38 +533,38 @@ class Control:
         reports: dict[str, _Counts] = {}
         for one in self.plan.queries:
             if one.in_switch and one.gate is None:
-                held = station.reports.get(one.identity)
-                reports[one.identity] = held or self._new_reports(one, station)
-        station.reports = reports
+                held = state.reports.get(one.identity)
+                reports[one.identity] = held or self._new_reports(one, state)
+        state.reports = reports
 
-    def _refit_gates(self, station: _Station) -> None:
+    def _refit_gates(self, state: _SwitchState) -> None:
         gates = {one.identity: one.gate for one in self.plan.queries if one.gate is not None}
-        for identity in station.gated.keys() - gates.keys():
-            station.gated.pop(identity).host.close()
+        for identity in state.gated.keys() - gates.keys():
+            state.gated.pop(identity).host.close()
         for identity, gate in gates.items():
-            lane = station.gated.get(identity)
+            lane = state.gated.get(identity)
             query = self._requests[identity].query
             if lane is None:
-                lane = station.gated[identity] = _Lane(self._gate_engine())
-                lane.host.base_us = station.base_us
+                lane = state.gated[identity] = _Lane(self._gate_engine())
+                lane.host.base_us = state.base_us
                 lane.host.add(query)
             lane.opens = stream(gate.opens)
             lane.names = {lane.opens, stream(gate.uncounted)}
             lane.merger.expect(lane.names)
             lane.merger.hurry(patience(query.window_us))
 
-    def _new_reports(self, one: QueryPlan, station: _Station) -> _Counts:
+    def _new_reports(self, one: QueryPlan, state: _SwitchState) -> _Counts:
         request = self._requests[one.identity]
         if request.coarse:
-            return Crossings(request, base_us=station.base_us)
+            return Crossings(request, base_us=state.base_us)
         query = request.query
         kind: type[CountReportReader | RegisterReads | Differences] = CountReportReader
         if isinstance(compile_query(query), WindowTable):
             kind = Differences if one.entries[0].role == "difference" else RegisterReads
-        return kind(query, one, base_us=station.base_us, since_us=station.clock.heard_us)
+        return kind(query, one, base_us=state.base_us, since_us=state.clock.heard_us)
 
     def _processed(
-        self, station: _Station, lane: _Lane, batch: RecordBatch | None, now: float | None
+        self, state: _SwitchState, lane: _Lane, batch: RecordBatch | None, now: float | None
     ) -> list[Written]:
         """Run packets through the operators; a window closes when all streams have passed its end."""
         horizon = None if now is None else lane.merger.horizon_us(now)
@@ -575,19 +573,19 @@ class Control:
             outputs += lane.host.process(batch, horizon_us=0 if horizon is None else horizon)
         if horizon is not None:
             outputs += lane.host.advance(horizon)
-        return self._addressed(station, outputs)
+        return self._addressed(state, outputs)
 
-    def _addressed(self, station: _Station, outputs: Sequence[QueryResult | Captured]) -> list[Written]:
+    def _addressed(self, state: _SwitchState, outputs: Sequence[QueryResult | Captured]) -> list[Written]:
         written: list[Written] = []
         for output in outputs:
             keys = self._outputs.get(output.query, ())
             if output.query == HANDSHAKE and isinstance(output, Captured):
                 written += [
-                    Written(keys, found, station.name) for found in station.handshakes.process(output.batch)
+                    Written(keys, found, state.name) for found in state.handshakes.process(output.batch)
                 ]
             elif isinstance(output, Captured) or (
-                self._moves.accepts(output.query, station.name, output.window_us - station.base_us)
-                and self._refinement.is_first(id(station), output)
+                self._moves.accepts(output.query, state.name, output.window_us - state.base_us)
+                and self._refinement.is_first(id(state), output)
             ):
-                written.append(Written(keys, output, station.name))
+                written.append(Written(keys, output, state.name))
         return written

@@ -278,10 +278,10 @@ def check_pipeline() -> Check:
         found = running.find()
         if found is None:
             return Check("pipeline", "optional", "none runs", "start one with `sdnator up`")
-        leading = ask(found.coordinator, "/health")["leading"]
+        active = ask(found.coordinator, "/health")["active"]
     except SdnatorError as error:
         return Check("pipeline", "missing", str(error), "see `sdnator status`")
-    return Check("pipeline", "ok", f"process {found.pid}, Coordinator {'active' if leading else 'standby'}")
+    return Check("pipeline", "ok", f"process {found.pid}, Coordinator {'active' if active else 'standby'}")
 
 
 def check_updates(url: str) -> Check:

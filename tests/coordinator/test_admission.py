@@ -21,7 +21,7 @@ class Door:
 
     def __init__(self) -> None:
         self.registry = Registry("c1", first_epoch=1000)
-        self.registry.lead()
+        self.registry.activate()
         self.admission = Admission(self.registry)
 
     def join(self, app: str = "app", name: str = "i1", said_by: str | None = None, **fields: Any) -> bool:

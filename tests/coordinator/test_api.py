@@ -46,7 +46,7 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
 @pytest.fixture
 def registry() -> Registry:
     registry = Registry("c1")
-    registry.lead()
+    registry.activate()
     now = time.monotonic()
     common: dict[str, Any] = {"revision": 1, "heartbeat": 1.0, "started": 5}
     registry.registered(
@@ -77,7 +77,7 @@ def north(engine: Engine, registry: Registry) -> Northbound:
             "declared_keys",
             "epochs",
         )
-        return {"leading": True, **dict.fromkeys(counts, 3)}
+        return {"active": True, **dict.fromkeys(counts, 3)}
 
     return Northbound(engine, registry, threading.Lock(), health, lambda: {"p": {"health": b"x"}}, EVENTS)
 
@@ -123,7 +123,7 @@ def test_capabilities_interests_assignments_and_flow(client: httpx.Client) -> No
 
 def test_health_names_the_apps(client: httpx.Client) -> None:
     health = client.get("/health").json()
-    assert health["leading"] is True
+    assert health["active"] is True
     assert health["apps"]["p"] == {"health": {"$bytes": "eA=="}}
 
 

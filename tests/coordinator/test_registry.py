@@ -17,7 +17,7 @@ class World:
     def __init__(self, **options: Any) -> None:
         options.setdefault("select", first)
         self.registry = Registry("c1", **options)
-        self.registry.lead()
+        self.registry.activate()
         self.now = 100.0
         self.told: dict[str, Assignments] = {}
 
@@ -205,13 +205,13 @@ def test_a_new_coordinator_keeps_who_works(order: tuple[str, str]) -> None:
     assert told.active == "i2"
 
     new = World(version=1000)
-    new.registry.follow()
+    new.registry.stand_by()
     for name in order:
         new.beat("app", name, version=told.version, epoch=told.epoch, active=name == "i2")
         assert name not in new.told["app"].revisions
         new.join("app", name)
         new.beat("app", name, version=told.version, epoch=told.epoch, active=name == "i2")
-    new.registry.lead()
+    new.registry.activate()
     new.send()
     assert new.told["app"].active == "i2"
     assert new.told["app"].epoch > told.epoch
@@ -221,24 +221,24 @@ def test_a_new_coordinator_keeps_who_works(order: tuple[str, str]) -> None:
 def test_a_new_coordinator_keeps_the_instance_that_worked_alone() -> None:
     """Of standbys that never heard of a Coordinator one works; the others wait."""
     world = World()
-    world.registry.follow()
+    world.registry.stand_by()
     for name in ("m1", "m2"):
         world.join("m", name)
         world.beat("m", name, version=0, epoch=0, active=name == "m2")
-    world.registry.lead()
+    world.registry.activate()
     world.send()
     assert world.told["m"].active == "m2"
 
 
 def test_who_follows_listens_and_gives_no_orders() -> None:
     world = World()
-    world.registry.follow()
+    world.registry.stand_by()
     world.beat("p", "p1")
     assert world.told.pop("p").revisions == {}, "it asks who that is"
     world.join("p", "p1", capabilities=(Capability("a"),))
     world.beat("p", "p1")
     assert world.told == {}
-    world.registry.lead()
+    world.registry.activate()
     world.send()
     assert world.told["p"].active == "p1"
 
@@ -278,18 +278,18 @@ def test_who_is_heard_after_a_stop_is_not_trusted_for_longer_than_others() -> No
     assert world.states() == {"a1": "unresponsive"}
 
 
-def test_who_leads_again_keeps_an_active_instance_that_asks_whether_it_still_is() -> None:
+def test_who_is_active_again_keeps_an_active_instance_that_asks_whether_it_still_is() -> None:
     world = World()
     world.join("a", "a2")
     world.join("a", "a1")
-    world.registry.follow()
+    world.registry.stand_by()
     world.beat("a", "a1", active=False)
     world.beat("a", "a2", active=False)
-    world.registry.lead()
+    world.registry.activate()
     assert {each.active for each in world.send()} == {"a2"}
 
 
-def test_who_leads_again_does_not_bring_back_an_instance_that_was_replaced() -> None:
+def test_who_is_active_again_does_not_bring_back_an_instance_that_was_replaced() -> None:
     """After a silence of all the dead are not known to be dead, and what they said last is old."""
     world = World()
     world.join("a", "a1")
@@ -297,10 +297,10 @@ def test_who_leads_again_does_not_bring_back_an_instance_that_was_replaced() -> 
     world.beat("a", "a1")
     world.run(0.6, [("a", "a2")])
     assert world.told["a"].active == "a2"
-    world.registry.follow()
+    world.registry.stand_by()
     world.now += 1.0
     world.beat("a", "a2", active=False)
-    world.registry.lead()
+    world.registry.activate()
     world.send()
     assert world.told["a"].active == "a2"
 

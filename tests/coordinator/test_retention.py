@@ -57,7 +57,7 @@ def test_what_is_too_much_goes_oldest_first(tmp_path: Path) -> None:
     archive.close()
 
 
-def test_one_that_does_not_lead_deletes_nothing(tmp_path: Path) -> None:
+def test_a_standby_deletes_nothing(tmp_path: Path) -> None:
     archive = filled(tmp_path)
     assert run(archive, tmp_path, 3, allowed=False, age_s=60).deleted == 0
     assert len(archive.find({})) == 4

@@ -1,4 +1,4 @@
-"""Real Coordinator processes: they know all again after kill -9, one of two leads, standby instances take over."""
+"""Real Coordinator processes: they know all again after kill -9, one of two is active, standby instances take over."""
 
 import json
 import signal
@@ -169,19 +169,19 @@ def test_after_kill_9_it_knows_all_again_and_data_flows_meanwhile(site: Site) ->
     assert producer.assignments()[0].key == "a.b.producer"
 
 
-def test_of_two_coordinators_one_leads_and_the_other_takes_over(site: Site) -> None:
-    # an interval so long that the first does not lose the lead by getting no core for a moment
-    first, one = site.coordinator("one", leader_interval_s=0.6)
-    until(lambda: one.get("/health").json()["leading"])
-    _, two = site.coordinator("two", leader_interval_s=0.6)
-    leader = one.get("/health").json()["leader"]
-    until(lambda: two.get("/health").json()["leader"] == leader)
-    assert two.get("/health").json()["leading"] is False
+def test_of_two_coordinators_one_is_active_and_the_other_takes_over(site: Site) -> None:
+    # an interval so long that the first does not become a standby by getting no core for a moment
+    first, one = site.coordinator("one", announce_interval_s=0.6)
+    until(lambda: one.get("/health").json()["active"])
+    _, two = site.coordinator("two", announce_interval_s=0.6)
+    active = one.get("/health").json()["active_instance"]
+    until(lambda: two.get("/health").json()["active_instance"] == active)
+    assert two.get("/health").json()["active"] is False
     producer = site.engine()
     producer.init("producer", PRODUCER, capabilities=[Capability("a")])
     until(lambda: states(two, "producer"))
     first.kill()
-    until(lambda: two.get("/health").json()["leading"])
+    until(lambda: two.get("/health").json()["active"])
     until(lambda: states(two, "producer") == {producer.instance_id: "active"})
 
 
@@ -221,7 +221,7 @@ def test_settings_are_checked() -> None:
         Settings(http_port=70000)
 
 
-def test_who_came_before_the_coordinator_led_is_in_its_history_too(site: Site) -> None:
+def test_who_came_before_the_coordinator_was_active_is_in_its_history_too(site: Site) -> None:
     early = site.engine()
     early.init("early", PRODUCER)
     _, client = site.coordinator("one")

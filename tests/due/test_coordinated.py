@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.chaos_links import UnixLink
 from due import NO_WAIT, PUB_ONLY, Capability, Interest
+from due.drivers import redis_wire
 from due.errors import Superseded
 from due.membership import ASSIGNMENT, Assignments, Registration
 from due.messages import Assignment
@@ -135,7 +136,9 @@ def test_an_app_that_was_stopped_for_a_moment_is_not_told_that_nothing_is_wanted
 
 
 @pytest.fixture
-def link(server, tmp_path):
+def link(server, tmp_path, monkeypatch):
+    # how long each attempt to connect takes while the link is cut
+    monkeypatch.setattr(redis_wire, "_ANSWER_SECONDS", 0.5)
     made = UnixLink(tmp_path / "link.sock", server.socket)
     yield made
     made.close()

@@ -38,7 +38,16 @@ def test_the_node_client_has_at_most_150_lines():
     assert len((EXAMPLES / "client.mjs").read_text().splitlines()) <= 150
 
 
-def _start(name: str, server, folder: Path) -> subprocess.Popen[str]:
+SAVING_OFTEN = """
+import runpy, sys
+from due import Engine
+Engine.keep_state.__kwdefaults__["every"] = 0.2
+runpy.run_path(sys.argv[1], run_name="__main__")
+"""
+"""Runs an example whose state is saved five times a second, instead of every five seconds."""
+
+
+def _start(name: str, server, folder: Path, *runner: str) -> subprocess.Popen[str]:
     environment = {
         "DUE_UPDATES": server.url,
         "DUE_ARCHIVE": f"sqlite://{folder / 'a.db'}",
@@ -46,7 +55,7 @@ def _start(name: str, server, folder: Path) -> subprocess.Popen[str]:
         "PYTHONPATH": str(EXAMPLES.parent),
     }
     return subprocess.Popen(
-        [sys.executable, str(EXAMPLES / name)],
+        [sys.executable, *runner, str(EXAMPLES / name)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env=environment,
@@ -81,7 +90,7 @@ def test_totals_go_on_in_the_next_process(server, make_engine, tmp_path):
         return found[-1].value["state"] if found else 0
 
     for rounds in (1, 2):
-        with _start("sharded_totals.py", server, tmp_path) as process:
+        with _start("sharded_totals.py", server, tmp_path, "-c", SAVING_OFTEN) as process:
             assert process.stdout is not None
             assert process.stdout.readline().startswith("Enter")
             for _ in range(10):

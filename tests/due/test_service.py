@@ -150,13 +150,14 @@ def test_metrics_health_and_json_logs_are_served_where_asked_for(start, tmp_path
         (["--settings", "/dev/zero"], "/dev/zero"),
         (["--archive", "ftp://x"], "ftp://x"),
         (["--updates", "http://x"], "http://x"),
-        (["--updates", "redis://127.0.0.1:1/0"], "127.0.0.1:1"),
+        (["--updates", "redis://127.0.0.1:1/0", "--engine", "{folder}/soon.json"], "127.0.0.1:1"),
     ],
 )
 def test_a_wrong_option_is_one_clear_line(start, tmp_path, arguments, text):
     (tmp_path / "wrong.json").write_text('{"factr": 3}')
     (tmp_path / "deep.json").write_text('{"factor": ' + "[" * 100_000)
     (tmp_path / "bytes.json").write_bytes(b'{"factor": "\xff"}')
+    (tmp_path / "soon.json").write_text('{"connect_timeout": 0.2}')
     process = start(*(a.format(folder=tmp_path) for a in arguments))
     _, stderr = process.communicate(timeout=60)
     assert process.returncode in (1, 2)

@@ -169,9 +169,9 @@ def test_killed_replay_takes_its_pipeline_along(running):
     assert processes_of(run) == []
 
 
-@pytest.mark.parametrize("part", ["apps.kitsune.service", "dataplane", "apps.firewall.service"])
+@pytest.mark.parametrize("part", ["apps.kitsune.service", "dataplane"])
 def test_death_of_a_part_is_told(running, part):
-    """Which part died, and how; exit code 1."""
+    """An app, or the switch: which part died, and how; exit code 1."""
     process, _, _ = running
     deadline = time.monotonic() + SECONDS
     while not (pids := parts_of(process.pid, part)):

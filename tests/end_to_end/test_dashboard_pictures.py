@@ -20,10 +20,10 @@ from tests.end_to_end.test_dashboard import TABS, Page, browser, soon, unreadabl
 from tests.end_to_end.test_up import Operator, until
 from tests.requirements import require_netns
 
-TRAIN = 9_000
+TRAIN = 5_000
 SPEED = 8
 """The house lives so many times faster than its clock says."""
-HOUSE = MiraiLikeOptions(seed=4, benign_seconds=420, attack_seconds=2_400)
+HOUSE = MiraiLikeOptions(seed=4, benign_seconds=240, attack_seconds=2_400)
 DESKTOP, PHONE = (1280, 1000), (390, 844)
 
 PANELS = """

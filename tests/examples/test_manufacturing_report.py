@@ -5,13 +5,13 @@ import re
 
 import msgspec
 import pytest
-from manufacturing.core.orders import SCENARIOS, Scenario
+from manufacturing.core.orders import Scenario
 from manufacturing.criteria import FLEETS
 from manufacturing.running import report
+from manufacturing.running import verify as module
 from manufacturing.running.command import main
 from manufacturing.running.in_process import InProcessProduction
 from manufacturing.running.verify import verify
-from manufacturing.scheduling import SCHEDULERS
 from manufacturing.statistics import CellResult, CellTable, cells
 
 SHARE = {
@@ -114,14 +114,20 @@ def test_verify_names_the_first_print_that_differs():
     )
 
 
-def test_verify_goes_on_where_it_stopped(tmp_path, capsys):
-    """Every scenario and scheduler through REST and DUE, each once; what the file holds is not run again."""
+def test_verify_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
+    """Each cell once through REST and DUE; what the file holds is not run again.
+
+    That all scenarios and schedulers go through is shown by test_rest_and_due_change_no_schedule.
+    """
+    kinds, names = ("normal", "anomalies"), ("fcfs", "dynamic")
+    monkeypatch.setattr(module, "SCENARIOS", kinds)
+    monkeypatch.setattr(module, "SCHEDULERS", names)
     path = tmp_path / "verified.jsonl"
     small = ["--fleets", "2", "--orders", "2", "--fraction", "0.02", "--in-process"]
     words = ["verify", "--results", str(path), "--seed", "3", *small]
     assert main(words) == 0
     said = capsys.readouterr().out
-    cells_of_a_fleet = len(SCENARIOS) * len(SCHEDULERS)
+    cells_of_a_fleet = len(kinds) * len(names)
     assert (
         f"{cells_of_a_fleet} of {cells_of_a_fleet} schedules as in the simulation; 0 cells are missing"
         in said

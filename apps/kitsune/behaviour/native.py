@@ -1,4 +1,4 @@
-"""`Behaviour` on the C ledger: equal results, no Python object a packet.
+"""`Behaviour` on the C tracker: equal results, no Python object a packet.
 
 Of training C returns sums, from which the Python baselines learn; when it ends, the baselines are handed to C.
 """
@@ -24,7 +24,7 @@ from apps.kitsune.behaviour.outside import NEVER
 from apps.kitsune.behaviour.rows import SenderId, address_of, parts_of
 from apps.kitsune.blocked import Blocked
 from apps.kitsune.kernel import Columns, Kernel
-from apps.kitsune.ledger import (
+from apps.kitsune.kernel_rows import (
     WORDS,
     SwitchNumbers,
     check,

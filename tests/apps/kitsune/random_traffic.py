@@ -1,4 +1,4 @@
-"""Small networks in which everything happens: for comparing the C ledgers with their Python twins."""
+"""Small networks in which everything happens: for comparing the C trackers with their Python twins."""
 
 import numpy as np
 

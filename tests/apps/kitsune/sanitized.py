@@ -86,7 +86,7 @@ def entry(kernel: Kernel, columns: dict[str, np.ndarray]) -> None:
     assert kernel.lib.afterimage_update(state, struct, given, 10, kernel.pointer("double", out), 1000) == 0
 
 
-def ledgers(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
+def trackers(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
     """Senders, behaviour and victims: training, blocks, a batch of anything, findings, what a model keeps."""
     for _ in range(rounds):
         senders, rates = Senders(kernel), VictimRates(kernel)
@@ -162,7 +162,7 @@ def main() -> None:
     with np.errstate(all="ignore"):
         features(kernel, random, int(rounds))
         network(kernel, random, int(rounds))
-        ledgers(kernel, random, int(rounds))
+        trackers(kernel, random, int(rounds))
         checkpoints(kernel, random, int(rounds) // 2)
     print("clean")
 

@@ -109,7 +109,7 @@ def test_other_versions_and_other_bytes_are_refused():
             load(wrong, options, load_kernel())
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data(), stage=st.sampled_from([1, 3, 9]))
 def test_a_damaged_checkpoint_is_refused_or_works(data, stage):
     """Bytes of the kernel's states and values of the header, changed at random."""

@@ -1,4 +1,4 @@
-"""The C ledger finds what its Python twin finds, to the last bit."""
+"""The C tracker finds what its Python twin finds, to the last bit."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Of several Coordinators one leads, whoever starts, stops or pauses."""
+"""Of several Coordinators one is active, whoever starts, stops or pauses."""
 
 from collections.abc import Iterable
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.leadership import Claim, Leadership
+from coordinator.active_standby import ActiveStandby, Claim
 
 STEP = 0.05
 
@@ -17,14 +17,14 @@ class Room:
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.present: dict[str, Leadership] = {}
+        self.present: dict[str, ActiveStandby] = {}
         self.stopped: set[str] = set()
 
     def enter(self, name: str) -> None:
-        self.present[name] = Leadership(name, started=int(self.now * 1e9), now=self.now)
+        self.present[name] = ActiveStandby(name, started=int(self.now * 1e9), now=self.now)
 
     def run(self, seconds: float) -> list[list[str]]:
-        """Who led in each step."""
+        """Which ones were active in each step."""
         history = []
         for _ in range(round(seconds / STEP)):
             self.now += STEP
@@ -34,7 +34,7 @@ class Room:
                 claim = one.tick(self.now)
                 if claim is not None:
                     self.tell(claim, self.present)
-            history.append(self.leaders())
+            history.append(self.active())
         return history
 
     def tell(self, claim: Claim, names: Iterable[str]) -> None:
@@ -42,11 +42,11 @@ class Room:
             if name not in self.stopped:
                 self.present[name].heard(claim, self.now)
 
-    def leaders(self) -> list[str]:
-        return [name for name, one in self.present.items() if one.leading and name not in self.stopped]
+    def active(self) -> list[str]:
+        return [name for name, one in self.present.items() if one.active and name not in self.stopped]
 
 
-def test_one_alone_leads_after_listening() -> None:
+def test_one_alone_becomes_active_after_listening() -> None:
     room = Room()
     room.enter("a")
     history = room.run(1.0)
@@ -54,13 +54,13 @@ def test_one_alone_leads_after_listening() -> None:
     assert history[-1] == ["a"]
 
 
-def test_a_second_one_waits_and_says_who_leads() -> None:
+def test_a_second_one_is_a_standby_and_says_which_one_is_active() -> None:
     room = Room()
     room.enter("b")
     room.run(1.0)
     room.enter("a")
-    assert all(leaders == ["b"] for leaders in room.run(3.0))
-    assert room.present["a"].leader == "b"
+    assert all(active == ["b"] for active in room.run(3.0))
+    assert room.present["a"].active_instance == "b"
 
 
 def test_two_that_start_together_agree_on_the_earlier() -> None:
@@ -94,7 +94,7 @@ def test_one_that_resigns_is_replaced_sooner() -> None:
     assert room.run(0.3)[-1] == ["b"]
 
 
-def test_one_that_was_stopped_does_not_come_back_as_a_second_leader() -> None:
+def test_one_that_was_stopped_does_not_come_back_as_a_second_active_one() -> None:
     room = Room()
     room.enter("a")
     room.run(1.0)
@@ -103,17 +103,17 @@ def test_one_that_was_stopped_does_not_come_back_as_a_second_leader() -> None:
     room.stopped = {"a"}
     assert room.run(2.0)[-1] == ["b"]
     room.stopped = set()
-    assert all(leaders == ["b"] for leaders in room.run(2.0))
+    assert all(active == ["b"] for active in room.run(2.0))
 
 
 @pytest.mark.parametrize("term", [0, 5])
-def test_of_two_leaders_the_higher_term_stays(term: int) -> None:
-    one = Leadership("a", started=1, now=0.0)
+def test_of_two_active_ones_the_higher_term_stays(term: int) -> None:
+    one = ActiveStandby("a", started=1, now=0.0)
     for step in range(40):
         one.tick(step * STEP)
-    assert one.leading
-    one.heard(Claim(instance_id="z", started=0, term=term, leading=True), 2.0)
-    assert one.leading == (term < 1)
+    assert one.active
+    one.heard(Claim(instance_id="z", started=0, term=term, active=True), 2.0)
+    assert one.active == (term < 1)
 
 
 steps = st.lists(
@@ -123,7 +123,7 @@ steps = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(steps)
-def test_whatever_happens_in_the_end_one_leads(happenings: list[tuple[str, int]]) -> None:
+def test_whatever_happens_in_the_end_one_is_active(happenings: list[tuple[str, int]]) -> None:
     room = Room()
     room.enter("first")
     for what, number in happenings:
@@ -141,17 +141,17 @@ def test_whatever_happens_in_the_end_one_leads(happenings: list[tuple[str, int]]
             room.run(0.3)
     room.stopped = set()
     room.run(3.0)
-    assert len(room.leaders()) == 1
+    assert len(room.active()) == 1
 
 
 def test_a_claim_from_far_ahead_is_not_believed() -> None:
-    """Or whoever says the highest number would keep every Coordinator from leading."""
-    one = Leadership("a", started=1, now=0.0)
+    """Or whoever says the highest number would keep every Coordinator from becoming active."""
+    one = ActiveStandby("a", started=1, now=0.0)
     for _ in range(20):
         one.tick(one._ticked + STEP)
-    assert one.leading
-    one.heard(Claim(instance_id="b", started=0, term=2**53, leading=True), one._ticked)
-    assert one.leading
+    assert one.active
+    one.heard(Claim(instance_id="b", started=0, term=2**53, active=True), one._ticked)
+    assert one.active
     for term in (2**64, -1):
         with pytest.raises(msgspec.ValidationError):
             msgspec.convert({"instance_id": "b", "started": 0, "term": term}, Claim)

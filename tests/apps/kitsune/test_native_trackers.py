@@ -1,4 +1,4 @@
-"""The C ledgers of senders and victims return what their Python twins return, and the whole detector does."""
+"""The C trackers of senders and victims return what their Python twins return, and the whole detector does."""
 
 import json
 
@@ -12,7 +12,7 @@ from apps.kitsune import victims as victims_module
 from apps.kitsune.accused import Accused
 from apps.kitsune.afterimage import AfterImage
 from apps.kitsune.kernel import ColumnError, load_kernel
-from apps.kitsune.ledger import KernelRows, RowRoom
+from apps.kitsune.kernel_rows import KernelRows, RowRoom
 from apps.kitsune.senders import Senders
 from apps.kitsune.victims import VictimRates
 from apps.messages import Target
@@ -125,7 +125,7 @@ def test_columns_that_do_not_fit_are_refused():
 
 @pytest.mark.parametrize("mode", ["reference", "bounded"])
 def test_features_of_columns_that_were_checked_before_are_the_same(mode):
-    """A detector checks a batch once, for features and ledgers."""
+    """A detector checks a batch once, for features and trackers."""
     batch, kernel = traffic(np.random.default_rng(3), 300, 0.0), load_kernel()
     one, other = (AfterImage(mode, kernel=kernel) for _ in range(2))
     for count in (300, 1, 0):

@@ -1,6 +1,6 @@
-"""What the C ledgers (senders, behaviour, victims) share: packet columns as pointers, numbers of switches, blocks.
+"""What the C trackers (senders, behaviour, victims) share: packet columns as pointers, numbers of switches, blocks.
 
-A ledger takes a batch in one call and returns events: no Python object a packet.
+A tracker takes a batch in one call and returns events: no Python object a packet.
 """
 
 import ipaddress
@@ -41,7 +41,7 @@ class RowRoom:
 
 
 class KernelRows(CheckedColumns):
-    """A batch whose columns the ledgers read; made once and handed to all of them.
+    """A batch whose columns the trackers read; made once and handed to all of them.
 
     Args:
         kernel: the C kernel.
@@ -72,7 +72,7 @@ class KernelRows(CheckedColumns):
         self.pointer = ffi.new("PacketRows *", list(map(ffi.from_buffer, _POINTERS, kept)))
         self._room = (room or RowRoom()).of(self.count * lib.row_bytes())
         self.decoded = ffi.cast("Row *", ffi.from_buffer(self._room))
-        """The packets as the ledgers read them."""
+        """The packets as the trackers read them."""
         lib.rows_read(self.pointer, self.count, self.decoded)
 
     def benign(
@@ -123,7 +123,7 @@ def seed() -> int:
 
 
 def events_in(kernel: Kernel, dtype: np.dtype[np.void], pointer: Any, count: int) -> list[tuple[Any, ...]]:
-    """Events of a ledger as tuples in the order of the fields."""
+    """Events of a tracker as tuples in the order of the fields."""
     if not count:
         return []
     data = kernel.ffi.buffer(pointer, count * dtype.itemsize)
