@@ -241,6 +241,27 @@ def test_an_offence_that_only_makes_a_block_longer_weighs_nothing():
     assert on.written("network.incident.firewall.")[-1]["evidence"][-1]["source"] == "offence"
 
 
+def test_a_source_of_syns_that_was_blocked_before_is_blocked_for_longer():
+    """By address, since that is all that is known of it; the flood alone decides."""
+    quick = SynRules(grace_ms=0, patience_ms=0, resets=0)
+    archived: list[Item] = []
+    for number in range(2):
+        engine, at = FakeEngine(), NOW + number * 1_000 * SECOND
+        engine.archived = archived
+        on = Desk(syn=quick, engine=engine)
+        on.switch(at=at)
+        on.hand(SYNS, batch(*[(at // 1000, "77.0.0.1", VICTIM, 80)] * 600))
+        on.tick_until(lambda on=on: on.blocked)
+        block = on.decisions[-1]
+        assert (block.target.address, block.level) == ("77.0.0.1", number)
+        archived.append(
+            Item("network.block.firewall.ipv4", block.to_value(), at, at, "firewall", "i1", number)
+        )
+    (found,) = on.written(f"{OWN}.offence")
+    assert (found["address"], found["sender"], found["nats"]) == ("77.0.0.1", None, 0.0)
+    assert (found["since"], found["forgeable"]) == (NOW, True)
+
+
 def test_who_is_only_reported_is_reported_with_its_offences():
     """Its incident and a foreign app see why the bound was reached."""
     on = blocked_before(desk())
