@@ -306,7 +306,8 @@ class FirewallService:
         return {
             **self._counts,
             **self._floods.health(),
-            "arp_thefts": self._thefts.thefts,
+            **self._thefts.health(),
+            **self._own.health(),
             "blocks": sum(not each.decision.dry_run for each in self._lifecycle.blocks.values()),
             "would_block": sum(each.decision.dry_run for each in self._lifecycle.blocks.values()),
             "rate_limits": len(self._limits.standing),
@@ -318,7 +319,6 @@ class FirewallService:
             "refused_by_cap": self._lifecycle.refused,
             "blocking_stopped": int(bool(self._lifecycle.stopped)),
             "stopped_by": self._lifecycle.stopped,
-            "bindings": len(self._bindings),
             "evidence_missed": self._order.missed,
             "archive_away": self._archive.unanswered,
             "answers_unstored": self._stored.unstored,

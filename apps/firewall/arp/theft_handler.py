@@ -49,13 +49,17 @@ class TheftHandler:
         self._allowed = allowed
         self._switches = switches
         self._publish = publish
-        self.thefts = 0
+        self._found = 0
 
     def arps(self, item: Item, batch: RecordBatch) -> None:
         """ARP packets of a switch."""
         for theft in self._bindings.add(batch):
-            self.thefts += 1
+            self._found += 1
             self._on_theft(theft, item)
+
+    def health(self) -> dict[str, int]:
+        """Counters for the operator and for Prometheus."""
+        return {"arp_thefts": self._found, "bindings": len(self._bindings)}
 
     def _on_theft(self, theft: BindingConflict, item: Item) -> None:
         switch = next(iter(self._switches)) if len(self._switches) == 1 else EVERY_SWITCH

@@ -24,6 +24,8 @@ QUIET_S: Final = 60
 """Seconds of capture time without more after which a finding is over."""
 MOST: Final = 4_096
 """Findings followed at a time; the one heard of least recently is forgotten, without a last message."""
+BEGINNINGS: Final = 50
+"""Findings that may begin within a second without leading to a decision: who has many names fills no archive."""
 _SECOND: Final = 1_000_000_000
 _TEXT: Final = 3_900
 
@@ -61,6 +63,9 @@ class OngoingFindings:
     def __init__(self) -> None:
         self._ongoing: OrderedDict[_Subject, _Ongoing] = OrderedDict()
         """The one heard of last is the last."""
+        self._second = self._begun = 0
+        self.put_off = 0
+        """Beginnings put off because there were too many within a second."""
 
     def __len__(self) -> int:
         return len(self._ongoing)
@@ -90,14 +95,24 @@ class OngoingFindings:
             packets=known.packets - (known.told or 0),
             nats=max(0.0, evidence.nats - known.said(now)),
         )
-        return OwnFinding(whole, known.told is None or known.packets >= GROWTH * max(1, known.told))
+        return OwnFinding(whole, self._is_news(known, now))
 
     def told(self, evidence: Evidence) -> None:
         """A message was written with what `found` has returned."""
         known = self._ongoing.get(_subject(evidence))
         if known is not None:
+            self._begun += known.told is None
             known.nats = known.said(evidence.event_time) + evidence.nats
             known.told, known.told_at = known.packets, evidence.event_time
+
+    def _is_news(self, known: _Ongoing, now: int) -> bool:
+        if known.told is not None:
+            return known.packets >= GROWTH * max(1, known.told)
+        if now // _SECOND > self._second:
+            self._second, self._begun = now // _SECOND, 0
+        if self._begun >= BEGINNINGS:
+            self.put_off += 1
+        return self._begun < BEGINNINGS
 
     def over(self, now: int) -> Iterator[Evidence]:
         """The last messages of findings that are over by a capture time; they weigh nothing."""

@@ -36,6 +36,7 @@ class OwnEvidence:
         self._incidents = incidents
         self._bound = bound
         self._ongoing = OngoingFindings()
+        self._written = 0
 
     @property
     def bound(self) -> float:
@@ -45,6 +46,10 @@ class OwnEvidence:
     def found(self, evidence: Evidence, *, again: bool = False) -> OwnFinding:
         """The evidence by which a finding that may go on is decided, and whether it is news; see `OngoingFindings`."""
         return self._ongoing.found(evidence, again=again)
+
+    def health(self) -> dict[str, int]:
+        """Counters for the operator and for Prometheus."""
+        return {"own_evidence": self._written, "own_evidence_put_off": self._ongoing.put_off}
 
     def tell(self, evidence: Evidence, bound: float = 0.0) -> None:
         """Write evidence, before what is decided by it.
@@ -68,6 +73,7 @@ class OwnEvidence:
             self._write(evidence)
 
     def _write(self, evidence: Evidence) -> None:
+        self._written += 1
         self._engine.write(
             f"{OWN_EVIDENCE}.{evidence.source}",
             evidence.to_value(),

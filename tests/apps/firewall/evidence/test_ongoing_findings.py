@@ -4,7 +4,7 @@ import pytest
 from msgspec import structs
 
 from apps.firewall.evidence import ongoing_findings
-from apps.firewall.evidence.ongoing_findings import GROWTH, QUIET_S, OngoingFindings
+from apps.firewall.evidence.ongoing_findings import BEGINNINGS, GROWTH, QUIET_S, OngoingFindings
 from apps.firewall.policy.sequential_test import HALF_LIFE_S
 from tests.apps.firewall.incidents.samples import SECOND, evidence
 
@@ -78,6 +78,16 @@ def test_the_longest_text_has_room_for_its_end():
     told(made, flood(100, text="x" * 4_096))
     (last,) = made.over(1_000 * SECOND)
     assert type(last).from_value(last.to_value()) == last
+
+
+def test_many_names_within_a_second_fill_no_archive():
+    """Those put off begin later, if they go on; what decides is told in any case."""
+    made = OngoingFindings()
+    many = [structs.replace(flood(100), service=f"tcp/{n}") for n in range(BEGINNINGS + 5)]
+    assert len(told(made, *many)) == BEGINNINGS
+    assert made.put_off == 5
+    later = structs.replace(flood(101), service=f"tcp/{BEGINNINGS}")
+    assert [packets for packets, _ in told(made, later)] == [20]
 
 
 def test_findings_are_bounded(monkeypatch):
