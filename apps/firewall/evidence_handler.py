@@ -94,8 +94,8 @@ class EvidenceHandler:
         earlier = self._offences_of(verdict.target, alert.event_time)
         reason = verdict.reason if earlier is not None else f"{verdict.reason} ({UNKNOWN_HISTORY})"
         earlier = earlier or EarlierBlocks()
-        offence = offence_evidence(alert, verdict.target, earlier) if earlier.count else None
-        self._block(alert, verdict.target, reason, earlier.count, offence)
+        offence = offence_evidence(alert, verdict.target, earlier) if earlier.times else None
+        self._block(alert, verdict.target, reason, earlier.times, offence)
 
     def evidence(self, item: Item, evidence: Evidence) -> None:
         """There is evidence against a sender, or for protecting a victim."""

@@ -10,7 +10,8 @@ from due import Item
 class EarlierBlocks(NamedTuple):
     """What the archive knows of a target: its earlier blocks."""
 
-    count: int = 0
+    times: int = 0
+    """How often it was blocked."""
     first: int = 0
     """Capture time of the first, ns."""
     last: int = 0
@@ -37,7 +38,7 @@ def offences_of_many(addresses: Sequence[str]) -> dict[str, Any]:
 
 def count_offences(items: Iterable[Item], target: Target, before: int, excused: Container[str] = ()) -> int:
     """Number of earlier blocks of the target; see `earlier_blocks`."""
-    return earlier_blocks(items, target, before, excused).count
+    return earlier_blocks(items, target, before, excused).times
 
 
 def earlier_blocks(

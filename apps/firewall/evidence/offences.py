@@ -34,5 +34,5 @@ def offence_evidence(
         packets=0,
         mac_addresses=cause.mac_addresses,
         role=cause.role,
-        text=f"{target.address} has {earlier.count:,} earlier block{'s' if earlier.count > 1 else ''}",
+        text=f"{target.address} has {earlier.times:,} earlier block{'s' if earlier.times > 1 else ''}",
     )

@@ -181,7 +181,7 @@ class Decider:
             refusal="" if target is not None else refusal,
             nats=total,
             bound=needed,
-            offences=None if earlier is None else earlier.count,
+            offences=None if earlier is None else earlier.times,
             offence=offence,
             tally=tally,
         )
@@ -345,9 +345,9 @@ def _offence_of(
     evidence: Evidence, target: Target | None, earlier: EarlierBlocks | None, needed: float
 ) -> Evidence | None:
     """Earlier blocks as evidence: `LEAST_BOUND` of what is needed must come from what was seen now."""
-    if target is None or earlier is None or not earlier.count:
+    if target is None or earlier is None or not earlier.times:
         return None
-    nats = min(OFFENCE_NATS * min(earlier.count, MOST_OFFENCES), needed - LEAST_BOUND)
+    nats = min(OFFENCE_NATS * min(earlier.times, MOST_OFFENCES), needed - LEAST_BOUND)
     return offence_evidence(evidence, target, earlier, nats)
 
 

@@ -250,7 +250,7 @@ class FloodHandler:
         if news or decisions:
             self._own.tell(finding.evidence)
         earlier = (offences or {}).get(finding.source)
-        if decisions and earlier is not None and earlier.count:
+        if decisions and earlier is not None and earlier.times:
             self._own.tell(offence_evidence(finding.evidence, finding.target, earlier))
         # the guard before the block has had the source's connections reset
         return [self._publish(each, False) for each in decisions]

@@ -200,7 +200,7 @@ class SynDefence:
             finding.reason + note,
             (finding.exhibit,),
             evidence.event_time,
-            offences=(offences or {}).get(finding.source, EarlierBlocks()).count,
+            offences=(offences or {}).get(finding.source, EarlierBlocks()).times,
         )
         return [made]
 
