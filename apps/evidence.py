@@ -1,12 +1,14 @@
 """Evidence against a sender, or for protecting a victim: one message for every source of evidence.
 
     kitsune, sonata_adapter, any app ──Evidence──► firewall   network.evidence.<app>.<kind>
+    firewall ──Evidence──► any app                            network.evidence.firewall.<kind>
     kitsune ──TrainingState──► firewall, page                 network.training.<app>
     kitsune ──DriftState──► people                            network.drift.<app>
     firewall ──Judged──► replay                               network.judged.firewall
 
 The weight of evidence is a number of nats, so that evidence of different sources adds up: how much more likely
-an attack makes what was seen than the benign traffic of training does.
+an attack makes what was seen than the benign traffic of training does.  The firewall's own rules, which decide by
+themselves, weigh what a decision takes at that time.
 """
 
 from typing import Annotated, Final, Literal
@@ -52,7 +54,7 @@ class Evidence(Message, frozen=True, kw_only=True):
     id: Name
     kind: Kind
     source: Name
-    """What found it, the last segment of its key: a statistic, a query."""
+    """What found it, the last segment of its key: a statistic, a query; `spoofing`, `flood` or `offence` of the firewall."""
     sender: Sender | None = None
     """Who did it; None if the senders' addresses are forged or too many to name."""
     address: Name = ""
@@ -78,7 +80,7 @@ class Evidence(Message, frozen=True, kw_only=True):
     event_time: Time
     """Capture time of the last one, ns."""
     packets: Number
-    """Number of packets that it is based on."""
+    """Number of packets that it is based on; 0 for earlier blocks."""
     first_packet: Number = 0
     """Arrival number at the switch of the packet that triggered it."""
     number: Number = 0

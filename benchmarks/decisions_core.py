@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from apps.evidence import Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings
+from apps.firewall.evidence.history import EarlierBlocks
 from apps.firewall.policy.block_lifecycle import BlockLifecycle
 from apps.firewall.policy.decider import Decider
 from apps.firewall.policy.rate_limits import RateLimits
@@ -171,7 +172,7 @@ class DecisionRun:
         self._untold.append(decision)
 
     def _hear(self, evidence: Evidence) -> None:
-        proposal = self.decider.evidence(evidence, "kitsune", lambda _: 0)
+        proposal = self.decider.evidence(evidence, "kitsune", lambda _: EarlierBlocks())
         nats, _ = self.decider.sum_of(evidence)
         self.heard.append(EvidenceHeard(evidence.event_time, evidence.sender, evidence.victims, nats))
         if proposal is None:

@@ -5,12 +5,15 @@ from typing import Final
 
 from msgspec import structs
 
-from apps.evidence import Evidence
+from apps.evidence import Evidence, TrainingState
 from apps.firewall.arrivals import evidence_of
 from apps.firewall.enforcement.announcer import Announcer
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import OFFENCES_READ, Archive
 from apps.firewall.evidence.exhibits import Exhibits
+from apps.firewall.evidence.history import EarlierBlocks
+from apps.firewall.evidence.offences import offence_evidence
+from apps.firewall.evidence.own_evidence import OwnEvidence
 from apps.firewall.evidence.shared import shared_sender
 from apps.firewall.incidents.incident_reports import IncidentReports
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
@@ -38,6 +41,7 @@ class EvidenceHandler:
         archive: earlier offences.
         announcer: notices.
         incidents: what belongs together.
+        own: writes earlier offences.
         lessons: what was called a false alarm.
         publish: writes a decision.
         clock: monotonic time, seconds.
@@ -52,6 +56,7 @@ class EvidenceHandler:
         archive: Archive,
         announcer: Announcer,
         incidents: IncidentReports,
+        own: OwnEvidence,
         lessons: FalseAlarms,
         publish: Callable[[Decision], Decision],
         clock: Callable[[], float],
@@ -63,12 +68,18 @@ class EvidenceHandler:
         self._archive = archive
         self._announcer = announcer
         self._incidents = incidents
+        self._own = own
         self._lessons = lessons
         self._publish = publish
         self._clock = clock
         self._earlier: dict[Target, tuple[float, list[Item]]] = {}
         """Archived blocks by target, and when they were read."""
         self._exhibits = Exhibits()
+
+    def trained(self, state: TrainingState | None) -> None:
+        """The state of training, in progress or done; None: there was none."""
+        self.decider.trained(state)
+        self._lifecycle.trained_hosts = 0 if state is None else state.hosts
 
     def alert(self, item: Item, alert: Alert) -> None:
         """A sender had an anomalous second."""
@@ -82,7 +93,9 @@ class EvidenceHandler:
             return
         earlier = self._offences_of(verdict.target, alert.event_time)
         reason = verdict.reason if earlier is not None else f"{verdict.reason} ({UNKNOWN_HISTORY})"
-        self._block(alert, verdict.target, reason, earlier or 0)
+        earlier = earlier or EarlierBlocks()
+        offence = offence_evidence(alert, verdict.target, earlier) if earlier.times else None
+        self._block(alert, verdict.target, reason, earlier.times, offence)
 
     def evidence(self, item: Item, evidence: Evidence) -> None:
         """There is evidence against a sender, or for protecting a victim."""
@@ -97,7 +110,9 @@ class EvidenceHandler:
         evidence = structs.replace(evidence, **changes)
         proposal = self.decider.evidence(evidence, item.app_id, lambda target: self._offences_of(target, at))
         if evidence.nats > 0:
-            self._incidents.evidence(self.decider.test.placed(evidence), *self.decider.sum_of(evidence))
+            nats, bound = self.decider.sum_of(evidence)
+            bound = (proposal.bound if proposal is not None else 0.0) or bound
+            self._incidents.evidence(self.decider.test.placed(evidence), nats, bound)
         if proposal is not None:
             self._follow(proposal, item)
 
@@ -111,6 +126,8 @@ class EvidenceHandler:
     def _follow(self, proposal: Proposal, item: Item) -> None:
         """Carry a proposal out, or report why it is not."""
         evidence = proposal.evidence
+        if proposal.offence is not None and proposal.target is None:
+            self._own.tell(proposal.offence, proposal.bound)
         if proposal.service is not None:
             exhibits = (evidence_of(item, evidence.text),)
             for decision in self._syn.guard(proposal.service, proposal.reason, exhibits, evidence.event_time):
@@ -127,7 +144,8 @@ class EvidenceHandler:
             self._incidents.spared(evidence, proposal.nats, proposal.bound, proposal.refusal)
         else:
             unknown = "" if proposal.offences is not None else f" ({UNKNOWN_HISTORY})"
-            self._block(evidence, proposal.target, proposal.reason + unknown, proposal.offences or 0)
+            reason, offences = proposal.reason + unknown, proposal.offences or 0
+            self._block(evidence, proposal.target, reason, offences, proposal.offence, proposal.bound)
             self.decider.settled(proposal)
 
     def _grounds_of(self, proposal: Proposal) -> tuple[Ground, ...]:
@@ -135,7 +153,15 @@ class EvidenceHandler:
             return ()
         return self._lessons.book.take(proposal.tally.subject, proposal.evidence.event_time)
 
-    def _block(self, cause: Alert | Evidence, target: Target, reason: str, offences: int) -> None:
+    def _block(
+        self,
+        cause: Alert | Evidence,
+        target: Target,
+        reason: str,
+        offences: int,
+        offence: Evidence | None,
+        bound: float = 0.0,
+    ) -> None:
         """Block a sender, unless a cap forbids it."""
         sender = cause.sender
         assert sender is not None  # noqa: S101 - callers have a sender
@@ -143,6 +169,8 @@ class EvidenceHandler:
         if cap is not None:
             self._lifecycle.refuse(cap, sender.ip or sender.mac, cause.event_time)
             return
+        if offence is not None:
+            self._own.tell(offence, bound)
         decision = self._lifecycle.open(
             sender.switch,
             target,
@@ -159,10 +187,10 @@ class EvidenceHandler:
         for each in gather_blocks(self._lifecycle, self._syn.gather, cause.event_time):
             self._publish(each)
 
-    def _offences_of(self, target: Target, now: int) -> int | None:
+    def _offences_of(self, target: Target, now: int) -> EarlierBlocks | None:
         """Earlier blocks of a target; None if the archive does not answer."""
         earlier = self._earlier_blocks(target)
-        return None if earlier is None else history.count_offences(earlier, target, now, self._lessons)
+        return None if earlier is None else history.earlier_blocks(earlier, target, now, self._lessons)
 
     def decided(self) -> None:
         """A decision was published: the archive knows more than was read."""
@@ -181,7 +209,7 @@ class EvidenceHandler:
             self._earlier[target] = now, asked
         return asked
 
-    def offences_of_many(self, addresses: Sequence[str], now: int) -> dict[str, int] | None:
+    def offences_of_many(self, addresses: Sequence[str], now: int) -> dict[str, EarlierBlocks] | None:
         """Earlier blocks by address; None if the archive does not answer."""
         if not addresses:
             return {}
@@ -191,6 +219,6 @@ class EvidenceHandler:
             return None
         targets = {address: Target(kind="ip", address=address) for address in addresses}
         return {
-            address: history.count_offences(items, target, now, self._lessons)
+            address: history.earlier_blocks(items, target, now, self._lessons)
             for address, target in targets.items()
         }

@@ -33,6 +33,7 @@ from apps.firewall.evidence.archive import Archive
 from apps.firewall.evidence.archived_state import ArchivedState
 from apps.firewall.evidence.history import FAMILIES
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
+from apps.firewall.evidence.own_evidence import EVIDENCE_CAPABILITY, OWN_APP, OwnEvidence
 from apps.firewall.evidence.writing_order import WritingOrder
 from apps.firewall.evidence_handler import EvidenceHandler
 from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
@@ -91,6 +92,7 @@ CAPABILITIES = (
         for kind in ("ipv4", "ipv6", *(["mac"] if family == "block" else ()))
     ),
     Capability(f"{EVENTS}.*", delivery="reliable", archive="always"),
+    EVIDENCE_CAPABILITY,
     INCIDENT_CAPABILITY,
     Capability(ALLOWED, delivery="reliable", archive="always"),
     Capability("network.p4_command.firewall.*", delivery="reliable"),
@@ -137,6 +139,9 @@ class FirewallService:
         self._switches: dict[str, str] = {}
         """Connected switches, and the controller instance that reported each."""
         self._lock = threading.RLock()
+        self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
+        self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
+        self._own = OwnEvidence(engine, self._incidents, lambda: self._handler.decider.test.bound)
         self._floods = FloodHandler(
             engine,
             settings,
@@ -144,6 +149,7 @@ class FirewallService:
             allowed,
             self._known,
             self._switches,
+            self._own,
             lambda decision, resets: self._publish(decision, resets=resets),
             lambda addresses, now: self._handler.offences_of_many(addresses, now),  # noqa: PLW0108 - it comes later
             self._lock,
@@ -163,8 +169,6 @@ class FirewallService:
         self._desk = Desk(
             self._lifecycle, self._syn, self._limits, allowed, self._lessons, self._past.decision
         )
-        self._announcer = Announcer(engine, *event_sinks(settings), settings.eve_format)
-        self._incidents = IncidentReports(engine, self._announcer, settings.eve_format)
         self._handler = EvidenceHandler(
             Decider(
                 rules, self._lifecycle, self._bindings, self._known, lambda: self._desk.allow, syn.ports_of
@@ -175,6 +179,7 @@ class FirewallService:
             self._archive,
             self._announcer,
             self._incidents,
+            self._own,
             self._lessons,
             self._publish,
             lambda: time.monotonic(),  # noqa: PLW0108 - tests set the clock of this module
@@ -184,6 +189,7 @@ class FirewallService:
             self._bindings,
             self._lifecycle,
             self._announcer,
+            self._own,
             lambda: self._desk.allow,
             self._switches,
             self._publish,
@@ -214,7 +220,8 @@ class FirewallService:
         self._hear("network.anomaly.kitsune.alert", Alert.from_item, self._on_alert)
         self._hear(f"{TRAINING}.*", arrivals.training_in, self._on_training)
         queries = (f"sonata_adapter.{query}" for query in self._settings.evidence_queries)
-        apps = (f"{app}.*" for app in self._settings.evidence_apps)
+        # it acts on its own evidence when it finds it
+        apps = (f"{app}.*" for app in self._settings.evidence_apps if app != OWN_APP)
         for key in (KITSUNES_EVIDENCE, *(f"{EVIDENCE}.{each}" for each in (*queries, *apps))):
             self._hear(key, Evidence.from_item, self._on_evidence)
         for enforcer in dict.fromkeys((SWITCHES, *self._settings.enforcers)):
@@ -259,9 +266,7 @@ class FirewallService:
         self._limits.restore(standing)
         self._incidents.restore(self._past.incidents())
         self._lessons.restore(self._past.false_alarms())
-        training = self._past.training()
-        self._handler.decider.trained(training)
-        self._lifecycle.trained_hosts = 0 if training is None else training.hosts
+        self._handler.trained(self._past.training())
         if standing:
             log.info("decisions in force from the archive: %d", len(standing))
 
@@ -276,7 +281,8 @@ class FirewallService:
     def tick(self) -> None:
         """Examine suspected floods that are due, and write known sources in batches."""
         with self._lock:
-            self._carry_on(self._order.overdue(time.monotonic()))
+            for act in self._order.overdue(time.monotonic()):
+                act()
             self._floods.tick()
             for notice in self._floods.notices(self._now):
                 self._announcer.say(notice, logging.INFO)
@@ -300,7 +306,8 @@ class FirewallService:
         return {
             **self._counts,
             **self._floods.health(),
-            "arp_thefts": self._thefts.thefts,
+            **self._thefts.health(),
+            **self._own.health(),
             "blocks": sum(not each.decision.dry_run for each in self._lifecycle.blocks.values()),
             "would_block": sum(each.decision.dry_run for each in self._lifecycle.blocks.values()),
             "rate_limits": len(self._limits.standing),
@@ -312,7 +319,6 @@ class FirewallService:
             "refused_by_cap": self._lifecycle.refused,
             "blocking_stopped": int(bool(self._lifecycle.stopped)),
             "stopped_by": self._lifecycle.stopped,
-            "bindings": len(self._bindings),
             "evidence_missed": self._order.missed,
             "archive_away": self._archive.unanswered,
             "answers_unstored": self._stored.unstored,
@@ -440,7 +446,7 @@ class FirewallService:
             self._say_notices()
 
     def _on_training(self, item: Item, state: TrainingState) -> None:
-        self._in_order(item, state.number, lambda: self._trained(state))
+        self._in_order(item, state.number, lambda: self._handler.trained(state))
 
     def _on_evidence(self, item: Item, evidence: Evidence) -> None:
         self._in_order(item, evidence.number, lambda: self._judge(item, evidence))
@@ -448,22 +454,15 @@ class FirewallService:
     def _in_order(self, item: Item, number: int, act: Callable[[], None]) -> None:
         with self._lock:
             writer = f"{item.app_id}.{item.instance_id}"
-            self._carry_on(self._order.take(writer, number, act, time.monotonic()))
-
-    def _carry_on(self, acts: Iterable[Callable[[], None]]) -> None:
-        for act in acts:
-            act()
-
-    def _trained(self, state: TrainingState) -> None:
-        self._handler.decider.trained(state)
-        self._lifecycle.trained_hosts = state.hosts
+            for each in self._order.take(writer, number, act, time.monotonic()):
+                each()
 
     def _judge(self, item: Item, evidence: Evidence) -> None:
         self._counts["evidence"] += 1
         at = self._time.fit(evidence.event_time)
         self._lapse(at)
-        since = min(evidence.since, at)
-        self._handler.evidence(item, structs.replace(evidence, event_time=at, since=since))
+        evidence = structs.replace(evidence, event_time=at, since=min(evidence.since, at))
+        self._handler.evidence(item, evidence)
         self._say_notices()
         self._judged[item.app_id] += 1
         judged = Judged(app=item.app_id, evidence=self._judged[item.app_id], decisions=self._decisions)
@@ -543,6 +542,7 @@ class FirewallService:
     def _lapse(self, now: int) -> None:
         for decision in [*self._lifecycle.due(now), *self._syn.due(now), *self._limits.due(now)]:
             self._publish(decision)
+        self._own.lapse(now)
         self._incidents.lapse(now)
 
     # -- output ------------------------------------------------------------------------

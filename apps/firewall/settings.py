@@ -26,7 +26,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     evidence_queries: tuple[str, ...] = ()
     """Queries whose results are evidence as well, the user's own among them (needs the Sonata adapter)."""
     evidence_apps: tuple[str, ...] = ()
-    """Further apps whose evidence counts, by app id."""
+    """Further apps whose evidence counts, by app id; the firewall acts on its own anyway, and not twice."""
     known_limit: int = 4000
     """Known sources in the switch, the most recent ones."""
     known_days: int = 30

@@ -57,9 +57,19 @@ class BindingConflict:
     address: str
     owner: BoundHost
     thief: BoundHost
+    claimed: int
+    """When it claimed the address."""
     at: int
-    certain: bool
-    """Whether a block of the claimant harms nobody else."""
+    """When the owner spoke."""
+    owner_trained: bool
+    """Whether the owner was present in training; otherwise it may be the attacker."""
+    thief_alone: bool
+    """Whether no other host behind its port could have forged its MAC."""
+
+    @property
+    def certain(self) -> bool:
+        """Whether a block of the claimant harms nobody else."""
+        return self.owner_trained and self.thief_alone
 
 
 class ArpBindings:
@@ -148,11 +158,11 @@ class ArpBindings:
 
     def _contested(self, address: int, bound: _Binding, now: int) -> Iterator[BindingConflict]:
         for key in [key for key in self._claims if key[0] == address]:
-            if now - self._claims.pop(key) <= self._contest:
-                thief = key[1]
+            claimed, thief = self._claims.pop(key), key[1]
+            if now - claimed <= self._contest:
                 text = str(ipaddress.IPv4Address(address))
-                certain = bound.trained and self.is_alone(thief)
-                yield BindingConflict(text, bound.host, thief, now, certain)
+                alone = self.is_alone(thief)
+                yield BindingConflict(text, bound.host, thief, claimed, now, bound.trained, alone)
 
     def is_alone(self, host: BoundHost) -> bool:
         """Whether it is the only host behind its port."""

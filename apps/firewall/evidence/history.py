@@ -1,10 +1,21 @@
 """A sender's history from archived items.  Pure."""
 
 from collections.abc import Container, Iterable, Iterator, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from apps.messages import Action, Decision, FalseAlarm, Instruction, MessageError, Target
 from due import Item
+
+
+class EarlierBlocks(NamedTuple):
+    """What the archive knows of a target: its earlier blocks."""
+
+    times: int = 0
+    """How often it was blocked."""
+    first: int = 0
+    """Capture time of the first, ns."""
+    last: int = 0
+    """Capture time of the last, ns."""
 
 
 def offences_query(target: Target) -> dict[str, Any]:
@@ -26,12 +37,27 @@ def offences_of_many(addresses: Sequence[str]) -> dict[str, Any]:
 
 
 def count_offences(items: Iterable[Item], target: Target, before: int, excused: Container[str] = ()) -> int:
-    """Earlier blocks of the target, counted by decision; neither extensions nor the excused ones are offences."""
-    ids = set()
+    """Number of earlier blocks of the target; see `earlier_blocks`."""
+    return earlier_blocks(items, target, before, excused).times
+
+
+def earlier_blocks(
+    items: Iterable[Item], target: Target, before: int, excused: Container[str] = ()
+) -> EarlierBlocks:
+    """Earlier blocks of the target, counted by decision; neither extensions nor the excused ones are offences.
+
+    Args:
+        items: from the archive.
+        target: what was blocked.
+        before: capture time, ns; later blocks do not count.
+        excused: ids of decisions that were false alarms.
+    """
+    began: dict[str, int] = {}
     for decision in _readable(items):
         if decision.target == target and decision.event_time < before and not decision.dry_run:
-            ids.add(decision.id)
-    return sum(each not in excused for each in ids)
+            began[decision.id] = min(decision.event_time, began.get(decision.id, decision.event_time))
+    times = [at for name, at in began.items() if name not in excused]
+    return EarlierBlocks(len(times), min(times), max(times)) if times else EarlierBlocks()
 
 
 DECISIONS: Final = (

@@ -100,19 +100,40 @@ class IncidentBook:
         Returns:
             Incidents to publish.
         """
-        now = self._clock(evidence.event_time)
+        self._clock(evidence.event_time)
         suspect = total_nats >= SUSPECT_SHARE * bound
-        mine = _accused(evidence)
-        shared = not mine or (suspect and evidence.kind in SHARED_VICTIM)
-        theirs: list[AttackerKey] = [("victim", victim) for victim in evidence.victims] if shared else []
+        mine, theirs = _about(evidence, suspect=suspect)
         found = self._same(mine, theirs)
         if found is not None and not found.shown and total_nats - evidence.nats < FADED_SHARE * total_nats:
             self._forget(found)
             found = None
         found = found or self._begin((*mine, *theirs), evidence.since, evidence.event_time)
         found.hear(evidence, mine or theirs, total_nats, bound)
-        self._know(found, (*mine, *theirs))
-        return self._told(found, "more", now, may_open=suspect)
+        return self._heard(found, (*mine, *theirs), suspect=suspect)
+
+    def hear_own(self, evidence: Evidence, share: float, bound: float) -> list[Incident]:
+        """Take a piece of evidence on which the firewall acts without the sequential test.
+
+        Args:
+            evidence: the piece.
+            share: what its source makes up of the sum, beside what the test has added up.
+            bound: what that sum must reach for a decision.
+
+        Returns:
+            Incidents to publish.
+        """
+        now = self._clock(evidence.event_time)
+        suspect = share >= SUSPECT_SHARE * bound
+        mine, theirs = _about(evidence, suspect=suspect)
+        # what earlier blocks are based on is no part of what happens now
+        begun = now if evidence.kind == "offence" else evidence.since
+        found = self._same(mine, theirs) or self._begin((*mine, *theirs), begun, evidence.event_time)
+        found.hear_own(evidence, mine or theirs, share, bound)
+        return self._heard(found, (*mine, *theirs), suspect=suspect)
+
+    def _heard(self, found: OpenIncident, keys: Sequence[AttackerKey], *, suspect: bool) -> list[Incident]:
+        self._know(found, keys)
+        return self._told(found, "more", self._now, may_open=suspect)
 
     def hear_alert(self, alert: Alert) -> list[Incident]:
         """Take an alert: it opens an incident, whatever its weight is.
@@ -406,16 +427,16 @@ class IncidentBook:
         target = decision.target
         for key in reversed(sums):
             if _names(key, target.kind, target.address) or key == ("victim", target.address):
-                return sums[key].total, sums[key].bound
+                return sums[key].sum, sums[key].bound
         strongest = found.strongest()
-        return strongest.total, strongest.bound
+        return strongest.sum, strongest.bound
 
     def _action_of(self, decision: Decision, found: OpenIncident) -> IncidentAction:
         before = found.actions.get(decision.id)
         if before is not None:
             return structs.replace(before, until=decision.expires, state=before.state)
         nats, bound = self._sum_of(decision, found)
-        sums = [one for one in found.sums.values() if (one.total, one.bound) == (nats, bound)]
+        sums = [one for one in found.sums.values() if (one.sum, one.bound) == (nats, bound)]
         return IncidentAction(
             decision=decision.id,
             remedy=_REMEDIES[decision.action],
@@ -499,6 +520,13 @@ class IncidentBook:
         for decision in one.actions:
             if self._by_decision.get(decision) is one:
                 del self._by_decision[decision]
+
+
+def _about(evidence: Evidence, *, suspect: bool) -> tuple[list[AttackerKey], list[AttackerKey]]:
+    """Keys of whom a piece of evidence accuses, and of the victims that its incident has in common with others."""
+    mine = _accused(evidence)
+    shared = not mine or (suspect and evidence.kind in SHARED_VICTIM)
+    return mine, [("victim", victim) for victim in evidence.victims] if shared else []
 
 
 def _accused(evidence: Evidence) -> list[AttackerKey]:

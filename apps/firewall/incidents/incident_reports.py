@@ -61,6 +61,16 @@ class IncidentReports:
         """
         self._publish(self._book.hear_evidence(evidence, total_nats, bound))
 
+    def own(self, evidence: Evidence, share: float, bound: float) -> None:
+        """The firewall acts on evidence of its own, which the sequential test does not add up.
+
+        Args:
+            evidence: the piece.
+            share: what its source makes up of the sum, beside what the test has added up.
+            bound: what that sum must reach for a decision.
+        """
+        self._publish(self._book.hear_own(evidence, share, bound))
+
     def spared(self, evidence: Evidence, total_nats: float, bound: float, why: str) -> None:
         """The sum has reached its bound, and an alert is all that may be done.
 

@@ -46,6 +46,13 @@ class SumAgainst:
     total: float = 0.0
     bound: float = 0.0
     shares: dict[str, Contribution] = field(default_factory=dict)
+    own: dict[str, Contribution] = field(default_factory=dict)
+    """By source: evidence of the firewall itself, which counts in full beside `total`."""
+
+    @property
+    def sum(self) -> float:
+        """What decides: the sum of the sequential test, and what the firewall itself adds."""
+        return self.total + sum(share.nats for share in self.own.values())
 
     def add(self, piece: Contribution, total: float, bound: float) -> None:
         """Take a piece; `total` is the sum with it, so what came before has faded to the rest."""
@@ -62,7 +69,7 @@ class SumAgainst:
 
     def largest(self) -> tuple[Contribution, ...]:
         """Shares, the largest first."""
-        ordered = sorted(self.shares.values(), key=lambda share: -share.nats)
+        ordered = sorted((*self.shares.values(), *self.own.values()), key=lambda share: -share.nats)
         return tuple(share for share in ordered if share.nats > 0)[:MOST_CONTRIBUTIONS]
 
 
@@ -130,9 +137,26 @@ class OpenIncident:
     def hear(self, evidence: Evidence, keys: Sequence[AttackerKey], total: float, bound: float) -> None:
         """Take a piece of evidence; `total` is the sum against its sender with it."""
         piece = piece_of(evidence)
-        self.blame(keys, evidence.sender).add(piece, total, bound)
+        against = self.blame(keys, evidence.sender)
+        against.add(piece, total, bound)
+        self._take(evidence, piece, against)
+
+    def hear_own(self, evidence: Evidence, keys: Sequence[AttackerKey], share: float, bound: float) -> None:
+        """Take a piece of evidence of the firewall itself; `share` is what its source makes up of the sum."""
+        piece = piece_of(evidence)
+        against = self.blame(keys, evidence.sender)
+        against.own[piece.source] = structs.replace(piece, nats=share)
+        against.bound = bound
+        if evidence.kind == "offence":  # about the past: it says nothing of what happens now
+            self.peak = max(self.peak, against.sum)
+            self.note(piece)
+        else:
+            self._take(evidence, piece, against)
+
+    def _take(self, evidence: Evidence, piece: Contribution, against: SumAgainst) -> None:
         self.nameless = self.nameless or not (evidence.sender or evidence.address)
-        self.peak = max(self.peak, total)
+        self.attacker_text = self.attacker_text or evidence.address
+        self.peak = max(self.peak, against.sum)
         self.weigh(evidence.kind, evidence.nats)
         self.begun, self.last = min(self.begun, evidence.since), max(self.last, evidence.event_time)
         self.name_victims(evidence.victims, evidence.victim_count)
@@ -185,6 +209,7 @@ class OpenIncident:
         self.names |= other.names
         self.attackers_before = max(self.attackers_before, other.attackers_before)
         self.attacker = self.attacker or other.attacker
+        self.attacker_text = self.attacker_text or other.attacker_text
         self.begun, self.last = min(self.begun, other.begun), max(self.last, other.last)
         self.nameless = self.nameless or other.nameless
         self.past.update(other.past)
@@ -222,12 +247,12 @@ class OpenIncident:
 
     def strongest(self) -> SumAgainst:
         """The sum against the attacker who has come closest to his bound."""
-        return max(self.sums.values(), key=lambda one: one.total / (one.bound or 1.0), default=SumAgainst())
+        return max(self.sums.values(), key=lambda one: one.sum / (one.bound or 1.0), default=SumAgainst())
 
     def report(self, change: Change, now: int) -> Incident:
         """The incident as a message."""
         strongest = self.strongest()
-        nats, bound = self.decided or (strongest.total, strongest.bound)
+        nats, bound = self.decided or (strongest.sum, strongest.bound)
         return Incident(
             id=self.id,
             kind=self.kind,
@@ -258,7 +283,10 @@ class OpenIncident:
     def who(self) -> str:
         """The attackers in words."""
         if self.attacker is None:
-            return self.attacker_text or FORGED
+            named = self.attacker_text
+            if named and self.nameless and not named.startswith(FORGED):
+                return f"{FORGED}, and {named}"
+            return named or FORGED
         first = who(self.attacker)
         if self.nameless:
             return f"{FORGED}, and {first}"

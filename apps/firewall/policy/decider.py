@@ -7,13 +7,15 @@ paper        the first packet at or above Kitsune's threshold
 
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from msgspec import structs
 
 from apps.evidence import ONE_HOST, Evidence, TrainingState
 from apps.firewall.arp.arp_bindings import ArpBindings, BoundHost
+from apps.firewall.evidence.history import EarlierBlocks
+from apps.firewall.evidence.offences import offence_evidence
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.rate_limits import limit_of, limit_words, scan_limit_of, usual_rate_of
 from apps.firewall.policy.rules import AllowList, PolicyVerdict, Rules, judge, narrowest_target
@@ -22,7 +24,7 @@ from apps.firewall.syn.services import TcpService
 from apps.messages import Alert, RateLimit, Sender, Target
 
 OFFENCE_NATS: Final = 2.0
-"""By so much each earlier block lowers the bound ..."""
+"""So much each earlier block adds to the sum ..."""
 MOST_OFFENCES: Final = 3
 """... up to this many."""
 PROBATION_SHARE: Final = 0.5
@@ -31,7 +33,7 @@ TELL_AGAIN_S: Final = 600
 MOST_TOLD: Final = 16_384
 _PARTS_SHOWN: Final = 3
 
-Offences = Callable[[Target], int | None]
+Offences = Callable[[Target], EarlierBlocks | None]
 """Earlier blocks of a target; None if the archive does not answer."""
 Services = Callable[[str], Collection[int] | None]
 """TCP ports of an address with a service; None if nobody can know them."""
@@ -53,7 +55,10 @@ class Proposal:
     """Why nothing is done although the bound is crossed."""
     nats: float = 0.0
     bound: float = 0.0
+    """What the sum had to reach: less than the bound of the test on probation."""
     offences: int | None = 0
+    offence: Evidence | None = None
+    """The earlier blocks that are a part of the sum; to be written."""
     tally: EvidenceSum | None = None
 
 
@@ -150,25 +155,23 @@ class Decider:
             return None
         total = tally.total(now, bound)
         target = _target_of(evidence, sender)
-        needed, earlier = bound, 0
+        needed = bound
+        earlier: EarlierBlocks | None = EarlierBlocks()
         if self._lifecycle.on_probation(sender, now):
             needed = max(LEAST_BOUND, PROBATION_SHARE * bound)
         if target is not None and needed - MOST_OFFENCES * OFFENCE_NATS <= total:
-            found = offences(target)
-            earlier = found or 0
-            needed = max(LEAST_BOUND, needed - OFFENCE_NATS * min(earlier, MOST_OFFENCES))
-            unknown = found is None
-        else:
-            unknown = False
+            earlier = offences(target)
+        offence = _offence_of(evidence, target, earlier, needed)
+        total += offence.nats if offence is not None else 0.0
         if total < needed:
             return None
-        reason = _reason(tally, now, bound, total, needed, earlier)
+        reason = _reason(tally, now, bound, total, needed, offence)
         target, refusal = self._chosen(evidence, sender, target)
         spared = self._allow().covers(sender)
         if target is None and not spared and self._may_be_planted(evidence, sender):
             remedy = self._for_the_victim(tally, f"{reason}; {refusal}", total, needed)
             if remedy is not None:
-                return remedy
+                return replace(remedy, offence=offence)
         if refusal and not self._news(sender, now):
             return None
         return Proposal(
@@ -178,7 +181,8 @@ class Decider:
             refusal="" if target is not None else refusal,
             nats=total,
             bound=needed,
-            offences=None if unknown else earlier,
+            offences=None if earlier is None else earlier.times,
+            offence=offence,
             tally=tally,
         )
 
@@ -257,7 +261,7 @@ class Decider:
     def _towards(self, evidence: Evidence, tally: EvidenceSum, total: float, bound: float) -> Proposal | None:
         """A victim of senders that cannot be told apart, or whose addresses are forged."""
         now = evidence.event_time
-        reason = _reason(tally, now, bound, total, bound, 0)
+        reason = _reason(tally, now, bound, total, bound)
         if evidence.address:
             refusal = (
                 f"it is not known on which port {evidence.address} is, nor whether the address is its own"
@@ -331,13 +335,31 @@ def _is_anothers(evidence: Evidence) -> bool:
 
 
 def _target_of(evidence: Evidence, sender: Sender) -> Target | None:
+    """What a block would match."""
     if evidence.forged or evidence.kind == "spoofing":  # the address is not the sender's own
         return Target(kind="mac", address=sender.mac, port=sender.port)
     return narrowest_target(sender, evidence.mac_addresses)
 
 
-def _reason(tally: EvidenceSum, now: int, bound: float, total: float, needed: float, earlier: int) -> str:
+def _offence_of(
+    evidence: Evidence, target: Target | None, earlier: EarlierBlocks | None, needed: float
+) -> Evidence | None:
+    """Earlier blocks as evidence: `LEAST_BOUND` of what is needed must come from what was seen now."""
+    if target is None or earlier is None or not earlier.times:
+        return None
+    nats = min(OFFENCE_NATS * min(earlier.times, MOST_OFFENCES), needed - LEAST_BOUND)
+    return offence_evidence(evidence, target, earlier, nats)
+
+
+def _reason(
+    tally: EvidenceSum,
+    now: int,
+    bound: float,
+    total: float,
+    needed: float,
+    offence: Evidence | None = None,
+) -> str:
     shares = [(nats, each) for nats, each in tally.shares(now, bound) if nats > 0]
     parts = [f"{each.latest.text} ({nats:.1f})" for nats, each in shares[:_PARTS_SHOWN]]
-    before = f", {earlier} earlier block{'s' if earlier > 1 else ''}" if earlier else ""
+    before = f", {offence.nats:.1f} of it because {offence.text}" if offence is not None else ""
     return f"evidence of {total:.1f} nats, {needed:.1f} needed{before}: " + "; ".join(parts)

@@ -10,7 +10,7 @@ Pure; times are capture time in ns and the caller's monotonic clock in seconds.
 from dataclasses import dataclass
 from typing import Final
 
-from apps.firewall.syn.syn_defence import Suspicion
+from apps.firewall.syn.flood_evidence import Suspicion
 
 HOSTS_WATCHED: Final = 64
 AGAIN_MS: Final = 10

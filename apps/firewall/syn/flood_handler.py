@@ -9,17 +9,21 @@ from typing import Any, Final
 
 import due
 from apps.firewall.arrivals import FloodReported, SwitchReport, evidence_of
+from apps.firewall.evidence.history import EarlierBlocks
 from apps.firewall.evidence.known_sources import KnownSources
+from apps.firewall.evidence.offences import offence_evidence
+from apps.firewall.evidence.own_evidence import OwnEvidence
 from apps.firewall.evidence.recent_rows import AGED_S
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.rules import AllowList
 from apps.firewall.settings import Settings
 from apps.firewall.syn.examinations import Examination, Examinations
+from apps.firewall.syn.flood_evidence import Suspicion, SynFinding
 from apps.firewall.syn.recent_syns import Surges
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.suspect_samples import SuspectSamples
 from apps.firewall.syn.syn_ack_buffer import Answers, SynAckBuffer, Wanted, packet_outs
-from apps.firewall.syn.syn_defence import Suspicion, SynDefence, Watch
+from apps.firewall.syn.syn_defence import SynDefence, Watch
 from apps.messages import Confirmation, Decision
 from due import Engine, Item, RecordBatch
 
@@ -41,6 +45,7 @@ class FloodHandler:
         allowed: the allow-list of the settings.
         known: addresses known from handshakes.
         switches: names of connected switches.
+        own: writes what decides as evidence.
         publish: writes a decision; with `False` no connections are reset for it.
         offences: earlier blocks of addresses by a capture time, ns; None if the archive does not answer.
         lock: of the service, for the timer's thread.
@@ -55,8 +60,9 @@ class FloodHandler:
         allowed: tuple[str, ...],
         known: KnownSources,
         switches: Collection[str],
+        own: OwnEvidence,
         publish: Callable[[Decision, bool], Decision],
-        offences: Callable[[Sequence[str], int], dict[str, int] | None],
+        offences: Callable[[Sequence[str], int], dict[str, EarlierBlocks] | None],
         lock: "threading.RLock",
         clock: Callable[[], float],
     ) -> None:
@@ -64,6 +70,7 @@ class FloodHandler:
         self._engine = engine
         self._rules = rules
         self._switches = switches
+        self._own = own
         self._publish = publish
         self._offences = offences
         self._lock = lock
@@ -89,13 +96,13 @@ class FloodHandler:
     def report(self, item: Item, flood: FloodReported, now: int) -> None:
         """A query has found a flood."""
         summary = f"{flood.count} new half-open connections to {flood.dst} within a window"
-        self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
+        self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start, flood.count))
 
     def surge(self, item: Item, flood: FloodReported, now: int) -> None:
         """The switch has counted the SYNs itself; from now on some of them are copied."""
         summary = f"{flood.count} SYNs went to {flood.dst} within {self._rules.window_ms} ms"
         self._request(self._samples.begin(flood.dst, self._clock()))
-        self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start))
+        self._suspect(Suspicion(flood.dst, evidence_of(item, summary), now, flood.window_start, flood.count))
 
     def syns(self, item: Item, batch: RecordBatch) -> None:
         """SYNs of a plausible time, at least one."""
@@ -108,7 +115,8 @@ class FloodHandler:
             self._request(self._samples.ended(self._clock()))
         for surge in self._surges.add(batch) if rules.copies == "all" else ():
             summary = f"{rules.threshold} SYNs went to {surge.host} within {rules.window_ms} ms"
-            self._suspect(Suspicion(surge.host, evidence_of(item, summary), surge.at, surge.window))
+            exhibit = evidence_of(item, summary)
+            self._suspect(Suspicion(surge.host, exhibit, surge.at, surge.window, rules.threshold))
         if self._examinations.live:
             self.look_at_what_is_due()
 
@@ -224,17 +232,33 @@ class FloodHandler:
             return
         often = watch.often(self._rules) if due.sure else ()
         offences = self._offences(often, watch.now)
-        for decision in self.defence.conclude(watch, offences, sure=due.sure):
-            # the guard before the block has had the source's connections reset
-            decision = self._publish(decision, False)  # noqa: PLW2901 - as it was published
-            if decision.action == "protect" and not decision.dry_run:
-                target = decision.target
-                wanted = Wanted(
-                    TcpService(target.address, target.port or 0), since=due.suspicion.since - _BEFORE_NS
-                )
-                self._resets.plan(decision.id, wanted, self._clock())
+        for finding in self.defence.findings(watch, self._own.bound, sure=due.sure):
+            for decision in self._decide(finding, offences, sure=due.sure):
+                self._plan_resets(decision, due.suspicion.since - _BEFORE_NS)
         if watch.unsure:
             self._examinations.doubt(due, self._clock())
+
+    def _decide(
+        self, finding: SynFinding, offences: dict[str, EarlierBlocks] | None, *, sure: bool
+    ) -> list[Decision]:
+        """Decide by what was found, and write it where it is news or decides; returns what was published."""
+        news = False
+        if not finding.source:
+            evidence, news = self._own.found(finding.evidence, again=sure)
+            finding = finding._replace(evidence=evidence)
+        decisions = self.defence.decide(finding, offences)
+        if news or decisions:
+            self._own.tell(finding.evidence)
+        earlier = (offences or {}).get(finding.source)
+        if decisions and earlier is not None and earlier.times:
+            self._own.tell(offence_evidence(finding.evidence, finding.target, earlier))
+        # the guard before the block has had the source's connections reset
+        return [self._publish(each, False) for each in decisions]
+
+    def _plan_resets(self, decision: Decision, since: int) -> None:
+        if decision.action == "protect" and not decision.dry_run:
+            service = TcpService(decision.target.address, decision.target.port or 0)
+            self._resets.plan(decision.id, Wanted(service, since=since), self._clock())
 
     def _is_too_early(self, watch: Watch, due: Examination) -> bool:
         """Whether the sample, which began with the report, is still too small to tell."""

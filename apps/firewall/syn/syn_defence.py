@@ -1,28 +1,29 @@
 """Defence against SYN floods: which services are guarded, and which sources are blocked.
 
     switch seen ──► guard of the services that the settings name, and known sources
-    syn_flood result or surge ──► the SYNs that came towards that host ──► policy ──► guard, soon
-                                                             ... once more, later ──► block, surely
+    syn_flood result or surge ──► the SYNs that came towards that host ──► policy ──► evidence ──► guard, soon
+                                                                   ... once more, later ──► block, surely
     handshake ──► known source
 
 Pure: decisions are returned and the caller publishes them; times are capture time in ns.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 from typing import Any
 
+from apps.firewall.evidence.history import EarlierBlocks
 from apps.firewall.evidence.known_sources import KnownSources
 from apps.firewall.evidence.shared import shared_text
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle, decision_id
 from apps.firewall.policy.prefix_aggregation import Network, any_within, crowded_prefixes
 from apps.firewall.policy.rules import AllowList
+from apps.firewall.syn.flood_evidence import Suspicion, SynFinding, flood_evidence, source_evidence
 from apps.firewall.syn.recent_syns import RecentSyns
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_policy import Sample, SynRules, SynVerdict, judge_syns
-from apps.messages import Decision, Exhibit, Target
+from apps.messages import Decision, Exhibit
 
 EVERY_SWITCH = "*"
 UNKNOWN_HISTORY = "history unknown: Data Archives do not answer"
@@ -31,22 +32,12 @@ SERVICES_LEARNT = 4096
 SOURCES_SAMPLED = 4096
 
 
-@dataclass(frozen=True)
-class Suspicion:
-    """A flood towards a host; times are capture time in ns."""
-
-    host: str
-    evidence: Exhibit
-    now: int
-    since: int
-
-
 class Watch:
     """The SYNs towards one host, under examination."""
 
-    def __init__(self, host: str, evidence: Exhibit, now: int) -> None:
-        self.host = host
-        self.evidence = evidence
+    def __init__(self, suspicion: Suspicion, now: int) -> None:
+        self.suspicion = suspicion
+        self.host = suspicion.host
         self.now = now
         self.unsure = False
         """Sources would be blocked if they had had more time to finish their handshakes."""
@@ -120,18 +111,13 @@ class SynDefence:
             if service.address == host:
                 expires = now + self.rules.protect_s * SECOND
                 self._guarded[service] = _changed(decision, expires=expires)
-        watch = Watch(host, suspicion.evidence, now)
+        watch = Watch(suspicion, now)
         for port, source in self.recent.towards(host, since, until):
             watch.add(port, source)
         for at, source, service in self._finished:
             if since <= at and (until is None or at <= until) and service.address == host:
                 watch.finished(service.port, source)
         return watch
-
-    def _guard_known_services(self, watch: Watch) -> list[Decision]:
-        reason = f"{watch.evidence.summary}, whose SYNs were not seen here: its known service is guarded"
-        services = [service for service in self.services if service.address == watch.host]
-        return [guard for service in services for guard in self._guard(service, reason, watch)]
 
     def handshake(self, source: str, service: TcpService, at: int) -> None:
         """A source has completed a handshake with a service."""
@@ -149,35 +135,74 @@ class SynDefence:
             return None
         return tuple(service.port for service in self.services if service.address == address)
 
-    def conclude(
-        self, watch: Watch, offences: Mapping[str, int] | None, *, sure: bool = True
-    ) -> list[Decision]:
-        """Decisions for a watch; `offences` are earlier blocks by address, None if unknown.
+    def findings(self, watch: Watch, nats: float, *, sure: bool = True) -> Iterator[SynFinding]:
+        """What a watch has come to, as evidence.
 
-        Unless handshakes had time to complete (`sure`) nobody is blocked: the service is guarded, and
-        the watch is marked as unsure.
+        To be decided one by one: what is decided about one counts for those after it.  Unless handshakes had time to
+        complete (`sure`) nobody is to be blocked: the service is to be guarded, and the watch is marked as unsure.
+
+        Args:
+            watch: the SYNs towards a host.
+            nats: the weight of a rule that decides by itself.
+            sure: whether handshakes had time to complete.
         """
         sampled = self.rules.copies == "suspects"
         if not len(self.recent) or (sampled and not watch.total):  # the stream of SYNs does not reach us
-            return self._guard_known_services(watch)
+            yield from self._known_services(watch, nats)
+            return
         by_port: dict[int, dict[str, int]] = {}
         for (port, source), count in watch.syns.items():
             by_port.setdefault(port, {})[source] = count
-        decisions: list[Decision] = []
         for port, syns in sorted(by_port.items()):
             sample = Sample(TcpService(watch.host, port), syns)
             verdict = judge_syns(sample, self.rules, self.allow, self.known, self.gather)
             if verdict.block and sure and self._is_dead(sample.service):
                 # a device may send SYNs to a server that is gone: nothing is half-open there.  Where
                 # only one direction passes the switch the guard has to do, since nobody can tell the two apart
-                decisions += self._guard(sample.service, f"{verdict.reason} once it answers anybody", watch)
+                yield flood_evidence(sample, f"{verdict.reason} once it answers anybody", watch, nats)
             elif verdict.block and not sure:
                 watch.unsure = True
                 reason = f"{verdict.reason} unless they finish their handshakes soon; guarded meanwhile"
-                decisions += self._guard(sample.service, reason, watch)
+                yield flood_evidence(sample, reason, watch, nats)
             else:
-                decisions += self._carry_out(sample.service, verdict, watch, offences)
-        return decisions
+                yield from self._of_verdict(sample, verdict, watch, nats)
+
+    def _known_services(self, watch: Watch, nats: float) -> Iterator[SynFinding]:
+        suspicion = watch.suspicion
+        reason = f"{suspicion.evidence.summary}, whose SYNs were not seen here: its known service is guarded"
+        for service in [each for each in self.services if each.address == watch.host]:
+            unseen = Sample(service, {"": suspicion.count})
+            yield flood_evidence(unseen, reason, watch, nats)
+
+    def _of_verdict(
+        self, sample: Sample, verdict: SynVerdict, watch: Watch, nats: float
+    ) -> Iterator[SynFinding]:
+        if verdict.protects:
+            yield flood_evidence(sample, verdict.reason, watch, nats)
+        blocked = {block.decision.target.address for block in self._lifecycle.blocks.values()}
+        for source in verdict.block:
+            if source not in blocked and not self._lifecycle.in_blocked_prefix(source):
+                yield source_evidence(source, sample, verdict.reason, watch, nats)
+
+    def decide(self, finding: SynFinding, offences: Mapping[str, EarlierBlocks] | None) -> list[Decision]:
+        """Decisions by a finding; `offences` are earlier blocks by address, None if unknown."""
+        evidence = finding.evidence
+        if not finding.source:
+            return self.guard(finding.service, finding.reason, (finding.exhibit,), evidence.event_time)
+        cap = self._lifecycle.cap_reached(evidence.event_time)
+        if cap is not None:
+            self._lifecycle.refuse(cap, finding.source, evidence.event_time)
+            return []
+        note = "" if offences is not None else f" ({UNKNOWN_HISTORY})"
+        made = self._lifecycle.open(
+            EVERY_SWITCH,
+            finding.target,
+            finding.reason + note,
+            (finding.exhibit,),
+            evidence.event_time,
+            offences=(offences or {}).get(finding.source, EarlierBlocks()).times,
+        )
+        return [made]
 
     def _is_dead(self, service: TcpService) -> bool:
         return service not in self.services and self._is_silent(service)
@@ -238,37 +263,6 @@ class SynDefence:
             _changed(self._guarded.pop(service), action="unprotect", reason=reason, event_time=now)
             for service in over
         ]
-
-    def _carry_out(
-        self, service: TcpService, verdict: SynVerdict, watch: Watch, offences: Mapping[str, int] | None
-    ) -> list[Decision]:
-        decisions: list[Decision] = []
-        if verdict.protects:
-            decisions += self._guard(service, verdict.reason, watch)
-        blocked = {block.decision.target.address for block in self._lifecycle.blocks.values()}
-        for source in verdict.block:
-            if source in blocked or self._lifecycle.in_blocked_prefix(source):
-                continue
-            cap = self._lifecycle.cap_reached(watch.now)
-            if cap is not None:
-                self._lifecycle.refuse(cap, source, watch.now)
-                continue
-            target = Target(kind="ip", address=source)
-            note = "" if offences is not None else f" ({UNKNOWN_HISTORY})"
-            decisions.append(
-                self._lifecycle.open(
-                    EVERY_SWITCH,
-                    target,
-                    verdict.reason + note,
-                    (watch.evidence,),
-                    watch.now,
-                    offences=(offences or {}).get(source, 0),
-                )
-            )
-        return decisions
-
-    def _guard(self, service: TcpService, reason: str, watch: Watch) -> list[Decision]:
-        return self.guard(service, reason, (watch.evidence,), watch.now)
 
     def guard(
         self, service: TcpService, reason: str, evidence: tuple[Exhibit, ...], now: int

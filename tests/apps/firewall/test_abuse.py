@@ -7,9 +7,10 @@ from apps.firewall.arp.arp_bindings import ArpBindings
 from apps.firewall.evidence.known_sources import KnownSources
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.rules import AllowList, Rules
+from apps.firewall.syn.flood_evidence import Suspicion
 from apps.firewall.syn.recent_syns import HOSTS, Surges
 from apps.firewall.syn.services import TcpService
-from apps.firewall.syn.syn_defence import SOURCES_SAMPLED, Suspicion, SynDefence
+from apps.firewall.syn.syn_defence import SOURCES_SAMPLED, SynDefence
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Decision, Exhibit
 from apps.packets import read_frames
@@ -22,6 +23,7 @@ from tests.apps.firewall.alerts import alert
 from tests.apps.firewall.desk import ALERT, ARP, HANDSHAKE, NOW, SYNS, Desk
 from tests.apps.firewall.rows import arp, records, spoofed_syns
 from tests.apps.firewall.syn.test_recent_syns import batch
+from tests.apps.firewall.syn.test_syn_defence import decided
 from tests.requirements import shared_data
 
 WEB = TcpService("10.0.0.1", 80)
@@ -58,7 +60,7 @@ def test_flood_from_the_prefix_of_a_real_host(prefix, host):
     made.handshake(host, service, NOW)
     rows = [(1, f"{prefix}{n}", service.address, 80) for n in range(256) for _ in range(5)]
     made.recent.add(batch(*rows))
-    (decision,) = made.conclude(made.suspect(Suspicion(service.address, ANY, NOW, 0)), {})
+    (decision,) = decided(made, made.suspect(Suspicion(service.address, ANY, NOW, 0)))
     assert (decision.action, decision.target) == ("protect", service.target)
 
 
@@ -67,7 +69,7 @@ def test_prefix_where_nobody_lives_is_blocked_as_one():
     made = defence()
     rows = [(1, f"10.4.0.{n}", WEB.address, 80) for n in range(256) for _ in range(5)]
     made.recent.add(batch(*rows))
-    (decision,) = made.conclude(made.suspect(Suspicion(WEB.address, ANY, NOW, 0)), {})
+    (decision,) = decided(made, made.suspect(Suspicion(WEB.address, ANY, NOW, 0)))
     assert (decision.action, decision.target.address) == ("block", "10.4.0.0/24")
 
 
@@ -77,7 +79,7 @@ def test_client_that_retries_is_not_blocked_with_the_flooders():
     rows = [(1, f"77.0.0.{n}", WEB.address, 80) for n in range(3) for _ in range(300)]
     rows += [(1, NEIGHBOUR, WEB.address, 80)] * 8
     made.recent.add(batch(*rows))
-    blocked = made.conclude(made.suspect(Suspicion(WEB.address, ANY, NOW, 0)), {})
+    blocked = decided(made, made.suspect(Suspicion(WEB.address, ANY, NOW, 0)))
     assert sorted(each.target.address for each in blocked) == ["77.0.0.0", "77.0.0.1", "77.0.0.2"]
 
 
@@ -140,7 +142,7 @@ def test_a_million_forged_sources():
         for host, since, _ in surges.add(rows) if number % 5 == 0 else ():
             watch = made.suspect(Suspicion(host, ANY, NOW, since))
             assert len(watch.syns) <= SOURCES_SAMPLED
-            decisions += made.conclude(watch, {}, sure=True)
+            decisions += decided(made, watch)
     assert [each.action for each in decisions] == ["protect"]
     assert len(made.recent) <= 2 * size
     assert len(made.known) == 1
@@ -180,7 +182,7 @@ def test_flash_crowd_is_no_flood():
     decisions = [
         each
         for host, since, _ in suspected
-        for each in made.conclude(made.suspect(Suspicion(host, ANY, NOW, since)), {})
+        for each in decided(made, made.suspect(Suspicion(host, ANY, NOW, since)))
     ]
     assert decisions == []
 
@@ -203,8 +205,9 @@ class Watchman:
         self.syns += len(syns)
         self.defence.recent.add(syns)
         for host, since, _ in self.surges.add(syns):
-            watch = self.defence.suspect(Suspicion(host, ANY, since + SECOND, since))
-            self.decisions += self.defence.conclude(watch, {})
+            self.decisions += decided(
+                self.defence, self.defence.suspect(Suspicion(host, ANY, since + SECOND, since))
+            )
 
 
 def test_real_packets():

@@ -161,6 +161,41 @@ def test_a_decision_without_evidence_before_it_opens_one():
     assert len(book) == 1
 
 
+def test_earlier_blocks_are_a_part_of_the_sum_and_say_nothing_of_what_happens():
+    """They neither make the incident older nor name it; what comes next is added to the test's own sum."""
+    book = IncidentBook()
+    begun = opened(book, kind="unlike_training", nats=5.0).begun
+    offence = evidence(100.1, kind="offence", source="offence", since=1, nats=4.0, packets=0)
+    book.hear_own(offence, 4.0, BOUND)
+    (told,) = book.decided(decision())
+    (action,) = told.actions
+    assert [(each.source, each.nats) for each in action.contributions] == [
+        ("strangers", 6.0),
+        ("offence", 4.0),
+    ]
+    assert (action.nats, action.bound, told.peak_nats) == (10.0, BOUND, 10.0)
+    assert (told.kind, told.begun, told.packets) == ("unlike_training", begun, 20)
+    (more,) = book.hear_evidence(evidence(103.0, nats=1.0), 7.0, BOUND)
+    shares = more.contributions
+    assert [(each.source, each.nats) for each in shares] == [("strangers", 7.0), ("offence", 4.0)]
+
+
+def test_a_rule_that_decides_by_itself_opens_an_incident():
+    """Who is named by an address alone is named after those whom nobody can name."""
+    book = IncidentBook()
+    nameless = evidence(100.0, None, kind="flood", source="flood", nats=BOUND)
+    (told,) = book.hear_own(nameless, BOUND, BOUND)
+    assert (told.change, told.kind, told.nats, told.attacker) == ("opened", "flood", BOUND, None)
+    book.hear_own(structs.replace(nameless, address="192.0.2.66"), BOUND, BOUND)
+    (blocked,) = book.decided(decision(target=Target(kind="ip", address="192.0.2.66")))
+    assert (blocked.id, len(book)) == (told.id, 1)
+    assert blocked.attacker_text == "forged or too many addresses, and 192.0.2.66"
+    after = IncidentBook()
+    after.restore([blocked])
+    after.hear_own(nameless, BOUND, BOUND)
+    assert after.flush()[-1].attacker_text == blocked.attacker_text
+
+
 def test_nothing_enforced_is_nothing_mitigated():
     """Dry runs, failures and mere alerts are no mitigation."""
     book = IncidentBook()

@@ -8,11 +8,13 @@ from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.instructions import Desk, target_in
 from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.policy.rules import AllowList, Rules
+from apps.firewall.syn.flood_evidence import Suspicion
 from apps.firewall.syn.services import TcpService
-from apps.firewall.syn.syn_defence import Suspicion, SynDefence
+from apps.firewall.syn.syn_defence import SynDefence
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Decision, Exhibit, Instruction, Target
 from tests.apps.firewall.syn.test_recent_syns import batch
+from tests.apps.firewall.syn.test_syn_defence import decided
 
 WEB = TcpService("10.0.0.1", 80)
 NOW = 1_000 * SECOND
@@ -113,7 +115,7 @@ def test_panic_lifts_blocks_and_guards():
     lifecycle = BlockLifecycle(Rules())
     syn = SynDefence(ledger_rules(), (), lifecycle, AllowList(), KnownSources(10))
     syn.recent.add(batch(*[(1, f"77.0.{n // 256}.{n % 256}", WEB.address, WEB.port) for n in range(600)]))
-    syn.conclude(syn.suspect(Suspicion(WEB.address, SAID, NOW, 0)), {})
+    decided(syn, syn.suspect(Suspicion(WEB.address, SAID, NOW, 0)))
     made = Desk(lifecycle, syn, RateLimits(Rules()), (), FalseAlarms(90))
     tell(made, "block", "192.0.2.1")
     decisions, answer = tell(made, "panic")

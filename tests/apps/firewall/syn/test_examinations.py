@@ -1,7 +1,7 @@
 """Floods are examined at a capture time: as soon as the packets have reached it, however fast they come."""
 
 from apps.firewall.syn.examinations import Examinations
-from apps.firewall.syn.syn_defence import Suspicion
+from apps.firewall.syn.flood_evidence import Suspicion
 from tests.apps.firewall.syn.test_syn_defence import FLOOD
 
 SECOND = 1_000_000_000

@@ -3,9 +3,10 @@
 from apps.firewall.evidence.known_sources import KnownSources
 from apps.firewall.policy.block_lifecycle import SECOND, BlockLifecycle
 from apps.firewall.policy.rules import AllowList, Rules
+from apps.firewall.syn.flood_evidence import Suspicion
 from apps.firewall.syn.recent_syns import RecentSyns
 from apps.firewall.syn.services import TcpService
-from apps.firewall.syn.syn_defence import SERVICES_LEARNT, SOURCES_SAMPLED, Suspicion, SynDefence, Watch
+from apps.firewall.syn.syn_defence import SERVICES_LEARNT, SOURCES_SAMPLED, SynDefence, Watch
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Decision, Exhibit
 from tests.apps.firewall.syn.test_recent_syns import batch
@@ -20,6 +21,11 @@ def defence(*guards: TcpService, rules: Rules | None = None, allow: tuple[str, .
     return SynDefence(SynRules(), guards, lifecycle, AllowList.parse(allow), KnownSources(10))
 
 
+def decided(made: SynDefence, watch: Watch) -> list[Decision]:
+    """What a look that is sure leads to."""
+    return [each for finding in made.findings(watch, 10.0) for each in made.decide(finding, {})]
+
+
 def flood(made: SynDefence, sources: int, each: int, now: int = NOW) -> list[Decision]:
     rows = [
         (1, f"10.2.{n % sources // 256}.{n % sources % 256}", WEB.address, WEB.port)
@@ -27,7 +33,7 @@ def flood(made: SynDefence, sources: int, each: int, now: int = NOW) -> list[Dec
     ]
     made.recent = RecentSyns(len(rows))
     made.recent.add(batch(*rows))
-    return made.conclude(made.suspect(Suspicion(WEB.address, FLOOD, now, 0)), {})
+    return decided(made, made.suspect(Suspicion(WEB.address, FLOOD, now, 0)))
 
 
 def test_services_of_the_settings_are_guarded_on_every_switch_that_comes():
@@ -82,7 +88,7 @@ def test_flood_whose_syns_pass_elsewhere_leads_to_a_guard_of_known_services():
     made = defence()
     made.handshake("10.3.0.1", WEB, NOW)
     made.handshake("10.3.0.1", TcpService("10.0.0.9", 22), NOW)
-    (decision,) = made.conclude(made.suspect(Suspicion(WEB.address, FLOOD, NOW, 0)), {})
+    (decision,) = decided(made, made.suspect(Suspicion(WEB.address, FLOOD, NOW, 0)))
     assert (decision.action, decision.target) == ("protect", WEB.target)
     assert FLOOD.summary in decision.reason
 
@@ -112,7 +118,7 @@ def test_flash_crowd_is_no_flood():
     made.recent.add(batch(*[(1, source, WEB.address, WEB.port) for source in sources]))
     for source in sources:
         made.handshake(source, WEB, NOW)
-    assert made.conclude(made.suspect(Suspicion(WEB.address, FLOOD, NOW, 0)), {}) == []
+    assert decided(made, made.suspect(Suspicion(WEB.address, FLOOD, NOW, 0))) == []
 
 
 def test_known_source_that_floods_is_spared():
@@ -139,7 +145,7 @@ def test_dry_run_marks_guards_and_blocks():
 
 def test_state_is_bounded():
     """Any number of forged sources and of services does not fill the memory."""
-    watch = Watch(WEB.address, FLOOD, NOW)
+    watch = Watch(Suspicion(WEB.address, FLOOD, NOW, 0), NOW)
     made = defence()
     for number in range(20_000):
         watch.add(80, str(number))
