@@ -26,9 +26,9 @@ from due.drivers.sqlite import SqliteArchive
 from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
 from sdnator import app_catalogue
 
-HOURS: Final = 12.0
-_ITEM_BYTES: Final = 4_096
-_ITEMS: Final = 1
+HOURS: Final = 4.0
+_ITEM_BYTES: Final = 6_000
+_ITEMS: Final = 4
 """Written to the archive each second."""
 _PRUNE_S: Final = 60
 _VIEWS_S: Final = 30
