@@ -24,8 +24,8 @@ from benchmarks.soak_state_stage import LOOKS, START_NS, FastClock, FastEngine, 
 from due import Engine
 from due.codec import encode_value
 
-HOURS: Final = 6.0
-PACKETS: Final = 6_000_000
+HOURS: Final = 5.0
+PACKETS: Final = 4_000_000
 """Of the recording."""
 _DECISIONS: Final = tuple(
     f"network.{family}.firewall." for family in ("block", "block_prefix", "protect", "meter")
