@@ -8,6 +8,7 @@ when training has long been over.
 """
 
 import re
+import struct
 import subprocess
 import sys
 import tempfile
@@ -42,6 +43,7 @@ _ADDRESS: Final = re.compile(rb"\b(\d{1,3})\.(\d{1,3})\.(\d{1,3})\.(\d{1,3})\b")
 _AT_HOME: Final = (0, 10, 127, 169, 172, 192, 198)
 _MULTICAST: Final = 224
 _TURN: Final = 7_919 * 257
+_HEAD: Final = struct.Struct("!I")
 
 
 class Recorded(NamedTuple):
@@ -76,6 +78,18 @@ def recorded(packets: int) -> Recording:
 
 
 def office(packets: int) -> Iterator[RecordBatch]:
+    """Batches of `traffic`, made in another process."""
+    command = [sys.executable, "-m", "benchmarks.soak_state_recording", str(packets)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        try:
+            while head := process.stdout.read(_HEAD.size):
+                yield decode_value(process.stdout.read(*_HEAD.unpack(head)))
+        finally:
+            process.kill()
+
+
+def traffic(packets: int) -> Iterator[RecordBatch]:
     """Batches of office traffic with time stamps of `PPS` from `START_NS` on."""
     fed = 0
     for part in NETWORKS["office"](1).chunks(_MORNING_S, _END_S):
@@ -94,7 +108,7 @@ def _record(packets: int) -> Recording:
     detector, shakes = detector_for(TRAINING), Handshakes()
     begin_us = START_NS // 1000 + packets // _SETTLED * 1_000_000 // PPS
     found: list[Recorded] = []
-    for batch in office(packets):
+    for batch in traffic(packets):
         _, alerts = detector.process(batch, SWITCH)
         heard = detector.take_evidence()
         completed = shakes.process(batch)
@@ -181,5 +195,15 @@ def _other(found: "re.Match[bytes]", turn: int) -> bytes:
     return b"%d.%d.%d.%d" % (first, low >> 16, low >> 8 & 0xFF, low & 0xFF)
 
 
+def _main(packets: int, *file: str) -> None:
+    """Write a recording to a file, or the traffic itself to standard output."""
+    if file:
+        Path(file[0]).write_bytes(msgspec.msgpack.encode(_record(packets)))
+        return
+    for batch in traffic(packets):
+        payload = encode_value(batch)
+        sys.stdout.buffer.write(_HEAD.pack(len(payload)) + payload)
+
+
 if __name__ == "__main__":
-    Path(sys.argv[2]).write_bytes(msgspec.msgpack.encode(_record(int(sys.argv[1]))))
+    _main(int(sys.argv[1]), *sys.argv[2:])

@@ -50,13 +50,15 @@ def clocks(monkeypatch):
         monkeypatch.setattr(sys.modules[name], "time", time)
 
 
-@pytest.mark.parametrize("part", ["coordinator", "firewall", "sonata_adapter"])
+@pytest.mark.parametrize(
+    ("part", "scale"), [("coordinator", "0.01"), ("firewall", "0.008"), ("sonata_adapter", "0.006")]
+)
 @pytest.mark.usefixtures("clocks")
-def test_a_part_lives_through_its_minutes(part, tmp_path, monkeypatch):
+def test_a_part_lives_through_its_minutes(part, scale, tmp_path, monkeypatch):
     """What a service hears and says in them is in its health."""
     monkeypatch.setattr(soak_state_firewall, "PACKETS", 150_000)
     file = tmp_path / "f.json"
-    assert soak_state.main(["--part", part, "--scale", "0.01", "--objects", "--json", str(file)]) in (0, 1)
+    assert soak_state.main(["--part", part, "--scale", scale, "--objects", "--json", str(file)]) in (0, 1)
     found = json.loads(file.read_text())
     assert len(found["mib"]) == 60
     assert {"later_mib_per_hour", "noise", "growing", "more_objects"} <= found.keys()
