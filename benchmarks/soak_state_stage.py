@@ -26,7 +26,9 @@ LOOKS: Final = 20 * SPANS
 """How often memory is looked at."""
 _MOST_OBJECTS: Final = 12
 _WINDOW: Final = Options().window_bytes
-_RETAIN: Final = Options().retain_bytes
+_RETAIN: Final = 1 << 20
+"""Of what a producer keeps for a server that comes back empty.  In a pipeline it is `retain_bytes`, 16 MiB, and keys
+with few items take many hours to fill their share: that bound is known, and here it is reached within the hour."""
 _ARCHIVE_AT: Final = 200
 
 Written = Callable[[str, Any], None]
