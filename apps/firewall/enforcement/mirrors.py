@@ -12,6 +12,8 @@ from msgspec import structs
 from apps.messages import Decision
 
 COPIES: Final = "; would only: the switch sees copies, so nothing can be stopped there"
+MOST_MIRRORS: Final = 256
+"""As many as switches are connected at a time; the one heard of longest ago is forgotten."""
 _EVERY_SWITCH: Final = ("", "*")
 
 
@@ -19,23 +21,28 @@ class Mirrors:
     """The mirrors among the connected switches."""
 
     def __init__(self, *, elsewhere: bool = False) -> None:
-        self._mirrors: set[str] = set()
+        self._mirrors: dict[str, None] = {}
+        """The one heard of last is the last."""
         self._elsewhere = elsewhere
         """Enforcers that are no switches carry blocks out, whatever the switches see."""
 
     def __contains__(self, switch: str) -> bool:
         return switch in self._mirrors
 
+    def __len__(self) -> int:
+        return len(self._mirrors)
+
     def note(self, switch: str, *, mirror: bool) -> None:
         """Remember whether a switch sees copies only."""
+        self._mirrors.pop(switch, None)
         if mirror:
-            self._mirrors.add(switch)
-        else:
-            self._mirrors.discard(switch)
+            self._mirrors[switch] = None
+        while len(self._mirrors) > MOST_MIRRORS:
+            del self._mirrors[next(iter(self._mirrors))]
 
     def marked(self, decision: Decision, connected: Collection[str]) -> Decision:
         """The decision, as a dry run where no switch that could carry it out sees more than copies."""
-        all_copies = bool(connected) and self._mirrors.issuperset(connected)
+        all_copies = bool(connected) and self._mirrors.keys() >= set(connected)
         if decision.switch not in self._mirrors and not (decision.switch in _EVERY_SWITCH and all_copies):
             return decision
         if self._elsewhere and decision.action in ("block", "unblock"):

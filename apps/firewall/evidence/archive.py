@@ -56,6 +56,10 @@ class Archive:
         """Whether the last query got no answer."""
         return self._quiet_until > time.monotonic()
 
+    def health(self) -> dict[str, int]:
+        """Counters for the operator and for Prometheus."""
+        return {"archive_away": self.unanswered, "archive_items_read": self.items_read}
+
     def find(
         self,
         query: str | Mapping[str, Any],

@@ -8,10 +8,12 @@ from typing import Final
 
 from apps.messages import Sender
 
-_MOST: Final = 16_384
+MOST_SHARED: Final = 2_048
+"""Senders, and texts, of which the first object is known: those of the last half hour, where each second brings another
+one.  What was pushed out is shared by what came before, and is forgotten with it."""
 
 
-@lru_cache(maxsize=_MOST)
+@lru_cache(maxsize=MOST_SHARED)
 def shared_sender(sender: Sender) -> Sender:
     """The sender as it came first.
 
@@ -24,7 +26,7 @@ def shared_sender(sender: Sender) -> Sender:
     return sender
 
 
-@lru_cache(maxsize=_MOST)
+@lru_cache(maxsize=MOST_SHARED)
 def shared_text(text: str) -> str:
     """A short text as it came first, such as an address or a key.
 

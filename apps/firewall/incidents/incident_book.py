@@ -83,6 +83,11 @@ class IncidentBook:
     def __len__(self) -> int:
         return len(self._open)
 
+    @property
+    def suspicions(self) -> int:
+        """How many are kept that may become an incident."""
+        return len(self._quiet)
+
     def has(self, decision: str) -> bool:
         """Whether a decision belongs to an incident that is not over."""
         return decision in self._by_decision

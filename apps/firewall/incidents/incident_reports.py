@@ -140,6 +140,7 @@ class IncidentReports:
         """Counters for the operator and for Prometheus."""
         return {
             "incidents_open": len(self._book),
+            "suspicions": self._book.suspicions,
             "incident_reports": self._written,
             "incident_openings_put_off": self._book.left_out,
         }

@@ -142,8 +142,7 @@ class BlockLifecycle:
 
     def cap_reached(self, now: int, host: str = "") -> str | None:
         """Why no further block, or none of this host, may be made now; None if it may."""
-        while self._recent and self._recent[0] <= now - 60 * SECOND:
-            self._recent.popleft()
+        self._forget_old(now)
         if len(self.blocks) >= self.rules.max_blocks:
             return f"{len(self.blocks)} blocks are in force (max_blocks)"
         if len(self._recent) >= self.rules.max_decisions_per_minute:
@@ -200,8 +199,14 @@ class BlockLifecycle:
         )
         block = Block(decision, training_rate, deque([(now, 0)]), host=host or target.address)
         self._hold(block)
+        self._forget_old(now)
         self._recent.append(now)
         return decision
+
+    def _forget_old(self, now: int) -> None:
+        """Only decisions of the last minute count towards a cap."""
+        while self._recent and self._recent[0] <= now - MINUTE:
+            self._recent.popleft()
 
     def _new_id(self, switch: str, target: Target, now: int) -> str:
         """An id that nothing had that was decided lately: a lift ends its id for good."""

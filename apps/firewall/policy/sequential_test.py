@@ -40,6 +40,8 @@ MOST_SOURCES: Final = 32
 """Sources remembered for one subject."""
 FADED_NATS: Final = 0.1
 """A sum that has faded to less decides nothing any more, and is forgotten."""
+FADED_SUPPORT_NATS: Final = 0.5
+"""The same of a sum of supporting evidence alone, which decides nothing by itself."""
 PLACE_HELD_S: Final = 3_600
 """Seconds of capture time for which it is known where an address was last seen."""
 _SWEEP_S: Final = 60
@@ -78,7 +80,8 @@ class EvidenceSum:
 
     def faded(self, now: int, bound: float) -> bool:
         """Whether nothing is left that could count in a decision."""
-        return self.total(now, bound) < FADED_NATS
+        alone = any(not each.latest.supporting for each in self.contributions.values())
+        return self.total(now, bound) < (FADED_NATS if alone else FADED_SUPPORT_NATS)
 
     def shares(self, now: int, bound: float) -> list[tuple[float, SourceNats]]:
         """What each source adds to the sum, the largest first."""
@@ -153,7 +156,7 @@ class SequentialTest:
         elif len(tally.contributions) >= MOST_SOURCES:
             weakest = min(tally.contributions, key=lambda each: tally.contributions[each].at(now))
             del tally.contributions[weakest]
-        tally.contributions[source] = SourceNats(nats, now, evidence)
+        tally.contributions[source] = SourceNats(nats, now, _kept(evidence, former))
         return tally
 
     def sum_of(self, evidence: Evidence) -> float:
@@ -197,3 +200,15 @@ class SequentialTest:
     def forget(self, subject: Subject) -> None:
         """Reset the sum of a subject: after a decision, or a false alarm."""
         self._tallies.pop(subject, None)
+
+
+def _kept(evidence: Evidence, former: SourceNats | None) -> Evidence:
+    """What is kept of a piece for an hour: names that others have, too, and the words of one that added something."""
+    before = former.latest.text if former is not None else ""
+    return structs.replace(
+        evidence,
+        id="",
+        service=shared_text(evidence.service),
+        victims=tuple(map(shared_text, evidence.victims)),
+        text=evidence.text if evidence.nats > 0 else before,
+    )

@@ -74,6 +74,7 @@ class LearntQueries(Generic[Learnt, Made]):
                 made.train(self._network())
             self._kept[key] = made.baseline
         self._watched = watched
+        self._kept = {key: baseline for key, baseline in self._kept.items() if key in watched}
         self._assign()
         return refused
 

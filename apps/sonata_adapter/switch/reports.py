@@ -24,6 +24,8 @@ from due import RecordBatch
 
 _KEPT: Final = 4
 """Windows whose reported keys are remembered, against a report that comes twice."""
+OVERFLOWS_KEPT: Final = 64
+"""Windows of which it is remembered that a key had no cell."""
 
 
 class CountReportReader:
@@ -42,7 +44,8 @@ class CountReportReader:
         self._reduces = {entry.bit for entry in found.entries if entry.role == "reduce"}
         self._host: HostEngine | None = None
         self._seen: dict[int, set[tuple[int | str, ...]]] = {}
-        self._overflows: dict[int, int] = {}
+        self._overflows: set[int] = set()
+        """Windows in which a key had no cell."""
         inner = kinds_of(outcome.node)
         self._columns: list[tuple[str, Kind]] = [
             (name, kind_of(value, inner)) for name, value in outcome.names
@@ -83,10 +86,12 @@ class CountReportReader:
             self._host.add(self._query)
         for number in np.unique((batch["time_us"] - self._base_us) // self._query.window_us).tolist():
             window = self._base_us + number * self._query.window_us
-            self._overflows[window] = self._overflows.get(window, 0) + 1
+            self._overflows.add(window)
         for output in self._host.process(batch):
             assert isinstance(output, QueryResult)  # noqa: S101 - of a crossing query
             yield from self._once(self._window(output.at_us), output.fields, output.at_us)
+        while len(self._overflows) > OVERFLOWS_KEPT:
+            self._overflows.discard(min(self._overflows))
 
     def _window(self, time_us: int) -> int:
         length = self._query.window_us
@@ -99,10 +104,8 @@ class CountReportReader:
             return
         seen.add(key)
         while len(self._seen) > _KEPT:
-            oldest = min(self._seen)
-            del self._seen[oldest]
-            self._overflows.pop(oldest, None)
-        overflows = self._overflows.get(window, 0)
+            del self._seen[min(self._seen)]
+        overflows = window in self._overflows
         yield QueryResult(
             query=self._query.name,
             window_us=window,

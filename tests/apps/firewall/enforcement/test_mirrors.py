@@ -3,7 +3,7 @@
 import pytest
 
 from apps.firewall.enforcement.eve import decision_event
-from apps.firewall.enforcement.mirrors import COPIES, Mirrors
+from apps.firewall.enforcement.mirrors import COPIES, MOST_MIRRORS, Mirrors
 from apps.firewall.syn.syn_policy import SynRules
 from apps.messages import Instruction
 from tests.apps.firewall.alerts import alert
@@ -65,3 +65,13 @@ def test_decision_for_all_switches_is_carried_out_where_one_sees_more_than_copie
     marked = known.marked(decision(switch=switch), connected)
     assert marked.dry_run is dry
     assert known.marked(marked, connected) == marked
+
+
+def test_mirrors_that_came_and_went_are_forgotten():
+    """Whatever names switches are given over the months."""
+    mirrors = Mirrors()
+    for number in range(3 * MOST_MIRRORS):
+        mirrors.note(f"s{number}", mirror=True)
+    assert len(mirrors) == MOST_MIRRORS
+    assert f"s{3 * MOST_MIRRORS - 1}" in mirrors
+    assert "s0" not in mirrors

@@ -48,7 +48,12 @@ def test_evidence_and_decisions_become_items_and_lines():
     ]
     assert [important for _, important in lines.taken] == [False, True, True, False, True]
     told.flush()
-    assert told.health() == {"incidents_open": 0, "incident_reports": 6, "incident_openings_put_off": 0}
+    assert told.health() == {
+        "incidents_open": 0,
+        "suspicions": 0,
+        "incident_reports": 6,
+        "incident_openings_put_off": 0,
+    }
 
 
 def test_a_decision_of_no_incident_has_its_own_line():

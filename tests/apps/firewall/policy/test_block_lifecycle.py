@@ -213,3 +213,11 @@ def test_same_decision_has_the_same_id_in_every_replay():
     lifecycle = BlockLifecycle(Rules())
     made = opened_for(lifecycle, other)
     assert made.id != opened(lifecycle).id
+
+
+def test_only_decisions_of_the_last_minute_are_remembered_for_the_cap():
+    """Also where nothing asks for the cap: an operator's blocks do not."""
+    lifecycle = BlockLifecycle(Rules())
+    for second in range(0, 3_000, 10):
+        opened(lifecycle, at_s=second)
+    assert len(lifecycle._recent) == 6

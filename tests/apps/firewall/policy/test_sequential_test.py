@@ -6,7 +6,13 @@ import pytest
 from msgspec import structs
 
 from apps.evidence import Evidence, TrainingState
-from apps.firewall.policy.sequential_test import HALF_LIFE_S, PLACE_HELD_S, SequentialTest
+from apps.firewall.policy.sequential_test import (
+    FADED_NATS,
+    FADED_SUPPORT_NATS,
+    HALF_LIFE_S,
+    PLACE_HELD_S,
+    SequentialTest,
+)
 from tests.apps.firewall.alerts import CAMERA, SECOND
 
 
@@ -110,3 +116,29 @@ def test_subjects_are_bounded():
         sender = structs.replace(CAMERA, ip=f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}")
         test.hear(evidence(sender=sender), "kitsune")
     assert len(test) == 16_384
+
+
+@pytest.mark.parametrize(
+    ("supporting", "least"), [(False, FADED_NATS), (True, FADED_SUPPORT_NATS)], ids=["alone", "supporting"]
+)
+def test_what_only_supports_is_forgotten_sooner(supporting, least):
+    """It decides nothing by itself, and most strangers of a busy network have no other evidence against them."""
+    test = trained()
+    test.hear(evidence(2.0, 100, supporting=supporting), "kitsune")
+    half_lives = math.log2(2.0 / least)
+    for share, left in ((0.95, 1), (1.1, 0)):
+        someone = structs.replace(CAMERA, ip=f"10.9.9.{left}")
+        test.hear(evidence(1.0, 100 + int(share * half_lives * HALF_LIFE_S), sender=someone), "kitsune")
+        assert (CAMERA in test._tallies) == bool(left)
+
+
+def test_of_a_piece_its_words_are_kept_if_it_added_something():
+    """Kitsune says of each sender every ten seconds that a packet scored too high, at no nats."""
+    test = trained()
+    told = test.hear(evidence(0.0, 100, source="threshold"), "kitsune").contributions
+    assert told["kitsune.threshold"].latest.text == ""
+    test.hear(evidence(2.0, 100), "kitsune")
+    assert told["kitsune.ports"].latest.text == "ports of a camera"
+    test.hear(evidence(0.0, 110, text="nothing new"), "kitsune")
+    assert told["kitsune.ports"].latest.text == "ports of a camera"
+    assert {each.latest.id for each in told.values()} == {""}
