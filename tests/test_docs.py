@@ -39,7 +39,7 @@ def shell_lines() -> list[tuple[str, str]]:
 def capture(tmp_path_factory):
     """What stands for CAPTURE.pcap and LABELS.csv."""
     path = tmp_path_factory.mktemp("docs") / "capture.pcap"
-    make(MiraiLikeOptions(seed=2, benign_seconds=60, attack_seconds=10), path)
+    make(MiraiLikeOptions(seed=2, benign_seconds=120, attack_seconds=20), path)
     return path
 
 
