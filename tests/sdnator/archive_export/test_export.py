@@ -20,11 +20,13 @@ from sdnator.cli.archive_commands import archive_app
 from sdnator.errors import BadInput, PipelineError
 from sdnator.testing.archived_packets import archive_packets, out_of_order
 from sdnator.testing.query_traffic import BASE_US, mixed
+from tests.due.drivers.mongo_server import PATIENT, nx_server
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
 
 HOUR_US, HOUR_NS = 3_600 * 10**6, 3_600 * 10**9
 EDGE_US = -(-BASE_US // HOUR_US) * HOUR_US
+SHIFT_US = EDGE_US - BASE_US - 6_000_000
 BEGIN_NS = 472_300 * HOUR_NS - 5 * 10**9
 """Five seconds before an hour of the archive ends."""
 PERIOD = ("--since", "2023-11-18T02:00:00+00:00", "--until", "2023-11-18T06:00:00+00:00")
@@ -44,9 +46,7 @@ def url(tmp_path, frames):
     """An archive whose packets cross an hour of event time, and one of the archive."""
     found = f"sqlite://{tmp_path}/archive.db"
     with closing(open_archive(found)) as archive:
-        archive_packets(
-            archive, "s1", frames, base_us=BASE_US, begin_ns=BEGIN_NS, shift_us=EDGE_US - BASE_US - 6_000_000
-        )
+        archive_packets(archive, "s1", frames, base_us=BASE_US, begin_ns=BEGIN_NS, shift_us=SHIFT_US)
     return found
 
 
@@ -80,6 +80,9 @@ def test_rows_are_in_the_files_of_their_hours(tmp_path, url, frames):
         assert begin <= times.min() <= times.max() < begin + HOUR_US
     assert {path.name for path in found} == {f"{name_of(hour)}-000.parquet" for hour in (472_299, 472_300)}
     assert len({path.parts[:2] for path in found}) == 2
+    whole = pq.read_table(tmp_path / "day")  # as other programs read it
+    assert whole.num_rows == len(frames)
+    assert {"date", "hour"} <= set(whole.column_names)
     columns = {
         name: np.concatenate([table[name].to_numpy() for table in found.values()])
         for name in (*PACKET_COLUMNS, "archive_row", "archive_item", "archive_ns")
@@ -93,6 +96,19 @@ def test_rows_are_in_the_files_of_their_hours(tmp_path, url, frames):
     written = np.concatenate([np.full(len(item.value), item.timestamp) for item in items])
     assert np.array_equal(columns["archive_ns"][order], written)
     assert len(np.unique(columns["archive_item"])) == len(items)
+
+
+def test_the_archive_may_be_in_mongodb(tmp_path, url, frames):
+    """The same rows as out of SQLite, with the same places."""
+    exported(tmp_path / "day", url)
+    with nx_server(tmp_path) as server:
+        mongo = f"{server}?{PATIENT}"
+        with closing(open_archive(mongo)) as archive:
+            archive_packets(archive, "s1", frames, base_us=BASE_US, begin_ns=BEGIN_NS, shift_us=SHIFT_US)
+        exported(tmp_path / "other", mongo)
+    found, other = tables(tmp_path / "day"), tables(tmp_path / "other")
+    assert found.keys() == other.keys()
+    assert all(table.equals(other[path]) for path, table in found.items())
 
 
 def test_an_hour_takes_the_place_of_its_predecessor(tmp_path, url):
