@@ -42,7 +42,7 @@ def archive_packets(
     """
     state = {"switch": switch, "base_us": base_us, "primary": True}
     archive.insert([_item(f"network.switch.{_WRITER}.{switch}", state, begin_ns, 1, switch)])
-    items = []
+    items: list[Item] = []
     for at in range(0, len(frames), size):
         batch = batch_of(list(frames[at : at + size]), at)
         columns = {name: batch[name] for name in PACKET_COLUMNS}

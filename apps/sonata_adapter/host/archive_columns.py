@@ -24,9 +24,9 @@ TIME: Final = "time_us"
 _SWITCH_SEGMENT: Final = 3
 _ROWS_BITS: Final = 40
 _SPARK_TYPES: Final = {
-    "u1": "smallint", "u2": "int", "u4": "bigint", "u8": "bigint", "i4": "int", "i8": "bigint",
+    "u1": "smallint", "u2": "int", "u4": "bigint", "u8": "decimal(20,0)", "i4": "int", "i8": "bigint",
 }  # fmt: skip
-"""numpy's types as Spark reads them out of Parquet; u8 as its bits."""
+"""numpy's types as Spark reads them out of Parquet."""
 
 CLOCK_SCHEMA: Final = f"{KEY} string, {WRITTEN} bigint, {ITEM} bigint, {ROW} bigint, {TIME} bigint"
 """What tells when windows are over, as Spark's schema."""
@@ -55,15 +55,22 @@ def switch_of(key: str) -> str:
 
 
 def numbers(batch: Any, name: str, kind: str = "i8") -> np.ndarray:
-    """A column of an Arrow batch as numpy's; u8 comes as its bits.
+    """A column of an Arrow batch as numpy's.
 
     Args:
         batch: with `PACKET_SCHEMA` or `CLOCK_SCHEMA`.
         name: of the column.
-        kind: numpy's type of the result.
+        kind: numpy's type of the result; u8 comes as a decimal.
     """
-    column: np.ndarray = batch.column(name).to_numpy(zero_copy_only=False)
-    return column.astype(kind)
+    column = batch.column(name)
+    if kind != "u8":
+        plain: np.ndarray = column.to_numpy(zero_copy_only=False)
+        return plain.astype(kind)
+    if not len(column):
+        return np.empty(0, dtype=kind)
+    # of 128 bits the lower half
+    halves = np.frombuffer(column.buffers()[1], dtype="<u8")[2 * column.offset :]
+    return halves[: 2 * len(column) : 2].copy()
 
 
 def packets_in(batch: Any) -> RecordBatch:
