@@ -133,7 +133,7 @@ def test_the_archive_on_spark_finds_what_it_finds_on_the_host(tmp_path):
     """Packets come late and cross hours; the lines, and what is said of the late ones, are the same."""
     if importlib.util.find_spec("pyarrow") is None:
         missing("pyarrow is not installed: pip install 'sdnator[arrow]'")
-    names = ["new_tcp", "port_scan", "syn_flood", "arp_scan"]
+    names = ["new_tcp", "syn_flood", "arp_scan"]
     url, hour_us = f"sqlite://{tmp_path}/archive.db", 3_600 * 10**6
     shift_us = -TRAFFIC_US % hour_us - 7_000_000  # the hour ends seven seconds after the first packet
     with closing(open_archive(url)) as archive:
