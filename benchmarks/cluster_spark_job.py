@@ -10,8 +10,9 @@ import msgspec
 
 from apps.sonata_adapter.arrivals import data_in
 from apps.sonata_adapter.host.spark_jars import kafka_connector_jars
+from apps.sonata_adapter.host.spark_place import SparkPlace, cluster_session
 from apps.sonata_adapter.host.spark_records import WindowJob
-from apps.sonata_adapter.host.spark_stream import KafkaPackets, KafkaWindows, SparkPlace, cluster_session
+from apps.sonata_adapter.host.spark_stream import KafkaPackets, KafkaWindows
 from apps.sonata_adapter.spark_service import APP, SWITCHES, requests
 from due import Item
 from due.drivers.kafka_names import parse_kafka_url

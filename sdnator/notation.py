@@ -1,6 +1,7 @@
 """Notation for the command line: addresses in keys, times such as `1h`, sizes in place of long values."""
 
 import re
+import time
 from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
@@ -56,6 +57,23 @@ def instant_ns(text: str, now: int, option: str) -> int:
             f"{option} {text}: give a time ago such as 1h, or one such as 2024-05-01T12:00"
         ) from None
     return int(when.timestamp()) * 10**9 + when.microsecond * 1_000
+
+
+def period_ns(since: str, until: str) -> tuple[int, int]:
+    """Begin and end of a period as ns since the epoch, the end not included.
+
+    Args:
+        since: as for `instant_ns`.
+        until: the same; empty: now.
+
+    Raises:
+        BadInput: one is no time, or the period is empty.
+    """
+    now = time.time_ns()
+    begin, end = instant_ns(since, now, "--since"), instant_ns(until, now, "--until") if until else now + 1
+    if begin >= end:
+        raise BadInput(f"--since {since}: give a time before the end of the period")
+    return begin, end
 
 
 def local_time(time_ns: int, *, fraction: bool = False) -> str:

@@ -6,18 +6,24 @@ import re
 import shlex
 import subprocess
 import sys
+import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from apps.sonata_adapter.host.spark import SparkMissing, require_spark
+from due.backends import open_archive
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.capture.labels import labels_path, read_labels
 from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from sdnator.replay.packet_accounting import PacketState
+from sdnator.testing.archived_packets import archive_packets
+from sdnator.testing.query_traffic import BASE_US, mixed
 from tests.end_to_end.command import sdnator
-from tests.requirements import optional_program, require_netns
+from tests.requirements import missing, optional_program, require_netns
 from tests.sdnator.datasets.publisher import UCI, serving
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -60,6 +66,17 @@ def fetched(capture, tmp_path_factory):
         yield publisher.url, home
 
 
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """URL of an archive with packets of the last minutes."""
+    url = f"sqlite://{tmp_path_factory.mktemp('docs-archive')}/archive.db"
+    frames = mixed(["ddos"], seconds=6)
+    with closing(open_archive(url)) as driver:
+        begin_ns = time.time_ns() - 300 * 10**9
+        archive_packets(driver, "s1", frames, base_us=BASE_US, begin_ns=begin_ns, every_ns=10**6)
+    return url
+
+
 def prepared(words: list[str]) -> tuple[list[str], str]:
     """Makes what a command about users or certificates begins with; further words, and what a person would type."""
     if words[1:3] == ["cert", "add"]:
@@ -70,6 +87,19 @@ def prepared(words: list[str]) -> tuple[list[str], str]:
         there = sdnator("user", "add", words[3], "--password-stdin", given=_TYPED)
         assert there.returncode == 0, there.stderr
     return ([], "") if words[2] == "remove" else (["--password-stdin"], _TYPED)
+
+
+def require_parts(words: list[str]) -> None:
+    """What a command needs of its machine."""
+    if "bmv2" in words:
+        optional_program("simple_switch_grpc")
+    if "bmv2" in words or "syn-flood" in words:
+        require_netns()
+    if "spark" in words:
+        try:
+            require_spark()
+        except SparkMissing as error:
+            missing(str(error))
 
 
 BRIDGE = next(line for _, line in shell_lines() if " bridge " in line and " enrol " not in line)
@@ -86,11 +116,9 @@ def test_command_of_the_documents_works(document, line, capture, tmp_path, monke
         return
     assert words[0] == ".venv/bin/sdnator", f"no test knows how to run: {line}"
     monkeypatch.chdir(tmp_path)
-    if "bmv2" in words:
-        optional_program("simple_switch_grpc")
-        require_netns()
-    if "syn-flood" in words:
-        require_netns()
+    require_parts(words)
+    if words[1] in ("archive", "queries") and "--since" in words:
+        monkeypatch.setenv("DUE_ARCHIVE", request.getfixturevalue("archive"))
     if "mirai" in words:
         mirror, home = request.getfixturevalue("fetched")
         monkeypatch.setenv("XDG_DATA_HOME", str(home))

@@ -8,7 +8,6 @@ streams go on where they were; the results of the last batch may then come twice
 """
 
 import logging
-import socket
 import sys
 import threading
 import time
@@ -25,14 +24,9 @@ from apps.sonata_adapter.errors import InvalidRequest, SonataError
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
 from apps.sonata_adapter.host.spark_clock import ReadClock
 from apps.sonata_adapter.host.spark_jars import kafka_connector_jars
+from apps.sonata_adapter.host.spark_place import MASTER, SparkPlace, cluster_session, way_to
 from apps.sonata_adapter.host.spark_records import UnknownSwitch, WindowJob
-from apps.sonata_adapter.host.spark_stream import (
-    KafkaPackets,
-    KafkaWindows,
-    SparkPlace,
-    cluster_session,
-    streamed,
-)
+from apps.sonata_adapter.host.spark_stream import KafkaPackets, KafkaWindows, streamed
 from apps.sonata_adapter.keys import QUERY_PREFIX, QueryRequest, request_of
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from apps.sonata_adapter.results import QueryResult
@@ -62,7 +56,6 @@ _AGAIN_S: Final = 2.0
 _CLOCK_S: Final = 0.5
 _MOST_FAILURES: Final = 5
 """In a row, without a batch between them."""
-_MASTER: Final = "spark://"
 _SEGMENTS: Final = 5
 """Of a key of packets: kind, app, switch, query."""
 
@@ -329,7 +322,7 @@ def checkpoint(settings: Settings, folder: str) -> str:
     """Where Spark keeps its state; raises `InvalidOption` where a cluster could not reach it."""
     if "://" in settings.checkpoint:
         return settings.checkpoint.rstrip("/")
-    if settings.spark_master.startswith(_MASTER):
+    if settings.spark_master.startswith(MASTER):
         raise InvalidOption(
             f"checkpoint {settings.checkpoint!r}: on a cluster give a place that all machines reach, as "
             "hdfs://HOST:PORT/sdnator, or file:///FOLDER for a folder that all have mounted"
@@ -339,7 +332,7 @@ def checkpoint(settings: Settings, folder: str) -> str:
 
 def place(settings: Settings) -> SparkPlace:
     """Where Spark runs; raises `SparkMissing`."""
-    host = settings.driver_host or _way_to(settings.spark_master)
+    host = settings.driver_host or way_to(settings.spark_master)
     return SparkPlace(
         master=settings.spark_master,
         driver_host=host,
@@ -347,19 +340,6 @@ def place(settings: Settings) -> SparkPlace:
         python=settings.python,
         options=settings.options,
     )
-
-
-def _way_to(master: str) -> str:
-    """Our address on the way to the master; sends nothing."""
-    if not master.startswith(_MASTER):
-        return "127.0.0.1"
-    host, _, port = master.removeprefix(_MASTER).partition(",")[0].rpartition(":")
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((host, int(port)))
-            return str(probe.getsockname()[0])
-    except (OSError, ValueError):
-        raise InvalidOption(f"spark_master {master}: write spark://HOST:PORT") from None
 
 
 def main(argv: Sequence[str] | None = None) -> int:

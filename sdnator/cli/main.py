@@ -26,6 +26,7 @@ COMMANDS = {
         "sdnator.cli.coordinator_commands:apps",
         "List apps and their instances: state, process, items written and received.",
     ),
+    "archive": ("sdnator.cli.archive_commands:archive_app", "Data Archives: export to Parquet."),
     "audit": (
         "sdnator.cli.audit_command:audit",
         "Show the audit trail: sign-ins, refusals, changes of users and apps, instructions to firewall and detector.",
@@ -133,7 +134,7 @@ GROUPS = {
         "tables", "counters",
     ),
     "Decide": ("blocks", "allow", "model"),
-    "Data": ("dataset", "backup", "restore"),
+    "Data": ("dataset", "archive", "backup", "restore"),
     "Maintain": ("config", "doctor", "plan", "program", "shell"),
 }  # fmt: skip
 """In which order `sdnator --help` shows commands; what stands nowhere is maintenance."""

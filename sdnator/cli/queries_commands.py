@@ -31,9 +31,11 @@ from sdnator.capture.captures import CaptureError
 from sdnator.cli.due_commands import Updates
 from sdnator.cli.plain_table import plain_table
 from sdnator.cli.plan_question import ask_plan
-from sdnator.cli.queries_run import PastPackets, archived, as_line, as_text, captured, engine_of
+from sdnator.cli.queries_run import Past, as_line, as_text, engine_of, over_archive, over_captures
+from sdnator.cli.queries_spark import SparkRun, on_spark_over_archive
 from sdnator.cli.queries_workbench import fields_text, fields_value, tested, tested_text, tested_value
 from sdnator.errors import BadInput
+from sdnator.notation import period_ns
 from sdnator.up import running
 
 queries = typer.Typer(
@@ -223,8 +225,12 @@ def run_query(
         list[Path] | None, typer.Option(help="pcap or pcapng; several are read one after the other.")
     ] = None,
     since: Annotated[
-        str, typer.Option(help="Use archived packets of this period instead: 30s, 10m, 1h, 7d.")
+        str,
+        typer.Option(
+            help="Use packets archived since then instead: 1h or 7d ago, or a local time such as 2024-05-01T12:00."
+        ),
     ] = "",
+    until: Annotated[str, typer.Option(help="End, like --since.", show_default="now")] = "",
     archive: Annotated[
         str,
         typer.Option(
@@ -237,26 +243,49 @@ def run_query(
     master: Annotated[
         str, typer.Option(help="Where Spark runs: local[N] or spark://HOST:PORT.")
     ] = "local[2]",
+    spark_option: Annotated[
+        list[str] | None,
+        typer.Option(help="Further option of Spark, such as spark.executor.memory=4g.", metavar="NAME=VALUE"),
+    ] = None,
+    parquet: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the packets that Spark reads; hours that it holds whole are not exported again.",
+            metavar="DIR",
+            show_default="a temporary one",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per result.")] = False,
 ) -> None:
     """Run a query over captures or the archive; results are the same as live.
+
+    On Spark archived packets are exported to Parquet first, as by `sdnator archive export`.
 
     Example: sdnator queries run network.traffic_query.sonata.new_tcp:threshold=20 --capture day.pcap
     """
     request = _request(key, templates())
     if request.kind == "handshake":
         raise BadInput(f"{HANDSHAKE} is followed live only; run a query or a raw stream")
-    if bool(capture) == bool(since):
-        raise BadInput("give either --capture FILE or --since 1h")
+    if bool(capture) == bool(since) or (until and not since):
+        raise BadInput("give either --capture FILE or --since 1h, and --until only with --since")
+    on_spark = engine == "spark" and bool(since)
+    if (parquet or spark_option) and not on_spark:
+        raise BadInput("--parquet and --spark-option: only with --since and --engine spark")
     try:
-        past = PastPackets(request, engine_of(engine, master))
-        streams = captured(capture) if capture else archived(running.archive_url(archive), since)
-        for output in past.run(streams):
+        if capture:
+            found = over_captures(request, capture, engine_of(engine, master))
+        else:
+            past = Past(running.archive_url(archive), *period_ns(since, until))
+            if on_spark:
+                found = on_spark_over_archive(request, past, SparkRun(master, spark_option or [], parquet))
+            else:
+                found = over_archive(request, past, engine_of(engine, master))
+        for output in found.outputs:
             typer.echo(json.dumps(as_line(output)) if as_json else as_text(output))
     except (CaptureError, DueError, SonataError) as error:
         raise BadInput(str(error)) from None
-    if past.notes:
-        typer.echo(f"sdnator: {past.notes}", err=True)
+    for note in filter(None, found.notes()):
+        typer.echo(f"sdnator: {note}", err=True)
 
 
 def _request(key: str, known: dict[str, Template]) -> QueryRequest:

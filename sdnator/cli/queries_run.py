@@ -1,6 +1,6 @@
 """Queries over captures or archived packets, with the operators of a live run.
 
-    captured │ archived ─► (switch, clock zero, batch) ─► one `HostEngine` for each switch ─► outputs
+    captured │ ArchivedPieces ─► (switch, clock zero, batch) ─► one `HostEngine` for each switch ─► outputs
 
 Windows count from a switch's clock zero, as live.  For a capture that is the second of its first packet, for
 the archive the value that the controller wrote to `network.switch.p4runtime_ctrl.<switch>`.
@@ -9,6 +9,7 @@ the archive the value that the controller wrote to `network.switch.p4runtime_ctr
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -16,24 +17,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from apps.messages import MessageError
 from apps.packets import read_frames
+from apps.sonata_adapter.arrivals import data_in
+from apps.sonata_adapter.host.archive_columns import switch_of
 from apps.sonata_adapter.host.engine import HostEngine, WindowEngine
 from apps.sonata_adapter.keys import QueryRequest
 from apps.sonata_adapter.results import Captured, QueryResult
-from due import Item, RecordBatch
+from due import RecordBatch
 from due.drivers.base import ArchiveDriver
+from sdnator.archive_export.archive_items import archived_items
+from sdnator.archive_export.export import PACKETS
 from sdnator.capture.captures import Capture
 from sdnator.errors import BadInput
 from sdnator.northbound import open_existing
-from sdnator.notation import duration_ns
 from sdnator.plurals import counted
 
 _WIDTH = 256
 _BATCH = 16_384
-_PACKETS = "network.packets.p4runtime_ctrl.*.all"
-_STATES = "network.switch.p4runtime_ctrl.*"
-_SLICE_NS = 60 * 10**9
-"""Length of the pieces in which the archive is read, since an hour of packets may not fit into memory."""
+_STATES = "network.switch.p4runtime_ctrl"
+_STATES_READ = 1_000
 
 
 class Piece(NamedTuple):
@@ -57,10 +60,12 @@ class PastPackets:
     def run(self, pieces: Iterable[Piece]) -> Iterator[QueryResult | Captured]:
         """Outputs in the order in which windows end."""
         for piece in pieces:
+            if not len(piece.batch):
+                continue
             engine = self._engines.get(piece.switch)
             if engine is None:
                 engine = self._engines[piece.switch] = self._make(base_us=piece.base_us)
-                if not piece.whole and len(piece.batch):
+                if not piece.whole:
                     engine.watermark_us = int(piece.batch["time_us"][0])
                 engine.add(self._request.query)
             yield from engine.process(piece.batch)
@@ -72,14 +77,49 @@ class PastPackets:
     def notes(self) -> str:
         """Remarks on the results, for display; empty: none."""
         engines = self._engines.values()
-        packets, late = sum(e.packets for e in engines), sum(e.late for e in engines)
         bare = sum(engine.without_payload for engine in engines)
-        notes = [] if packets else ["no packets in that time; they are archived while somebody observes them"]
+        notes = [count_notes(sum(e.packets for e in engines), sum(e.late for e in engines))]
         if bare:
             notes.append(f"{bare:,} packets without payload: the archive holds headers only; use --capture")
-        if late:
-            notes.append(f"{late:,} packets arrived after the result of their window")
-        return "; ".join(notes)
+        return "; ".join(filter(None, notes))
+
+
+def count_notes(packets: int, late: int) -> str:
+    """Remarks on these numbers of packets read, and left out for being late; empty: none."""
+    if not packets:
+        return "no packets in that time; they are archived while somebody observes them"
+    return f"{late:,} packets arrived after the result of their window" if late else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundInPast:
+    """What a query finds."""
+
+    outputs: Iterable[QueryResult | Captured]
+    notes: Callable[[], Iterable[str]]
+    """Remarks for display, once all outputs were taken; empty ones say nothing."""
+
+
+class Past(NamedTuple):
+    """A period of an archive."""
+
+    url: str
+    begin: int
+    """ns; what was written from then on."""
+    end: int
+    """ns; what was written before."""
+
+
+def over_captures(request: QueryRequest, paths: list[Path], make: Callable[..., WindowEngine]) -> FoundInPast:
+    """Run a query over captures, one after the other."""
+    past = PastPackets(request, make)
+    return FoundInPast(outputs=past.run(captured(paths)), notes=lambda: [past.notes])
+
+
+def over_archive(request: QueryRequest, period: Past, make: Callable[..., WindowEngine]) -> FoundInPast:
+    """Run a query over archived packets."""
+    past, pieces = PastPackets(request, make), ArchivedPieces(period)
+    return FoundInPast(outputs=past.run(pieces), notes=lambda: [past.notes, pieces.notes])
 
 
 def engine_of(name: str, master: str) -> Callable[..., WindowEngine]:
@@ -124,29 +164,47 @@ def _batch(times_us: list[int], lengths: list[int], frames: list[bytes], first: 
     return RecordBatch({**batch, "frame": np.array(cut, dtype=f"V{_WIDTH}"), "captured": sizes})
 
 
-def archived(url: str, since: str) -> Iterator[Piece]:
-    """Packets in the archive that were written within the last `since` (`30s`, `1h`)."""
-    begin = time.time_ns() - duration_ns(since, "--since")
-    with closing(open_existing(url)) as archive:
-        bases: dict[str, int] = {}
-        for item in _slices(archive, begin, time.time_ns()):
-            switch = item.key.split(".")[3]
-            if switch not in bases:
-                bases[switch] = _base_us(archive, switch)
-            yield Piece(switch, bases[switch], item.value, whole=False)
+class ArchivedPieces:
+    """Packets in the archive that were written within a period."""
+
+    def __init__(self, period: Past) -> None:
+        self._period = period
+        self._refused = self._damaged = 0
+
+    def __iter__(self) -> Iterator[Piece]:
+        with closing(open_existing(self._period.url)) as archive:
+            bases: dict[str, int] = {}
+            for item in archived_items(archive, PACKETS, self._period.begin, self._period.end):
+                try:
+                    batch = data_in(item)
+                except MessageError:
+                    self._refused += 1
+                    continue
+                switch = switch_of(item.key)
+                if switch not in bases:
+                    bases[switch] = base_us(archive, switch)
+                yield Piece(switch, bases[switch], batch, whole=False)
+            self._damaged = archive.damaged
+
+    @property
+    def notes(self) -> str:
+        """What was left out, for display; empty: nothing."""
+        return loss_notes(self._refused, self._damaged)
 
 
-def _slices(archive: ArchiveDriver, begin: int, end: int) -> Iterator[Item]:
-    while begin < end:
-        until = min(begin + _SLICE_NS, end)
-        yield from archive.find({"dataKey": _PACKETS, "timestamp": {"$gte": begin, "$lt": until}})
-        begin = until
+def loss_notes(refused: int, damaged: int) -> str:
+    """Remarks on items without packets, and rows that the archive could not read; empty: there are none."""
+    notes = [f"{counted(refused, 'item')} left out: no packets in them"] if refused else []
+    if damaged:
+        notes.append(f"the archive could not read {counted(damaged, 'row')}")
+    return "; ".join(notes)
 
 
-def _base_us(archive: ArchiveDriver, switch: str) -> int:
-    """Clock zero of a switch, from its newest state."""
-    states = archive.find({"dataKey": _STATES.replace("*", switch)})
-    return next((int(item.value["base_us"]) for item in reversed(states) if "base_us" in item.value), 0)
+def base_us(archive: ArchiveDriver, switch: str) -> int:
+    """Clock zero of a switch, from its newest state; 0: there is none."""
+    states = archive.find({"dataKey": f"{_STATES}.{switch}"}, limit=_STATES_READ)
+    values = (item.value for item in reversed(states) if isinstance(item.value, dict))
+    return next((int(value["base_us"]) for value in values if "base_us" in value), 0)
 
 
 def as_line(output: QueryResult | Captured) -> dict[str, Any]:

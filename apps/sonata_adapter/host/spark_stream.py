@@ -8,20 +8,16 @@ s3a://, …) and the driver; the driver sends them the jars.
 """
 
 import json
-import logging
-import os
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 
 from apps.sonata_adapter.errors import InvalidRequest
-from apps.sonata_adapter.host.spark import SparkFailed, SparkMissing, require_spark
+from apps.sonata_adapter.host.spark import SparkFailed
 from apps.sonata_adapter.host.spark_records import (
     NO_QUERY,
     RESULTS,
@@ -38,31 +34,6 @@ from due.drivers.kafka_names import KafkaAddress
 
 Take = Callable[[Sequence[tuple[str, QueryResult]]], None]
 """Gets the results of a batch, each with its switch; the batch counts as done when it returns."""
-_ARROW_ROWS: Final = 16
-"""Records, or windows of a shard, that a worker holds at a time; each may have megabytes."""
-_QUIET: Final = {
-    "spark.ui.enabled": "false",
-    "spark.ui.showConsoleProgress": "false",
-    "spark.sql.session.timeZone": "UTC",
-    "spark.sql.execution.arrow.maxRecordsPerBatch": str(_ARROW_ROWS),
-    # each costs a hundred calls into the JVM, and is looked at three times a second
-    "spark.sql.streaming.numRecentProgressUpdates": "8",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class SparkPlace:
-    """Where Spark runs, and what it is given."""
-
-    master: str = "local[2]"
-    """As Spark writes it: `local[2]`, `spark://host:7077`."""
-    driver_host: str = "127.0.0.1"
-    """Name or address at which the workers reach this machine."""
-    jars: Sequence[Path] = ()
-    python: str = sys.executable
-    """On the workers."""
-    options: Mapping[str, str] = field(default_factory=dict)
-    """Further options of Spark."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,36 +94,6 @@ class KafkaPackets:
 
 def _user(address: KafkaAddress) -> tuple[str, str]:
     return address.user, address.password
-
-
-def cluster_session(place: SparkPlace) -> Any:
-    """Spark's session of this process, made for `place`; raises `SparkMissing`."""
-    require_spark()
-    if find_spec("pyarrow") is None or find_spec("pandas") is None:
-        raise SparkMissing(
-            "Spark's Arrow functions need pyarrow and pandas: pip install 'sdnator[arrow,spark]'"
-        )
-    from pyspark.errors import PySparkException
-    from pyspark.sql import SparkSession
-
-    os.environ.setdefault("PYSPARK_PYTHON", place.python)
-    os.environ.setdefault("SPARK_LOCAL_HOSTNAME", place.driver_host)
-    options = {
-        **_QUIET,
-        "spark.driver.host": place.driver_host,
-        "spark.driver.bindAddress": place.driver_host,
-        "spark.jars": ",".join(map(str, place.jars)),
-        **place.options,
-    }
-    builder = SparkSession.builder.master(place.master).appName("sdnator sonata_spark")
-    for name, value in options.items():
-        builder = builder.config(name, value)
-    try:
-        session = builder.getOrCreate()
-    except (PySparkException, OSError) as error:
-        raise SparkMissing(f"Spark does not start on {place.master}: {error}") from None
-    logging.getLogger("py4j").setLevel(logging.WARNING)
-    return session
 
 
 def streamed(query: Query) -> Query:

@@ -2,7 +2,9 @@
 
 import importlib.util
 import re
+import tempfile
 import time
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -13,30 +15,62 @@ from apps.sonata_adapter.host.spark import SparkMissing
 from apps.sonata_adapter.host.spark_jars import kafka_connector_jars
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from apps.sonata_adapter.spark_service import Settings, checkpoint, kafka_address, packets_key, requests
+from due.backends import open_archive
 from due.errors import InvalidOption
 from sdnator.errors import PipelineError
+from sdnator.testing.archived_packets import archive_packets, out_of_order
 from sdnator.testing.kafka_servers import KafkaMissing
 from sdnator.testing.query_traffic import BASE_US, mixed
 from sdnator.testing.spark_stage import SparkStage, texts, truth
 from sdnator.testing.waiting import wait_for
+from tests.end_to_end.command import sdnator
 from tests.requirements import missing
 
 ROOT = Path(__file__).resolve().parents[3]
 BASES = {"s1": BASE_US + 300_000, "s2": BASE_US - 7_123_456}
 
 
-@pytest.fixture
-def stage(tmp_path):
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
     for module in ("pyspark", "pyarrow", "confluent_kafka"):
         if importlib.util.find_spec(module) is None:
             missing(f"{module} is not installed: pip install 'sdnator[arrow,kafka,spark]'")
     try:
-        with SparkStage(tmp_path) as made:
+        with SparkStage(tmp_path_factory.mktemp("stage")) as made:
             yield made
     except (KafkaMissing, SparkMissing) as reason:
         missing(str(reason))
     except PipelineError as error:
         pytest.fail(str(error))
+
+
+@pytest.fixture
+def mounted():
+    """A folder that all machines have: the workers' /tmp is their own."""
+    with tempfile.TemporaryDirectory(prefix="sdnator-test-", dir="/var/tmp") as made:
+        yield Path(made)
+
+
+@pytest.mark.timeout(600)
+def test_a_day_of_the_archive_on_a_cluster(stage, mounted):
+    """The command runs a query over an exported archive, and finds what the host engine finds."""
+    url = f"sqlite://{mounted}/archive.db"
+    begin_ns = 472_300 * 3_600 * 10**9 - 5 * 10**9
+    with closing(open_archive(url)) as archive:
+        for switch, seed in (("s1", 1), ("s2", 2)):
+            frames = out_of_order(mixed(["ddos", "port_scan"], seconds=12, seed=seed), 4_000_000)
+            archive_packets(archive, switch, frames, base_us=BASES[switch], begin_ns=begin_ns)
+    command = ["queries", "run", "ddos:window=1s", "--archive", url, "--json"]
+    command += ["--since", "2023-11-18T02:00:00+00:00", "--until", "2023-11-18T06:00:00+00:00"]
+    spark = ["--engine", "spark", "--master", stage.cluster.url, "--parquet", mounted / "day"]
+    for name, value in stage.cluster.options.items():
+        spark += ["--spark-option", f"{name}={value}"]
+    host, cluster = sdnator(*command), sdnator(*command, *spark)
+    assert (host.returncode, cluster.returncode) == (0, 0), cluster.stderr[-3000:]
+    assert sorted(cluster.stdout.splitlines()) == sorted(host.stdout.splitlines())
+    assert host.stdout
+    assert "after the result of their window" in host.stderr
+    assert host.stderr.strip() in cluster.stderr
 
 
 @pytest.mark.timeout(1800)

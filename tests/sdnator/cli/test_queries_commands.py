@@ -166,7 +166,12 @@ def test_run_over_a_capture_equals_naive(name, tmp_path):
     ("arguments", "what"),
     [
         (("run", "ddos"), "either --capture FILE or --since"),
-        (("run", "ddos", "--since", "1y", "--archive", "sqlite:///x"), "30s, 10m, 1h or 7d"),
+        (("run", "ddos", "--since", "1y", "--archive", "sqlite:///x"), "a time ago such as 1h"),
+        (("run", "ddos", "--since", "1h", "--until", "2h"), "before the end"),
+        (("run", "ddos", "--capture", "x.pcap", "--until", "2h"), "--until only with --since"),
+        (("run", "ddos", "--since", "1h", "--parquet", "x"), "only with --since and --engine spark"),
+        (("run", "ddos", "--capture", "x.pcap", "--engine", "spark", "--parquet", "x"), "only with --since"),
+        (("run", "ddos", "--since", "1h", "--engine", "flink", "--archive", "memory://"), "numpy or spark"),
         (("run", "ddos", "--capture", "/nowhere.pcap"), "no such file"),
         (("run", "nothing", "--capture", "x"), "there are new_tcp"),
         (("explain", "network.traffic_query.sonata.ddos:window=*"), "name one query"),

@@ -1,6 +1,7 @@
 """Spark in place of numpy: the same results from the same frames, shard by shard."""
 
 import importlib.util
+from contextlib import closing
 from functools import partial
 
 import pytest
@@ -23,13 +24,19 @@ from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.query.catalogue import CATALOGUE
 from apps.sonata_adapter.service import CAPABILITIES, INTERESTS, Settings, SonataAdapterService
 from due import NO_WAIT
+from due.backends import open_archive
 from sdnator.capture.captures import CaptureWriter
 from sdnator.cli.queries_commands import queries
+from sdnator.testing.archived_packets import archive_packets, out_of_order
 from sdnator.testing.controller_run import ControllerRun, Heard
 from sdnator.testing.query_traffic import BASE_US as TRAFFIC_US
 from sdnator.testing.query_traffic import batch_of, batches, mixed
 from sdnator.testing.waiting import wait_for
 from tests.requirements import missing, require_program
+
+ARCHIVED_NS = 472_300 * 3_600 * 10**9 - 5 * 10**9
+"""Five seconds before an hour of the archive ends; of what is written, PERIOD leaves out the end."""
+PERIOD = ("--since", "2023-11-18T03:59:55+00:00", "--until", "2023-11-18T04:00:20+00:00")
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -118,6 +125,30 @@ def results(query, file, engine):
     done = CliRunner().invoke(queries, ["run", query, "--capture", str(file), "--json", "--engine", engine])
     assert done.exit_code == 0, done.output[-3000:]
     return sorted(line for line in done.stdout.splitlines() if line.startswith("{"))
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("spark")
+def test_the_archive_on_spark_finds_what_it_finds_on_the_host(tmp_path):
+    """Packets come late and cross hours; the lines, and what is said of the late ones, are the same."""
+    if importlib.util.find_spec("pyarrow") is None:
+        missing("pyarrow is not installed: pip install 'sdnator[arrow]'")
+    names = ["new_tcp", "port_scan", "syn_flood", "arp_scan"]
+    url, hour_us = f"sqlite://{tmp_path}/archive.db", 3_600 * 10**6
+    shift_us = -TRAFFIC_US % hour_us - 7_000_000  # the hour ends seven seconds after the first packet
+    with closing(open_archive(url)) as archive:
+        for switch, base_us in (("s1", TRAFFIC_US + shift_us - 300_000), ("s2", TRAFFIC_US + 1_234_567)):
+            frames = out_of_order(mixed(names, seconds=14, seed=len(switch)), 4_000_000)
+            archive_packets(archive, switch, frames, base_us=base_us, begin_ns=ARCHIVED_NS, shift_us=shift_us)
+    for number, name in enumerate(names[:3]):
+        # the first one exports to a temporary folder, the others read the same one
+        spark = ["--engine", "spark", *(("--parquet", str(tmp_path / "day")) if number else ())]
+        command = ["run", f"{name}:window={number + 1}s", "--archive", url, "--json", *PERIOD]
+        host, found = (CliRunner().invoke(queries, [*command, *more]) for more in ([], spark))
+        assert found.exit_code == 0, found.output[-3000:]
+        assert sorted(found.stdout.splitlines()) == sorted(host.stdout.splitlines())
+        assert len(host.stdout.splitlines()) > number % 2
+        assert found.stderr == host.stderr != ""
 
 
 @pytest.mark.timeout(600)
