@@ -6,7 +6,7 @@ cells of the entry ────────────────────�
 
 The switch has no counter of keys.  But it reports each frame whose key found its cell taken, and of K keys that are
 spread over S cells by a hash, K - S (1 - e^(-K/S)) find none: few keys without a cell tell of many with one (128 keys
-in 8,192 cells leave one without).
+in 8,192 cells leave one without).  Gates report nothing, and are left alone.
 """
 
 from collections.abc import Iterable, Mapping
@@ -187,7 +187,8 @@ class CellNeeds:
         """End windows that are over; `clocks`: for each switch the time since its zero, us."""
         told = {name: now_us for name, now_us in clocks.items() if now_us is not None}
         self._end_windows(entries, told)
-        counts = {counted(entry): entry for entry in entries.values() if entry.has_cells}
+        mine = [entry for entry in entries.values() if entry.has_cells and entry.role != "gate"]
+        counts = {counted(entry): entry for entry in mine}
         for what, entry in counts.items():
             by_switch = self._seen.setdefault(what, {})
             for name, now_us in told.items():

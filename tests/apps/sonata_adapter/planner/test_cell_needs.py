@@ -103,6 +103,14 @@ def test_keys_that_come_back_each_minute_keep_their_cells():
     assert watched({second for second in each if second < 600}, 25).enough(ENTRY) == 2_048
 
 
+def test_gates_are_left_alone():
+    """They report no frame, so that silence says nothing."""
+    gate = msgspec.structs.replace(ENTRY, role="gate", count_of=ENTRY.bit)
+    needs = watched(set(), 11, entry=gate)
+    assert needs.enough(gate) is None
+    assert needs.told([gate]) == {3: "8,192 cells"}
+
+
 def test_a_clock_that_begins_anew_is_followed():
     """Windows of the old clock say nothing of the new one."""
     needs = watched({10, 12}, 11)
