@@ -26,7 +26,9 @@ from apps.sonata_adapter.host.gates import with_passed
 from apps.sonata_adapter.host.handshake import Handshakes
 from apps.sonata_adapter.host.merge import Merger, patience
 from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
-from apps.sonata_adapter.planner.moves import Moves, improvements
+from apps.sonata_adapter.planner.cell_moves import better_places
+from apps.sonata_adapter.planner.cell_needs import CellWords
+from apps.sonata_adapter.planner.moves import Moves, surely_us
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, copies_saved, plan
 from apps.sonata_adapter.planner.rates import MeasuredRates
@@ -54,8 +56,6 @@ class Written(msgspec.Struct, frozen=True):
 
 WEIGH_S: Final = 2.0
 """Seconds between two looks at where queries had better run."""
-_IN_FORCE_S: Final = 2.0
-"""Seconds after which entries that were asked for are taken to be in the switch."""
 MOST_KEYS: Final = 1_024
 """Most keys that are served at a time."""
 _Counts = CountReportReader | RegisterReads | Differences | Crossings
@@ -213,9 +213,10 @@ class Control:
             return None
         self._weighed_at = now
         self._count_copies()
+        self._rates.cells.look(self.plan.entries, self._since_zero())
         changed = self._moves.end(self._since_zero())
-        if not changed and not self._moves.under_way and self.needs_rates:
-            better = improvements(
+        if not changed and not self._moves.under_way:
+            better = better_places(
                 self._requests.values(), self._limits, self.plan, self._rates, self._refinement.resting
             )
             for count, side in better.items():
@@ -243,13 +244,11 @@ class Control:
 
     def _surely_us(self, request: QueryRequest, now: float) -> dict[str, int]:
         """For each switch the capture time at which a count that is asked for now will be in force."""
-        found = {}
-        for name, heard_us in self._since_zero().items():
-            rate = max(1.0, self._switches[name].clock.rate)
-            margin_us = max(request.query.window_us, round(_IN_FORCE_S * rate * 1e6))
-            idle_us = round(self._switches[name].clock.idle_s(now) * rate * 1e6)
-            found[name] = 0 if heard_us is None else heard_us + idle_us + margin_us
-        return found
+        clocks = {name: state.clock for name, state in self._switches.items()}
+        return {
+            name: surely_us(heard_us, clocks[name].rate, clocks[name].idle_s(now), request.query.window_us)
+            for name, heard_us in self._since_zero().items()
+        }
 
     def everything(self) -> ControllerUpdates:
         """Everything in force, for a controller that has just started."""
@@ -288,6 +287,7 @@ class Control:
         written: list[Written] = []
         if len(batch):
             state.clock.hear(int(batch["time_us"].max()))
+            self._rates.cells.reported(switch, bit, batch, self.plan.entries, state.base_us)
         for found in self.plan.queries:
             if any(entry.bit == bit for entry in found.entries) and found.identity in state.reports:
                 written += self._addressed(state, state.reports[found.identity].take(bit, batch))
@@ -390,6 +390,7 @@ class Control:
             },
             "tuples": {self._moves.owner(one.identity): self._tuples(one) for one in self.plan.queries},
             "overflow": {self._moves.owner(one.identity): self._overflow(one) for one in self.plan.queries},
+            "cells": {self._moves.owner(one.identity): self.cells_of(one).text for one in self.plan.queries},
             "moved": self._moves.moved,
             "bits": len(self.plan.entries) + len(self.plan.copies) + len(self.plan.gate_bits),
             "host_packets": sum(lane.host.packets for lane in lanes),
@@ -433,6 +434,10 @@ class Control:
                 each.missed for each in reports if isinstance(each, (RegisterReads, Differences))
             ),
         }
+
+    def cells_of(self, one: QueryPlan) -> CellWords:
+        """The cells of a query and how many keys they have, in words."""
+        return self._rates.cells.told(one.entries)
 
     def _tuples(self, one: QueryPlan) -> int:
         """Tuples that reached the host for a query, from all switches."""

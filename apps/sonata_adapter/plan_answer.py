@@ -72,6 +72,7 @@ def _planned(
     shown = first if first.identity in planned else control.count_of(request)
     one = plans.of(shown.identity)
     meaning = templates[request.name].meaning if request.kind == "query" else ""
+    cells = control.cells_of(one)
     answer: dict[str, Any] = {
         "key": key,
         "state": "running" if running else "possible",
@@ -79,13 +80,13 @@ def _planned(
         "identity": request.identity,
         "output": request.output,
         "in_switch": one.in_switch,
-        "operators": [msgspec.to_builtins(each) for each in placed_operators(shown, one)],
+        "operators": [msgspec.to_builtins(each) for each in placed_operators(shown, one, cells)],
         "entries": _entries(one),
         "copies": [
             {"bit": copy.bit, "match": match_text(copy.match), "payload": copy.payload} for copy in one.copies
         ],
         "others": sum(each.identity != request.identity for each in control.requests),
-        "text": explain(request, plans, meaning=meaning, count=shown.identity),
+        "text": explain(request, plans, meaning=meaning, count=shown.identity, cells=cells),
     }
     return answer | ({"came": control.came(one)} if running else {})
 

@@ -14,7 +14,14 @@ _WHOLE = 128
 """Bits of an address in a cell's key."""
 
 
-def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "", count: str = "") -> str:
+def explain(
+    request: QueryRequest,
+    found: QueryPlans,
+    *,
+    meaning: str = "",
+    count: str = "",
+    cells: Mapping[int, str] | None = None,
+) -> str:
     """The plan of one query as a text diagram; for a refined query, while no prefix crosses.
 
     Args:
@@ -22,6 +29,7 @@ def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "", coun
         found: plans, that of the query among them.
         meaning: of the query, in words.
         count: identity under which it is planned, if not its own.
+        cells: by bit, the cells of its entries in words; by default their number.
     """
     planned = {query.identity for query in found.queries}
     first = coarsest(request)
@@ -33,7 +41,7 @@ def explain(request: QueryRequest, found: QueryPlans, *, meaning: str = "", coun
     lines += _level_lines(request)
     lines.append(f"  in the switch{'' if one.in_switch else ': only copies, because ' + one.reason}")
     for entry in one.entries:
-        lines += _entry_lines(entry)
+        lines += _entry_lines(entry, (cells or {}).get(entry.bit, f"{entry.size:,} cells"))
     for copy in one.copies:
         what = "frames" if copy.payload else "headers"
         lines.append(f"    bit {copy.bit:<3} copies {what} of {match_text(copy.match)}")
@@ -78,7 +86,7 @@ def _level_lines(request: QueryRequest) -> list[str]:
     ]
 
 
-def _entry_lines(entry: StageEntry) -> list[str]:
+def _entry_lines(entry: StageEntry, cells: str) -> list[str]:
     if entry.role == "clock":
         period = duration_text(entry.window_us // 1000)
         return [
@@ -94,7 +102,6 @@ def _entry_lines(entry: StageEntry) -> list[str]:
         "gate": f"counts frames by ({key}), lets them pass from {entry.threshold} on",
         "look": f"lets frames pass whose ({key}){_side(entry)} has passed",
     }[entry.role]
-    cells = f"{entry.size:,} cells"
     return [
         f"    bit {entry.bit:<3} {match_text(entry.match)}",
         f"      stage {entry.stage}: {what}, {cells}",

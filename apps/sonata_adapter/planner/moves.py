@@ -19,9 +19,11 @@ from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.planner.refinement_levels import levels_of
 
 Side = Literal["switch", "host"]
+_IN_FORCE_S: Final = 2.0
+"""Seconds after which entries that were asked for are taken to be in the switch."""
 _OTHER: Final = " (moved)"
 """Tells the two counts of a query apart while it moves."""
-_LEAST_GAIN: Final = 100.0
+LEAST_GAIN: Final = 100.0
 """Copies a second; less is not worth a move."""
 _FACTOR: Final = 2.0
 """By so much what comes into the switch must save more than what leaves it: or they would change places again."""
@@ -72,7 +74,7 @@ class Moves:
         """Note where counts are; returns whether a move is off because the switch has no room: plan again."""
         inside = {one.identity for one in made.queries if one.in_switch}
         for identity, request in requests.items():
-            if _moves(request) and identity not in self._sides:
+            if movable(request) and identity not in self._sides:
                 self._sides[identity] = "switch" if identity in inside else "host"
         off = [
             identity
@@ -134,7 +136,7 @@ def improvements(
     waiting = {
         identity
         for identity, one in free.items()
-        if _moves(one) and not present.of(identity).in_switch and copies_saved(one, limits, rates) > 0
+        if movable(one) and not present.of(identity).in_switch and copies_saved(one, limits, rates) > 0
     }
     if not waiting:
         return {}
@@ -147,11 +149,28 @@ def improvements(
     goes = {one.identity for one in present.queries if one.in_switch and not ideal.of(one.identity).in_switch}
     gain = sum(copies_saved(free[identity], limits, rates) for identity in comes)
     loss = sum(copies_saved(free[identity], limits, rates) for identity in goes)
-    worthwhile = gain >= _FACTOR * loss and gain - loss >= _LEAST_GAIN
-    return dict.fromkeys(goes, "host") if worthwhile and all(map(_moves, map(free.__getitem__, goes))) else {}
+    worthwhile = gain >= _FACTOR * loss and gain - loss >= LEAST_GAIN
+    return (
+        dict.fromkeys(goes, "host") if worthwhile and all(map(movable, map(free.__getitem__, goes))) else {}
+    )
 
 
-def _moves(request: QueryRequest) -> bool:
+def surely_us(heard_us: int | None, rate: float, idle_s: float, window_us: int) -> int:
+    """When a count that is asked for now will be in force, us since a switch's zero.
+
+    Args:
+        heard_us: the time it has said last; None: none.
+        rate: of its clock, seconds a second.
+        idle_s: since when it has said none.
+        window_us: of the count.
+    """
+    pace = max(1.0, rate)
+    margin_us = max(window_us, round(_IN_FORCE_S * pace * 1e6))
+    return 0 if heard_us is None else heard_us + round(idle_s * pace * 1e6) + margin_us
+
+
+def movable(request: QueryRequest) -> bool:
+    """Whether a request is moved here; refinement moves the others."""
     return request.kind == "query" and not levels_of(request)
 
 

@@ -5,7 +5,7 @@ reduce by dst: count = …       switch   counting stage 1, 8,192 cells
 filter count >= 40             switch   a key is reported once a window, when it reaches 40
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import msgspec
@@ -30,14 +30,18 @@ class PlacedOperator(msgspec.Struct, frozen=True):
     why: str
 
 
-def placed_operators(request: QueryRequest, one: QueryPlan) -> list[PlacedOperator]:
+def placed_operators(
+    request: QueryRequest, one: QueryPlan, cells: Mapping[int, str] | None = None
+) -> list[PlacedOperator]:
     """Every operator of a query, in the order of its text.
 
     Args:
         request: the query.
         one: its plan.
+        cells: by bit, the cells of its entries in words; by default their number.
     """
-    walk: _Walk = _InSwitch(request, one) if one.in_switch else _OnHost(one)
+    told = cells or {}
+    walk: _Walk = _InSwitch(request, one, told) if one.in_switch else _OnHost(one)
     gated = request.query.gated
     if gated is None:
         return list(walk.steps(request.query.steps, ""))
@@ -46,7 +50,7 @@ def placed_operators(request: QueryRequest, one: QueryPlan) -> list[PlacedOperat
         first = PlacedOperator(gated.text(), "host", one.reason)
     else:
         walk = _BehindGate(gate)
-        first = PlacedOperator(gated.text(), "switch", _stages([gate]))
+        first = PlacedOperator(gated.text(), "switch", _stages([gate], told))
     return [first, *walk.steps(request.query.steps, "")]
 
 
@@ -84,7 +88,8 @@ class _Walk:
 class _InSwitch(_Walk):
     """A query that counting stages execute."""
 
-    def __init__(self, request: QueryRequest, one: QueryPlan) -> None:
+    def __init__(self, request: QueryRequest, one: QueryPlan, cells: Mapping[int, str]) -> None:
+        self._cells = cells
         self._entries = one.entries
         self._crossing = isinstance(compile_query(request.query), Crossing)
         self._sources = -1
@@ -119,10 +124,10 @@ class _InSwitch(_Walk):
     def _behind(self, step: Step, source: int) -> tuple[Place, str]:
         match step:
             case Distinct() if source not in self._reduced:
-                return "switch", _stages(self._mine("distinct", source))
+                return "switch", _stages(self._mine("distinct", source), self._cells)
             case Reduce() if source not in self._reduced:
                 self._reduced.add(source)
-                return "switch", _stages(self._counting(source))
+                return "switch", _stages(self._counting(source), self._cells)
             case Map() if source not in self._reduced:
                 return "switch", "chooses the parts of a cell's key"
         return self._later(step)
@@ -191,6 +196,8 @@ def _unplaced(condition: Expression) -> str:
     return "the classifier cannot express it"
 
 
-def _stages(entries: list[StageEntry]) -> str:
-    parts = dict.fromkeys(f"counting stage {entry.stage}, {entry.size:,} cells" for entry in entries)
+def _stages(entries: list[StageEntry], cells: Mapping[int, str]) -> str:
+    parts = dict.fromkeys(
+        f"counting stage {entry.stage}, {cells.get(entry.bit, f'{entry.size:,} cells')}" for entry in entries
+    )
     return "; ".join(parts)

@@ -6,7 +6,7 @@ a reduce behind a distinct stands in a later stage.
 
 from collections.abc import Iterable, Sequence
 from itertools import combinations
-from typing import Final, Literal
+from typing import Final, Literal, Protocol
 
 import msgspec
 
@@ -28,6 +28,8 @@ _KEY_PARTS: Final = {
 _LAST_KNOWN_PORT: Final = 1_023
 """The last well-known port: servers send from these, clients from the others."""
 Role = Literal["distinct", "reduce", "difference", "gate", "look", "clock"]
+CROWDED: Final = 2
+"""Entries that need so many times their cells are crowded; fewer are not worth a change."""
 _DIFFERENCE_ZERO: Final = 1 << 31
 """The cell's value for a difference of 0, because differences may be negative."""
 
@@ -133,9 +135,24 @@ class StageEntry(msgspec.Struct, frozen=True, kw_only=True):
         """Bits that the entry takes."""
         return (self.bit, self.opens, self.uncounted) if self.action == "gate" else (self.bit,)
 
+    @property
+    def has_cells(self) -> bool:
+        """Whether it has cells of its own: others of a difference or a gate use those of its first entry."""
+        return self.role in ("distinct", "reduce") or (self.role != "clock" and self.bit == self.count_of)
+
     def value(self, count: int) -> int:
         """What a count that was read from its cell means."""
         return count - _DIFFERENCE_ZERO if self.role == "difference" else count
+
+
+class KeysSeen(Protocol):
+    """What is known of the keys that an entry counts."""
+
+    def wanted(self, entry: StageEntry) -> int:
+        """Cells for the keys that were seen; 0: too few to tell."""
+
+    def enough(self, entry: StageEntry) -> int | None:
+        """Cells that are enough; None: not known."""
 
 
 class Copy(msgspec.Struct, frozen=True, kw_only=True):
@@ -175,21 +192,29 @@ def masks_of(keys: Iterable[Expression]) -> tuple[tuple[str, int], ...]:
     return tuple(sorted(masks.items()))
 
 
+class Shares(msgspec.Struct, frozen=True):
+    """How cells are shared out."""
+
+    splits: bool = False
+    """A distinct whose tuples hold the source port gets two entries, for packets from well-known ports and for the
+    others, each with its own cells: half as many keys are without a cell."""
+    keys: KeysSeen | None = None
+    """Whose entries get more cells than usual where their keys need them."""
+    spares: bool = False
+    """No entry gets more cells than are enough for its keys, where that is known."""
+
+
 class Space:
-    """The free bits, stages and cells.
+    """The free bits, stages and cells."""
 
-    `splits`: a distinct whose tuples hold the source port gets two entries, for packets from well-known
-    ports and for the others, each with its own cells: half as many keys are without a cell.
-    """
-
-    def __init__(self, limits: SwitchLimits, *, splits: bool = False) -> None:
+    def __init__(self, limits: SwitchLimits, shares: Shares | None = None) -> None:
         self._limits = limits
-        self._splits = splits
+        self._shares = shares or Shares()
         self._bits: set[int] = set()
         self._stages: list[list[StageEntry]] = [[] for _ in range(limits.stages)]
 
-    def copy(self, *, splits: bool | None = None) -> "Space":
-        twin = Space(self._limits, splits=self._splits if splits is None else splits)
+    def copy(self, shares: Shares | None = None) -> "Space":
+        twin = Space(self._limits, shares or self._shares)
         twin._bits = set(self._bits)
         twin._stages = [list(stage) for stage in self._stages]
         return twin
@@ -231,26 +256,29 @@ class Space:
         self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int, alternatives: int
     ) -> list[StageEntry]:
         """Entries for a distinct: those that are there already, with room behind them, or new ones."""
-        parts = _by_source_port(match) if self._splits and "source_port_mask" in dict(masks) else [match]
+        parts = (
+            _by_source_port(match) if self._shares.splits and "source_port_mask" in dict(masks) else [match]
+        )
         if self._there(match, masks, window_us) is not None:
             parts = [match]
         return [self._distinct(part, masks, window_us, alternatives) for part in parts]
 
     def _there(self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int) -> StageEntry | None:
+        """The largest that is the same."""
         wanted = ("distinct", match, masks, window_us)
-        for number, held in enumerate(self._stages):
-            for entry in held:
-                is_same = (entry.role, entry.match, entry.masks, entry.window_us) == wanted
-                if is_same and self._room_behind(number, match):
-                    return entry
-        return None
+        found = [
+            entry
+            for number, held in enumerate(self._stages)
+            for entry in held
+            if (entry.role, entry.match, entry.masks, entry.window_us) == wanted
+            and self._room_behind(number, match)
+        ]
+        return max(found, key=lambda entry: entry.size, default=None)
 
     def _distinct(
         self, match: Match, masks: tuple[tuple[str, int], ...], window_us: int, alternatives: int
     ) -> StageEntry:
         there = self._there(match, masks, window_us)
-        if there is not None:
-            return there
         new = StageEntry(
             role="distinct",
             bit=0,
@@ -261,7 +289,15 @@ class Space:
             threshold=0,
             by_bytes=0,
         )
-        return self.place(new, after=-1, cells=self._limits.distinct_cells // alternatives)
+        cells = self._limits.distinct_cells // alternatives
+        if there is not None and there.size * CROWDED > self._wish(new, there.size):
+            return there
+        try:
+            return self.place(new, after=-1, cells=cells)
+        except NotPlaced:
+            if there is None:
+                raise
+            return there
 
     def clock(self) -> StageEntry:
         """The entry with which the switch reports its time; raises `NotPlaced`.
@@ -292,14 +328,15 @@ class Space:
 
     def place(self, wanted: StageEntry, *, after: int, cells: int = 0) -> StageEntry:
         """The entry in the first stage behind `after` that has room; raises `NotPlaced`."""
-        wish = cells or self._limits.reduce_cells
+        usual = cells or self._limits.reduce_cells
+        wish = self._wish(wanted, usual)
         for number in range(after + 1, self._limits.stages):
             held = self._stages[number]
             if len(held) >= self._limits.entries:
                 continue
             if not all(disjoint(wanted.match, entry.match) for entry in held):
                 continue
-            gap = self._gap(held, wish)
+            gap = self._gap(held, wish, usual)
             if gap is None:
                 continue
             entry = msgspec.structs.replace(wanted, bit=self.bit(), stage=number, base=gap[0], size=gap[1])
@@ -316,9 +353,10 @@ class Space:
     def together(self, wanted: Sequence[StageEntry]) -> list[StageEntry]:
         """Entries for one difference or gate: all in one stage, on the same cells; raises `NotPlaced`."""
         apart = all(disjoint(one.match, other.match) for one, other in combinations(wanted, 2))
-        wish = sum(entry.role != "look" for entry in wanted) * self._limits.reduce_cells
+        usual = sum(entry.role != "look" for entry in wanted) * self._limits.reduce_cells
+        wish = self._wish(wanted[0], usual)
         for number, held in enumerate(self._stages if apart else ()):
-            gap = self._gap(held, wish)
+            gap = self._gap(held, wish, usual)
             fits = all(disjoint(one.match, other.match) for one in wanted for other in held)
             if not fits or gap is None or len(held) + len(wanted) > self._limits.entries:
                 continue
@@ -333,8 +371,17 @@ class Space:
             return found
         raise NotPlaced(f"no counting stage of {self._limits.stages} has room for its {wanted[0].role}")
 
-    def _gap(self, held: Iterable[StageEntry], wish: int) -> tuple[int, int] | None:
-        """The first gap of cells that is as large as wished, else the largest of at least a quarter."""
+    def _wish(self, entry: StageEntry, usual: int) -> int:
+        """How many cells an entry had better get."""
+        keys = self._shares.keys
+        if keys is None:
+            return usual
+        enough = keys.enough(entry) if self._shares.spares else None
+        found = max(usual, keys.wanted(entry)) if enough is None else enough
+        return min(found, max(usual, self._limits.cells))
+
+    def _gap(self, held: Iterable[StageEntry], wish: int, usual: int) -> tuple[int, int] | None:
+        """The first gap of cells that is as large as wished, else the largest of at least a quarter of the usual."""
         gaps = []
         start = 0
         for entry in sorted(held, key=lambda entry: entry.base):
@@ -345,7 +392,7 @@ class Space:
         if large is not None:
             return large
         base, size = max(gaps, key=lambda gap: gap[1])
-        return (base, size) if size >= max(1, wish // 4) else None
+        return (base, size) if size >= max(1, min(wish, usual) // 4) else None
 
 
 def _by_source_port(match: Match) -> list[Match]:

@@ -11,18 +11,21 @@ two entries.  Of a query with a gate the switch counts what opens it, and copies
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from math import gcd
+from math import fsum, gcd
 from typing import Final
 
 import msgspec
 
 from apps.sonata_adapter.errors import NotPlaced
 from apps.sonata_adapter.keys import QueryRequest
+from apps.sonata_adapter.planner.cell_needs import CellNeeds
 from apps.sonata_adapter.planner.conditions import Match, conditions_of, disjoint, narrowed
 from apps.sonata_adapter.planner.estimates import packets_per_second
 from apps.sonata_adapter.planner.placement import (
+    CROWDED,
     Copy,
     Role,
+    Shares,
     Space,
     StageEntry,
     SwitchLimits,
@@ -165,10 +168,56 @@ def plan(
 def _placed(
     requests: Sequence[QueryRequest], space: Space, limits: SwitchLimits, rates: MeasuredRates | None
 ) -> tuple[dict[str, QueryPlan], Space]:
-    """Plans for new requests, and what is free then; distincts are split where that takes no query's room."""
+    """Plans for new requests, and what is free then.
+
+    Cells are shared out so that most copies are saved; then so that keys have the cells that they need.  Entries that
+    could do with fewer have fewer only where that makes a difference to others.
+    """
+    keys = rates.cells if rates is not None and rates.cells.known else None
+    first = _split(requests, space, limits, rates, Shares(keys=keys))
+    if keys is None or all(one.in_switch and not crowded(one, keys, limits) for one in first[0].values()):
+        return first
+    modest = sorted(
+        requests, key=lambda one: max((keys.wanted(each) for each in _alone(one, limits)), default=0)
+    )
+    others = [
+        _split(modest, space, limits, rates, Shares(keys=keys, spares=True)),
+        _split(requests, space, limits, rates, Shares()),
+    ]
+    return max([first, *others], key=lambda trial: _worth(trial[0], keys, limits))
+
+
+def _alone(request: QueryRequest, limits: SwitchLimits) -> list[StageEntry]:
+    """Entries of a query alone in a switch; none: it cannot count it."""
+    try:
+        return _entries(request, Space(limits), limits)
+    except NotPlaced:
+        return []
+
+
+def _worth(plans: Mapping[str, QueryPlan], keys: CellNeeds, limits: SwitchLimits) -> tuple[float, int]:
+    """What plans save, and the cells that they give to keys that need them."""
+    entries = {entry.bit: entry for one in plans.values() for entry in one.entries}.values()
+    needed = sum(min(entry.size, keys.wanted(entry), limits.cells) for entry in entries)
+    return fsum(one.saved_per_second for one in plans.values()), needed
+
+
+def crowded(one: QueryPlan, keys: CellNeeds, limits: SwitchLimits) -> list[StageEntry]:
+    """Entries of a query with at most half of the cells that their keys need."""
+    return [entry for entry in one.entries if CROWDED * entry.size <= min(keys.wanted(entry), limits.cells)]
+
+
+def _split(
+    requests: Sequence[QueryRequest],
+    space: Space,
+    limits: SwitchLimits,
+    rates: MeasuredRates | None,
+    shares: Shares,
+) -> tuple[dict[str, QueryPlan], Space]:
+    """Plans with distincts split where that takes no query's room, and what is free then."""
     trials = []
     for splits in (True, False):
-        trial = space.copy(splits=splits)
+        trial = space.copy(msgspec.structs.replace(shares, splits=splits))
         trials.append(({one.identity: _counted(one, trial, limits, rates) for one in requests}, trial))
     (split, less), (whole, more) = trials
     as_many = all(split[identity].in_switch for identity, one in whole.items() if one.in_switch)
@@ -235,9 +284,8 @@ def _saving(
     request: QueryRequest, limits: SwitchLimits, rates: MeasuredRates | None, *, a_stage: bool = True
 ) -> float:
     """Copies a second that counting in the switch saves, for each stage that it takes; 0: it cannot."""
-    try:
-        stages = {entry.stage for entry in _entries(request, Space(limits), limits)}
-    except NotPlaced:
+    stages = {entry.stage for entry in _alone(request, limits)}
+    if not stages:
         return 0.0
     saved = packets_per_second((match for match, _ in _needed(request)), rates)
     return saved / len(stages) if a_stage else saved

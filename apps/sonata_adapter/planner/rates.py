@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
+from apps.sonata_adapter.planner.cell_needs import CellNeeds
+
 _SPAN_US: Final = 1_000_000
 """A rate is measured over at least this much capture time."""
 
@@ -23,6 +25,8 @@ class MeasuredRates:
     def __init__(self) -> None:
         self._totals: dict[tuple[str, str], _Total] = {}
         self._rates: dict[tuple[str, str], _Rate] = {}
+        self.cells = CellNeeds()
+        """How many keys are counted."""
 
     def note(self, switch: str, name: str, match: Mapping[str, Any], packets: int, time_us: int) -> None:
         """Take a total.
