@@ -84,6 +84,9 @@ class Connection:
         self._requests = Outgoing()
         self._election_id: Any = None
         self._opened_ms = 0
+        self._highest = 0
+        """The highest election id that the switch has seen, as far as it said."""
+        self._outbid_at = 0.0
         self._told: tuple[bool, Any] | None = None
         """What the listener knows: primary or not, and the election id of its writes."""
         self._active = active
@@ -121,6 +124,17 @@ class Connection:
         if active != self._active:
             self._active = active
             self._claim(self._usual_id())
+
+    def outbid(self) -> None:
+        """Claim above whoever is primary, unless its rank is higher; once a second at most.
+
+        Clocks of two machines differ, so the time of a stream does not decide between two of one rank.
+        """
+        now = time.monotonic()
+        of_lower_rank = self._highest >> 64 <= self._address.rank
+        if self._active and self._told == (False, None) and of_lower_rank and now - self._outbid_at > 1:
+            self._outbid_at = now
+            self._claim(min(max(self._highest + 1, self._usual_id()), _HIGHEST_ID))
 
     def break_off(self) -> None:
         """Close this stream; a new one is opened unless `close` was called."""
@@ -213,8 +227,8 @@ class Connection:
     def _arbitrated(self, arbitration: Any) -> None:
         """The switch repeats its status whenever a controller comes or goes; only changes are passed on."""
         self._stop_waiting()
+        highest = self._highest = arbitration.election_id.high << 64 | arbitration.election_id.low
         if arbitration.status.code == _NO_PRIMARY:
-            highest = arbitration.election_id.high << 64 | arbitration.election_id.low
             self._fill_the_place(min(max(highest + 1, self._usual_id()), _HIGHEST_ID))
             return
         primary = arbitration.status.code == _PRIMARY

@@ -13,8 +13,10 @@ from apps.p4runtime_ctrl.state.desired_state import INSERT, Change
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.telemetry.classifier import TelemetryRequest
 from p4rt import INSECURE
+from sdnator.testing.p4runtime_client import P4RuntimeClient
 from sdnator.testing.product_program import PROGRAM, program
 from sdnator.testing.switch_target import KINDS, SwitchTarget
+from sdnator.testing.waiting import wait_for
 from tests.requirements import optional_program
 
 
@@ -188,6 +190,19 @@ def test_a_backup_takes_over(target, attach):
     assert not standby.reports
     active.connection.close()
     assert str(standby.until_up()) == "nothing to change"
+
+
+def test_of_two_active_controllers_the_one_that_insists_becomes_primary(target, attach):
+    """Where the clock of the machine to which a switch is given is behind the other one's."""
+    first = attach(make(), rank=1)
+    first.until_up()
+    second = attach(make(), rank=1)
+    second.until_up()
+    wait_for(lambda: (first.connection.outbid(), len(first.reports) == 2)[1])
+    with P4RuntimeClient(target.address, election_id=(2 << 64)) as stronger:
+        stronger.arbitrate()
+        first.connection.outbid()
+        assert len(first.reports) == 2, "a higher rank is respected"
 
 
 LIMIT = RateLimit(kind="udp_from", port=53, rate=40, spared=("192.0.2.53", "192.0.2.54"), spared_rate=60)
