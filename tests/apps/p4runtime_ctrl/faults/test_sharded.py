@@ -13,7 +13,7 @@ from apps.messages import Target
 from dataplane.ports.capture_port import CaptureFeed
 from due import Capability
 from p4rt import p4runtime
-from sdnator.testing.controller_run import BASE_US, ControllerRun, Heard, block, frame
+from sdnator.testing.controller_run import BASE_US, Bystander, ControllerRun, Heard, block, frame
 from sdnator.testing.kafka_servers import KafkaMissing, KafkaServers
 from sdnator.testing.p4runtime_client import P4RuntimeClient
 from sdnator.testing.product_program import program
@@ -23,6 +23,7 @@ from tests.requirements import missing
 
 DECISIONS = Capability("network.block.firewall.*", delivery="reliable", archive="always")
 SWITCHES = ("s1", "s2")
+FORWARDED = 2
 
 
 class GivenServer:
@@ -60,7 +61,8 @@ class Site:
         """Addresses of blocks by decision, by switch."""
         self._numbers = count(1)
 
-    def controller(self):
+    def controller(self, **options):
+        """A controller of both switches; `options`: of both in its settings."""
         switches = [
             {
                 "name": name,
@@ -68,6 +70,7 @@ class Site:
                 "insecure": True,
                 "base_us": BASE_US,
                 "forward": {"1": 2},
+                **options,
             }
             for name, target in self.targets.items()
         ]
@@ -99,6 +102,14 @@ class Site:
         target = Target(kind="ip", address=address)
         decision = structs.replace(block(number, 1), switch=switch, target=target)
         self.decided[switch][decision.id] = address
+        self.engine.write("network.block.firewall.ipv4", decision.to_value(), event_time=number)
+
+    def lift(self, switch):
+        """Lift the block that was decided first of those in force."""
+        name = next(iter(self.decided[switch]))
+        target = Target(kind="ip", address=self.decided[switch].pop(name))
+        number = next(self._numbers)
+        decision = structs.replace(block(number, 1, "unblock"), switch=switch, target=target)
         self.engine.write("network.block.firewall.ipv4", decision.to_value(), event_time=number)
 
     def blocked(self, switch):
@@ -134,7 +145,7 @@ class Site:
 
 
 class Traffic:
-    """A frame a millisecond to each switch, and a block for each every few milliseconds, until it is left."""
+    """Until it is left a frame a millisecond to each switch, and decisions about each every few milliseconds."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
@@ -149,6 +160,8 @@ class Traffic:
                 feed.send([1000 * self.sent + n for n in range(4)], [60] * 4, [frame(1)] * 4)
                 if self.sent % 16 == 0 and len(self._site.decided[switch]) < 400:
                     self._site.decide(switch)
+                    if self.sent % 48 == 0:
+                        self._site.lift(switch)
             self.sent += 4
 
     def __enter__(self) -> "Traffic":
@@ -273,3 +286,32 @@ def test_one_that_ends_in_order_hands_over_and_one_that_comes_gets_its_share(sit
         traffic.more(200)
     for switch in SWITCHES:
         complete(site, switch)
+
+
+def test_switches_that_fail_closed_stay_open_while_any_controller_has_them(site):
+    controllers = {
+        each.pid: each for each in (site.controller(fail="closed"), site.controller(fail="closed"))
+    }
+    wait_for(lambda: site.divided(*controllers), why=site.why)
+    feeds = site.feeds()
+    dead = site.owner("s1")
+    site.stage.kill(controllers.pop(dead))
+    for switch in SWITCHES:
+        stays = f"{switch}: another controller is primary; port forwarding stays"
+        wait_for(lambda text=stays: text in site.stage.log(), why=site.why)
+        assert verdicts(feeds[switch]) == FORWARDED
+    site.stage.kill(controllers.popitem()[1])
+    for switch in SWITCHES:
+        closed = f"{switch}: its controller was killed: fail closed, port forwarding is removed"
+        wait_for(lambda text=closed: text in site.stage.log(), why=site.why)
+        with Bystander(site.targets[switch].address):
+            assert verdicts(feeds[switch]) == 0
+        feeds[switch].close()
+
+
+def verdicts(feed):
+    """What a switch does with a frame, but for copying it."""
+    feed.send([1], [60], [frame(4)])
+    found = []
+    wait_for(lambda: found.extend(feed.verdicts()) or found)
+    return found[0] & FORWARDED
