@@ -375,16 +375,21 @@ class Engine:
         """
         return self._require().keeper.named_here()
 
-    def shard_owners(self) -> dict[str, str]:
-        """Which instances the Coordinator has given the shards to.
+    def offer_shards(self, names: Iterable[str]) -> None:
+        """Say which of the shards named in `init` this instance can work on; without a call, all of them.
 
-        Returns:
-            Instance id by shard; empty without a Coordinator.
+        Args:
+            names: others are withdrawn from this instance, and given to those that can work on them.
 
         Raises:
+            InvalidOption: a name was not given to `init`.
             NotInitialised: called before `init` or after `close`.
         """
-        return self._require().keeper.owners()
+        offered = tuple(names)
+        session = self._require()
+        if not set(offered) <= set(self._shards):
+            raise InvalidOption(f"offer_shards({list(offered)!r}): init was given {list(self._shards)!r}")
+        session.keeper.offer(offered)
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back whenever this app's assignments change, and once immediately.

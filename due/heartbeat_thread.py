@@ -163,10 +163,10 @@ class HeartbeatThread:
         with self.lock:
             return self.member.named_here
 
-    def owners(self) -> dict[str, str]:
-        """See `Member.owners`."""
+    def offer(self, names: tuple[str, ...]) -> None:
+        """See `Member.offer`."""
         with self.lock:
-            return self.member.owners
+            self.member.offer(names, time.monotonic())
 
     def grant(self, shard: str) -> int:
         """See `Member.grant`."""
@@ -287,7 +287,7 @@ class HeartbeatThread:
         offered: tuple[str, ...] = ()
         held: tuple[str, ...] = ()
         if member.named:
-            offered, held = member.named, member.named_held
+            offered, held = member.offered, member.named_held
         elif member.registration.instances == "sharded":
             offered, held = receiver.offered()[:MOST_SHARDS], receiver.held()[:MOST_SHARDS]
         return member.beat(

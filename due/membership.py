@@ -279,6 +279,8 @@ class Member:
         self.registration = registration
         self.named = named
         """The app's own shards; none: its reliable paths are."""
+        self.offered = named
+        """Of these the ones that this instance can work on."""
         self.phase = Phase.WAITING if coordinated else Phase.ALONE
         self.current: Assignments | None = None
         self.changes = 0
@@ -338,10 +340,10 @@ class Member:
         mine = self._mine()
         return tuple(name for name in self.named if self.phase is Phase.ALONE or name in mine)
 
-    @property
-    def owners(self) -> dict[str, str]:
-        """The instance that each shard was given to, as far as the Coordinator has said."""
-        return {shard: grant.instance for shard, grant in self.current.shards.items()} if self.current else {}
+    def offer(self, names: tuple[str, ...], now: float) -> None:
+        """From now on these are the shards that this instance can work on; a Coordinator hears it at once."""
+        if names != self.offered:
+            self.offered, self._beat_at = names, now
 
     def _mine(self) -> dict[str, int]:
         if self.current is None:

@@ -20,10 +20,12 @@ from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
 from apps.p4runtime_ctrl.arrivals import (
     ClockReached,
     FramesToSend,
+    SwitchTold,
     command_and_requests_in,
     frames_in,
     offer_in,
     questions_in,
+    told_in,
 )
 from apps.p4runtime_ctrl.errors import ControllerError, P4InfoError
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
@@ -47,6 +49,8 @@ INTERESTS = (
     Interest("network.packet_out.*.*"),
     Interest("network.clock.*.*"),
 )
+SHARDED_INTERESTS = (Interest("network.switch.p4runtime_ctrl.*"),)
+"""Where the instances divide the switches each hears of the others."""
 CAPABILITIES = (
     Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.frames.p4runtime_ctrl.*.*", delivery="reliable"),
@@ -79,6 +83,7 @@ class P4RuntimeCtrlService:
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
         self._settings = settings
+        self._divided = settings.instances == "sharded"
         pipeline = load_pipeline(settings)
         names = [each.name for each in settings.switches]
         if len(set(names)) != len(names):
@@ -92,7 +97,6 @@ class P4RuntimeCtrlService:
         self._by_digest = {each.name: settings.by_digest(each) for each in settings.switches}
         self._watchdog = FailClosedWatchdog(settings)
         self._active = True
-        self._divided = settings.instances == "sharded"
         self._granted: frozenset[str] = frozenset()
         """Switches that the Coordinator has given to this instance."""
         self._opened = threading.Event()
@@ -135,6 +139,8 @@ class P4RuntimeCtrlService:
         )
         observe("network.packet_out.*.*").subscribe(reading("packet_out", frames_in, self._on_frames))
         observe("network.clock.*.*").subscribe(reading("clock", ClockReached.from_item, self._on_clock))
+        for one in SHARDED_INTERESTS if self._divided else ():
+            observe(one.key).subscribe(reading("switch", told_in, self._on_told))
 
     def _knows_its_switches(self) -> bool:
         return self._divided and self._engine.shards() is not None
@@ -165,6 +171,7 @@ class P4RuntimeCtrlService:
             pipeline,
             batch=settings.batch,
             linger_s=settings.linger_ms / 1000,
+            steps_up=self._divided,
         )
         return SwitchWorker(self._engine, settings, mine, ProgramInfo(pipeline.p4info), connect, self._intake)
 
@@ -194,6 +201,7 @@ class P4RuntimeCtrlService:
                 agent.stand(active=active)
 
     def _look_at_switches(self) -> None:
+        self._engine.offer_shards(name for name, agent in self._agents.items() if agent.within_reach)
         granted = self._engine.shards()
         if granted is None:
             return  # was stopped for a moment; nothing is known to have moved
@@ -255,6 +263,11 @@ class P4RuntimeCtrlService:
         agent = self._agents.get(item.key.rpartition(".")[2])
         if agent is not None:
             agent.clock_reached(reached.event_time)
+
+    def _on_told(self, item: Item, told: SwitchTold) -> None:
+        agent = self._agents.get(told.switch)
+        if agent is not None and item.instance_id != self._engine.instance_id:
+            agent.told(told, item.instance_id)
 
     def _on_offer(self, item: Item, offered: tuple[str, Offer]) -> None:
         self._take_offer(item, offered)

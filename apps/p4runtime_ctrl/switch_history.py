@@ -8,7 +8,6 @@ from apps.messages import Decision, Intake, TableCommand, youngest
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, as_remembered, commands_of, decisions_for
 from due import Engine, Item
-from due.errors import BackendError
 
 _RESTORED: Final = 100_000
 """Most archived decisions of a kind, and commands, that are read at a start, the newest."""
@@ -54,16 +53,6 @@ class SwitchHistory:
         archived = self._archived(f"network.p4_command.*.{self._mine.name}", since)
         commands = commands_of(archived, since, self._intake)
         return [] if self._mine.mirror else decisions, [*commands, *self._commands]
-
-    def predecessor(self) -> dict[str, object] | None:
-        """The state that another controller of this switch wrote last; None: there is none, or no archive now."""
-        try:
-            found = self._engine.get(f"network.switch.p4runtime_ctrl.{self._mine.name}", limit=1)
-        except BackendError:
-            return None
-        if not found or found[0].instance_id == self._engine.instance_id:
-            return None
-        return found[0].value if isinstance(found[0].value, dict) else None
 
     def _archived(self, key: str, since: int) -> list[Item]:
         return youngest(self._engine, {"dataKey": key}, since, _RESTORED)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from apps.messages import Confirmation, Decision, Intake, MessageError, TableCommand, one_line
-from apps.p4runtime_ctrl.arrivals import FramesToSend
+from apps.p4runtime_ctrl.arrivals import FramesToSend, SwitchTold
 from apps.p4runtime_ctrl.counter_reads import CounterReads
 from apps.p4runtime_ctrl.duty import SwitchDuty
 from apps.p4runtime_ctrl.errors import ControllerError, EntryError, Malformed, SwitchError
@@ -49,6 +49,8 @@ _SETTLE_S: Final = 1.0
 _SETTLE_LOSSLESS_S: Final = 15.0
 """As `_SETTLE_S`, in a replay on the embedded switch: nothing is lost on the way there, but a machine with too much to
 do may stand still for seconds."""
+_AWAY_S: Final = 2.0
+"""Seconds; a switch that dies is there again sooner, and does not go to another controller for it."""
 _UNCONFIRMED_S: Final = 15.0
 """What the primary controller of a switch has not confirmed after once or twice this time, it confirms no more."""
 
@@ -109,7 +111,7 @@ class SwitchWorker:
         self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
         self._session: P4RuntimeSession | None = None
         self._connected = self._was_backup = False
-        self._duty = SwitchDuty(divided=settings.instances == "sharded")
+        self._duty = SwitchDuty(lambda: engine.instance_id, divided=settings.instances == "sharded")
         self._history = SwitchHistory(engine, settings, mine, self._intake)
         self._aged_at = 0.0
         self._urgent: deque[Decision] = deque()
@@ -128,6 +130,7 @@ class SwitchWorker:
             mine.name, program, self._publish_counters, lambda error: self._put(partial(_fail, error))
         )
         self._publishing = threading.Lock()
+        self._away_since = time.monotonic()
         self._alive_at = 0.0
         self._settled_at = 0.0
         lossless = mine.clock == "packets" and mine.target == "embedded"
@@ -150,9 +153,19 @@ class SwitchWorker:
     def stand(self, *, active: bool) -> None:
         """Become active or standby; where the switches are divided, one that is primary goes on until another one is."""
         if self._duty.divided:
-            self._duty.granted = active
+            self._duty.give(granted=active)
         if active or not self._duty.divided or self._session is None:
             self._connection.stand(active=active)
+
+    def told(self, told: SwitchTold, instance: str) -> None:
+        """Another controller has said how the switch is."""
+        if self._session is None:
+            self._duty.heard(told, instance, time.monotonic())
+
+    @property
+    def within_reach(self) -> bool:
+        """Whether this controller can have the switch: it is connected, or was moments ago."""
+        return self._connected or time.monotonic() - self._away_since < _AWAY_S
 
     def insist(self) -> None:
         """The switch was given to this controller: let it be primary."""
@@ -242,7 +255,7 @@ class SwitchWorker:
 
     def _look_at_duty(self, now: float) -> None:
         late = self._duty.overdue(now)
-        if late:
+        if late and self._speaks:
             self._put(partial(self._publish_confirmations, late))
         if now - self._aged_at > _UNCONFIRMED_S and self._duty.backup:
             self._aged_at = now
@@ -375,8 +388,7 @@ class SwitchWorker:
         self._connected = True
         self._was_backup = True
         self._session = None
-        self._duty.backup = True
-        self._duty.settled()
+        self._duty.stand_back()
         self.problem = ""
         if self._duty.divided:
             self._rest()
@@ -384,7 +396,7 @@ class SwitchWorker:
         self._say("backup: another controller is primary")
 
     def _rest(self) -> None:
-        """Another controller has the switch: its packets and learnt addresses are told to that one."""
+        """Another controller has the switch, its packets and its learnt addresses."""
         if not self._duty.granted:
             self._connection.stand(active=False)
         self._switch.forget_learnt()
@@ -392,15 +404,15 @@ class SwitchWorker:
 
     def _follow(self) -> None:
         """Go on with time and numbers where the controller before had come to."""
-        told = self._history.predecessor() or {}
-        time_us, sequence = told.get("event_time"), told.get("sequence")
-        if isinstance(sequence, int) and isinstance(time_us, int):
-            self._outbound.follow(sequence)
-            self._progress.time_us = max(self._progress.time_us, time_us // 1000)
+        before, self._duty.before = self._duty.before, None
+        if before is not None:
+            self._outbound.follow(before.sequence)
+            self._progress.time_us = max(self._progress.time_us, before.event_time // 1000)
 
     def _lose(self, cause: str) -> None:
         if self._connected:
             _LOG.warning("%s: lost: %s", self.name, cause)
+            self._away_since = time.monotonic()
         self._connected = False
         self._duty.backup = False
         if not self._duty.granted:
@@ -489,12 +501,12 @@ class SwitchWorker:
 
     @property
     def _speaks(self) -> bool:
-        return self._duty.speaks(primary=self._session is not None)
+        return self._duty.speaks(time.monotonic(), primary=self._session is not None)
 
     def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
         if not self._speaks:
             return
-        if self._duty.divided and self._session is not None and self._session.denied:
+        if self._duty.divided and (self._session is None or self._session.denied):
             self._duty.withhold(list(confirmations), time.monotonic())
             return
         self._publish_confirmations(confirmations)
@@ -533,7 +545,7 @@ class SwitchWorker:
             "switch": self.name,
             "connected": self._connected,
             "primary": self._session is not None,
-            "owner": self._owner(),
+            "owner": self._duty.owner(time.monotonic(), primary=self._session is not None),
             "target": self._mine.target or self._mine.address,
             "program": self._program_name,
             "base_us": self._mine.base_us,
@@ -562,14 +574,6 @@ class SwitchWorker:
             "change": self._change,
             "brought_up_ms": self._brought_up_ms,
         }
-
-    def _owner(self) -> str:
-        """The instance that is primary, where several divide the switches; empty: none is."""
-        if not self._duty.divided:
-            return ""
-        if self._session is not None:
-            return self._engine.instance_id
-        return self._duty.owner(self._engine.shard_owners().get(self.name, ""), self._engine.instance_id)
 
     def _now(self) -> tuple[int, int]:
         return self._progress.time_us * 1000, self._progress.arrival

@@ -2,7 +2,8 @@
 
 A lost stream is opened again, with growing pauses.  The active controller claims to be primary with its rank, a
 standby with the lowest election id.  When the switch reports that there is no primary, a standby waits a
-moment for the active one, then asks to be primary.
+moment for the active one, then asks to be primary.  With `steps_up` a standby that is primary at once, because the switch
+is new, claims it with its rank, too.
 """
 
 import threading
@@ -67,6 +68,7 @@ class Connection:
         longest_pause_s: float = 0.2,
         active: bool = True,
         patience_s: float = _DEPUTY_WAITS_S,
+        steps_up: bool = False,
     ) -> None:
         self._address = address
         self._pipeline = pipeline
@@ -91,6 +93,7 @@ class Connection:
         """What the listener knows: primary or not, and the election id of its writes."""
         self._active = active
         self._patience_s = patience_s
+        self._steps_up = steps_up
         self._patience: threading.Timer | None = None
         name = address.target
         self._threads = [
@@ -232,6 +235,10 @@ class Connection:
             self._fill_the_place(min(max(highest + 1, self._usual_id()), _HIGHEST_ID))
             return
         primary = arbitration.status.code == _PRIMARY
+        if primary and self._steps_up and self._election_id.high < self._address.rank:
+            # of a switch that has seen no higher id; the next standby, or a watchdog, would win by its time alone
+            self._claim(self._address.rank << 64 | self._opened_ms)
+            return
         told = (primary, self._election_id if primary else None)
         if told == self._told:
             return

@@ -23,12 +23,14 @@ from tests.requirements import optional_program
 class Attached:
     """A connection that brings its switch up whenever it becomes primary, in the stream's thread."""
 
-    def __init__(self, address, switch, rank=1):
+    def __init__(self, address, switch, rank=1, **options):
         self.switch = switch
         self.changed = threading.Condition()
         self.reports, self.session, self.error = [], None, None
         pipeline = CompiledProgram(PROGRAM.read_bytes(), program().message)
-        self.connection = Connection(Address(address, 1, rank, security=INSECURE), pipeline, self)
+        self.backups = 0
+        place = Address(address, 1, rank, security=INSECURE)
+        self.connection = Connection(place, pipeline, self, **options)
         self.connection.open()
 
     def became_primary(self, session):
@@ -42,7 +44,7 @@ class Attached:
             self.changed.notify_all()
 
     def became_backup(self):
-        pass
+        self.backups += 1
 
     def lost(self, cause):
         pass
@@ -190,6 +192,16 @@ def test_a_backup_takes_over(target, attach):
     assert not standby.reports
     active.connection.close()
     assert str(standby.until_up()) == "nothing to change"
+
+
+def test_a_standby_that_found_the_switch_new_does_not_give_way_to_one_that_comes_later(target, attach):
+    """A watchdog, for one, which would close the switch."""
+    first = attach(make(), active=False, steps_up=True)
+    first.until_up()
+    watchdog = attach(make(), active=False)
+    wait_for(lambda: watchdog.backups)
+    assert (len(first.reports), first.backups) == (1, 0)
+    assert not watchdog.reports
 
 
 def test_of_two_active_controllers_the_one_that_insists_becomes_primary(target, attach):

@@ -13,6 +13,7 @@ from apps.messages import Target
 from dataplane.ports.capture_port import CaptureFeed
 from due import Capability
 from p4rt import p4runtime
+from sdnator.testing.cable import Cable
 from sdnator.testing.controller_run import BASE_US, Bystander, ControllerRun, Heard, block, frame
 from sdnator.testing.kafka_servers import KafkaMissing, KafkaServers
 from sdnator.testing.p4runtime_client import P4RuntimeClient
@@ -61,20 +62,21 @@ class Site:
         """Addresses of blocks by decision, by switch."""
         self._numbers = count(1)
 
-    def controller(self, **options):
-        """A controller of both switches; `options`: of both in its settings."""
+    def controller(self, addresses=None, *, timeout_s=5.0, **options):
+        """A controller of both switches; `addresses` of some, `options` of both in its settings."""
+        places = {name: target.address for name, target in self.targets.items()} | (addresses or {})
         switches = [
             {
                 "name": name,
-                "address": target.address,
+                "address": address,
                 "insecure": True,
                 "base_us": BASE_US,
                 "forward": {"1": 2},
                 **options,
             }
-            for name, target in self.targets.items()
+            for name, address in places.items()
         ]
-        return self.stage.controller(switches=switches, instances="sharded")
+        return self.stage.controller(switches=switches, instances="sharded", timeout_s=timeout_s)
 
     def feeds(self):
         return {"s1": self.stage.feed(), "s2": CaptureFeed(str(self._socket))}
@@ -137,8 +139,12 @@ class Site:
         )
 
     def arrivals(self, switch):
-        batches = [item.value["arrival"] for item in self.heard.items if f".{switch}.all" in item.key]
-        return np.concatenate(batches) if batches else np.zeros(0, dtype=np.uint64)
+        """Arrival numbers of the packets of a switch, by the instance that has passed them on."""
+        batches = {}
+        for item in list(self.heard.items):
+            if f".{switch}.all" in item.key:
+                batches.setdefault(item.instance_id, []).append(item.value["arrival"])
+        return {instance: np.concatenate(found).tolist() for instance, found in batches.items()}
 
     def why(self):
         return {s: (self.owner(s), self.states(s)[-1:]) for s in SWITCHES}, self.stage.log()[-4_000:]
@@ -190,8 +196,8 @@ def updates(request, tmp_path):
         servers = KafkaServers(tmp_path / "kafka").start()
     except KafkaMissing as reason:
         missing(str(reason))
-    with servers:
-        yield servers.url
+    yield servers.url
+    servers.stop()
 
 
 @pytest.fixture
@@ -208,12 +214,17 @@ def site(request, tmp_path):
 
 
 def complete(site, switch):
-    """Every decision has its entry, no entry lacks a decision, and what was handed on is in order and there once."""
+    """Every decision has its entry, no entry lacks a decision; each controller has passed packets on in order, none twice.
+
+    Returns all their arrival numbers, in order: what a controller had in its hands when it lost the switch comes late.
+    """
     wait_for(lambda: site.settled(switch), why=site.why)
     wait_for(lambda: site.holds(switch), why=lambda: (site.blocked(switch), site.why()))
     arrivals = site.arrivals(switch)
-    assert (arrivals[1:] > arrivals[:-1]).all()
-    return arrivals
+    assert all(found == sorted(found) for found in arrivals.values())
+    numbers = sorted(number for found in arrivals.values() for number in found)
+    assert len(set(numbers)) == len(numbers), "no packet is told twice"
+    return numbers
 
 
 @pytest.mark.parametrize("updates", ["valkey", "kafka"], indirect=True)
@@ -222,6 +233,7 @@ def test_after_a_kill_the_other_controller_goes_on_with_the_switch(site, updates
     wait_for(lambda: site.divided(*controllers), why=site.why)
     dead = site.owner("s1")
     other = next(pid for pid in controllers if pid != dead)
+    before = len(site.states("s2"))
     with Traffic(site) as traffic:
         traffic.more()
         site.stage.kill(controllers[dead])
@@ -229,18 +241,13 @@ def test_after_a_kill_the_other_controller_goes_on_with_the_switch(site, updates
         wait_for(lambda: site.owner("s1") == other and site.sends("s1"), why=site.why)
         traffic.more()
         sent = traffic.sent
+    wait_for(lambda: sum(map(len, site.arrivals("s2").values())) >= sent, why=site.why)
+    assert complete(site, "s2") == list(range(sent)), "packets of the other switch are not disturbed"
     taken_over = complete(site, "s1")
-    undisturbed = complete(site, "s2")
-    wait_for(lambda: len(site.arrivals("s2")) >= sent, why=site.why)
-    undisturbed = site.arrivals("s2")
-    assert undisturbed.tolist() == list(range(len(undisturbed))), (
-        "packets of the other switch are not disturbed"
-    )
-    assert {state["owner"] for state in site.states("s2") if state["primary"]} == {
-        site.states("s2")[-1]["owner"]
-    }
+    owners = {(state["owner"], state["primary"]) for state in site.states("s2")[before:]}
+    assert owners == {(site.states("s2")[-1]["owner"], True)}
     state = site.states("s1")[-1]
-    missing_here = int(taken_over[-1]) + 1 - len(taken_over)
+    missing_here = taken_over[-1] + 1 - len(taken_over)
     assert missing_here <= state["lost"] + state["unaccounted"], "what is missing is counted"
 
 
@@ -264,10 +271,7 @@ def test_a_controller_that_was_stopped_for_a_while_writes_no_more(site):
         wait_for(lambda: site.divided(*controllers), why=site.why)
         traffic.more()
     for switch in SWITCHES:
-        wait_for(lambda each=switch: site.settled(each), why=site.why)
-        wait_for(lambda each=switch: site.holds(each), why=site.why)
-        arrivals = site.arrivals(switch)
-        assert len(set(arrivals.tolist())) == len(arrivals), "no packet is told twice"
+        complete(site, switch)
     failed = [value for value in site.heard.values("confirmation") if value["state"] == "failed"]
     assert failed == [], "what another controller has carried out is not called a failure"
 
@@ -286,6 +290,23 @@ def test_one_that_ends_in_order_hands_over_and_one_that_comes_gets_its_share(sit
         traffic.more(200)
     for switch in SWITCHES:
         complete(site, switch)
+
+
+def test_where_a_controller_loses_its_switch_another_one_that_reaches_it_takes_it(site):
+    with Cable(site.targets["s1"].address) as one, Cable(site.targets["s1"].address) as other:
+        cables = {site.controller({"s1": each.address}, timeout_s=1.0).pid: each for each in (one, other)}
+        wait_for(lambda: site.divided(*cables), why=site.why)
+        first = site.owner("s1")
+        with Traffic(site) as traffic:
+            traffic.more()
+            cables[first].cut()
+            wait_for(lambda: site.owner("s1") not in (0, first) and site.sends("s1"), why=site.why)
+            traffic.more()
+        for switch in SWITCHES:
+            complete(site, switch)
+        said = [(value["id"], value["state"]) for value in site.heard.values("confirmation")]
+        last = {name: state for name, state in said if name in site.decided["s1"]}
+        assert "failed" not in last.values(), "the last word is that of the controller that has the switch"
 
 
 def test_switches_that_fail_closed_stay_open_while_any_controller_has_them(site):
