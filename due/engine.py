@@ -32,7 +32,7 @@ from due.errors import BackendError, DecodeError, InvalidKey, InvalidOption, Not
 from due.key_writer import ARCHIVE, BOTH, PUBLISH, KeyWriter
 from due.keys import Key
 from due.liveness import Liveness
-from due.membership import APP_ID, Registration
+from due.membership import APP_ID, MOST_SHARDS, Registration
 from due.messages import (
     Assignment,
     AssignmentCallback,
@@ -52,6 +52,7 @@ _MODES = (BOTH, PUBLISH, ARCHIVE, 0, BOTH, PUBLISH, ARCHIVE, 0)
 _NO_WAIT = 4
 _FLUSH_SECONDS = 30.0
 _LONGEST_EVERY = 3600.0
+_LONGEST_SHARD = 255
 
 
 class Engine:
@@ -75,6 +76,7 @@ class Engine:
         self._updates_url = default_updates(self.options)
         self._archive_url = default_archive(self.options)
         self._registration: Registration | None = None
+        self._shards: tuple[str, ...] = ()
         self._session: Session | None = None
         self._broken: Session | None = None
         """The session after one of its threads died, until `close`."""
@@ -145,6 +147,7 @@ class Engine:
         interests: Iterable[Interest] = (),
         capabilities: Iterable[Capability] = (),
         instances: Instances = "standby",
+        shards: Iterable[str] = (),
     ) -> None:
         """Connect to Data Updates and register with the Coordinator.
 
@@ -156,10 +159,12 @@ class Engine:
             instances: "standby": one instance is active, the others are standbys; "shared": all of them are active and
                 divide the items of reliable keys; "sharded": all of them are active, and each reliable path is read,
                 in order, by one of them, as the Coordinator divides the paths.
+            shards: names of what the instances of a sharded app divide instead of the reliable paths; see `shards`.
+                Then every instance gets every item, and a new one those that are written from now on.
 
         Raises:
             InvalidKey: a key breaks the grammar.
-            InvalidOption: the app id, `instances` or a declaration is wrong, or `init` was called before.
+            InvalidOption: the app id, `instances`, `shards` or a declaration is wrong, or `init` was called before.
             UpdatesUnavailable: Data Updates did not answer within `Options.connect_timeout`.
         """
         self._before_init("init")
@@ -167,6 +172,7 @@ class Engine:
             raise InvalidOption(f"app id {app_id!r}: 1 to {MAX_ID} characters of A-Z a-z 0-9 _ -")
         if instances not in get_args(Instances):
             raise InvalidOption(f"instances {instances!r}: 'standby', 'shared' or 'sharded'")
+        self._shards = _checked_shards(tuple(shards), instances)
         self._start(
             _checked_registration(
                 app_id=app_id,
@@ -354,6 +360,37 @@ class Engine:
             raise InvalidOption(f"keep_state(every={every}): above 0, at most {_LONGEST_EVERY:g} seconds")
         self._require().keep_state(state, every)
 
+    def shards(self) -> frozenset[str] | None:
+        """Which of the shards named in `init` are this instance's now.
+
+        The Coordinator divides them evenly, and moves no more than necessary when an instance comes, ends or dies.
+        Without a Coordinator one instance has all of them. An instance that was suspended may hear late that a
+        shard has moved; where two must never work on it, something else has to keep them apart.
+
+        Returns:
+            The names; None while that is not known, for instance after a suspension: nothing has moved then.
+
+        Raises:
+            NotInitialised: called before `init` or after `close`.
+        """
+        return self._require().keeper.named_here()
+
+    def offer_shards(self, names: Iterable[str]) -> None:
+        """Say which of the shards named in `init` this instance can work on; without a call, all of them.
+
+        Args:
+            names: others are withdrawn from this instance, and given to those that can work on them.
+
+        Raises:
+            InvalidOption: a name was not given to `init`.
+            NotInitialised: called before `init` or after `close`.
+        """
+        offered = tuple(names)
+        session = self._require()
+        if not set(offered) <= set(self._shards):
+            raise InvalidOption(f"offer_shards({list(offered)!r}): init was given {list(self._shards)!r}")
+        session.keeper.offer(offered)
+
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back whenever this app's assignments change, and once immediately.
 
@@ -439,6 +476,7 @@ class Engine:
             updates_url=self._updates_url,
             archive_url=self._archive_url,
             failed=self._fail,
+            shards=self._shards,
         )
         self._registration = registration
         try:
@@ -482,6 +520,17 @@ class Engine:
             self._outlets = {}
         self._outlets[text] = outlet
         return outlet
+
+
+def _checked_shards(shards: tuple[str, ...], instances: Instances) -> tuple[str, ...]:
+    """Raises `InvalidOption`."""
+    if shards and instances != "sharded":
+        raise InvalidOption('shards are for apps with instances="sharded"')
+    if len(set(shards)) != len(shards) or len(shards) > MOST_SHARDS:
+        raise InvalidOption(f"shards: {len(shards)} names; at most {MOST_SHARDS}, each once")
+    if not all(isinstance(name, str) and 0 < len(name) <= _LONGEST_SHARD for name in shards):
+        raise InvalidOption(f"shards: names of 1 to {_LONGEST_SHARD} characters")
+    return shards
 
 
 def _checked_registration(**fields: Any) -> Registration:

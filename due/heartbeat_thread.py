@@ -157,6 +157,17 @@ class HeartbeatThread:
         with self.lock:
             return self.member.standing(shard, grant)
 
+    def named_here(self) -> frozenset[str] | None:
+        """See `Member.named_here`; a suspension until this moment counts."""
+        self.check_pause()
+        with self.lock:
+            return self.member.named_here
+
+    def offer(self, names: tuple[str, ...]) -> None:
+        """See `Member.offer`."""
+        with self.lock:
+            self.member.offer(names, time.monotonic())
+
     def grant(self, shard: str) -> int:
         """See `Member.grant`."""
         with self.lock:
@@ -272,13 +283,15 @@ class HeartbeatThread:
 
     def _beat(self) -> Heartbeat:
         """A heartbeat with what this instance has done, and with its shards."""
-        receiver = self._dispatcher.receiver
-        sharded = self.member.registration.instances == "sharded"
-        return self.member.beat(
-            written=self.written(),
-            received=self._dispatcher.received,
-            offered=receiver.offered()[:MOST_SHARDS] if sharded else (),
-            held=receiver.held()[:MOST_SHARDS] if sharded else (),
+        member, receiver = self.member, self._dispatcher.receiver
+        offered: tuple[str, ...] = ()
+        held: tuple[str, ...] = ()
+        if member.named:
+            offered, held = member.offered, member.named_held
+        elif member.registration.instances == "sharded":
+            offered, held = receiver.offered()[:MOST_SHARDS], receiver.held()[:MOST_SHARDS]
+        return member.beat(
+            written=self.written(), received=self._dispatcher.received, offered=offered, held=held
         )
 
     def _send(self, message: Registration | Heartbeat) -> None:

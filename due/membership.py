@@ -274,8 +274,13 @@ class Member:
         now: float,
         handshake_timeout: float,
         coordinated: bool = True,
+        named: tuple[str, ...] = (),
     ) -> None:
         self.registration = registration
+        self.named = named
+        """The app's own shards; none: its reliable paths are."""
+        self.offered = named
+        """Of these the ones that this instance can work on."""
         self.phase = Phase.WAITING if coordinated else Phase.ALONE
         self.current: Assignments | None = None
         self.changes = 0
@@ -321,6 +326,24 @@ class Member:
         if self.registration.instances != "sharded" or self.phase is Phase.ALONE:
             return None
         return frozenset(self._mine()) if self.active else frozenset()
+
+    @property
+    def named_here(self) -> frozenset[str] | None:
+        """The app's own shards that are this instance's; None: not known at the moment."""
+        if self._fenced or (self.phase is Phase.WAITING and not self._yields):
+            return None
+        return frozenset(self.named_held) if self.active else frozenset()
+
+    @property
+    def named_held(self) -> tuple[str, ...]:
+        """The app's own shards that this instance had when that was last known."""
+        mine = self._mine()
+        return tuple(name for name in self.named if self.phase is Phase.ALONE or name in mine)
+
+    def offer(self, names: tuple[str, ...], now: float) -> None:
+        """From now on these are the shards that this instance can work on; a Coordinator hears it at once."""
+        if names != self.offered:
+            self.offered, self._beat_at = names, now
 
     def _mine(self) -> dict[str, int]:
         if self.current is None:

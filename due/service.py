@@ -26,7 +26,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, get_args, runtime_checkable
+from typing import Any, Protocol, TypeVar, cast, get_args, runtime_checkable
 
 import msgspec
 
@@ -105,6 +105,7 @@ def run(
     argv: Sequence[str] | None = None,
     *,
     instances: Instances = "standby",
+    shards: Callable[[Any], Iterable[str]] | None = None,
 ) -> int:
     """Run one app until a signal ends it.
 
@@ -116,7 +117,8 @@ def run(
         capabilities: declared to the Coordinator.
         argv: command line without the program's name; None takes that of the process.
         instances: "standby", "shared" or "sharded", unless --instances, or a field `instances` of the settings, says
-            otherwise.
+            otherwise; the two must not contradict each other.
+        shards: from the settings the names of what the instances divide if they are "sharded"; None: reliable paths.
 
     Returns:
         The exit code: 0, 1 or 2 as above.
@@ -134,9 +136,17 @@ def run(
         status = _status_server(arguments) if arguments.metrics else None
         engine = Engine(_options(arguments))
         engine.when_failed = _end_soon
-        chosen_instances = arguments.instances or getattr(chosen, "instances", instances)
+        chosen_instances = _instances(arguments.instances, getattr(chosen, "instances", None)) or instances
         roles = PRODUCER | CONSUMER
-        engine.init(app_id, roles, interests=interests, capabilities=capabilities, instances=chosen_instances)
+        named = shards(chosen) if shards is not None and chosen_instances == "sharded" else ()
+        engine.init(
+            app_id,
+            roles,
+            interests=interests,
+            capabilities=capabilities,
+            instances=chosen_instances,
+            shards=named,
+        )
     except (DueError, OSError) as error:
         print(f"{app_id}: {logs.without_passwords(str(error))}", file=sys.stderr)
         if status is not None:
@@ -151,6 +161,15 @@ def run(
         engine.close()
         if status is not None:
             status.close()
+
+
+def _instances(given: str, chosen: Instances | None) -> Instances | None:
+    """How instances work together: as an app's settings say, which has a part of its own for each way; else as given."""
+    if given and chosen is not None and given != chosen:
+        raise InvalidOption(
+            f"--instances {given}: the settings say instances = {chosen!r}; change them there"
+        )
+    return chosen or (cast("Instances", given) if given else None)
 
 
 def read_struct(path: str, kind: type[S]) -> S:

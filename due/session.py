@@ -14,7 +14,7 @@ from due.backends import open_archive, open_spool, open_updates
 from due.codec import packed
 from due.config import Options
 from due.dispatcher import Dispatcher
-from due.drivers.base import ArchiveDriver
+from due.drivers.base import ArchiveDriver, own_group
 from due.drivers.embedded_redis import EmbeddedServer, shared_server
 from due.errors import (
     BackendError,
@@ -56,6 +56,7 @@ class Session:
         updates_url: str,
         archive_url: str,
         failed: Failed,
+        shards: tuple[str, ...] = (),
     ) -> None:
         self._options = options
         self.failure: BaseException | None = None
@@ -69,19 +70,21 @@ class Session:
         app, me = registration.app_id, registration.instance_id
         self.publisher = self._driver.publisher(app)
         shared = registration.instances == "shared"
-        receiver = self._driver.receiver(app, me, shared=shared)
+        # with shards of its own an app's reliable paths are not divided: every instance reads all of them
+        receiver = self._driver.receiver(own_group(app, me) if shards else app, me, shared=shared)
         self.dispatcher = Dispatcher(receiver, shared=shared, tries=options.tries, failed=self._died)
         member = Member(
             registration,
             now=time.monotonic(),
             handshake_timeout=options.handshake_timeout,
             coordinated=options.coordinated,
+            named=shards,
         )
         control, pause = self._driver.receiver(app, me), options.pause_limit or 3 * options.heartbeat
         self.keeper = HeartbeatThread(
             member, control, self.publisher, self.dispatcher, pause=pause, failed=self._died
         )
-        if registration.instances == "sharded":
+        if registration.instances == "sharded" and not shards:
             self.dispatcher.shards = ShardWork(receiver, self.dispatcher.tracker, self.keeper)
         self.keeper.say, self.keeper.changed = self._say, self._changed
         self.keeper.written = self._written
@@ -272,7 +275,9 @@ class Session:
         """See `Engine.keep_state`."""
         self.check()
         if self.dispatcher.shards is None:
-            raise InvalidOption('keep_state is for apps with instances="sharded"')
+            raise InvalidOption(
+                'keep_state is for apps with instances="sharded" whose shards are reliable paths'
+            )
         if self._observed:
             raise InvalidOption("keep_state comes before the first subscription")
         self.dispatcher.shards.keep(state, every)

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from apps.intake import as_map
-from apps.messages import Message, MessageError, TableCommand, Time, sender_of
+from apps.messages import Message, MessageError, Name, Number, TableCommand, Time, sender_of
 from apps.p4runtime_ctrl.telemetry.demand import Offer
 from apps.packets import as_column, read_columns
 from due import Item, RecordBatch
@@ -34,6 +34,15 @@ class ClockReached(Message, frozen=True, kw_only=True):
     event_time: Time
 
 
+class SwitchTold(Message, frozen=True, kw_only=True):
+    """What another controller says of a switch in `network.switch.p4runtime_ctrl.<switch>`."""
+
+    switch: Name
+    primary: bool = False
+    event_time: Time = 0
+    sequence: Number = 0
+
+
 class FramesToSend(msgspec.Struct, frozen=True):
     """Frames that the switch is to send."""
 
@@ -41,6 +50,12 @@ class FramesToSend(msgspec.Struct, frozen=True):
     lengths: list[int]
     data: bytes
     """The frames, concatenated."""
+
+
+def told_in(item: Item) -> SwitchTold:
+    """`network.switch.p4runtime_ctrl.<switch>`: of another instance of this app."""
+    sender_of(item)
+    return SwitchTold.from_value(item.value)
 
 
 def offer_in(item: Item) -> tuple[str, Offer]:

@@ -4,6 +4,7 @@ One item for each wanted key, from one batch of the stream, in its order.  `writ
 reliable keys are behind; then the stream is not read, and gRPC's flow control stops the switch.
 """
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -56,6 +57,8 @@ class PacketPublisher:
         self._routes: dict[Kind, list[tuple[str, int]]] = {}
         self._unison = SequenceMerger()
         self._waited = 0
+        self._handovers: deque[int | None] = deque()
+        """The highest number of the controller before, or None: another one has the switch."""
 
     @property
     def fell_back(self) -> int:
@@ -86,6 +89,7 @@ class PacketPublisher:
 
     def packets(self, messages: list[Any]) -> None:
         """Publish packet-ins, in the order of their stream."""
+        self._hand_over()
         packets = self._packets.read(messages)
         if packets.cells is not None and len(packets.cells):
             self.answers += len(packets.cells)
@@ -102,6 +106,7 @@ class PacketPublisher:
 
     def digests(self, lists: list[Any]) -> None:
         """Publish digest lists, in the order of their stream; lists of counts after those of frames."""
+        self._hand_over()
         ours, theirs = self._counts.digest_id, self._digests.digest_id
         counts = [each for each in lists if each.digest_id == ours] if ours else []
         frames = [each for each in lists if each.digest_id == theirs]
@@ -129,8 +134,33 @@ class PacketPublisher:
             if len(batch):
                 self._write(key, batch, int(batch["time_us"][-1]) * 1000)
 
+    def rest(self) -> None:
+        """Another controller receives the packets, or has received them: what waits is published.  Any thread, soon."""
+        self._handovers.append(None)
+
+    def follow(self, sequence: int) -> None:
+        """Go on behind another controller.  Any thread, soon: whoever calls must not wait while consumers are behind.
+
+        Args:
+            sequence: the highest number that it has reported.
+        """
+        self._handovers.append(sequence)
+
+    def _hand_over(self) -> None:
+        while self._handovers:
+            sequence = self._handovers.popleft()
+            if sequence is not None:
+                self._unison.follow(sequence)
+                self.progress.follow(sequence)
+                continue
+            self._write_records(self._unison.flush())
+            self._unison.begin_anew()
+            self._waited = 0
+            self.progress.rest()
+
     def settle(self) -> None:
         """Called at intervals: publish records that have waited since the last call, without missing ones."""
+        self._hand_over()
         waits = self._unison.waits_for
         if waits and waits == self._waited:
             self._write_records(self._unison.flush())

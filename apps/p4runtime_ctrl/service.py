@@ -1,4 +1,8 @@
-"""The P4Runtime controller: between DUE and one `SwitchWorker` per switch."""
+"""The P4Runtime controller: between DUE and one `SwitchWorker` per switch.
+
+One instance is active, others stand by; or, with `instances = "sharded"`, the instances divide the switches: each of
+them hears everything and has a worker for every switch, and the switch's arbitration lets one of them write.
+"""
 
 import p4rt  # noqa: F401  # isort: skip  # before anything loads gRPC: it says how gRPC waits
 
@@ -6,20 +10,22 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import due.service
 from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
 from apps.p4runtime_ctrl.arrivals import (
     ClockReached,
     FramesToSend,
+    SwitchTold,
     command_and_requests_in,
     frames_in,
     offer_in,
     questions_in,
+    told_in,
 )
 from apps.p4runtime_ctrl.errors import ControllerError, P4InfoError
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
@@ -43,6 +49,8 @@ INTERESTS = (
     Interest("network.packet_out.*.*"),
     Interest("network.clock.*.*"),
 )
+SHARDED_INTERESTS = (Interest("network.switch.p4runtime_ctrl.*"),)
+"""Where the instances divide the switches each hears of the others."""
 CAPABILITIES = (
     Capability("network.packets.p4runtime_ctrl.*.*", delivery="reliable"),
     Capability("network.frames.p4runtime_ctrl.*.*", delivery="reliable"),
@@ -66,6 +74,8 @@ _OFFERS_READ: Final = 10_000
 """Most archived packet requests, and commands with such, restored at a start."""
 _LOOK_EVERY_S: Final = 0.25
 
+_T = TypeVar("_T")
+
 
 class P4RuntimeCtrlService:
     """All switches of the settings.  Raises `P4InfoError` for a program that cannot be read."""
@@ -73,6 +83,7 @@ class P4RuntimeCtrlService:
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
         self._settings = settings
+        self._divided = settings.instances == "sharded"
         pipeline = load_pipeline(settings)
         names = [each.name for each in settings.switches]
         if len(set(names)) != len(names):
@@ -86,19 +97,39 @@ class P4RuntimeCtrlService:
         self._by_digest = {each.name: settings.by_digest(each) for each in settings.switches}
         self._watchdog = FailClosedWatchdog(settings)
         self._active = True
+        self._granted: frozenset[str] = frozenset()
+        """Switches that the Coordinator has given to this instance."""
+        self._opened = threading.Event()
+        """What came before the archive was read may be handled."""
         self._looked_at = 0.0
 
     def start(self) -> None:
         """Returns when every switch is connected, or its first connection attempt has failed; a standby does not wait."""
-        while self._engine.health()["phase"] == "waiting":
+        while self._engine.health()["phase"] == "waiting" and not self._knows_its_switches():
             time.sleep(0.01)
-        self._active = bool(self._engine.health()["active"])
-        if self._settings.restore:
-            self._take_up_offers()
-        self._watchdog.start()
+        self._active = self._divided or bool(self._engine.health()["active"])
+        if self._divided:
+            # first, for a new reader gets what is written from now on; it waits until the archive is read
+            self._subscribe()
+            self._granted = self._engine.shards() or frozenset()
+        try:
+            if self._settings.restore:
+                self._take_up_offers()
+            self._watchdog.start()
+            for agent in self._agents.values():
+                agent.start(active=agent.name in self._granted if self._divided else self._active)
+        finally:
+            self._opened.set()
+        if not self._divided:
+            self._subscribe()
+        self._engine.on_assignments(self._on_assignments)
+        deadline = time.monotonic() + _START_S
         for agent in self._agents.values():
-            agent.start(active=self._active)
-        observe, reading = self._engine.observe, self._intake.reading
+            if self._active:
+                agent.wait_settled(deadline)
+
+    def _subscribe(self) -> None:
+        observe, reading = self._engine.observe, self._reading
         for key in DECISIONS:
             observe(key).subscribe(reading("decision", Decision.from_item, self._on_decision))
         observe(_COMMANDS).subscribe(reading("command", command_and_requests_in, self._on_command))
@@ -108,11 +139,22 @@ class P4RuntimeCtrlService:
         )
         observe("network.packet_out.*.*").subscribe(reading("packet_out", frames_in, self._on_frames))
         observe("network.clock.*.*").subscribe(reading("clock", ClockReached.from_item, self._on_clock))
-        self._engine.on_assignments(self._on_assignments)
-        deadline = time.monotonic() + _START_S
-        for agent in self._agents.values():
-            if self._active:
-                agent.wait_settled(deadline)
+        for one in SHARDED_INTERESTS if self._divided else ():
+            observe(one.key).subscribe(reading("switch", told_in, self._on_told))
+
+    def _knows_its_switches(self) -> bool:
+        return self._divided and self._engine.shards() is not None
+
+    def _reading(
+        self, kind: str, parse: Callable[[Item], _T], take: Callable[[Item, _T], None]
+    ) -> Callable[[Item], None]:
+        handle = self._intake.reading(kind, parse, take)
+
+        def heard(item: Item) -> None:
+            self._opened.wait()
+            handle(item)
+
+        return heard if self._divided else handle
 
     def ready(self) -> dict[str, str]:
         """For the ready line: switches that are not under control, and why."""
@@ -129,6 +171,7 @@ class P4RuntimeCtrlService:
             pipeline,
             batch=settings.batch,
             linger_s=settings.linger_ms / 1000,
+            steps_up=self._divided,
         )
         return SwitchWorker(self._engine, settings, mine, ProgramInfo(pipeline.p4info), connect, self._intake)
 
@@ -143,6 +186,9 @@ class P4RuntimeCtrlService:
 
     def _look_at_duty(self) -> None:
         """The active instance of this app is also the active controller of its switches."""
+        if self._divided:
+            self._look_at_switches()
+            return
         health = self._engine.health()
         if health["asking"]:
             return  # was stopped for a moment; no takeover is known yet
@@ -153,6 +199,21 @@ class P4RuntimeCtrlService:
             self._asked.clear()
             for agent in self._agents.values():
                 agent.stand(active=active)
+
+    def _look_at_switches(self) -> None:
+        self._engine.offer_shards(name for name, agent in self._agents.items() if agent.within_reach)
+        granted = self._engine.shards()
+        if granted is None:
+            return  # was stopped for a moment; nothing is known to have moved
+        for name, agent in self._agents.items():
+            if (name in granted) != (name in self._granted):
+                _LOG.info(
+                    "%s: %s", name, "given to this instance" if name in granted else "another instance's"
+                )
+                agent.stand(active=name in granted)
+            elif name in granted:
+                agent.insist()
+        self._granted = granted
 
     def stop(self) -> None:
         for agent in self._agents.values():
@@ -202,6 +263,11 @@ class P4RuntimeCtrlService:
         agent = self._agents.get(item.key.rpartition(".")[2])
         if agent is not None:
             agent.clock_reached(reached.event_time)
+
+    def _on_told(self, item: Item, told: SwitchTold) -> None:
+        agent = self._agents.get(told.switch)
+        if agent is not None and item.instance_id != self._engine.instance_id:
+            agent.told(told, item.instance_id)
 
     def _on_offer(self, item: Item, offered: tuple[str, Offer]) -> None:
         self._take_offer(item, offered)
@@ -271,7 +337,13 @@ def load_pipeline(settings: Settings) -> CompiledProgram:
 def main(argv: Sequence[str] | None = None) -> int:
     try:
         return due.service.run(
-            "p4runtime_ctrl", P4RuntimeCtrlService, Settings, INTERESTS, CAPABILITIES, argv
+            "p4runtime_ctrl",
+            P4RuntimeCtrlService,
+            Settings,
+            INTERESTS,
+            CAPABILITIES,
+            argv,
+            shards=lambda settings: [each.name for each in settings.switches],
         )
     except P4InfoError as error:
         _LOG.error("%s", error)

@@ -49,6 +49,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     telemetry: Literal["auto", "packet-in", "digest"] = "auto"
     """Source of the packets' record batches: copied frames, or digests with the header fields; auto: digests of
     embedded switches, which send them in lists, and copied frames of others."""
+    instances: Literal["standby", "sharded"] = "standby"
+    """`standby`: one instance has all switches and the others wait; `sharded`: the instances divide the switches, each of
+    which has one controller at a time."""
     batch: int = 1024
     """Maximum number of packets in one record batch."""
     linger_ms: float = 2.0

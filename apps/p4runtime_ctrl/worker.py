@@ -17,8 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from apps.messages import Confirmation, Decision, Intake, MessageError, TableCommand, one_line, youngest
-from apps.p4runtime_ctrl.arrivals import FramesToSend
+from apps.messages import Confirmation, Decision, Intake, MessageError, TableCommand, one_line
+from apps.p4runtime_ctrl.arrivals import FramesToSend, SwitchTold
+from apps.p4runtime_ctrl.counter_reads import CounterReads
+from apps.p4runtime_ctrl.duty import SwitchDuty
 from apps.p4runtime_ctrl.errors import ControllerError, EntryError, Malformed, SwitchError
 from apps.p4runtime_ctrl.packet_publisher import PacketPublisher
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
@@ -27,33 +29,30 @@ from apps.p4runtime_ctrl.southbound.connection import Connection, Listener
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.packet_out import PacketOuts
 from apps.p4runtime_ctrl.southbound.session import P4RuntimeSession
-from apps.p4runtime_ctrl.state.block_counters import BlockCounters
 from apps.p4runtime_ctrl.state.decision_ends import DecisionEnds
 from apps.p4runtime_ctrl.state.desired_state import check_entry
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
-from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, as_remembered, commands_of, decisions_for
 from apps.p4runtime_ctrl.state.live_clock import LiveClock
 from apps.p4runtime_ctrl.state.mac_learning import DIGEST
+from apps.p4runtime_ctrl.switch_history import SwitchHistory
 from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry.demand import Demand
 from apps.p4runtime_ctrl.telemetry.telemetry_counters import TelemetryCounters
-from due import NO_WAIT, PUB_ONLY, Engine, Item, RecordBatch
+from due import NO_WAIT, PUB_ONLY, Engine, RecordBatch
+from due.errors import BackendError
 
 _LOG = logging.getLogger(__name__)
 _JOBS: Final = 10_000
 _LOOK_S: Final = 0.1
-_RESTORED: Final = 100_000
-"""Most archived decisions of a kind, and commands, that are read at a start, the newest."""
 _ALIVE_S: Final = 1.0
 _SETTLE_S: Final = 1.0
 _SETTLE_LOSSLESS_S: Final = 15.0
 """As `_SETTLE_S`, in a replay on the embedded switch: nothing is lost on the way there, but a machine with too much to
 do may stand still for seconds."""
-_CALM_S: Final = 0.25
-"""Seconds; counters are read once for decisions in quick succession, since reading all blocks costs as much as
-carrying out several decisions."""
-_COUNTING_SHARE: Final = 5
-"""Counter reads take at most this fraction (1/n) of the time."""
+_AWAY_S: Final = 2.0
+"""Seconds; a switch that dies is there again sooner, and does not go to another controller for it."""
+_UNCONFIRMED_S: Final = 15.0
+"""What the primary controller of a switch has not confirmed after once or twice this time, it confirms no more."""
 
 Connect = Callable[[Listener], Connection]
 
@@ -112,22 +111,26 @@ class SwitchWorker:
         self._worker = threading.Thread(target=self._work, name=f"switch {mine.name}", daemon=True)
         self._session: P4RuntimeSession | None = None
         self._connected = self._was_backup = False
-        self._recent: deque[Decision] = deque(maxlen=_JOBS)
+        self._duty = SwitchDuty(lambda: engine.instance_id, divided=settings.instances == "sharded")
+        self._history = SwitchHistory(engine, settings, mine, self._intake)
+        self._aged_at = 0.0
         self._urgent: deque[Decision] = deque()
         """Decisions to carry out, before any other work."""
         self._ends = DecisionEnds()
         self._clock = LiveClock(mine.clock, time.time_ns() // 1000 if mine.clock == "own" else 0)
-        self._block_counters = BlockCounters()
+        self._counters = CounterReads(
+            self._switch,
+            session=lambda: self._session,
+            second=lambda: self._outbound.second,
+            put=self._put,
+            told=self._write_state,
+            pause_s=settings.counters_ms / 1000,
+        )
         self._telemetry_counters = TelemetryCounters(
             mine.name, program, self._publish_counters, lambda error: self._put(partial(_fail, error))
         )
         self._publishing = threading.Lock()
-        self._counting = threading.Event()
-        self._uncounted = False
-        """Decisions were carried out since the last counter read."""
-        self._counted_second = 0
-        self._counted_at = 0.0
-        self._count_after = 0.0
+        self._away_since = time.monotonic()
         self._alive_at = 0.0
         self._settled_at = 0.0
         lossless = mine.clock == "packets" and mine.target == "embedded"
@@ -144,11 +147,30 @@ class SwitchWorker:
     def start(self, *, active: bool) -> None:
         self._restore()
         self._worker.start()
-        self._connection.stand(active=active)
+        self.stand(active=active)
         self._connection.open()
 
     def stand(self, *, active: bool) -> None:
-        self._connection.stand(active=active)
+        """Become active or standby; where the switches are divided, one that is primary goes on until another one is."""
+        if self._duty.divided:
+            self._duty.give(granted=active)
+        if active or not self._duty.divided or self._session is None:
+            self._connection.stand(active=active)
+
+    def told(self, told: SwitchTold, instance: str) -> None:
+        """Another controller has said how the switch is."""
+        if self._session is None:
+            self._duty.heard(told, instance, time.monotonic())
+
+    @property
+    def within_reach(self) -> bool:
+        """Whether this controller can have the switch: it is connected, or was moments ago."""
+        return self._connected or time.monotonic() - self._away_since < _AWAY_S
+
+    def insist(self) -> None:
+        """The switch was given to this controller: let it be primary."""
+        if self._duty.backup:
+            self._connection.outbid()
 
     def stop(self) -> None:
         self._put(self._leave)
@@ -160,11 +182,13 @@ class SwitchWorker:
         """Queue a decision; a switch that sees copies only carries none out: a counter would claim a stop."""
         if self._mine.mirror:
             return
-        self._recent.append(as_remembered(decision))
+        self._history.heard(decision)
         self._urgent.append(decision)
         self._put(self._decide)
 
     def command(self, command: TableCommand) -> None:
+        if self._duty.divided:
+            self._history.heard_command(command)
         self._put(partial(self._command, command))
 
     def want(self, demand: Demand) -> None:
@@ -208,10 +232,11 @@ class SwitchWorker:
         if self._session is not None and now - self._alive_at > _ALIVE_S and self._jobs.empty():
             self._alive_at = now
             self._put(self._check_alive)
-        if now - self._counted_at > (_CALM_S if self._uncounted else 1):
-            self._count_soon()
+        self._counters.look(now)
         self._telemetry_counters.look(self._session, now)
         self._settle(now)
+        if self._duty.divided:
+            self._look_at_duty(now)
         ends_us = self._ends.next_us
         time_us = self._clock.look(
             self._progress.time_us, self._progress.received + self._progress.reported, now, ends_us
@@ -228,6 +253,14 @@ class SwitchWorker:
             changed = (received, lost) != (self._heard(), self._progress.lost)
             self._put(self._write_state if changed else self._repeat_state)
 
+    def _look_at_duty(self, now: float) -> None:
+        late = self._duty.overdue(now)
+        if late and self._speaks:
+            self._put(partial(self._publish_confirmations, late))
+        if now - self._aged_at > _UNCONFIRMED_S and self._duty.backup:
+            self._aged_at = now
+            self._put(self._switch.age_unconfirmed)
+
     def _settle(self, now: float) -> None:
         """Not while packets are published, which blocks while consumers are behind."""
         if now - self._settled_at > self._settle_s and self._publishing.acquire(blocking=False):
@@ -243,6 +276,8 @@ class SwitchWorker:
     # -- from the connection ------------------------------------------------------------------
 
     def became_primary(self, session: P4RuntimeSession) -> None:
+        if self._duty.backup:
+            self._outbound.rest()
         self._put(partial(self._take_over, session))
 
     def became_backup(self) -> None:
@@ -255,7 +290,7 @@ class SwitchWorker:
     def packets(self, messages: list[Any]) -> None:
         with self._publishing:
             self._outbound.packets(messages)
-        self._count_each_second()
+        self._counters.packets_came()
 
     def digests(self, lists: list[Any]) -> None:
         learnt = [each for each in lists if each.digest_id == self._learn_id]
@@ -265,7 +300,7 @@ class SwitchWorker:
         if lists:
             with self._publishing:
                 self._outbound.digests(lists)
-        self._count_each_second()
+        self._counters.packets_came()
 
     def other(self, message: Any) -> None:
         if message.WhichOneof("update") != "idle_timeout_notification":
@@ -286,10 +321,6 @@ class SwitchWorker:
     def _publish_counters(self, counters: RecordBatch) -> None:
         key = f"network.telemetry_counters.p4runtime_ctrl.{self.name}"
         self._engine.write(key, counters, [NO_WAIT], event_time=self._now()[0] or None)
-
-    def _count_each_second(self) -> None:
-        if self._outbound.second != self._counted_second:
-            self._count_soon()
 
     # -- the worker ---------------------------------------------------------------------------
 
@@ -326,9 +357,11 @@ class SwitchWorker:
 
     def _take_over(self, session: P4RuntimeSession) -> None:
         self._connected = True
+        self._duty.backup = False
+        self._duty.settled()
         if self._was_backup:
-            self._was_backup = False
             self._restore()
+            self._was_backup = False
         began = time.monotonic()
         try:
             report = self._switch.bring_up(session)
@@ -344,21 +377,46 @@ class SwitchWorker:
         self._brought_up_ms = (time.monotonic() - began) * 1000
         self._session = session
         self._confirm(report.confirmations)
+        if self._duty.divided:
+            self._follow()
         _LOG.info("%s: primary; %s", self.name, report)
         self._say(f"primary: {report}")
 
     def _stand_back(self) -> None:
+        if self._session is not None:
+            _LOG.warning("%s: another controller is primary: this one has stopped writing", self.name)
         self._connected = True
         self._was_backup = True
         self._session = None
+        self._duty.stand_back()
         self.problem = ""
+        if self._duty.divided:
+            self._rest()
         self.settled.set()
         self._say("backup: another controller is primary")
+
+    def _rest(self) -> None:
+        """Another controller has the switch, its packets and its learnt addresses."""
+        if not self._duty.granted:
+            self._connection.stand(active=False)
+        self._switch.forget_learnt()
+        self._outbound.rest()
+
+    def _follow(self) -> None:
+        """Go on with time and numbers where the controller before had come to."""
+        before, self._duty.before = self._duty.before, None
+        if before is not None:
+            self._outbound.follow(before.sequence)
+            self._progress.time_us = max(self._progress.time_us, before.event_time // 1000)
 
     def _lose(self, cause: str) -> None:
         if self._connected:
             _LOG.warning("%s: lost: %s", self.name, cause)
+            self._away_since = time.monotonic()
         self._connected = False
+        self._duty.backup = False
+        if not self._duty.granted:
+            self._connection.stand(active=False)
         self.problem = cause
         self.settled.set()
         self._say(f"lost: {cause}")
@@ -373,9 +431,7 @@ class SwitchWorker:
             for decision in decisions:
                 self._ends.add(decision)
             self._confirm(self._switch.decide(decisions, self._session))
-            self._uncounted = True
-            if time.monotonic() - self._counted_at > _CALM_S:
-                self._count_soon()
+            self._counters.decided()
             self._say_if_none_is_left()
 
     def _command(self, command: TableCommand) -> None:
@@ -383,8 +439,7 @@ class SwitchWorker:
         self._say_if_none_is_left()
 
     def _say_if_none_is_left(self) -> None:
-        """Without blocks no counter is read, and the last one would be listed until a packet comes."""
-        if self._block_counters.shown and not self._switch.blocks:
+        if self._counters.outdated:
             self._write_state()
 
     def _want(self, demand: Demand) -> None:
@@ -427,7 +482,7 @@ class SwitchWorker:
     def _send_out(self, packets: Sequence[Any], what: str) -> None:
         """Best effort, like frames; what cannot be sent is counted."""
         if self._session is None:
-            self._sent["packet_outs_refused"] += len(packets)
+            self._sent["packet_outs_refused"] += len(packets) if self._speaks else 0
             return
         sent = self._session.send(packets)
         self._sent[what] += sent
@@ -444,54 +499,19 @@ class SwitchWorker:
     def _change_secret(self) -> None:
         self._switch.change_secret(secrets.randbits(32), secrets.randbits(32), self._session)
 
-    def _count_soon(self) -> None:
-        """Start a read of block counters, unless one runs, none is due, or there are no blocks."""
-        if self._counting.is_set() or self._session is None or not self._switch.blocks:
-            return
-        if time.monotonic() < self._count_after:
-            return
-        self._counting.set()
-        self._put(self._count)
-
-    def _count(self) -> None:
-        """Not in this thread: a switch under a flood answers late, and a decision must not wait for it."""
-        self._uncounted = False
-        told = (self._session, self._switch.counted_tables, time.monotonic())
-        threading.Thread(
-            target=self._read_counters, args=told, name=f"counters {self.name}", daemon=True
-        ).start()
-
-    def _read_counters(self, session: P4RuntimeSession | None, tables: Sequence[int], began: float) -> None:
-        found: list[dict[str, Any]] = []
-        failed: Exception | None = None
-        try:
-            if session is not None:
-                entries = [entry for table in tables for entry in session.read_counters(table)]
-                found = self._switch.readings(entries)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the worker says it, or ends with it
-            failed = error
-        finally:
-            self._put(partial(self._counted, session, found, began, failed))
-
-    def _counted(
-        self,
-        session: P4RuntimeSession | None,
-        found: list[dict[str, Any]],
-        began: float,
-        failed: Exception | None,
-    ) -> None:
-        self._counted_second = self._outbound.second
-        self._counted_at = time.monotonic()
-        spent = self._counted_at - began
-        self._count_after = began + max(self._settings.counters_ms / 1000, spent * _COUNTING_SHARE)
-        self._counting.clear()
-        if failed is not None:
-            raise failed
-        if session is not None and session is self._session:
-            self._block_counters.take(found)
-            self._write_state()
+    @property
+    def _speaks(self) -> bool:
+        return self._duty.speaks(time.monotonic(), primary=self._session is not None)
 
     def _confirm(self, confirmations: Iterable[Confirmation]) -> None:
+        if not self._speaks:
+            return
+        if self._duty.divided and (self._session is None or self._session.denied):
+            self._duty.withhold(list(confirmations), time.monotonic())
+            return
+        self._publish_confirmations(confirmations)
+
+    def _publish_confirmations(self, confirmations: Iterable[Confirmation]) -> None:
         key = f"network.confirmation.p4runtime_ctrl.{self.name}"
         waiting = list(confirmations)
         for place, confirmation in enumerate(waiting, start=1):
@@ -510,8 +530,8 @@ class SwitchWorker:
 
     def _write_state(self, *flags: int) -> None:
         self._stated = (self._heard(), self._progress.lost, time.monotonic())
-        if not self._switch.blocks:
-            self._block_counters.take([])
+        if not self._speaks:
+            return
         key = f"network.switch.p4runtime_ctrl.{self.name}"
         self._engine.write(key, self._state(), [NO_WAIT, *flags], event_time=self._now()[0] or None)
 
@@ -525,6 +545,7 @@ class SwitchWorker:
             "switch": self.name,
             "connected": self._connected,
             "primary": self._session is not None,
+            "owner": self._duty.owner(time.monotonic(), primary=self._session is not None),
             "target": self._mine.target or self._mine.address,
             "program": self._program_name,
             "base_us": self._mine.base_us,
@@ -537,6 +558,8 @@ class SwitchWorker:
             "fell_back": self._outbound.fell_back,
             "skipped": self._outbound.skipped,
             "lost": self._progress.lost,
+            "unaccounted": self._progress.unaccounted,
+            "sequence": self._progress.sequence,
             "malformed": self._progress.malformed,
             "times_doubted": self._progress.times_doubted,
             "restarts": self._progress.restarts,
@@ -545,22 +568,11 @@ class SwitchWorker:
             **self._sent,
             "arrival": arrival,
             "event_time": event_time,
-            "blocks": self._block_counters.shown,
+            "blocks": self._counters.shown,
             "blocks_total": self._switch.blocks,
-            **self._learning(),
+            **self._switch.learning,
             "change": self._change,
             "brought_up_ms": self._brought_up_ms,
-        }
-
-    def _learning(self) -> dict[str, Any]:
-        learning = self._switch.mac_learning
-        if learning is None:
-            return {}
-        return {
-            "learnt": len(learning),
-            "moved": learning.moved,
-            "learn_refused": learning.refused,
-            "learn_malformed": learning.malformed,
         }
 
     def _now(self) -> tuple[int, int]:
@@ -568,21 +580,18 @@ class SwitchWorker:
 
     def _restore(self) -> None:
         """Restore the desired state from Data Archives and from items received since."""
-        if not self._settings.restore:
+        try:
+            decisions, commands = self._history.read()
+        except BackendError as error:
+            if not (self._was_backup and self._duty.divided):
+                raise
+            # every decision was heard here, too
+            _LOG.warning("%s: taken over without the archive, which cannot be read: %s", self.name, error)
             return
-        since = self._settings.restore_since
-        recently = max(since, time.time_ns() - LONGEST_S * 1_000_000_000)
-        items = [item for key in DECISIONS for item in self._archived(key, recently)]
-        decisions = decisions_for(self.name, items, list(self._recent), since, self._intake)
-        decisions = [] if self._mine.mirror else decisions
-        archived = self._archived(f"network.p4_command.*.{self.name}", since)
         for decision in decisions:
             self._ends.add(decision)
-        for problem in self._switch.restore(decisions, commands_of(archived, since, self._intake)):
+        for problem in self._switch.restore(decisions, commands):
             _LOG.warning("%s: not restored: %s", self.name, one_line(problem))
-
-    def _archived(self, key: str, since: int) -> list[Item]:
-        return youngest(self._engine, {"dataKey": key}, since, _RESTORED)
 
 
 def _fail(error: Exception) -> None:

@@ -261,7 +261,7 @@ class Receiver(Protocol):
         ...
 
     def aside(self) -> list[tuple[bytes, str]]:
-        """Payloads set aside for this group, oldest first, with reasons."""
+        """Payloads set aside by this app, oldest first, with reasons."""
         ...
 
     def drain(self) -> bool:
@@ -284,6 +284,16 @@ class Receiver(Protocol):
         ...
 
 
+def own_group(app: str, instance: str) -> str:
+    """The group of a single instance, which reads every path however many instances the app has."""
+    return f"{app}:{instance}"
+
+
+def app_of(group: str) -> str:
+    """The app whose instances are this group, or one of them."""
+    return group.partition(":")[0]
+
+
 class UpdatesDriver(Protocol):
     """Data Updates behind one URL."""
 
@@ -294,7 +304,7 @@ class UpdatesDriver(Protocol):
         ...
 
     def receiver(self, group: str, consumer: str, *, shared: bool = False) -> Receiver:
-        """A new receiving half: `consumer` of the readers `group`.
+        """A new receiving half: `consumer` of the readers `group`, an app id or an `own_group`.
 
         `shared`: members divide the streams among them, so order is not kept between them.
         """

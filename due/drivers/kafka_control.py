@@ -29,6 +29,7 @@ from confluent_kafka import (
 )
 from confluent_kafka.admin import AdminClient, NewTopic, OffsetSpec
 
+from due.drivers.base import app_of
 from due.drivers.kafka_names import (
     MOST_BYTES,
     TOO_EARLY,
@@ -189,7 +190,7 @@ class ControlLog:
             return [
                 reader_key(group, member)
                 for (group, member), seen in self._readers.items()
-                if group == app and not seen.left and now - seen.changed_at > seconds
+                if app_of(group) == app and not seen.left and now - seen.changed_at > seconds
             ]
 
     def make_topic(self, topic: str) -> None:
@@ -418,7 +419,7 @@ class ControlLog:
             self._note_topic(app, name, msgspec.msgpack.decode(value, type=TopicRecord))
         elif kind == "reader":
             group, _, member = name.partition("/")
-            if group != app:
+            if app_of(group) != app:
                 raise ValueError(name)
             if not value:
                 seen = self._readers.get((group, member))
@@ -448,7 +449,7 @@ class ControlLog:
         if seen is None:
             if len(self._readers) >= _MOST_READERS:
                 self._forget(now)
-            of_one = sum(group == record.group for group, _ in self._readers)
+            of_one = sum(app_of(group) == app_of(record.group) for group, _ in self._readers)
             if len(self._readers) >= _MOST_READERS or of_one >= _MOST_OF_ONE:
                 raise ValueError(record.member)
             seen = ReaderSeen(record, record.since if record.since >= 0 else offset, now)

@@ -22,7 +22,7 @@ from confluent_kafka import (
     TopicPartition,
 )
 
-from due.drivers.base import NO_RIGHT, Delivery
+from due.drivers.base import NO_RIGHT, Delivery, app_of
 from due.drivers.kafka_control import ControlLog, ReaderRecord, reader_key, reader_record
 from due.drivers.kafka_names import MOST_BYTES, TOO_EARLY, KafkaAddress, is_denied
 from due.drivers.kafka_progress import Partition, PartitionProgress
@@ -65,6 +65,7 @@ class KafkaReceiver:
     ) -> None:
         self._address, self._control, self._producer = address, control, producer
         self._group, self._member, self._shared = group, consumer, shared
+        self._app = app_of(group)
         self._lock = threading.RLock()
         self._patterns: dict[str, int] = {}
         self._followed: dict[str, str] = {}
@@ -219,7 +220,7 @@ class KafkaReceiver:
 
     def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
         """See `Receiver.set_aside`."""
-        topic = self._address.aside(self._group)
+        topic = self._address.aside(self._app)
         try:
             self._control.make_topic(topic)
             self._producer.produce(
@@ -234,7 +235,7 @@ class KafkaReceiver:
 
     def aside(self) -> list[tuple[bytes, str]]:
         """See `Receiver.aside`."""
-        topic = self._address.aside(self._group)
+        topic = self._address.aside(self._app)
         reader = Consumer(
             self._address.client(
                 **{"group.id": self._address.group(self._group), "enable.auto.commit": False}
@@ -285,7 +286,7 @@ class KafkaReceiver:
             self._commit(wait=True)
             if self._said is not None:
                 self._producer.produce(
-                    self._address.control(self._group), None, reader_key(self._group, self._member)
+                    self._address.control(self._app), None, reader_key(self._group, self._member)
                 )
                 self._producer.flush(_CALL_SECONDS)
         self._consumer.close()
@@ -302,8 +303,8 @@ class KafkaReceiver:
         self._said = record
         key, value = reader_record(record)
         if first:
-            self._control.make_topic(self._address.control(self._group))
-        self._producer.produce(self._address.control(self._group), value, key)
+            self._control.make_topic(self._address.control(self._app))
+        self._producer.produce(self._address.control(self._app), value, key)
         if first:
             self._producer.flush(_CALL_SECONDS)
         else:

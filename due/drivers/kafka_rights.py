@@ -3,7 +3,7 @@
     publish network.x.mine.**   ─►  WRITE, CREATE  due.b.mine.network.x, due.r.mine.network.x
     publish network.*.mine.**   ─►  WRITE, CREATE  due.b.mine.network.…, due.r.mine.network.…
     observe network.y.*.*       ─►  READ           due.b.<app>.network.y, … of every app that publishes
-    its own                     ─►  due.control.<app>, due.aside.<app>, positions of the group due.<app>
+    its own                     ─►  due.control.<app>, due.aside.<app>, positions of the groups due.<app>, due.<app>:…
 
 Rights end at a key's third segment, as topics do: a grant of `a.b.c.d` gives all of `a.b.c`.  Brokers know names and
 beginnings of names only, so where the third segment is open it stands for the apps of the other rights; where the
@@ -13,6 +13,7 @@ first is open and the second is not, nothing is given.
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+from due.drivers.base import own_group
 from due.drivers.kafka_names import KafkaAddress
 from due.drivers.redis_rights import EVERYTHING, Rights, with_membership
 from due.keys import ANY, ANY_NUMBER, Key
@@ -69,6 +70,8 @@ def kafka_rights(rights: Rights, address: KafkaAddress, apps: Sequence[str]) -> 
         KafkaRight("GROUP", own, anything, "READ"),
         KafkaRight("GROUP", address.group("control."), False, "READ"),
     }
+    if not anything:
+        found.add(KafkaRight("GROUP", address.group(own_group(rights.app, "")), True, "READ"))
     # how far other groups are
     found.add(KafkaRight("GROUP", address.group(""), True, "DESCRIBE"))
     return found

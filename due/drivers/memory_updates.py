@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Iterable
 
-from due.drivers.base import Delivery
+from due.drivers.base import Delivery, app_of
 from due.drivers.memory_archive import memory_name
 from due.drivers.memory_streams import MemoryStream
 from due.errors import Timeout, UpdatesUnavailable
@@ -306,13 +306,13 @@ class MemoryReceiver:
         """See `Receiver.set_aside`."""
         with self._space.lock:
             self._counts["set_aside"] += 1
-            kept = self._space.aside.setdefault(self._group, deque(maxlen=_ASIDE_LENGTH))
+            kept = self._space.aside.setdefault(app_of(self._group), deque(maxlen=_ASIDE_LENGTH))
             kept.append((payload, reason))
 
     def aside(self) -> list[tuple[bytes, str]]:
         """See `Receiver.aside`."""
         with self._space.lock:
-            return list(self._space.aside.get(self._group, ()))
+            return list(self._space.aside.get(app_of(self._group), ()))
 
     def drain(self) -> bool:
         """Nothing to drain: payloads are in memory already."""

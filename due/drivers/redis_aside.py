@@ -1,4 +1,4 @@
-"""Payloads set aside: one stream per group, bounded by entries, bytes and age."""
+"""Payloads set aside: one stream per app, bounded by entries, bytes and age."""
 
 import logging
 from typing import Any
@@ -15,17 +15,17 @@ _MOST_OF_ONE = 4 << 20
 _DAYS_S = 7 * 86_400
 
 
-def aside_name(group: str) -> str:
-    """The stream of payloads set aside for a group."""
-    return f"due:poison:{group}"
+def aside_name(app: str) -> str:
+    """The stream of payloads set aside for an app."""
+    return f"due:poison:{app}"
 
 
 class Aside:
-    """Payloads set aside for one group: the youngest thousand or 16 MiB; deleted after an idle week."""
+    """Payloads set aside for one app: the youngest thousand or 16 MiB; deleted after an idle week."""
 
-    def __init__(self, commands: Any, group: str) -> None:
+    def __init__(self, commands: Any, app: str) -> None:
         self._commands = commands  # Any: redis-py types an answer by options it cannot see
-        self._name = aside_name(group)
+        self._name = aside_name(app)
         self.counts = {"set_aside": 0, "set_aside_cut": 0, "set_aside_failed": 0}
 
     def put(self, path: str, payload: bytes, reason: str) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import hiredis
 import redis
 
-from due.drivers.base import NO_RIGHT, Delivery
+from due.drivers.base import NO_RIGHT, Delivery, app_of
 from due.drivers.redis_acks import Acknowledgements
 from due.drivers.redis_aside import Aside
 from due.drivers.redis_dead_members import SILENT_SECONDS, DeadMembers
@@ -53,7 +53,7 @@ _LOOK_SECONDS = 1.0
 _HOLD_SECONDS = 0.2
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
-_STREAM, _WORK = stream_name(""), "due:work:"
+_STREAM = stream_name("")
 _Expected = tuple[str, str, str]
 """Kind of an answer, path, id."""
 _ACK, _NEW, _AHEAD, _OURS, _HISTORY = ((kind, "", "") for kind in ("ack", "new", "ahead", "ours", "history"))
@@ -89,7 +89,7 @@ class StreamReader:
         self._places = GroupPlaces(commands, group)
         self._dead = DeadMembers(commands, group, consumer)
         self._upkeep = Upkeep(commands, group, consumer)
-        self.aside = Aside(commands, group)
+        self.aside = Aside(commands, app_of(group))
         self._look_at = 0.0
         self._alone = False
         self._quiet = False
@@ -483,7 +483,7 @@ class StreamReader:
         self._size.answered(time.monotonic())
         found = set()
         for name, entries in reply or ():
-            path = name.decode().removeprefix(_WORK).partition(":")[2]
+            path = name.decode().rpartition(":")[2]
             if entries:
                 found.add(path)
             for token, fields in entries:

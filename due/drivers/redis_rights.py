@@ -3,7 +3,7 @@
     publish a.b.*  ─►  PUBLISH due:a.b.* │ XADD … due:stream:a.b.* │ who reads it, and how far they are
     observe c.**   ─►  (P)SUBSCRIBE due:c, due:c.* │ XREAD … due:stream:c, due:stream:c.* │ SADD due:readers:c …
     its own        ─►  due:work:<app>:*, due:lease:<app>:*, due:poison:<app>, due:streams:<app>, due:wake:<app>,
-                       its membership's channels
+                       and the same of its instances: <app>:<instance>; its membership's channels
 
 Who observes writes nothing on a stream: how far a group is stands in its own list.
 
@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
+from due.drivers.base import own_group
 from due.drivers.redis_leases import lease_name
 from due.drivers.redis_streams import (
     PRODUCERS,
@@ -122,6 +123,7 @@ def acl_rules(rights: Rights) -> list[str]:
     allow a command the one with the fewest patterns.
     """
     own = rights.app
+    wakes = [wake_name(own), wake_name(own_group(own, ANY))]
     told, heard = with_membership(rights)
     publish, observe = _globs(told), _globs(heard)
     return [
@@ -133,9 +135,9 @@ def acl_rules(rights: Rights) -> list[str]:
         _selector(["+xinfo|groups", "+xpending"], _keys("%R~", (work_name("*", path) for path in publish))),
         _selector(_KNOWS_READERS, _keys("~", map(readers_name, publish))),
         _selector(["+subscribe", "+psubscribe"], _channels((*observe, "streams:*"))),
-        _selector(_READS_STREAM, _keys("%R~", (*map(stream_name, observe), wake_name(own)))),
+        _selector(_READS_STREAM, _keys("%R~", (*map(stream_name, observe), *wakes))),
         _selector(["+sadd"], _keys("~", map(readers_name, observe))),
-        _selector(["+xadd", "+expire"], [f"~{wake_name(own)}"]),
+        _selector(["+xadd", "+expire"], _keys("~", wakes)),
         _selector(_OWN_LEASES, [f"~{lease_name(own, '*')}"]),
         _selector(_OWN_ASIDE, [f"~due:poison:{own}"]),
         _selector(_OWN_ANNOUNCEMENTS, [f"~{announced_name(own)}"]),

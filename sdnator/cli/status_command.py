@@ -45,6 +45,7 @@ def status(*, as_json: Json = False) -> None:
     }
     apps = _states(found.coordinator)
     health = _health(found.coordinator) if apps is not None else None
+    processes = _processes(found.coordinator) if apps is not None else {}
     control = controlled(health) if health is not None else None
     incidents = open_incidents(health) if health is not None else None
     model = model_of(health) if health is not None else None
@@ -70,7 +71,7 @@ def status(*, as_json: Json = False) -> None:
     else:
         _show_status(found, parts, apps)
         wired = {str(one["name"]) for one in found.switches if one.get("forward")}
-        for line in (*control_lines(control, wired), *damage_lines(damaged)):
+        for line in (*control_lines(control, wired, processes), *damage_lines(damaged)):
             print(line)
         for number, line in enumerate(model_lines(model) if model is not None else ()):
             print(line if number else f"model: {line}")
@@ -155,6 +156,17 @@ def _states(coordinator: str) -> dict[str, str] | None:
         return None
 
 
+def _processes(coordinator: str) -> dict[str, str]:
+    """By instance: its process in words; empty where the Coordinator does not answer."""
+    from sdnator.northbound import ask
+
+    try:
+        found = ask(coordinator, "/instances")
+    except PipelineError:
+        return {}
+    return {one["instance_id"]: f"process {one['pid']} on {one['host']}" for one in found}
+
+
 def _health(coordinator: str) -> Mapping[str, Any] | None:
     """What the Coordinator says of all apps; None if it does not answer."""
     from sdnator.northbound import ask
@@ -201,15 +213,21 @@ def controlled(health: Mapping[str, Any]) -> dict[str, Any] | None:
     told = health.get("apps", {}).get("p4runtime_ctrl", {}).get("health", {}).get("app", {})
     if "switches" not in told:
         return None
-    names = ("connected", "primary", "fail", "learnt")
+    names = ("connected", "primary", "owner", "fail", "learnt")
     switches = {one["switch"]: {name: one[name] for name in names if name in one} for one in told["switches"]}
     return {"watchdog": bool(told.get("watchdog")), "switches": switches}
 
 
-def control_lines(control: Mapping[str, Any] | None, wired: Collection[str]) -> Iterator[str]:
-    """Text: a line for each switch; the watchdog covers those that are `wired`."""
+def control_lines(
+    control: Mapping[str, Any] | None, wired: Collection[str], processes: Mapping[str, str] | None = None
+) -> Iterator[str]:
+    """Text: a line for each switch; the watchdog covers those that are `wired`, and `processes` are instances in words."""
     for name, one in (control or {"switches": {}})["switches"].items():
-        state = "under control" if one.get("connected") and one.get("primary") else "NOT under control"
+        # of several controllers that divide the switches any one may have told
+        owner = one.get("owner", "")
+        has = one.get("connected") and (one.get("primary") or owner)
+        by = f" of {_named(owner, processes or {})}" if owner else ""
+        state = f"under control{by}" if has else "NOT under control"
         if one.get("fail") == "closed":
             watch = "a watchdog runs" if control and control["watchdog"] else "but NO watchdog runs"
             fails = f"fails closed, {watch if name in wired else 'and has no port forwarding'}"
@@ -217,6 +235,11 @@ def control_lines(control: Mapping[str, Any] | None, wired: Collection[str]) -> 
             fails = "fails open: port forwarding stays without a controller"
         learnt = f"; {counted(one['learnt'], 'MAC address')} learnt" if "learnt" in one else ""
         yield f"switch {name} is {state}; it {fails}{learnt}"
+
+
+def _named(instance: str, processes: Mapping[str, str]) -> str:
+    """An instance in words."""
+    return "another instance" if instance == "another" else processes.get(instance, f"instance {instance}")
 
 
 def down(

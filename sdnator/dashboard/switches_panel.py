@@ -81,9 +81,17 @@ class SwitchesPanel:
     def _said(self, name: str) -> str:
         with self._board.lock:
             state = self._board.switches.get(name, {})
+            owner = next(
+                (
+                    f" · controller: {one['pid']} on {one['host']}"
+                    for one in self._board.instances
+                    if one["instance_id"] == state.get("owner")
+                ),
+                "",
+            )
         if not state:
             return "its controller has not reported yet"
         rank = "primary" if state.get("primary") else "backup"
         joined = f"connected, {rank}" if state.get("connected") else "not connected"
         sent, lost = number(int(state.get("packet_in", 0))), number(int(state.get("lost", 0)))
-        return f"{joined} · {state.get('program', '')} · {sent} packet-ins, {lost} lost"
+        return f"{joined} · {state.get('program', '')} · {sent} packet-ins, {lost} lost{owner}"

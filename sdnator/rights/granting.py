@@ -41,6 +41,7 @@ _PRODUCT: dict[str, Rights] = {
                 *_DECISIONS,
                 *(f"network.{family}.*.*" for family in ("p4_command", "telemetry", "cell_request")),
                 *(f"network.{family}.*.*" for family in ("packet_out", "clock")),
+                _SWITCHES,  # of its other instances
             ),
             read=(*_DECISIONS, "network.p4_command.*.*", "network.telemetry.*.*"),
         ),

@@ -15,6 +15,7 @@ from due.membership import (
     Member,
     Phase,
     Registration,
+    ShardGrant,
     Verdict,
 )
 from due.messages import Assignment, Capability, Interest
@@ -318,3 +319,27 @@ def test_whatever_stands_in_a_message_there_is_one_error(kind, data):
     for wrong in (value, data.draw(anything)):
         with suppress(msgspec.ValidationError):
             kind.from_value(wrong)
+
+
+def test_shards_of_the_apps_own_are_as_the_coordinator_says_and_unknown_after_a_suspension():
+    registration = Registration(
+        app_id="ctrl", instance_id="me", instances="sharded", revision=1, heartbeat=0.5, started=1
+    )
+    member = Member(registration, now=0.0, handshake_timeout=1.0, named=("s1", "s2"))
+    assert member.named_here is None, "no Coordinator was heard yet"
+    mine, other = ShardGrant("me", 3), ShardGrant("other", 3)
+    member.assigned(_assignments(active="", shards={"s1": mine, "s2": other}), 0.1)
+    assert (member.named_here, member.named_held) == (frozenset({"s1"}), ("s1",))
+    assert member.paused(5.0)
+    assert (member.named_here, member.named_held) == (None, ("s1",))
+    member.assigned(_assignments(active="", version=2, shards={"s1": other, "s2": other}), 5.1)
+    assert member.named_here == frozenset()
+
+
+def test_without_a_coordinator_one_instance_has_all_shards_of_the_app():
+    registration = Registration(
+        app_id="ctrl", instance_id="me", instances="sharded", revision=1, heartbeat=0.5, started=1
+    )
+    member = Member(registration, now=0.0, handshake_timeout=1.0, named=("s1", "s2"))
+    member.tick(1.0)
+    assert member.named_here == frozenset({"s1", "s2"})

@@ -2,7 +2,8 @@
 
 A lost stream is opened again, with growing pauses.  The active controller claims to be primary with its rank, a
 standby with the lowest election id.  When the switch reports that there is no primary, a standby waits a
-moment for the active one, then asks to be primary.
+moment for the active one, then asks to be primary.  With `steps_up` a standby that is primary at once, because the switch
+is new, claims it with its rank, too.
 """
 
 import threading
@@ -67,6 +68,7 @@ class Connection:
         longest_pause_s: float = 0.2,
         active: bool = True,
         patience_s: float = _DEPUTY_WAITS_S,
+        steps_up: bool = False,
     ) -> None:
         self._address = address
         self._pipeline = pipeline
@@ -84,10 +86,14 @@ class Connection:
         self._requests = Outgoing()
         self._election_id: Any = None
         self._opened_ms = 0
+        self._highest = 0
+        """The highest election id that the switch has seen, as far as it said."""
+        self._outbid_at = 0.0
         self._told: tuple[bool, Any] | None = None
         """What the listener knows: primary or not, and the election id of its writes."""
         self._active = active
         self._patience_s = patience_s
+        self._steps_up = steps_up
         self._patience: threading.Timer | None = None
         name = address.target
         self._threads = [
@@ -121,6 +127,17 @@ class Connection:
         if active != self._active:
             self._active = active
             self._claim(self._usual_id())
+
+    def outbid(self) -> None:
+        """Claim above whoever is primary, unless its rank is higher; once a second at most.
+
+        Clocks of two machines differ, so the time of a stream does not decide between two of one rank.
+        """
+        now = time.monotonic()
+        of_lower_rank = self._highest >> 64 <= self._address.rank
+        if self._active and self._told == (False, None) and of_lower_rank and now - self._outbid_at > 1:
+            self._outbid_at = now
+            self._claim(min(max(self._highest + 1, self._usual_id()), _HIGHEST_ID))
 
     def break_off(self) -> None:
         """Close this stream; a new one is opened unless `close` was called."""
@@ -213,11 +230,15 @@ class Connection:
     def _arbitrated(self, arbitration: Any) -> None:
         """The switch repeats its status whenever a controller comes or goes; only changes are passed on."""
         self._stop_waiting()
+        highest = self._highest = arbitration.election_id.high << 64 | arbitration.election_id.low
         if arbitration.status.code == _NO_PRIMARY:
-            highest = arbitration.election_id.high << 64 | arbitration.election_id.low
             self._fill_the_place(min(max(highest + 1, self._usual_id()), _HIGHEST_ID))
             return
         primary = arbitration.status.code == _PRIMARY
+        if primary and self._steps_up and self._election_id.high < self._address.rank:
+            # of a switch that has seen no higher id; the next standby, or a watchdog, would win by its time alone
+            self._claim(self._address.rank << 64 | self._opened_ms)
+            return
         told = (primary, self._election_id if primary else None)
         if told == self._told:
             return

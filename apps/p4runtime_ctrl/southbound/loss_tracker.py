@@ -39,6 +39,12 @@ class LossTracker:
         """Capture time of the newest frame seen."""
         self.expected: frozenset[Source] = frozenset(("packet",))
         """Expected streams."""
+        self.unaccounted = 0
+        """Numbers between the last report of the controller before and the first to arrive here; at most so many are lost."""
+        self._before: int | None = None
+        """The last number that the controller before had reported."""
+        self._first: int | None = None
+        """The first number to arrive since this controller has the switch."""
         self._arrived = False
         self._clock = SteadyTime(_STEP_US)
         self._lost = 0
@@ -50,6 +56,31 @@ class LossTracker:
     def lost(self) -> int:
         """Numbers that never arrived."""
         return self._lost
+
+    @property
+    def sequence(self) -> int:
+        """The highest number that has arrived; 0: none yet."""
+        return self._highest or 0
+
+    def rest(self) -> None:
+        """Another controller receives the packets from now on: what is missing here from then on is no loss."""
+        self._settle(everything=True)
+        self._passed.clear()
+        self._highest = self._before = self._first = None
+
+    def follow(self, sequence: int) -> None:
+        """Go on behind another controller.
+
+        Args:
+            sequence: the highest number that it has reported.
+        """
+        self._before = sequence
+        self._join()
+
+    def _join(self) -> None:
+        if self._before is not None and self._first is not None:
+            self.unaccounted += max(0, self._first - self._before - 1)
+            self._before = None
 
     def expect_first(self) -> None:
         """The switch has just loaded its program: the next number is 1."""
@@ -125,6 +156,9 @@ class LossTracker:
             return
         if self._highest is None:
             self._highest = int(numbers[0]) - 1
+        if self._first is None:
+            self._first = int(numbers[0])
+            self._join()
         highest = self._highest
         known = numbers[numbers <= highest]
         if len(known) and self._gaps:

@@ -88,10 +88,27 @@ class SequenceMerger:
         self._passed: dict[Source, int] = {"digest": 0, "packet": 0}
         self._told = 0
         """All numbers up to this one are finished."""
+        self._follows = False
+        """`_told` is what another controller reported last; it may have handed on more."""
 
     def __len__(self) -> int:
         """Rows that wait."""
         return sum(len(rows) for rows in self._held.values() if rows is not None)
+
+    def begin_anew(self) -> None:
+        """Another controller receives the frames from now on."""
+        self._passed = dict.fromkeys(self._passed, 0)
+        self._told, self._follows = 0, False
+
+    def follow(self, sequence: int) -> None:
+        """Go on behind another controller, unless rows were told already.
+
+        Args:
+            sequence: the highest number that it has reported.
+        """
+        if not self._told:
+            self._passed = {stream: max(number, sequence) for stream, number in self._passed.items()}
+            self._told, self._follows = sequence, True
 
     @property
     def waits_for(self) -> int:
@@ -108,7 +125,7 @@ class SequenceMerger:
 
     def flush(self) -> list[PacketRows]:
         """Return all waiting rows and give up missing numbers."""
-        before = self._told
+        before, self._follows = 0 if self._follows else self._told, False
         told = self._tell(_WRAP)
         if told:
             first = before + 1 if before else int(told[0].sequence[0])

@@ -178,6 +178,8 @@ class P4RuntimeSession:
         self._election_id = election_id
         self.broken = False
         """A call could not reach the switch: the stream must be opened again."""
+        self.denied = False
+        """The switch refused the last write: somebody else may be primary by now."""
         self._address = address
         self._pipeline = pipeline
 
@@ -297,6 +299,7 @@ class P4RuntimeSession:
             self._invoke(self._stub.Write, request, patience=4)
         except grpc.RpcError as error:
             return self._failures(error, updates)
+        self.denied = False
         return [UpdateOutcome()] * len(updates)
 
     def _failures(self, error: Any, updates: list[Any]) -> list[UpdateOutcome]:
@@ -337,6 +340,7 @@ class P4RuntimeSession:
     def _translated(self, error: Any) -> SwitchError:
         found = translated(error, self._address.target)
         self.broken |= isinstance(found, Unreachable)
+        self.denied |= isinstance(found, NotPrimary)
         return found
 
     def _invoke(

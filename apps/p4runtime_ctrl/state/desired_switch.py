@@ -140,6 +140,8 @@ class DesiredSwitch:
             self._desired.put(self.mac_learning.flood())
         self._owners: dict[bytes, Owner] = {}
         self._unconfirmed: dict[bytes, EntryUpdate] = {}
+        self._aged: dict[bytes, EntryUpdate] = {}
+        """Of those the ones that were there when `age_unconfirmed` was called last."""
         self._telemetry = EntrySet()
         self._secrets = (0, (0,) * len(SECRET_WORDS))
 
@@ -306,6 +308,30 @@ class DesiredSwitch:
             if "seen" in reading:  # the tables were read one after the other
                 reading["seen"] = max(seen[reading["id"]], reading["packets"])
         return found
+
+    @property
+    def learning(self) -> dict[str, int]:
+        """Counts of MAC learning; empty if it is off."""
+        learning = self.mac_learning
+        if learning is None:
+            return {}
+        return {
+            "learnt": len(learning),
+            "moved": learning.moved,
+            "learn_refused": learning.refused,
+            "learn_malformed": learning.malformed,
+        }
+
+    def forget_learnt(self) -> None:
+        """Another controller learns from now on; what it has learnt is read from the switch again."""
+        if self.mac_learning is not None:
+            for change in self.mac_learning.forget_all():
+                self._desired.discard(change.entry)
+
+    def age_unconfirmed(self) -> None:
+        """Forget which updates are to be confirmed, of those that were so at the last call; they stay desired."""
+        left = {key: one for key, one in self._unconfirmed.items() if self._aged.get(key) is not one}
+        self._unconfirmed, self._aged = left, dict(left)
 
     def withdraw(self, transport: Transport) -> None:
         """Fail closed: remove port forwarding before the controller ends."""

@@ -109,6 +109,10 @@ class MacLearning:
             return []
         return self._drop(place)
 
+    def forget_all(self) -> list[Change]:
+        """Forget every address; returns the changes that would remove them."""
+        return [change for place in list(self._ports) for change in self._drop(place)]
+
     def undo(self, changes: Iterable[Change]) -> None:
         """The switch refused these changes: their addresses are unknown again."""
         for change in changes:

@@ -13,20 +13,24 @@ from apps.p4runtime_ctrl.state.desired_state import INSERT, Change
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch
 from apps.p4runtime_ctrl.telemetry.classifier import TelemetryRequest
 from p4rt import INSECURE
+from sdnator.testing.p4runtime_client import P4RuntimeClient
 from sdnator.testing.product_program import PROGRAM, program
 from sdnator.testing.switch_target import KINDS, SwitchTarget
+from sdnator.testing.waiting import wait_for
 from tests.requirements import optional_program
 
 
 class Attached:
     """A connection that brings its switch up whenever it becomes primary, in the stream's thread."""
 
-    def __init__(self, address, switch, rank=1):
+    def __init__(self, address, switch, rank=1, **options):
         self.switch = switch
         self.changed = threading.Condition()
         self.reports, self.session, self.error = [], None, None
         pipeline = CompiledProgram(PROGRAM.read_bytes(), program().message)
-        self.connection = Connection(Address(address, 1, rank, security=INSECURE), pipeline, self)
+        self.backups = 0
+        place = Address(address, 1, rank, security=INSECURE)
+        self.connection = Connection(place, pipeline, self, **options)
         self.connection.open()
 
     def became_primary(self, session):
@@ -40,7 +44,7 @@ class Attached:
             self.changed.notify_all()
 
     def became_backup(self):
-        pass
+        self.backups += 1
 
     def lost(self, cause):
         pass
@@ -188,6 +192,29 @@ def test_a_backup_takes_over(target, attach):
     assert not standby.reports
     active.connection.close()
     assert str(standby.until_up()) == "nothing to change"
+
+
+def test_a_standby_that_found_the_switch_new_does_not_give_way_to_one_that_comes_later(target, attach):
+    """A watchdog, for one, which would close the switch."""
+    first = attach(make(), active=False, steps_up=True)
+    first.until_up()
+    watchdog = attach(make(), active=False)
+    wait_for(lambda: watchdog.backups)
+    assert (len(first.reports), first.backups) == (1, 0)
+    assert not watchdog.reports
+
+
+def test_of_two_active_controllers_the_one_that_insists_becomes_primary(target, attach):
+    """Where the clock of the machine to which a switch is given is behind the other one's."""
+    first = attach(make(), rank=1)
+    first.until_up()
+    second = attach(make(), rank=1)
+    second.until_up()
+    wait_for(lambda: (first.connection.outbid(), len(first.reports) == 2)[1])
+    with P4RuntimeClient(target.address, election_id=(2 << 64)) as stronger:
+        stronger.arbitrate()
+        first.connection.outbid()
+        assert len(first.reports) == 2, "a higher rank is respected"
 
 
 LIMIT = RateLimit(kind="udp_from", port=53, rate=40, spared=("192.0.2.53", "192.0.2.54"), spared_rate=60)

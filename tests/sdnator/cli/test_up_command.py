@@ -176,6 +176,25 @@ def test_status_tells_who_closes_a_switch_that_nobody_controls():
     assert list(control_lines(None, ())) == []
 
 
+def test_status_names_the_process_that_has_each_switch():
+    """Any of the controllers that divide the switches may have told."""
+    one = {"connected": True, "primary": False, "fail": "open"}
+    switches = {
+        "s1": {**one, "owner": "i1"},
+        "s2": {**one, "owner": "i2", "primary": True},
+        "s3": {**one, "owner": "another"},
+        "s4": {**one, "owner": ""},
+    }
+    processes = {"i1": "process 7 on rack", "i2": "process 8 on shelf"}
+    said = [line.partition(";")[0] for line in control_lines({"switches": switches}, (), processes)]
+    assert said == [
+        "switch s1 is under control of process 7 on rack",
+        "switch s2 is under control of process 8 on shelf",
+        "switch s3 is under control of another instance",
+        "switch s4 is NOT under control",
+    ]
+
+
 def test_status_tells_of_a_program_that_leaves_its_arrays():
     calm = {"restarts": 0, "cause": "", "suppressed_lines": 0}
     (line,) = trouble_lines({"firewall": calm, "switch": calm | {"out_of_range": 2}})

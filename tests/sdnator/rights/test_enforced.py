@@ -10,6 +10,7 @@ import pytest
 import redis
 
 from due import CONSUMER, PRODUCER, PUB_ONLY, Capability, Engine, Options
+from due.drivers.base import own_group
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis_leases import lease_name
 from due.drivers.redis_rights import Rights
@@ -115,6 +116,10 @@ def _as_kitsune(path: str) -> Iterator[tuple[str | int, ...]]:
     yield ("XRANGE", set_aside, "-", "+")
     yield ("XADD", wake_name("kitsune"), "*", "i", "x")
     yield ("XREAD", "STREAMS", wake_name("kitsune"), "0")
+    one = own_group("kitsune", "i1")
+    yield ("XADD", wake_name(one), "*", "i", "x")
+    yield ("XADD", work_name(one, path), "9-9", "i", "")
+    yield ("HSET", lease_name(one, path), "c", "0")
     yield ("ZADD", announced_name("kitsune"), 1, path)
     yield ("ZREM", announced_name("kitsune"), path)
     yield ("SREM", PRODUCERS, "kitsune")
@@ -187,19 +192,22 @@ def test_an_app_can_say_and_see_nothing_but_its_own(place):
     keeper.close()
 
 
-def test_who_may_read_a_stream_leaves_every_other_group_where_it_is(place):
+@pytest.mark.parametrize("group", ["mine", own_group("mine", "i1")])
+def test_who_may_read_a_stream_leaves_every_other_group_where_it_is(place, group):
     """The only writes of a reader are on keys of its own, and its name among the readers."""
     server, identities = place
-    url, work = identities.url(server.url, "mine"), work_name("mine", OPEN)
+    url, work = identities.url(server.url, "mine"), work_name(group, OPEN)
     commands, admin = client(url), client(server.admin_url)
     admin.xadd(stream_name(OPEN), {"f": "x"})
     for attempt in (
-        ("XREAD", "STREAMS", stream_name(OPEN), wake_name("mine"), "0", "0"),
-        ("SADD", readers_name(OPEN), "mine"),
-        ("XGROUP", "CREATE", work, "mine", "0", "MKSTREAM"),
+        ("XREAD", "STREAMS", stream_name(OPEN), wake_name(group), "0", "0"),
+        ("SADD", readers_name(OPEN), group),
+        ("XGROUP", "CREATE", work, group, "0", "MKSTREAM"),
         ("XADD", work, "9-9", "i", ""),
-        ("XREADGROUP", "GROUP", "mine", "c", "STREAMS", work, ">"),
-        ("XACK", work, "mine", "9-9"),
+        ("XREADGROUP", "GROUP", group, "c", "STREAMS", work, ">"),
+        ("XACK", work, group, "9-9"),
+        ("XADD", wake_name(group), "*", "i", "x"),
+        ("HSET", lease_name(group, OPEN), "c", "1"),
     ):
         commands.execute_command(*attempt)
     assert admin.xlen(stream_name(OPEN)) == 1

@@ -24,6 +24,7 @@ def test_a_part_of_the_product_is_granted_what_it_declares(name):
     wanted = [
         *module.INTERESTS,
         *getattr(module, "SYN_INTERESTS", ()),
+        *getattr(module, "SHARDED_INTERESTS", ()),
         *getattr(module, "ENFORCER_INTERESTS", ()),
     ]
     for interest in wanted:

@@ -111,3 +111,30 @@ def test_the_arrival_number_is_the_newest_of_both_streams(lists, newest):
     for source, numbers in lists:
         note(progress, numbers, source)
     assert progress.arrival == newest
+
+
+@pytest.mark.parametrize("told_first", [True, False])
+def test_behind_another_controller_what_neither_saw_is_counted_apart(told_first):
+    progress = LossTracker()
+    if told_first:
+        progress.follow(100)
+    note(progress, [105, 106, 108])
+    if not told_first:
+        progress.follow(100)
+    assert (progress.unaccounted, progress.lost, progress.sequence) == (4, 1, 108)
+
+
+def test_what_another_controller_received_meanwhile_is_no_loss():
+    progress = LossTracker()
+    note(progress, [1, 2, 4])
+    progress.rest()
+    progress.follow(5_000)
+    note(progress, [5_001, 5_003])
+    assert (progress.lost, progress.unaccounted, progress.restarts) == (2, 0, 0)
+
+
+def test_a_switch_that_counts_from_one_again_behind_another_controller_has_nothing_unaccounted():
+    progress = LossTracker()
+    progress.follow(5_000)
+    note(progress, [1, 2])
+    assert (progress.lost, progress.unaccounted) == (0, 0)

@@ -89,3 +89,23 @@ def test_any_interleaving_tells_the_same(kinds, turns):
     got += told(unison.flush())
     assert got == [number for number, kind in enumerate(kinds, start=1) if kind != "lost"]
     assert len(unison) == 0
+
+
+def test_behind_another_controller_the_next_number_waits_for_nothing():
+    unison = SequenceMerger()
+    unison.follow(5_000)
+    assert told(unison.digests(rows([5_001, 5_002]))) == [5_001, 5_002]
+    unison.begin_anew()
+    unison.follow(9_000)
+    assert told(unison.digests(rows([9_001, 9_002]))) == [9_001, 9_002]
+
+
+def test_numbers_that_the_controller_before_may_have_told_are_not_called_skipped():
+    unison = SequenceMerger()
+    assert not unison.digests(rows([5_010, 5_011]))
+    unison.follow(5_000)
+    assert told(unison.flush()) == [5_010, 5_011]
+    assert unison.skipped == 0
+    assert not unison.digests(rows([5_014]))
+    assert told(unison.flush()) == [5_014]
+    assert unison.skipped == 2

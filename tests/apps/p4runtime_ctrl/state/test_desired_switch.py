@@ -176,6 +176,16 @@ def test_decisions_made_while_the_switch_is_away_are_carried_out_later():
     assert str(report) == "2 inserted, 1 removed"
 
 
+def test_what_another_controller_will_have_confirmed_is_carried_out_and_not_confirmed():
+    held, switch = Held(), make()
+    switch.decide([decision(1)], None)
+    switch.age_unconfirmed()
+    switch.decide([decision(2, address="10.0.0.2")], None)
+    switch.age_unconfirmed()
+    assert said(switch.bring_up(held).confirmations) == [("d2", "installed")]
+    assert held.names() == {block_name("10.0.0.1"), block_name("10.0.0.2")}
+
+
 def test_a_restarted_switch_and_a_restarted_controller():
     held, switch = Held(), make(forward={1: 2})
     switch.bring_up(held)
