@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.replay_live_load import Offered, load_process
-from benchmarks.replay_live_stage import UpProcess, Wire, possible, wires
+from benchmarks.replay_live_stage import UpProcess, HostWire, possible, wires
 from benchmarks.soak_figures import lost_in
 from benchmarks.switch_stage import SwitchProcess, primary, process, program
 from benchmarks.switch_wire import bmv2_installed
@@ -46,6 +46,8 @@ _TRAINING_S: Final = 60.0
 _SETTLED_S: Final = 2.5
 """Nothing is on its way any more where Kitsune's count stands still for so long."""
 _DRAIN_S: Final = 60.0
+_TOLD_S: Final = 1.2
+"""Within so long every app has told what it lost."""
 _POLL_S: Final = 0.05
 _SEED: Final = 1
 _APPS: Final = ("p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall")
@@ -76,10 +78,10 @@ class Step:
         return whole and scored and in_time and self.pps >= _OFFERED * self.wanted_pps
 
 
-class Bench:
+class LiveBench:
     """A load on two wires, and what becomes of it."""
 
-    def __init__(self, pipe: Any, ends: tuple[Wire, Wire], up: UpProcess | None = None) -> None:
+    def __init__(self, pipe: Any, ends: tuple[HostWire, HostWire], up: UpProcess | None = None) -> None:
         self._pipe = pipe
         self._ends = ends
         self._up = up
@@ -91,6 +93,7 @@ class Bench:
         offered: Offered = self._pipe.recv()
         sent = sum(offered.sent)
         lag = self._settle(scored + sent)
+        time.sleep(_TOLD_S)
         after = self._counted()
         gone = {name: count - lost.get(name, 0) for name, count in self._lost().items()}
         gone["refused_by_wire"] = sent - (after["sent"] - before["sent"])
@@ -193,7 +196,7 @@ def live(folder: Path, scale: float = 1.0) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = {}
     with _load() as (pipe, ends), UpProcess(folder, *_ports(ends)) as up:
-        bench = Bench(pipe, ends, up)
+        bench = LiveBench(pipe, ends, up)
         _wait_for_apps(up)
         bench.train()
         found["live_pps_lossless"], steps = highest(bench.step, scale)
@@ -208,7 +211,7 @@ def live(folder: Path, scale: float = 1.0) -> dict[str, Any]:
 
 
 @contextmanager
-def _load() -> Iterator[tuple[Any, tuple[Wire, Wire]]]:
+def _load() -> Iterator[tuple[Any, tuple[HostWire, HostWire]]]:
     """The process that offers frames, and the two wires that it offers them to."""
     with wires() as ends:
         places = tuple((each.namespace, each.host) for each in ends)
@@ -231,10 +234,10 @@ def _forwarding(kind: str, folder: Path, scale: float) -> float:
         for near, far in ((1, 2), (2, 1)):
             entry = names.entry("ingress.forward_port", {"ingress_port": near}, "ingress.to_port", [far])
             controller.write(insert(entry))
-        return highest(Bench(pipe, ends).step, scale)[0]
+        return highest(LiveBench(pipe, ends).step, scale)[0]
 
 
-def _ports(ends: tuple[Wire, Wire]) -> list[str]:
+def _ports(ends: tuple[HostWire, HostWire]) -> list[str]:
     return [f"{number}=veth:{end.switch}" for number, end in enumerate(ends, 1)]
 
 

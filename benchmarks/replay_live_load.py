@@ -62,7 +62,7 @@ class Lap:
         """Join frames."""
         none: list[int] = []
         block = FrameBlock.of(none, none, frames)
-        return cls(block.data, np.concatenate(([0], np.cumsum(block.captured, dtype=np.int64))), outside)
+        return cls(block.data, block.starts(), outside)
 
     def slices(self, first: int, count: int, end: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Beginnings and ends of an end's frames among `count` from `first` on, which begin again after a lap.

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from dataplane.bmv2 import ending_with_us
 from sdnator.errors import PipelineError
 from sdnator.network_namespaces import inside
 from sdnator.northbound import ask
@@ -30,7 +31,7 @@ _OURS: Final = re.compile(r"sdnlive(\d+)[ab]")
 
 
 @dataclass(frozen=True)
-class Wire:
+class HostWire:
     """A veth pair with one end in a namespace of its own."""
 
     namespace: str
@@ -40,7 +41,7 @@ class Wire:
     """The end here."""
 
     @classmethod
-    def make(cls, stack: ExitStack, side: str) -> "Wire":
+    def make(cls, stack: ExitStack, side: str) -> "HostWire":
         """A wire with names of this process that is removed with `stack`.
 
         Args:
@@ -85,11 +86,11 @@ def possible() -> bool:
 
 
 @contextmanager
-def wires() -> Iterator[tuple[Wire, Wire]]:
+def wires() -> Iterator[tuple[HostWire, HostWire]]:
     """Wires of the office and of the Internet."""
     _remove_orphans()
     with ExitStack() as stack:
-        yield Wire.make(stack, "a"), Wire.make(stack, "b")
+        yield HostWire.make(stack, "a"), HostWire.make(stack, "b")
 
 
 def _remove_orphans() -> None:
@@ -128,7 +129,11 @@ class UpProcess:
         places = {f"XDG_{kind}_HOME": str(self._folder / kind.lower()) for kind in kinds}
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                self._command, env={**os.environ, **places}, cwd=self._folder, stdout=log, stderr=log
+                ending_with_us(self._command),
+                env={**os.environ, **places},
+                cwd=self._folder,
+                stdout=log,
+                stderr=log,
             )
         try:
             self._coordinator = self._wait()

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks.replay_live import LAG_S, MOST_PPS, Step, highest
-from benchmarks.replay_live_load import Lap, office_lap
+from benchmarks.replay_live_load import Lap, load_process, office_lap
+from benchmarks.replay_live_stage import wires
+from benchmarks.switch_stage import process
+from tests.requirements import require_netns
 
 
 def step(pps, *, wanted=None, came=1000, scored=1000, lag=0.5, lost=None):
@@ -81,3 +84,18 @@ def test_the_office_speaks_both_ways():
     lengths = np.diff(lap.starts)
     assert lengths.min() >= 60
     assert lengths.max() <= 1_518
+
+
+def test_the_kernel_counts_what_is_offered_at_both_ends():
+    """Nobody holds the other ends of the wires: nothing comes back."""
+    require_netns()
+    with wires() as ends:
+        places = tuple((each.namespace, each.host) for each in ends)
+        with process(load_process, places, 1) as load:
+            before = [end.counted() for end in ends]
+            load.send((2_000.0, 0.2))
+            offered = load.recv()
+            after = [end.counted() for end in ends]
+    assert min(offered.sent) > 0
+    assert tuple(b["sent"] - a["sent"] for a, b in zip(before, after, strict=True)) == offered.sent
+    assert [end["came"] for end in after] == [end["came"] for end in before]
