@@ -1,12 +1,14 @@
 """The live part of `benchmarks.replay`: the rate it finds is one that held, and its load is what it says it is."""
 
+import threading
+from multiprocessing import Pipe
+
 import numpy as np
 import pytest
 
 from benchmarks.replay_live import LAG_S, MOST_PPS, Step, highest
 from benchmarks.replay_live_load import Lap, load_process, office_lap
 from benchmarks.replay_live_stage import wires
-from benchmarks.switch_stage import process
 from tests.requirements import require_netns
 
 
@@ -90,12 +92,17 @@ def test_the_kernel_counts_what_is_offered_at_both_ends():
     """Nobody holds the other ends of the wires: nothing comes back."""
     require_netns()
     with wires() as ends:
+        load, its_end = Pipe()
         places = tuple((each.namespace, each.host) for each in ends)
-        with process(load_process, places, 1) as load:
-            before = [end.counted() for end in ends]
-            load.send((2_000.0, 0.2))
-            offered = load.recv()
-            after = [end.counted() for end in ends]
+        thread = threading.Thread(target=load_process, args=(its_end, places, 1))
+        thread.start()
+        assert load.recv() == "ready"
+        before = [end.counted() for end in ends]
+        load.send((2_000.0, 0.2))
+        offered = load.recv()
+        after = [end.counted() for end in ends]
+        load.send(0)
+        thread.join()
     assert min(offered.sent) > 0
     assert tuple(b["sent"] - a["sent"] for a, b in zip(before, after, strict=True)) == offered.sent
     assert [end["came"] for end in after] == [end["came"] for end in before]
