@@ -12,6 +12,8 @@ alone; `reproducible_pps` with blocking and `--reproducible`; `packet_in_pps` wi
 `best_pps` is the best round.  Rounds take turns; figures are medians of `rounds`, which are fewer than asked for if ten
 minutes are over before (`kept`, reproducible and packet-ins: of the first round alone).
 `--long` adds a capture of 764,137 packets.
+`--only PART ...` measures some parts: loop, detector, pipeline (`benchmarks.switch_pipeline`: `pipeline_pps`,
+`pipeline_full_pps`), live (`benchmarks.replay_live`: `live_pps_lossless`, `live_vs_bmv2`; root).
 """
 
 import statistics
@@ -31,7 +33,9 @@ from apps.kitsune.detector import Detector
 from apps.kitsune.kernel import load_kernel
 from apps.kitsune.service import Settings
 from benchmarks.measure import arguments, machine, table, write_json
+from benchmarks.replay_live import live
 from benchmarks.replay_processes import ProcessMeter
+from benchmarks.switch_pipeline import figures_of
 from sdnator.capture.packet_sources import Batch, CaptureSource
 from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from sdnator.replay import run
@@ -50,6 +54,9 @@ LONGEST_S = 600.0
 """No round begins that is likely to end later than that."""
 ONCE = ("kept", "reproducible", "packet_in")
 """Ways that are measured in the first round alone."""
+PARTS = ("loop", "detector", "pipeline", "live")
+PIPELINE_S = 1.0
+"""Traffic of each round."""
 
 
 def capture_of(folder: Path, packets: int) -> Path:
@@ -178,7 +185,6 @@ def measured(capture: Path, rounds: int) -> dict[str, Any]:
             result = passed if name == "default" else result
         longest = max(longest if number > 1 else 0.0, time.monotonic() - since)
     assert result is not None
-    batches = batches_of(capture)
     default, blocking = found["default"], found["blocking"]
     return {
         "rounds": len(default),
@@ -196,12 +202,15 @@ def measured(capture: Path, rounds: int) -> dict[str, Any]:
         "start_cpu_s": statistics.median(each["start_cpu_s"] for each in default),
         "rss_mb": _medians([each["rss_mb"] for each in default]),
         "archived_bytes_per_packet": found["kept"][0]["archived_bytes_per_packet"],
-        "scores_equal": scores_equal(batches, result, options),
-        **detector_vs_kernel(batches, options, rounds),
-        "detector_vs_kernel_handed_over": detector_vs_kernel(joined(batches, HANDED_OVER), options, rounds)[
-            "detector_vs_kernel"
-        ],
+        "scores_equal": scores_equal(batches_of(capture), result, options),
     }
+
+
+def detector_figures(capture: Path, rounds: int) -> dict[str, float]:
+    """`detector_vs_kernel` in both sizes of batches."""
+    batches, options = batches_of(capture), ReplayOptions()
+    handed_over = detector_vs_kernel(joined(batches, HANDED_OVER), options, rounds)["detector_vs_kernel"]
+    return detector_vs_kernel(batches, options, rounds) | {"detector_vs_kernel_handed_over": handed_over}
 
 
 def _medians(rows: Sequence[dict[str, float]]) -> dict[str, float]:
@@ -213,14 +222,24 @@ def _medians(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 def main() -> int:
     parser = arguments("replay", __doc__, rounds=ROUNDS)
     parser.add_argument("--long", action="store_true", help=f"also a capture of {LONG_PACKETS:,} packets")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to measure")
     chosen = parser.parse_args()
-    about = machine()
+    about, figures = machine(), dict[str, Any]()
     with tempfile.TemporaryDirectory(prefix="sdnator-bench-") as folder:
-        figures = measured(capture_of(Path(folder), max(60_000, int(PACKETS * chosen.scale))), chosen.rounds)
+        if not {"loop", "detector"}.isdisjoint(chosen.only):
+            capture = capture_of(Path(folder), max(60_000, int(PACKETS * chosen.scale)))
+        if "loop" in chosen.only:
+            figures |= measured(capture, chosen.rounds)
+        if "detector" in chosen.only:
+            figures |= detector_figures(capture, chosen.rounds)
+        if "pipeline" in chosen.only:
+            figures |= figures_of(PIPELINE_S * chosen.scale, chosen.rounds)
+        if "live" in chosen.only:
+            figures |= live(Path(folder, "live"), chosen.scale)
         if chosen.long:
             long, _ = one_round(capture_of(Path(folder), LONG_PACKETS), ReplayOptions(), mitigate=False)
             figures |= {"long": long}
-    table(("figure", "value"), [(name, value) for name, value in figures.items()])
+    table(("figure", "value"), [each for each in figures.items() if each[0] != "live_steps"])
     write_json(chosen.json, {"machine": about, **figures})
     return 0
 

@@ -84,9 +84,12 @@ class ReceivedFrames:
 
     def joined(self) -> bytes:
         """All frames end to end."""
-        longest = int(self.lengths.max(initial=0))
-        inside = np.arange(longest, dtype=np.uint32) < self.lengths[:, None]
-        return self.slots[:, :longest][inside].tobytes()
+        memory, room = self.slots.reshape(-1).data, self.slots.shape[1]
+        begins = range(0, self.slots.size, room)
+        # a view costs less than a tenth of a microsecond; a mask up to the longest frame, a nanosecond a byte
+        return b"".join(
+            [memory[at : at + size] for at, size in zip(begins, self.lengths.tolist(), strict=True)]
+        )
 
     def frame(self, row: int) -> bytes:
         """One frame."""

@@ -8,7 +8,7 @@ import pytest
 
 from dataplane.p4runtime.device import Device
 from dataplane.p4runtime.trust import AnyProgram
-from dataplane.packet_loop import PacketClock, PacketLoop
+from dataplane.packet_loop import PacketClock, PacketLoop, gathering_s
 from dataplane.ports.port import MemoryPort
 from sdnator.testing.p4runtime_client import (
     TIMEOUT_S,
@@ -48,6 +48,29 @@ def test_stopping_is_no_fault():
     loop.stop()
     assert ended.is_set()
     assert not loop.failed
+
+
+def test_frames_of_a_stream_are_gathered_and_single_ones_are_not():
+    """A millisecond from one round to the next; what took longer does not wait, either."""
+    assert gathering_s(1, 0.0002) == 0.0
+    assert gathering_s(7, 0.0002) == 0.0
+    assert gathering_s(8, 0.0002) == pytest.approx(0.0008)
+    assert gathering_s(500, 0.002) == 0.0
+
+
+def test_a_stream_is_moved_whole_and_in_order():
+    """Gathered or not, every frame passes once."""
+    with SwitchDouble(programs=AnyProgram()) as switch, P4RuntimeClient(switch.address) as controller:
+        config = program_config(PROGRAM)
+        controller.arbitrate()
+        controller.set_pipeline(config)
+        names = EntryBuilder(config.p4info)
+        controller.write(insert(names.entry("I.ports", {"sm.ingress_port": 1}, "I.forward", [2])))
+        frames = [number.to_bytes(12, "big") + bytes(48) for number in range(1000)]
+        for first in range(0, 1000, 20):
+            switch.memory[1].inject(*frames[first : first + 20])
+        until(lambda: len(switch.memory[2].outgoing) == 1000)
+        assert list(switch.memory[2].outgoing) == frames
 
 
 def test_frames_for_ports_that_do_not_exist_are_counted():
