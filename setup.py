@@ -67,11 +67,17 @@ setup(
                 ),
                 *(
                     f"apps/kitsune/{part}_dump.h"
-                    for part in ("state", "ledger", "senders", "victims", "behaviour")
+                    for part in ("state", "table", "senders", "victims", "behaviour")
                 ),
                 *(
-                    f"apps/kitsune/ledger_{part}.h"
-                    for part in ("table", "rows", "counter", "behaviour", "found", "ahead", "store")
+                    f"apps/kitsune/{part}.h"
+                    for part in (
+                        *("hash_table", "packet_rows"),
+                        *(
+                            f"behaviour_{each}"
+                            for each in ("counter", "state", "findings", "prefetch", "setup")
+                        ),
+                    )
                 ),
             ],
             # the first unrolls the loops over five time scales: features and scores take 7 % less than with -O2;

@@ -5,7 +5,7 @@
  * Of training it returns sums, from which Python makes baselines; afterwards findings.
  */
 
-#include "ledger_found.h"
+#include "behaviour_findings.h"
 
 typedef struct {
     Behaviour *b;
@@ -559,7 +559,7 @@ static void take_row(Behaviour *b, const Row *row, const Keys *keys, uint16_t nu
         over(&turn, &sender, *scored);
 }
 
-#include "ledger_ahead.h"
+#include "behaviour_prefetch.h"
 
 /* ---- the interface */
 
@@ -582,6 +582,6 @@ int behaviour_add(Behaviour *b, const Row *rows, long n, long first, long last, 
     return b->failed ? -1 : 0;
 }
 
-#include "ledger_store.h"
+#include "behaviour_setup.h"
 
 #include "behaviour_dump.h"

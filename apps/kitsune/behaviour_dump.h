@@ -6,7 +6,7 @@
 #ifndef BEHAVIOUR_DUMP_H
 #define BEHAVIOUR_DUMP_H
 
-#include "ledger_dump.h"
+#include "table_dump.h"
 
 #define MOST_DUMPED_EVENTS (2 * MOST_EVENTS)
 
@@ -207,7 +207,7 @@ long behaviour_dump(Behaviour *b, uint8_t *out, long room)
     return dump_behaviour(&dump, b, 0) ? -1 : (long)dump.at;
 }
 
-/* Into a fresh ledger, which is of no use where this fails; senders are those of so many switches. */
+/* Into a fresh tracker, which is of no use where this fails; senders are those of so many switches. */
 int behaviour_load(Behaviour *b, const uint8_t *in, long size, int32_t switches)
 {
     Dump dump = dump_from(in, size);

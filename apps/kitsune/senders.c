@@ -3,7 +3,7 @@
  *     rows ──► sender ──► who is charged ──► tally of the open second ──► SenderEvent when it closes
  */
 
-#include "ledger_rows.h"
+#include "packet_rows.h"
 
 #define HISTORY_S 10
 #define BACKWARDS_S 10

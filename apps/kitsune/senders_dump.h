@@ -6,7 +6,7 @@
 #ifndef SENDERS_DUMP_H
 #define SENDERS_DUMP_H
 
-#include "ledger_dump.h"
+#include "table_dump.h"
 
 static void dump_tally(Dump *dump, Tally *tally)
 {
@@ -113,7 +113,7 @@ long senders_dump(Senders *s, uint8_t *out, long room)
     return dump_senders(&dump, s, 0) ? -1 : (long)dump.at;
 }
 
-/* Into a fresh ledger, which is of no use where this fails; senders are those of so many switches. */
+/* Into a fresh tracker, which is of no use where this fails; senders are those of so many switches. */
 int senders_load(Senders *s, const uint8_t *in, long size, int32_t switches)
 {
     Dump dump = dump_from(in, size);

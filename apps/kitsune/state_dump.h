@@ -1,4 +1,4 @@
-/* Dumps of a ledger or of the statistics: the same code measures, writes and reads, so that what is read is what was
+/* Dumps of a tracker or of the statistics: the same code measures, writes and reads, so that what is read is what was
  * written.
  *
  * A dump holds no pointers and no hashes: what finds an entry is made anew when it is read, and every number that is

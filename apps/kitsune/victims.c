@@ -1,6 +1,6 @@
-/* Columns as rows, which all ledgers read; and what of each kind of flood comes to each host: `victims.py` in C. */
+/* Columns as rows, which all trackers read; and what of each kind of flood comes to each host: `victims.py` in C. */
 
-#include "ledger_rows.h"
+#include "packet_rows.h"
 
 /* In the order of `kernel.ROW_FIELDS`. */
 typedef struct {

@@ -3,7 +3,7 @@
 #ifndef VICTIMS_DUMP_H
 #define VICTIMS_DUMP_H
 
-#include "ledger_dump.h"
+#include "table_dump.h"
 
 static void check_victims(Dump *dump, const Table *table)
 {
@@ -34,7 +34,7 @@ long victims_dump(Victims *v, uint8_t *out, long room)
     return dump_victims(&dump, v) ? -1 : (long)dump.at;
 }
 
-/* Into a fresh ledger, which is of no use where this fails. */
+/* Into a fresh tracker, which is of no use where this fails. */
 int victims_load(Victims *v, const uint8_t *in, long size)
 {
     Dump dump = dump_from(in, size);

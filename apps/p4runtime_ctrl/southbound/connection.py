@@ -24,7 +24,7 @@ from apps.p4runtime_ctrl.southbound.session import (
 from p4rt import P4RuntimeStub, p4runtime, stream_of_bytes
 
 _FIRST_PAUSE: Final = 0.05
-_DEPUTY_WAITS_S: Final = 0.5
+_BACKUP_WAITS_S: Final = 0.5
 _LONGEST_LINGER_S: Final = 0.01
 _LISTS: Final = 4
 """Most digest lists handed over at once: up to eight thousand frames, so that all parts work at the same time."""
@@ -67,7 +67,7 @@ class Connection:
         linger_s: float = 0.002,
         longest_pause_s: float = 0.2,
         active: bool = True,
-        patience_s: float = _DEPUTY_WAITS_S,
+        patience_s: float = _BACKUP_WAITS_S,
         steps_up: bool = False,
     ) -> None:
         self._address = address

@@ -50,7 +50,7 @@ class FlowResult(NamedTuple):
         return self.result.to_value() | {"exporter": self.exporter}
 
 
-class _Station:
+class _Exporter:
     """What is kept for one exporter."""
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class QueryWindows:
         self._queries: dict[str, QueryRequest] = {}
         self._outputs: dict[str, tuple[str, ...]] = {}
         """Keys of the results, by the identity of their query."""
-        self._stations: dict[str, _Station] = {}
+        self._exporters: dict[str, _Exporter] = {}
         self.left_out = 0
         """Packets beyond `most_packets`: counts of packets are too small by these."""
         self.not_kept = 0
@@ -100,8 +100,8 @@ class QueryWindows:
             if request is not None:
                 wanted[request.identity] = request
                 outputs.setdefault(request.identity, set()).add(_own(request.output))
-        for station in self._stations.values():
-            _change(station.engine, self._queries, wanted)
+        for state in self._exporters.values():
+            _change(state.engine, self._queries, wanted)
         self._queries = wanted
         self._outputs = {identity: tuple(sorted(found)) for identity, found in outputs.items()}
         return refused
@@ -114,30 +114,30 @@ class QueryWindows:
             flows: columns of `FLOW_COLUMNS`.
             now_s: s, of a clock that never goes back.
         """
-        station = self._station(exporter)
-        if station is None or not self._queries or not len(flows):
+        state = self._state_of(exporter)
+        if state is None or not self._queries or not len(flows):
             return []
         # one vote for each time of export, since hundreds of records share it
         exports = np.unique(flows["time_us"])
-        believed = station.clock.believed(exports)
+        believed = state.clock.believed(exports)
         if believed is not None:
             flows = flows.take(np.isin(flows["time_us"], exports[believed]))
-        if not len(flows) or station.clock.now is None:
+        if not len(flows) or state.clock.now is None:
             return []
-        station.heard_s = now_s
+        state.heard_s = now_s
         groups = packet_groups(self._in_time(flows))
         packets = single_packets(groups, self._most_packets)
         self.left_out += max(0, int(groups["packets"].sum(dtype=np.float64)) - len(packets))
-        horizon_us = station.clock.now - self._delay_us
-        return list(self._addressed(exporter, station.engine.process(packets, horizon_us=horizon_us)))
+        horizon_us = state.clock.now - self._delay_us
+        return list(self._addressed(exporter, state.engine.process(packets, horizon_us=horizon_us)))
 
     def advance(self, now_s: float) -> list[FlowResult]:
         """Results of windows that are over although no records come any more."""
         found: list[FlowResult] = []
-        for exporter, station in self._stations.items():
-            if station.clock.now is not None:
-                passed_us = int((now_s - station.heard_s) * 1e6)
-                over = station.engine.advance(station.clock.now + passed_us - self._delay_us)
+        for exporter, state in self._exporters.items():
+            if state.clock.now is not None:
+                passed_us = int((now_s - state.heard_s) * 1e6)
+                over = state.engine.advance(state.clock.now + passed_us - self._delay_us)
                 found += self._addressed(exporter, over)
         return found
 
@@ -145,32 +145,32 @@ class QueryWindows:
         """Results of all open windows."""
         return [
             found
-            for exporter, station in self._stations.items()
-            for found in self._addressed(exporter, station.engine.finish())
+            for exporter, state in self._exporters.items()
+            for found in self._addressed(exporter, state.engine.finish())
         ]
 
     def health(self) -> dict[str, Any]:
         """Counters since the start."""
-        stations = self._stations.values()
+        states = self._exporters.values()
         return {
             "queries": sorted(self._queries),
-            "exporters": sorted(self._stations),
-            "packets": sum(station.engine.packets for station in stations),
-            "late": sum(station.engine.late for station in stations),
-            "times_doubted": sum(station.clock.doubted for station in stations),
+            "exporters": sorted(self._exporters),
+            "packets": sum(state.engine.packets for state in states),
+            "late": sum(state.engine.late for state in states),
+            "times_doubted": sum(state.clock.doubted for state in states),
             "left_out": self.left_out,
             "not_kept": self.not_kept,
         }
 
-    def _station(self, exporter: str) -> _Station | None:
-        station = self._stations.get(exporter)
-        if station is None:
-            if len(self._stations) >= MOST_EXPORTERS:
+    def _state_of(self, exporter: str) -> _Exporter | None:
+        state = self._exporters.get(exporter)
+        if state is None:
+            if len(self._exporters) >= MOST_EXPORTERS:
                 self.not_kept += 1
                 return None
-            station = self._stations[exporter] = _Station()
-            _change(station.engine, {}, self._queries)
-        return station
+            state = self._exporters[exporter] = _Exporter()
+            _change(state.engine, {}, self._queries)
+        return state
 
     def _in_time(self, flows: RecordBatch) -> RecordBatch:
         """Flows whose first and last packet lie at most `delay_us` before their export, and not after it."""

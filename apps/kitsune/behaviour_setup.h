@@ -1,7 +1,7 @@
 /* Making and filling what `behaviour.c` works on: at the beginning, at the end of training, and from a model file. */
 
-#ifndef LEDGER_STORE_H
-#define LEDGER_STORE_H
+#ifndef BEHAVIOUR_SETUP_H
+#define BEHAVIOUR_SETUP_H
 
 void behaviour_free(Behaviour *b)
 {

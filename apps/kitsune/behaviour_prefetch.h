@@ -1,7 +1,7 @@
 /* Rows ahead of the one whose turn it is: what they will look up is fetched early, since most of it is far away in memory. */
 
-#ifndef LEDGER_AHEAD_H
-#define LEDGER_AHEAD_H
+#ifndef BEHAVIOUR_PREFETCH_H
+#define BEHAVIOUR_PREFETCH_H
 
 #define AHEAD 8
 

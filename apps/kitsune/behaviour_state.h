@@ -1,10 +1,10 @@
 /* State of `behaviour.c`, the events that it returns, and the contacts of `behaviour/contacts.py`. */
 
-#ifndef LEDGER_BEHAVIOUR_H
-#define LEDGER_BEHAVIOUR_H
+#ifndef BEHAVIOUR_STATE_H
+#define BEHAVIOUR_STATE_H
 
-#include "ledger_counter.h"
-#include "ledger_rows.h"
+#include "behaviour_counter.h"
+#include "packet_rows.h"
 
 #define MOST_BLOCKS 64
 #define NO_SERVICE (-1)

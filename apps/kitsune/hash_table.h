@@ -1,11 +1,11 @@
-/* Hash tables of the ledgers: keys of six words, entries in order of insertion, numbers that stay while they live.
+/* Hash tables of the trackers: keys of six words, entries in order of insertion, numbers that stay while they live.
  *
  * Slots are probed one after the other and hold the hash beside the number, so that who looks for a key that is not
- * there reads no entry.  Tables of one ledger share a seed, so that a key is hashed once for all of them.
+ * there reads no entry.  Tables of one tracker share a seed, so that a key is hashed once for all of them.
  */
 
-#ifndef LEDGER_TABLE_H
-#define LEDGER_TABLE_H
+#ifndef HASH_TABLE_H
+#define HASH_TABLE_H
 
 #include <stdint.h>
 #include <stdlib.h>

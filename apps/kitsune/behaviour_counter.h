@@ -1,9 +1,9 @@
 /* Sliding sums, the weight of what is above training, and what was reported: `baseline.py` and `findings.py` in C. */
 
-#ifndef LEDGER_COUNTER_H
-#define LEDGER_COUNTER_H
+#ifndef BEHAVIOUR_COUNTER_H
+#define BEHAVIOUR_COUNTER_H
 
-#include "ledger_table.h"
+#include "hash_table.h"
 #include <math.h>
 
 #define MOST_WINDOWS 4

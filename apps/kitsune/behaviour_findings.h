@@ -1,9 +1,9 @@
 /* Addresses inside, kinds, and how `behaviour.c` counts, teaches and tells. */
 
-#ifndef LEDGER_FOUND_H
-#define LEDGER_FOUND_H
+#ifndef BEHAVIOUR_FINDINGS_H
+#define BEHAVIOUR_FINDINGS_H
 
-#include "ledger_behaviour.h"
+#include "behaviour_state.h"
 
 static int is_inside(Address address)
 {

@@ -1,9 +1,9 @@
 /* Packets as rows, with the meaning that `behaviour/rows.py` gives them, and what their keys are; blocks in force. */
 
-#ifndef LEDGER_ROWS_H
-#define LEDGER_ROWS_H
+#ifndef PACKET_ROWS_H
+#define PACKET_ROWS_H
 
-#include "ledger_table.h"
+#include "hash_table.h"
 #include <math.h>
 
 #define ECHO (1LL << 24)
@@ -28,7 +28,7 @@ typedef struct {
     uint8_t version;
 } Address;
 
-/* Made of columns once for all ledgers, by `rows_read`. */
+/* Made of columns once for all trackers, by `rows_read`. */
 typedef struct {
     double time;
     int64_t second;

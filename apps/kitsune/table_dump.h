@@ -1,9 +1,9 @@
-/* Tables of the ledgers as bytes, and back: entries keep their numbers and their order.  See `state_dump.h`. */
+/* Tables of the trackers as bytes, and back: entries keep their numbers and their order.  See `state_dump.h`. */
 
-#ifndef LEDGER_DUMP_H
-#define LEDGER_DUMP_H
+#ifndef TABLE_DUMP_H
+#define TABLE_DUMP_H
 
-#include "ledger_rows.h"
+#include "packet_rows.h"
 #include "state_dump.h"
 
 typedef void (*DumpPayload)(Dump *, void *context, void *payload);
