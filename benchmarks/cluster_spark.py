@@ -35,6 +35,8 @@ _STATE_S: Final = 0.5
 """Between two states of a switch; the controller writes one a second."""
 _SWITCHES: Final = 8
 _MOST_TIMED: Final = 3
+_MEMORY: Final = "1g"
+"""Of each executor where time is taken, as Spark has it by default."""
 _NOTE: Final = (
     "a core for each worker; on a machine of two cores workers, driver, Kafka and HDFS share them, "
     "so that 2 cannot be reached"
@@ -55,7 +57,7 @@ def figures(rounds: int, scale: float, end: float) -> dict[str, Any]:
         found = {"spark_equal_queries": len(names), "spark_queries": names}
         if time.monotonic() >= end:
             return found
-        with SparkStage(folder / "timed") as stage:
+        with SparkStage(folder / "timed", memory=_MEMORY) as stage:
             return found | _speed(stage, min(rounds, _MOST_TIMED), scale)
 
 

@@ -28,7 +28,6 @@ def main(path: str) -> int:
         pattern=settings["packets"],
         clocks=SWITCHES,
         group=APP,
-        at_once=1 << 20,
     )
     found = list(requests(settings["queries"]).values())
     job = WindowJob(

@@ -36,13 +36,14 @@ class SparkStage:
     Args:
         folder: for data, logs and settings.
         workers: of Spark, with a core each.
+        memory: of the executor on each worker.
     """
 
-    def __init__(self, folder: Path, workers: int = 2) -> None:
+    def __init__(self, folder: Path, workers: int = 2, memory: str = "512m") -> None:
         self.folder = folder
         self.kafka = KafkaServers(folder / "kafka")
         self.hdfs = HdfsServer(folder / "hdfs")
-        self.cluster = SparkCluster(folder / "spark", workers)
+        self.cluster = SparkCluster(folder / "spark", workers, memory)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
