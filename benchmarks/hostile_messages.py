@@ -276,6 +276,7 @@ TARGETS = (
     ),
     _target("kitsune", "network.packets.p4runtime_ctrl.s1.all", kitsune.packets_in, _PACKETS),
     _target("kitsune", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
+    _target("controller", _SWITCH_KEY, controller.told_in, STATE),
     _target("controller", "network.block.firewall.ipv4", Decision.from_item, DECISION.to_value()),
     _target("controller", "network.p4_command.app.s1", command_and_requests_in, _COMMAND.to_value()),
     _target("controller", "network.telemetry.firewall.q1", controller.offer_in, _OFFER.to_value()),

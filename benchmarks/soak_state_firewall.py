@@ -41,7 +41,7 @@ _TICKS: Final = 4
 """A second; a tick looks at clocks, and finds the same whether it comes every 50 ms or more seldom."""
 
 
-class FirewallRun:
+class FirewallHours:
     """The service and its surroundings.
 
     Args:
@@ -172,6 +172,6 @@ def figures(scale: float = 1.0, *, objects: bool = False) -> dict[str, Any]:
     """
     recording, hours = recorded(PACKETS), scale * HOURS
     with tempfile.TemporaryDirectory(prefix="soak-state-") as folder:
-        run = FirewallRun(recording, Path(folder))
+        run = FirewallHours(recording, Path(folder))
         found = watched(run.hours(hours), hours, run.health, objects=objects)
     return {**found, "messages_per_hour": round(len(recording.messages) * 3600 / recording.seconds)}

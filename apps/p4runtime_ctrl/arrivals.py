@@ -55,7 +55,10 @@ class FramesToSend(msgspec.Struct, frozen=True):
 def told_in(item: Item) -> SwitchTold:
     """`network.switch.p4runtime_ctrl.<switch>`: of another instance of this app."""
     sender_of(item)
-    return SwitchTold.from_value(item.value)
+    told = SwitchTold.from_value(item.value)
+    if item.key.rpartition(".")[2] != told.switch:
+        raise MessageError("fields", f"{item.key}: its value names switch {told.switch!r}")
+    return told
 
 
 def offer_in(item: Item) -> tuple[str, Offer]:

@@ -198,7 +198,7 @@ def _dotted(at: config_lines.Path) -> str:
 def _meant(at: config_lines.Path) -> str:
     """The most similar name, and other sections that have the name."""
     names = list(_names_at(at[:-1]))
-    near = difflib.get_close_matches(str(at[-1]), names, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(at[-1]), names, n=1)
     if near:
         return f"; did you mean {near[0]}?"
     elsewhere = [_dotted(path) for path, _ in option_paths() if path[-1] == at[-1]]

@@ -1,6 +1,6 @@
 """When the counters of blocks are read."""
 
-from apps.p4runtime_ctrl import worker
+from apps.p4runtime_ctrl import counter_reads, worker
 from apps.p4runtime_ctrl.settings import Settings
 from sdnator.testing.product_program import program
 from sdnator.testing.waiting import wait_for
@@ -23,7 +23,7 @@ class Read(Held):
 
 
 def test_decisions_that_follow_each_other_are_counted_together(monkeypatch):
-    monkeypatch.setattr(worker, "_CALM_S", 3600.0)
+    monkeypatch.setattr(counter_reads, "_CALM_S", 3600.0)
     engine, switch = Written(), Read()
     settings = Settings(switches=(MINE,), program="", p4info="", restore=False)
     one = worker.SwitchWorker(engine, settings, MINE, program(), Connected)
@@ -36,7 +36,7 @@ def test_decisions_that_follow_each_other_are_counted_together(monkeypatch):
         one.decide(decision(number, address=f"10.0.0.{number}"))
     wait_for(lambda: ("d5", "installed") in engine.confirmed(), 60)
     assert switch.readings == 1
-    monkeypatch.setattr(worker, "_CALM_S", 0.0)
+    monkeypatch.setattr(counter_reads, "_CALM_S", 0.0)
     everything = {f"d{number}" for number in range(1, 6)}
     wait_for(lambda: one.tick() or set(engine.counted()) == everything, 60)
     one.stop()
