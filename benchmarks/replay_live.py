@@ -1,7 +1,7 @@
 """The highest rate at which `sdnator up` forwards and scores every packet: the part `live` of `benchmarks.replay`.
 
 live_pps_lossless: `sdnator up` with its default settings on two veth interfaces, all apps running and Kitsune trained,
-  under an office's traffic both ways.  A rate holds where every frame that was offered came out at the other end (by
+  under an office's traffic both ways, but for the SYNs that open connections (`office_lap` says why).  A rate holds where every frame that was offered came out at the other end (by
   the kernel's counters in the hosts' namespaces), no app says that it lost anything, and Kitsune has scored as many
   packets, the last of them at most LAG_S after the load; it has one retry.  Rates are found by bisection, and
   the figure is one that then held for `CONFIRM_S`.  0.0: none.
