@@ -361,5 +361,12 @@ def _reason(
 ) -> str:
     shares = [(nats, each) for nats, each in tally.shares(now, bound) if nats > 0]
     parts = [f"{each.latest.text} ({nats:.1f})" for nats, each in shares[:_PARTS_SHOWN]]
-    before = f", {offence.nats:.1f} of it because {offence.text}" if offence is not None else ""
+    before = ""
+    if offence is not None:
+        # on probation so little is needed that the past has nothing left to add
+        before = (
+            f", {offence.nats:.1f} of it because {offence.text}"
+            if offence.nats >= 0.05
+            else f", and {offence.text}"
+        )
     return f"evidence of {total:.1f} nats, {needed:.1f} needed{before}: " + "; ".join(parts)

@@ -222,6 +222,19 @@ def test_what_must_come_from_now_is_the_bound_without_two_nats_for_each_earlier_
     assert bool(on.written(f"{OWN}.offence")) is (blocked and times > 0)
 
 
+def test_on_probation_the_earlier_block_is_told_though_it_adds_nothing():
+    """So little is needed then that all of it must come from now."""
+    on = desk()
+    hear(on, evidence(20.0, AT))
+    (first,) = on.decisions
+    on.engine.archived.append(
+        Item("network.block.firewall.mac", first.to_value(), NOW, NOW, "firewall", "i1", 1)
+    )
+    hear(on, evidence(6.0, AT + 700))
+    again = on.decisions[-1].reason
+    assert again.startswith(f"evidence of 6.0 nats, 5.0 needed, and {CAMERA.mac} has 1 earlier block: ")
+
+
 def test_an_archive_that_does_not_answer_knows_no_offence():
     engine = FakeEngine()
     engine.archive_away = True
