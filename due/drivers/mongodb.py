@@ -140,7 +140,7 @@ class MongoArchive:
             raise BackendError(f"archive {self.shown} is closed")
         with self._lock:
             if self._client is None or self._pid != os.getpid():
-                self._client, self._pid, self._spans = MongoClient(self._url), os.getpid(), {}
+                self._client, self._pid, self._spans = client_of(self._url), os.getpid(), {}
                 self._make_indexes(self._client[self._database][self._collection + self._ending])
             return self._client[self._database][name]
 
@@ -448,3 +448,15 @@ def _key_range(named: Sequence[Condition]) -> Document:
 def _short(error: Exception) -> str:
     text = str(error)
     return text if len(text) <= 200 else text[:200] + " …"
+
+
+def client_of(url: str) -> MongoClient[Document]:
+    """A client whose writes are acknowledged by a majority of a replica set, unless the URL says another `w`.
+
+    What a producer was told is stored then survives the primary's death; a single server is its own majority.
+
+    Args:
+        url: with the options of MongoDB's connection strings.
+    """
+    says_so = any(name.lower() == "w" for name, _ in parse_qsl(urlsplit(url).query))
+    return MongoClient(url) if says_so else MongoClient(url, w="majority")

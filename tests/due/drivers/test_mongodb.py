@@ -165,3 +165,14 @@ def test_keys_go_a_while_after_their_last_document_and_come_back(
     assert {key["_id"] for key in keys.find({})} == {"stays"}
     archive.insert(items(3, key="gone", start=10))
     assert len(archive.find({"dataKey": "gone"})) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "concern"),
+    [("", {"w": "majority"}), ("?w=1", {"w": 1}), ("?replicaSet=r&W=2&journal=true", {"w": 2, "j": True})],
+)
+def test_writes_wait_for_a_majority_unless_the_url_says_otherwise(
+    options: str, concern: dict[str, object]
+) -> None:
+    with mongodb.client_of(f"mongodb://127.0.0.1:1/due{options}") as client:
+        assert client.write_concern.document == concern
