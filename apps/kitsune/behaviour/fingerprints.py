@@ -12,6 +12,7 @@ Source: Antonakakis et al., Understanding the Mirai Botnet, USENIX Security 2017
 """
 
 import math
+from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Any, Final
@@ -105,8 +106,8 @@ class SynFingerprints:
         times = self._times.setdefault(sender, [])
         self._times.move_to_end(sender)
         _append(times, time)
-        within = [each for each in times if each >= time - HALF_LIFE_S]
-        return len(within), min(within)
+        first = bisect_left(times, times[-1] - HALF_LIFE_S)
+        return len(times) - first, times[first]
 
     def _forget_silent(self, time: float) -> None:
         """Who was silent for ten minutes, a few at a time, and who is one too many."""
@@ -137,6 +138,8 @@ class SynFingerprints:
 
 
 def _append(times: list[float], time: float) -> None:
-    times.append(time)
+    times.append(
+        time if not times or time > times[-1] else times[-1]
+    )  # two ports may deliver in another order
     if len(times) > MOST_EVENTS:
         del times[: MOST_EVENTS // 4]
