@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks.worker import end_in_order
 from dataplane.bmv2 import ending_with_us
 from sdnator.errors import PipelineError
 from sdnator.network_namespaces import inside
@@ -156,12 +157,7 @@ class UpProcess:
         raise PipelineError(f"no pipeline: {self._log.read_text(encoding='utf-8')[-2000:]}")
 
     def _end(self) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(60)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_in_order(self._process)
 
     def health(self) -> Mapping[str, Any]:
         """What the apps last told the Coordinator, by app."""

@@ -35,6 +35,7 @@ from benchmarks.soak_figures import figures, lost_in
 from benchmarks.soak_fill import PAIRS, TRAINED, fill_frames, fullness
 from benchmarks.soak_memory import folder_bytes, footprints
 from benchmarks.soak_traffic import LATE_S, OfficeLoad
+from benchmarks.worker import end_in_order
 from sdnator.capture.interfaces import VethPair
 from sdnator.errors import PipelineError
 from sdnator.northbound import ask
@@ -109,12 +110,7 @@ class SoakRun:
         self._stack.callback(self._end_up)
 
     def _end_up(self) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(60)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_in_order(self._process)
 
     def _running(self) -> running.Running:
         deadline = time.monotonic() + _START_S

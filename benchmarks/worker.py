@@ -2,13 +2,15 @@
 
 import multiprocessing
 import os
+import subprocess
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any
+from typing import Any, Final
 
 from due.drivers.embedded_redis import die_with_parent
 
+_END_S: Final = 60
 _spawn = multiprocessing.get_context("spawn")
 
 
@@ -26,3 +28,13 @@ def _run(parent: int, target: Callable[..., None], pipe: Connection, *arguments:
     if os.getppid() != parent:  # it was gone before we asked to be told
         return
     target(pipe, *arguments)
+
+
+def end_in_order(process: "subprocess.Popen[Any]") -> None:
+    """Ask a program to end, and kill it where it still runs after a minute."""
+    process.terminate()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
