@@ -7,9 +7,8 @@ import logging
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -26,7 +25,6 @@ from apps.firewall.enforcement.announcer import EVENTS, Announcer
 from apps.firewall.enforcement.declared_enforcers import DeclaredEnforcers
 from apps.firewall.enforcement.event_sink import event_sinks
 from apps.firewall.enforcement.mirrors import Mirrors
-from apps.firewall.enforcement.storing import StoredAnswers
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
@@ -37,11 +35,12 @@ from apps.firewall.evidence.own_evidence import EVIDENCE_CAPABILITY, OWN_APP, Ow
 from apps.firewall.evidence.writing_order import WritingOrder
 from apps.firewall.evidence_handler import EvidenceHandler
 from apps.firewall.incidents.incident_reports import INCIDENT_CAPABILITY, IncidentReports
+from apps.firewall.instruction_handler import InstructionHandler
 from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider
 from apps.firewall.policy.false_alarms import FalseAlarms
-from apps.firewall.policy.instructions import Desk, refused_as_foreign, refused_as_late
+from apps.firewall.policy.instructions import Desk
 from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.settings import Settings
 from apps.firewall.syn.flood_handler import TELEMETRY, FloodHandler
@@ -50,7 +49,6 @@ from apps.firewall.syn.suspect_samples import SuspectSamples
 from apps.firewall.syn.syn_defence import EVERY_SWITCH
 from apps.messages import (
     Alert,
-    Answer,
     Confirmation,
     Decision,
     Instruction,
@@ -61,7 +59,7 @@ from apps.messages import (
     one_line,
 )
 from apps.packets import SteadyTime
-from due import Capability, DueError, Engine, Interest, Item, Key, RecordBatch
+from due import Capability, Engine, Interest, Item, Key, RecordBatch
 
 KITSUNES_EVIDENCE = f"{EVIDENCE}.kitsune.*"
 SAMPLES = "network.packets.p4runtime_ctrl.*"
@@ -108,9 +106,6 @@ COMMAND = "network.p4_command.firewall"
 MOST_SWITCHES = 256
 STEP_S = 3600
 """Seconds; a larger jump of capture time is not accepted at once."""
-ARCHIVED_WORD_S = 2.0
-CLOCKS_DIFFER_NS = 2 * 3600 * 1_000_000_000
-PANICS = {"dataKey": history.INSTRUCTIONS, "value.verb": "panic"}
 
 T = TypeVar("T")
 
@@ -194,10 +189,19 @@ class FirewallService:
             self._switches,
             self._publish,
         )
-        self._stored = StoredAnswers(engine, threading.Lock())
-        self._panics: deque[str] = deque(maxlen=1000)
-        """Ids of archived panics that were carried out."""
-        self._words_since = time.time_ns()
+        self._instructions = InstructionHandler(
+            engine,
+            self._desk,
+            self._past,
+            self._archive,
+            self._lessons,
+            self._handler,
+            self._intake,
+            self._lock,
+            self._publish,
+            self._tell_allowed,
+            lambda: self._now,
+        )
         self._time = SteadyTime(STEP_S * 1_000_000_000)
         """Capture time last reported by the switches, ns."""
         self._row_time = SteadyTime(STEP_S * 1_000_000)
@@ -229,8 +233,8 @@ class FirewallService:
             if enforcer != SWITCHES:
                 self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
-        self._answer_earlier()
-        self._hear(history.INSTRUCTIONS, Instruction.from_item, self._on_instruction)
+        self._instructions.answer_earlier()
+        self._hear(history.INSTRUCTIONS, Instruction.from_item, self._instructions.instruct)
         if self._settings.detect:
             self._hear_tcp()
         if self._settings.detect and self._settings.arp != "off":
@@ -257,9 +261,7 @@ class FirewallService:
 
     def _take_up_history(self) -> None:
         """Restore what was in force before a restart, as it still is in the switch."""
-        self._stored.take_up(self._past.answered())
-        self._desk.take_up(history.carried_out(self._past.instructions(), self._stored.carried_out()))
-        self._panics.extend(self._past.panics())
+        self._instructions.restore()
         standing = self._past.standing()
         self._lifecycle.restore(standing)
         self._syn.restore(standing)
@@ -290,8 +292,8 @@ class FirewallService:
             for switch in self._switches if updates else ():
                 self._command(switch, updates)
             self._say_notices()
-        self._answer_earlier()
-        self._read_archived_words()
+        self._instructions.answer_earlier()
+        self._instructions.read_archived_words()
         self._announcer.check()
 
     def stop(self) -> None:
@@ -313,7 +315,7 @@ class FirewallService:
             "rate_limits": len(self._limits.standing),
             "rate_limits_refused": self._limits.refused,
             "known_sources": len(self._known),
-            "allowed": len(self._desk.entries),
+            **self._instructions.health(),
             "false_alarms": len(self._lessons),
             "allowed_left_out": self._allow_entries.left_out,
             "refused_by_cap": self._lifecycle.refused,
@@ -321,7 +323,6 @@ class FirewallService:
             "stopped_by": self._lifecycle.stopped,
             "evidence_missed": self._order.missed,
             "evidence_sums": len(self._handler.decider.test),
-            "answers_unstored": self._stored.unstored,
             **self._archive.health(),
             "times_doubted": self._time.doubted + self._row_time.doubted,
             **self._incidents.health(),
@@ -329,73 +330,6 @@ class FirewallService:
             **self._enforcers.health(),
             **self._announcer.health(),
         }
-
-    # -- instructions -------------------------------------------------------------------------------
-
-    def _on_instruction(self, item: Item, instruction: Instruction) -> None:
-        self._answer_earlier()
-        self._answer(item, instruction)
-
-    def _answer(self, item: Item, instruction: Instruction) -> None:
-        with self._lock:
-            again = instruction.id in self._stored
-            answer = self._stored.given(instruction.id) if again else self._carry_out(instruction, item)
-        if answer is not None:
-            answer, key = answer if again else self._stored.checked(answer), history.answer_key(item.key)
-            self._engine.write(key, answer.to_value(), [due.NO_WAIT])
-            # once this returns, those who sent the instruction need not send it again
-            self._stored.keep(answer)
-
-    def _answer_earlier(self) -> None:
-        """What an earlier run received, but did not answer, or answered without being heard."""
-        with self._stored.catching_up() as now:
-            if not now:
-                return
-            with suppress(DueError):
-                self._engine.flush(ARCHIVED_WORD_S)  # what was refused until now was promised to nobody
-            self._enforcers.tell_allowed(self._desk.entries)
-            self._stored.take_up(self._past.answered())
-            for key, answer in self._past.recent_answers():
-                self._engine.write(key, answer.to_value(), [due.PUB_ONLY, due.NO_WAIT])
-            for item, instruction in self._past.unanswered(self._stored):
-                self._answer(item, instruction)
-
-    def _carry_out(self, instruction: Instruction, item: Item) -> Answer:
-        summary = f"{instruction.verb} {instruction.subject}: {instruction.reason}"
-        evidence = evidence_of(item, summary)
-        self._stored.began(instruction.id)
-        early = (
-            self._desk.decided_before(instruction, evidence)
-            or refused_as_late(instruction, time.time_ns())
-            or refused_as_foreign(instruction, item.app_id)
-        )
-        if early is not None:
-            return early
-        decisions, answer = self._desk.carry_out(instruction, evidence, self._now or evidence.timestamp)
-        for decision in decisions:
-            self._publish(decision)
-        for lesson in self._lessons.told():
-            self._handler.learnt(lesson)
-            self._engine.write(history.lesson_key(lesson), lesson.to_value(), [due.NO_WAIT])
-        updates = self._allow_entries.change(self._desk.entries)
-        for switch in self._switches if updates else ():
-            self._keep(switch, updates)
-        self._enforcers.tell_allowed(self._desk.entries)
-        return answer
-
-    def _read_archived_words(self) -> None:
-        """A `blocks panic` while Data Updates were unreachable is in the archive only."""
-        # the writer's clock may be behind ours, or ours may have been set back
-        items = self._archive.look(PANICS, self._words_since - CLOCKS_DIFFER_NS, ARCHIVED_WORD_S)
-        with self._lock:
-            for item in items:
-                self._words_since = max(self._words_since, min(item.timestamp, time.time_ns()))
-                said = self._intake.read(history.INSTRUCTIONS, Instruction.from_item, item)
-                if said is None or said.id in self._panics:
-                    continue
-                self._panics.append(said.id)
-                if said.verb == "panic" and said.id not in self._stored:
-                    self._carry_out(said, item)
 
     # -- SYN floods ---------------------------------------------------------------------------
 
@@ -469,6 +403,12 @@ class FirewallService:
         self._engine.write(f"{JUDGED}.firewall", judged.to_value(), [due.NO_WAIT], event_time=at)
 
     # -- switches -----------------------------------------------------------------------------
+
+    def _tell_allowed(self) -> None:
+        updates = self._allow_entries.change(self._desk.entries)
+        for switch in self._switches if updates else ():
+            self._keep(switch, updates)
+        self._enforcers.tell_allowed(self._desk.entries)
 
     def _keep(self, switch: str, updates: Iterable[TableUpdate], name: str = "") -> None:
         """Write entries that outlive the controller."""

@@ -181,7 +181,7 @@ def test_prefix_block_by_hand_lives_and_dies_as_a_command():
 @pytest.mark.parametrize("clock_s", [1, -3600])
 def test_panic_in_the_archive_is_carried_out(monkeypatch, clock_s):
     """Once: said while Data Updates were away, be it after the wall clock was set back by an hour."""
-    monkeypatch.setattr("apps.firewall.service.ARCHIVED_WORD_S", 0.0)
+    monkeypatch.setattr("apps.firewall.instruction_handler.ARCHIVED_WORD_S", 0.0)
     desk = Desk()
     desk.hand(
         INSTRUCTION, Instruction(id="a", verb="block", subject="192.0.2.1").to_value(), pattern=INSTRUCTIONS
