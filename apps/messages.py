@@ -103,8 +103,8 @@ def sender_of(item: Item) -> str:
     return item.app_id
 
 
-def youngest(engine: Engine, query: Mapping[str, Any], since: int, most: int) -> list[Item]:
-    """Read the youngest matching items from the archive, page by page.
+def read_latest(engine: Engine, query: Mapping[str, Any], since: int, most: int) -> list[Item]:
+    """Read the latest matching items from the archive, page by page.
 
     Args:
         engine: of the app that asks.

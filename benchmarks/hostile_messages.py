@@ -14,7 +14,7 @@ from apps.evidence import Evidence, TrainingState
 from apps.firewall import arrivals as firewall
 from apps.incidents import Incident
 from apps.kitsune import service as kitsune
-from apps.kitsune.model_orders import ModelOrder, order_in
+from apps.kitsune.model_instructions import ModelInstruction, instruction_in
 from apps.messages import (
     Alert,
     Answer,
@@ -226,8 +226,8 @@ TARGETS = (
     _target(
         "kitsune",
         "network.instruction.operator.kitsune",
-        order_in,
-        ModelOrder(id="o1", verb="retrain").to_value(),
+        instruction_in,
+        ModelInstruction(id="o1", verb="retrain").to_value(),
     ),
     DecoderTarget(
         "webhook answer", answer_in, (MessageError,), (b'{"state": "installed", "cause": ""}',), mutate_text

@@ -16,7 +16,7 @@ from typing import Any, Final
 from benchmarks.soak_slope import slope
 from due import Assignment, Capability, Item, Key, Options
 from due.codec import decode_value, encode_value
-from due.drivers.redis_streams import StreamLedger
+from due.drivers.redis_streams import SendWindow
 from due.drivers.sqlite import SqliteArchive
 
 START_NS: Final = 1_700_000_000_000_000_000
@@ -104,7 +104,7 @@ class FastEngine:
         self._reliable = [Key.parse(one.key) for one in capabilities if one.delivery == "reliable"]
         self._observed: list[Observed] = []
         self._routes: dict[str, list[Observed]] = {}
-        self._ledgers: dict[str, StreamLedger | None] = {}
+        self._windows: dict[str, SendWindow | None] = {}
         self._numbers: Counter[str] = Counter()
         self._waiting: list[Item] = []
         self.archived: tuple[str, ...] = ()
@@ -133,15 +133,15 @@ class FastEngine:
             return False
         path = key.partition(":")[0]
         self._numbers[key] += 1
-        if path not in self._ledgers:
+        if path not in self._windows:
             kept = any(pattern.matches_path(path) for pattern in self._reliable)
-            self._ledgers[path] = StreamLedger(path, _WINDOW, _RETAIN, 30.0) if kept else None
-        ledger = self._ledgers[path]
-        if ledger is not None:
-            entry = ledger.add(payload)
+            self._windows[path] = SendWindow(path, _WINDOW, _RETAIN, 30.0) if kept else None
+        window = self._windows[path]
+        if window is not None:
+            entry = window.add(payload)
             entry.id = (self._clock.time_ns() // 1_000_000, self._numbers[key])
-            ledger.acknowledged(entry.id)
-            ledger.trim_point(sum(each is not None for each in self._ledgers.values()))
+            window.acknowledged(entry.id)
+            window.trim_point(sum(each is not None for each in self._windows.values()))
         if self.archived and key.startswith(self.archived):
             self._waiting.append(self._item(key, decode_value(payload), event_time, self.app_id))
             if len(self._waiting) >= _ARCHIVE_AT:
@@ -178,14 +178,14 @@ class FastEngine:
     @property
     def retained_bytes(self) -> int:
         """What a producer keeps of what it has written, for a server that comes back empty."""
-        ledgers = [each for each in self._ledgers.values() if each is not None]
-        return sum(entry.size for ledger in ledgers for entry in ledger.retained)
+        windows = [each for each in self._windows.values() if each is not None]
+        return sum(entry.size for window in windows for entry in window.retained)
 
     def retained(self) -> dict[str, int]:
         """The same in kB by path, the largest first."""
         found = {
             path: sum(entry.size for entry in each.retained) >> 10
-            for path, each in self._ledgers.items()
+            for path, each in self._windows.items()
             if each is not None
         }
         return dict(sorted(found.items(), key=lambda pair: -pair[1]))

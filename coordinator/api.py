@@ -343,7 +343,7 @@ class _Handlers:
             await run_in_threadpool(subscription.dispose)
 
     def _answer(self, query: dict[str, Any], request: Request) -> Response:
-        """The youngest `limit` items, oldest first; `since` and `until` are ns.
+        """The latest `limit` items, oldest first; `since` and `until` are ns.
 
         Searches the last minute first and goes back until there are enough: the archive may be large.
         """
@@ -377,7 +377,7 @@ class _Handlers:
 
 
 def _shown(items: Sequence[Item]) -> Iterator[bytes]:
-    """Items as JSON, youngest first, as many as fit into an answer."""
+    """Items as JSON, newest first, as many as fit into an answer."""
     size = 0
     for item in reversed(items):
         text = JSONResponse(views.item(item)).body

@@ -80,7 +80,7 @@ class Engine:
         self._session: Session | None = None
         self._broken: Session | None = None
         """The session after one of its threads died, until `close`."""
-        self._outlets: dict[str, KeyWriter] = {}
+        self._writers: dict[str, KeyWriter] = {}
         self._lock = threading.RLock()
         self.when_failed: Callable[[], None] = lambda: None
         """Called by a thread that dies; `due.service` ends the process."""
@@ -218,7 +218,7 @@ class Engine:
             NotInitialised: called before `init` or after `close`.
             EngineFailed: a thread of the engine has died.
         """
-        outlet = self._outlets.get(key) or self._outlet(key)
+        writer = self._writers.get(key) or self._writer(key)
         now = time.time_ns()
         bits = 0
         for flag in flags:
@@ -229,19 +229,21 @@ class Engine:
         if event_time is not None:
             event_time = checked_time(event_time)
         session = self._session or self._require()
-        if awake_ns() > session.keeper.alive_until:
-            session.keeper.check_pause()
-        with outlet.lock:
-            if outlet.fast:
+        if awake_ns() > session.heartbeats.alive_until:
+            session.heartbeats.check_pause()
+        with writer.lock:
+            if writer.fast:
                 if bits >= _NO_WAIT:
-                    outlet.put(value, mode, event_time, now, stays=False)
-                    outlet.cut()
+                    writer.put(value, mode, event_time, now, stays=False)
+                    writer.cut()
                 else:
-                    outlet.put(value, mode, event_time, now)
+                    writer.put(value, mode, event_time, now)
                 return True
-            if not outlet.retired:
-                return session.gate.write(outlet, (freeze(value), mode, bits >= _NO_WAIT, event_time, now))
-        self._outlets.pop(key, None)
+            if not writer.retired:
+                return session.admission.write(
+                    writer, (freeze(value), mode, bits >= _NO_WAIT, event_time, now)
+                )
+        self._writers.pop(key, None)
         return self.write(key, value, (bits,), event_time=event_time)
 
     def flush(self, timeout: float = _FLUSH_SECONDS) -> None:
@@ -296,7 +298,7 @@ class Engine:
             NotInitialised: called before `init` or after `close`.
         """
         session = self._require()
-        if not session.keeper.member.registration.consumer:
+        if not session.heartbeats.member.registration.consumer:
             raise NotAllowed(f"observe({key!r}): init was not given the role CONSUMER")
         return Observation(Key.parse(key), frequency, _start_id(since), session.opened, session.closed)
 
@@ -373,7 +375,7 @@ class Engine:
         Raises:
             NotInitialised: called before `init` or after `close`.
         """
-        return self._require().keeper.named_here()
+        return self._require().heartbeats.named_here()
 
     def offer_shards(self, names: Iterable[str]) -> None:
         """Say which of the shards named in `init` this instance can work on; without a call, all of them.
@@ -389,7 +391,7 @@ class Engine:
         session = self._require()
         if not set(offered) <= set(self._shards):
             raise InvalidOption(f"offer_shards({list(offered)!r}): init was given {list(self._shards)!r}")
-        session.keeper.offer(offered)
+        session.heartbeats.offer(offered)
 
     def on_assignments(self, callback: AssignmentCallback) -> None:
         """Call back whenever this app's assignments change, and once immediately.
@@ -405,7 +407,7 @@ class Engine:
         Returns:
             One per capability and matching interest; empty while nobody wants anything.
         """
-        return self._require().keeper.member.assignments
+        return self._require().heartbeats.member.assignments
 
     def wanted(self, key: str) -> bool:
         """Ask whether anybody wants what a key names.
@@ -419,9 +421,9 @@ class Engine:
         Raises:
             InvalidKey: the key breaks the grammar.
         """
-        keeper = self._require().keeper
-        with keeper.lock:
-            return keeper.member.wanted(Key.parse(key))
+        heartbeats = self._require().heartbeats
+        with heartbeats.lock:
+            return heartbeats.member.wanted(Key.parse(key))
 
     def set_aside(self) -> list[tuple[Item, str]]:
         """Items of reliable keys on which this app's callbacks kept failing.
@@ -451,7 +453,7 @@ class Engine:
         with self._lock:
             session = self._session or self._broken
             self._session = self._broken = self._registration = None
-            self._outlets = {}
+            self._writers = {}
         if session is not None:
             session.close()
 
@@ -462,7 +464,7 @@ class Engine:
         """
         _inherited.extend(session for session in (self._session, self._broken) if session is not None)
         self._session = self._broken = None
-        self._outlets = {}
+        self._writers = {}
         self._lock = threading.RLock()
 
     def _before_init(self, what: str) -> None:
@@ -489,7 +491,7 @@ class Engine:
         """A thread has died: hide the session from all calls.  No lock: a waiting thread may hold it."""
         if self._session is not None and self._session.failure is error:
             self._broken, self._session = self._session, None
-            self._outlets = {}
+            self._writers = {}
             self.when_failed()
 
     def _require(self) -> Session:
@@ -506,20 +508,20 @@ class Engine:
             raise NotInitialised("the engine is not initialised: call init(app_id, role) first")
         return session
 
-    def _outlet(self, text: str) -> KeyWriter:
+    def _writer(self, text: str) -> KeyWriter:
         session = self._require()
         key = Key.parse(text)
         if not key.concrete:
             at = max(text.find("*"), 0)
             raise InvalidKey(text, at, "items are written under concrete keys, without wildcards and lists")
-        if not session.keeper.member.registration.producer:
+        if not session.heartbeats.member.registration.producer:
             raise NotAllowed(f"write({text!r}): init was not given the role PRODUCER")
         retirements = session.retirements
-        outlet = session.outlet(key)
+        writer = session.writer(key)
         if session.retirements != retirements:
-            self._outlets = {}
-        self._outlets[text] = outlet
-        return outlet
+            self._writers = {}
+        self._writers[text] = writer
+        return writer
 
 
 def _checked_shards(shards: tuple[str, ...], instances: Instances) -> tuple[str, ...]:

@@ -115,7 +115,7 @@ class HeartbeatThread:
         self._heard = 0
         self._errors = LogLimit(log)
         self._closed = False
-        self._thread = LoudThread("due-keeper", self._run, failed)
+        self._thread = LoudThread("due-heartbeat", self._run, failed)
 
     def start(self) -> None:
         """Register and begin."""

@@ -27,17 +27,17 @@ class Liveness:
     """Asks the dispatcher and watches the other threads.  Thread-safe."""
 
     def __init__(
-        self, dispatcher: Dispatcher, keeper: HeartbeatThread, archiver: Callable[[], Archiver | None]
+        self, dispatcher: Dispatcher, heartbeats: HeartbeatThread, archiver: Callable[[], Archiver | None]
     ) -> None:
         self._dispatcher = dispatcher
-        self._keeper = keeper
+        self._heartbeats = heartbeats
         self._archiver = archiver
         self._seen = -1.0
 
     def beat(self) -> bool:
         """Whether the threads answered since the last call; asks them again."""
         answered = self._dispatcher.answered
-        alive = answered != self._seen and self._keeper_silent() < STALLED_SECONDS
+        alive = answered != self._seen and self._heartbeat_silent() < STALLED_SECONDS
         self._seen = answered
         self._dispatcher.ask()
         return alive
@@ -45,17 +45,21 @@ class Liveness:
     def state(self) -> dict[str, Any]:
         """`status`: ok, busy or stalled; and for each thread the seconds since its last sign of life."""
         self._dispatcher.ask()
-        unanswered, keeper, archiver = self._dispatcher.unanswered(), self._keeper_silent(), self._archiver()
+        unanswered, heartbeats, archiver = (
+            self._dispatcher.unanswered(),
+            self._heartbeat_silent(),
+            self._archiver(),
+        )
         busy = self._dispatcher.busy_since is not None
-        shown: dict[str, Any] = {"dispatcher_s": round(unanswered, 1), "keeper_s": round(keeper, 1)}
+        shown: dict[str, Any] = {"dispatcher_s": round(unanswered, 1), "heartbeat_s": round(heartbeats, 1)}
         if archiver is not None:
             shown["archiver_s"] = round(time.monotonic() - archiver.turned, 1)
-        stalled = unanswered > (BUSY_SECONDS if busy else STALLED_SECONDS) or keeper > STALLED_SECONDS
+        stalled = unanswered > (BUSY_SECONDS if busy else STALLED_SECONDS) or heartbeats > STALLED_SECONDS
         slow = busy and unanswered > 1.0
         return {"status": "stalled" if stalled else "busy" if slow else "ok", **shown}
 
-    def _keeper_silent(self) -> float:
-        return time.monotonic() - self._keeper.turned
+    def _heartbeat_silent(self) -> float:
+        return time.monotonic() - self._heartbeats.turned
 
 
 class HeartbeatPipe:

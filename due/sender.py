@@ -59,40 +59,40 @@ class Agenda:
         """The earliest due time; infinite if nothing is scheduled."""
         return self._heap[0][0] if self._heap else math.inf
 
-    def plan(self, outlet: KeyWriter, due: float) -> None:
+    def plan(self, writer: KeyWriter, due: float) -> None:
         """Schedule a writer, replacing its earlier due time."""
-        outlet.due, outlet.ticket = due, next(self._tickets)
-        entry = (due, outlet.ticket, outlet)
-        if self._heap and self._heap[0][2] is outlet:
+        writer.due, writer.ticket = due, next(self._tickets)
+        entry = (due, writer.ticket, writer)
+        if self._heap and self._heap[0][2] is writer:
             heapreplace(self._heap, entry)
         else:
             heappush(self._heap, entry)
 
-    def postpone(self, outlet: KeyWriter, due: float) -> None:
+    def postpone(self, writer: KeyWriter, due: float) -> None:
         """Move a writer to a later time; a writer that is not first in the heap is only marked."""
-        outlet.due = due
-        if self._heap and self._heap[0][1] == outlet.ticket:
-            self.plan(outlet, due)
+        writer.due = due
+        if self._heap and self._heap[0][1] == writer.ticket:
+            self.plan(writer, due)
 
     def take(self, now: float) -> list[tuple[float, KeyWriter]]:
         """Remove and return the writers that are due, with their due times."""
         found = []
         while self._heap and self._heap[0][0] <= now:
-            _, ticket, outlet = heappop(self._heap)
-            if ticket != outlet.ticket:
+            _, ticket, writer = heappop(self._heap)
+            if ticket != writer.ticket:
                 continue
-            if outlet.due > now:
-                self.plan(outlet, outlet.due)
+            if writer.due > now:
+                self.plan(writer, writer.due)
             else:
-                found.append((outlet.due, outlet))
+                found.append((writer.due, writer))
         return found
 
 
 class BatchSender:
     """Flushes key writers after their linger time, or when their next paced item is due.
 
-    `service` is called with the outlet's lock held and returns after how many seconds to come again, None
-    for not before the outlet is dirty again; `blocked` says that the outlet's writer waits for readers.
+    `service` is called with the writer's lock held and returns after how many seconds to come again, None
+    for not before the writer is dirty again; `blocked` says that a writer waits for readers.
     """
 
     def __init__(
@@ -121,29 +121,29 @@ class BatchSender:
             self._set()
         self._thread.start()
 
-    def dirty(self, outlet: KeyWriter) -> None:
+    def dirty(self, writer: KeyWriter) -> None:
         """Schedule a flush: a batch has begun or an item is paced.  The caller holds the writer's lock.
 
         It comes after the linger time, or later if the writer fills whole frames on an overloaded machine.
         """
         now = time.monotonic()
         with self._lock:
-            eased = _FRAME_EASING * outlet.stay if now - outlet.due < _FORGET_SECONDS else 0.0
-            stay = outlet.stay = max(self._linger, eased)
-            if not outlet.queued:
-                outlet.queued = True
-                self._agenda.plan(outlet, now + stay)
+            eased = _FRAME_EASING * writer.stay if now - writer.due < _FORGET_SECONDS else 0.0
+            stay = writer.stay = max(self._linger, eased)
+            if not writer.queued:
+                writer.queued = True
+                self._agenda.plan(writer, now + stay)
                 self._set()
-            elif outlet.pacer is None and 0.0 < outlet.due < now + stay / 2:
+            elif writer.pacer is None and 0.0 < writer.due < now + stay / 2:
                 # not for each batch: setting the timer is a system call
-                self._agenda.postpone(outlet, now + stay)
+                self._agenda.postpone(writer, now + stay)
                 self._set()
 
-    def hurry(self, outlet: KeyWriter) -> None:
+    def hurry(self, writer: KeyWriter) -> None:
         """Flush this writer now."""
         with self._lock:
-            outlet.queued = True
-            self._agenda.plan(outlet, 0.0)
+            writer.queued = True
+            self._agenda.plan(writer, 0.0)
             self._set()
 
     def close(self) -> None:
@@ -171,46 +171,46 @@ class BatchSender:
             now = time.monotonic()
             with self._lock:
                 due = self._agenda.take(now)
-            for planned, outlet in due:
-                ticket = outlet.ticket
-                again = self._visit(outlet, late=now - planned if planned else 0.0)
+            for planned, writer in due:
+                ticket = writer.ticket
+                again = self._visit(writer, late=now - planned if planned else 0.0)
                 with self._lock:
-                    if again is not None and outlet.ticket == ticket:  # otherwise `hurry` was called
-                        self._agenda.plan(outlet, now + again)
+                    if again is not None and writer.ticket == ticket:  # otherwise `hurry` was called
+                        self._agenda.plan(writer, now + again)
             with self._lock:
                 self._rings_at = math.nan  # the timer has fired
                 self._set()
 
-    def _visit(self, outlet: KeyWriter, late: float) -> float | None:
+    def _visit(self, writer: KeyWriter, late: float) -> float | None:
         """Flush one writer; returns seconds until the next flush.  Skips a writer that waits for readers.
 
         If this flush is `late`, the cores are overloaded, and the next ones come less often: the writers need
         the CPU more, and each flush costs several wake-ups.
         """
         with self._lock:
-            if outlet.empty and (outlet.fast or outlet.lock.locked()):
+            if writer.empty and (writer.fast or writer.lock.locked()):
                 # the writer is sending or waits for readers; its next batch schedules a new flush
-                outlet.queued = False
+                writer.queued = False
                 return None
         pressure = self._pressure.felt(late)
-        if outlet.filled != outlet.filled_before:
-            outlet.filled_before = outlet.filled
-            outlet.patience = self._linger
+        if writer.filled != writer.filled_before:
+            writer.filled_before = writer.filled
+            writer.patience = self._linger
             soon = max(self._linger, min(_BUSY_LINGER, 3 * self._linger))
-            outlet.stay = max(soon, min(late, _LONGEST_WAIT), pressure)
-            return outlet.stay
-        if self._blocked(outlet) or not outlet.lock.acquire(blocking=False):
-            outlet.patience = max(min(max(2 * outlet.patience, self._linger, late), _LONGEST_WAIT), pressure)
-            return outlet.patience
+            writer.stay = max(soon, min(late, _LONGEST_WAIT), pressure)
+            return writer.stay
+        if self._blocked(writer) or not writer.lock.acquire(blocking=False):
+            writer.patience = max(min(max(2 * writer.patience, self._linger, late), _LONGEST_WAIT), pressure)
+            return writer.patience
         try:
-            outlet.patience = outlet.stay = self._linger
-            outlet.queued = False
-            again = self._service(outlet, time.time_ns())
-            outlet.queued = again is not None
+            writer.patience = writer.stay = self._linger
+            writer.queued = False
+            again = self._service(writer, time.time_ns())
+            writer.queued = again is not None
         except DueError as error:
-            log.error("%s: %s", outlet.key, error)  # noqa: TRY400 - no trace needed
+            log.error("%s: %s", writer.key, error)  # noqa: TRY400 - no trace needed
             return None
         else:
             return again
         finally:
-            outlet.lock.release()
+            writer.lock.release()

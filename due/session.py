@@ -41,7 +41,7 @@ from due.write_admission import WriteAdmission
 log = logging.getLogger("due")
 
 _KEYS_SHOWN = 32
-_MOST_OUTLETS = 10_000
+_MOST_WRITERS = 10_000
 """With more keys than this, idle key writers are removed."""
 
 
@@ -81,17 +81,17 @@ class Session:
             named=shards,
         )
         control, pause = self._driver.receiver(app, me), options.pause_limit or 3 * options.heartbeat
-        self.keeper = HeartbeatThread(
+        self.heartbeats = HeartbeatThread(
             member, control, self.publisher, self.dispatcher, pause=pause, failed=self._died
         )
         if registration.instances == "sharded" and not shards:
-            self.dispatcher.shards = ShardWork(receiver, self.dispatcher.tracker, self.keeper)
-        self.keeper.say, self.keeper.changed = self._say, self._changed
-        self.keeper.written = self._written
-        self.gate = WriteAdmission(self.keeper, self.publisher, options.handshake_bytes)
-        self.gate.failed = self.check
-        self.sender = BatchSender(options.linger, self.gate.service, self.gate.blocked, self._died)
-        self.outlets: dict[str, KeyWriter] = {}
+            self.dispatcher.shards = ShardWork(receiver, self.dispatcher.tracker, self.heartbeats)
+        self.heartbeats.say, self.heartbeats.changed = self._say, self._changed
+        self.heartbeats.written = self._written
+        self.admission = WriteAdmission(self.heartbeats, self.publisher, options.handshake_bytes)
+        self.admission.failed = self.check
+        self.sender = BatchSender(options.linger, self.admission.service, self.admission.blocked, self._died)
+        self.writers: dict[str, KeyWriter] = {}
         """By canonical key."""
         self.retirements = 0
         """How often idle key writers were removed."""
@@ -102,7 +102,7 @@ class Session:
         self._observed: list[Observation] = []
         self._declared = registration.interests
         self._archiver: Archiver | None = None
-        self.liveness = Liveness(self.dispatcher, self.keeper, lambda: self._archiver)
+        self.liveness = Liveness(self.dispatcher, self.heartbeats, lambda: self._archiver)
         self._archive: ArchiveDriver = open_archive(archive_url)
         self._lock = threading.RLock()
         self._unpublished = 0
@@ -123,9 +123,9 @@ class Session:
                 f"{self._options.connect_timeout:g} s: start the server, or give another URL"
             ) from None
         self.sender.start()
-        self.keeper.start()
+        self.heartbeats.start()
         self.dispatcher.start()
-        always = any(each.archive == "always" for each in self.keeper.member.registration.capabilities)
+        always = any(each.archive == "always" for each in self.heartbeats.member.registration.capabilities)
         if always or any(self._spool_folder().glob("spool*.db")):
             # at once: an earlier instance left frames in the spool, or a full disk would give no reserve later
             try:
@@ -147,55 +147,55 @@ class Session:
             self._tell_failure(error)
             self.dispatcher.halt()
 
-    def outlet(self, key: Key) -> KeyWriter:
+    def writer(self, key: Key) -> KeyWriter:
         """The key writer of a key."""
         with self._lock:
-            outlet = self.outlets.get(key.text)
-            if outlet is None:
-                if len(self.outlets) >= _MOST_OUTLETS:
-                    self._retire_outlets()
-                outlet = self._new_outlet(key)
-                outlet.sequence, outlet.published = self._retired.pop(key.text, (0, 0))
-                self._retired_items -= outlet.sequence
-                self.outlets[key.text] = outlet
-            return outlet
+            writer = self.writers.get(key.text)
+            if writer is None:
+                if len(self.writers) >= _MOST_WRITERS:
+                    self._retire_writers()
+                writer = self._new_writer(key)
+                writer.sequence, writer.published = self._retired.pop(key.text, (0, 0))
+                self._retired_items -= writer.sequence
+                self.writers[key.text] = writer
+            return writer
 
-    def _retire_outlets(self) -> None:
+    def _retire_writers(self) -> None:
         """Remove idle key writers, but not their numbers: readers would take new ones for repeats."""
-        for text, outlet in list(self.outlets.items()):
-            numbers = outlet.retire()
+        for text, writer in list(self.writers.items()):
+            numbers = writer.retire()
             if numbers is not None:
-                del self.outlets[text]
+                del self.writers[text]
                 self._retired[text] = numbers
                 self._retired_items += numbers[0]
         self.retirements += 1
 
     def _written(self) -> int:
-        return self._retired_items + sum(outlet.sequence for outlet in list(self.outlets.values()))
+        return self._retired_items + sum(writer.sequence for writer in list(self.writers.values()))
 
     def _busiest(self) -> dict[str, int]:
         """Items by key without specs, for the keys with most writes."""
         counts: Counter[str] = Counter()
-        for outlet in list(self.outlets.values()):
-            counts[outlet.key.path] += outlet.sequence
+        for writer in list(self.writers.values()):
+            counts[writer.key.path] += writer.sequence
         return dict(counts.most_common(_KEYS_SHOWN))
 
-    def flush_outlet(self, outlet: KeyWriter) -> bool:
+    def flush_writer(self, writer: KeyWriter) -> bool:
         """Send what is buffered; False while items wait for an assignment or for their rate."""
-        with outlet.lock:
-            self.gate.review(outlet)
-            outlet.cut()
-            return not outlet.held and (outlet.pacer is None or outlet.pacer.due() is None)
+        with writer.lock:
+            self.admission.review(writer)
+            writer.cut()
+            return not writer.held and (writer.pacer is None or writer.pacer.due() is None)
 
     def flush(self, timeout: float) -> None:
         """See `Engine.flush`."""
         deadline = time.monotonic() + timeout
-        for outlet in list(self.outlets.values()):
-            while not self.flush_outlet(outlet):
+        for writer in list(self.writers.values()):
+            while not self.flush_writer(writer):
                 self.check()
                 if time.monotonic() > deadline:
                     raise Timeout(
-                        f"{outlet.key} still waits for an assignment or for its rate after {timeout} s"
+                        f"{writer.key} still waits for an assignment or for its rate after {timeout} s"
                     )
                 time.sleep(0.005)
         self.publisher.settle(max(0.1, deadline - time.monotonic()))
@@ -205,9 +205,9 @@ class Session:
 
     def _check_place(self) -> None:
         """Raise `Superseded` if readers may have refused what was written since the last successful flush."""
-        written = self._written() + self.gate.taken_back + self.gate.not_kept
+        written = self._written() + self.admission.taken_back + self.admission.not_kept
         since, self._acknowledged = written - self._acknowledged, written
-        superseded = self.keeper.superseded
+        superseded = self.heartbeats.superseded
         lost_place, self._superseded = superseded > self._superseded, superseded
         if lost_place and since:
             raise Superseded(
@@ -218,18 +218,18 @@ class Session:
     @property
     def active(self) -> bool:
         """See `Engine.active`."""
-        with self.keeper.lock:
-            return self.keeper.member.reading
+        with self.heartbeats.lock:
+            return self.heartbeats.member.reading
 
     @property
     def connected(self) -> bool:
         """See `Engine.connected`."""
-        return self.keeper.connected and self.dispatcher.receiver.connected
+        return self.heartbeats.connected and self.dispatcher.receiver.connected
 
     def flush_archive(self, timeout: float) -> None:
         """Wait until this engine's writes are in the archive."""
-        for outlet in list(self.outlets.values()):
-            self.flush_outlet(outlet)
+        for writer in list(self.writers.values()):
+            self.flush_writer(writer)
         if self._archiver is not None:
             self._archiver.flush(timeout)
 
@@ -262,14 +262,14 @@ class Session:
         if len(interests or ()) > MOST_DECLARED or len(capabilities or ()) > MOST_DECLARED:
             raise InvalidOption(f"declare: at most {MOST_DECLARED} interests and capabilities")
         if capabilities is not None:
-            with self.keeper.lock:
-                self.keeper.member.declare(time.monotonic(), capabilities=capabilities)
+            with self.heartbeats.lock:
+                self.heartbeats.member.declare(time.monotonic(), capabilities=capabilities)
             self._changed()
         if interests is not None:
             with self._lock:
                 self._declared = interests
             self._declare_interests()
-        self.keeper.wake()
+        self.heartbeats.wake()
 
     def keep_state(self, state: ShardState, every: float) -> None:
         """See `Engine.keep_state`."""
@@ -289,7 +289,7 @@ class Session:
 
     def health(self) -> dict[str, Any]:
         """See `Engine.health`."""
-        member = self.keeper.member
+        member = self.heartbeats.member
         health: dict[str, Any] = {
             "app": member.registration.app_id,
             "instance": member.registration.instance_id,
@@ -298,14 +298,14 @@ class Session:
             "active": member.active,
             "asking": member.asking,
             "epoch": member.epoch,
-            "written": self.keeper.written(),
-            "unpublished": self._unpublished + self.gate.lost,
-            "outlets": len(self.outlets),
+            "written": self.heartbeats.written(),
+            "unpublished": self._unpublished + self.admission.lost,
+            "key_writers": len(self.writers),
             "keys": self._busiest(),
-            **self.gate.counts,
+            **self.admission.counts,
             "updates": self.publisher.statistics(),
             "receiving": self.dispatcher.statistics(),
-            "misunderstood_assignments": self.keeper.misunderstood,
+            "misunderstood_assignments": self.heartbeats.misunderstood,
             "liveness": self.liveness.state(),
             "damaged_rows": self._archive.damaged,
         }
@@ -319,7 +319,7 @@ class Session:
         with _reported("what was written last could not be sent"):
             self.flush(5.0)
         self.sender.close()
-        self.keeper.close()
+        self.heartbeats.close()
         with _reported("the goodbye could not be sent"):
             self.publisher.settle(1.0)
         self.publisher.close()
@@ -330,8 +330,8 @@ class Session:
         if self._server is not None:
             self._server.stop()
 
-    def _new_outlet(self, key: Key) -> KeyWriter:
-        registration = self.keeper.member.registration
+    def _new_writer(self, key: Key) -> KeyWriter:
+        registration = self.heartbeats.member.registration
         return KeyWriter(
             key,
             registration.app_id,
@@ -342,21 +342,21 @@ class Session:
             dirty=self.sender.dirty,
         )
 
-    def _sink(self, outlet: KeyWriter, sent: list[Sent], mode: int) -> None:
+    def _sink(self, writer: KeyWriter, sent: list[Sent], mode: int) -> None:
         if mode & PUBLISH:
-            self._publish(outlet, sent)
+            self._publish(writer, sent)
         if mode & ARCHIVE:
             archiver = self._archiver or self._open_archiver()
             for frame, payload in sent:
-                archiver.put(packed(frame, payload, index=outlet.index))
+                archiver.put(packed(frame, payload, index=writer.index))
 
-    def _publish(self, outlet: KeyWriter, sent: list[Sent]) -> None:
-        if outlet.reliable:
+    def _publish(self, writer: KeyWriter, sent: list[Sent]) -> None:
+        if writer.reliable:
             for _, payload in sent:
-                self.publisher.append(outlet.key.path, payload)
+                self.publisher.append(writer.key.path, payload)
             return
         try:
-            self.publisher.publish(outlet.key.path, *(payload for _, payload in sent))
+            self.publisher.publish(writer.key.path, *(payload for _, payload in sent))
         except UpdatesUnavailable:
             self._unpublished += sum(len(frame.timestamps) for frame, _ in sent)
 
@@ -376,33 +376,33 @@ class Session:
             return self._archiver
 
     def _spool_folder(self) -> Path:
-        return self._options.folder() / "spool" / self.keeper.member.registration.app_id
+        return self._options.folder() / "spool" / self.heartbeats.member.registration.app_id
 
     def _say(self, text: str, value: object) -> None:
         """Write a membership message, regardless of assignments."""
-        outlet = self._said.get(text)
-        if outlet is None:
-            outlet = self._said[text] = self._new_outlet(Key(text))
-        with outlet.lock:
-            outlet.put(value, PUBLISH, None, time.time_ns(), stays=False)
-            outlet.cut()
+        writer = self._said.get(text)
+        if writer is None:
+            writer = self._said[text] = self._new_writer(Key(text))
+        with writer.lock:
+            writer.put(value, PUBLISH, None, time.time_ns(), stays=False)
+            writer.cut()
 
     def _changed(self) -> None:
         """Permissions may have changed."""
-        for outlet in list(self.outlets.values()):
-            outlet.fast = False
-            self.sender.hurry(outlet)
-        self.gate.changed()
+        for writer in list(self.writers.values()):
+            writer.fast = False
+            self.sender.hurry(writer)
+        self.admission.changed()
         self._tell()
 
     def _tell(self) -> None:
         callback = self._callback
         if callback is None:
             return
-        with self.keeper.lock:
-            if self.keeper.member.asking:
+        with self.heartbeats.lock:
+            if self.heartbeats.member.asking:
                 return  # suspended for a moment: no assignment was withdrawn
-            wanted = self.keeper.member.assignments
+            wanted = self.heartbeats.member.assignments
         if wanted != self._told:
             self._told = wanted
             self.dispatcher.post(lambda: callback(wanted))
@@ -411,12 +411,12 @@ class Session:
         with self._lock:
             observed = tuple(Interest(o.key.text, o.frequency) for o in self._observed)
         interests = tuple(dict.fromkeys((*self._declared, *observed)))
-        with self.keeper.lock:
-            member = self.keeper.member
+        with self.heartbeats.lock:
+            member = self.heartbeats.member
             if interests == member.registration.interests:
                 return
             member.declare(time.monotonic(), interests=interests)
-        self.keeper.wake()
+        self.heartbeats.wake()
 
 
 @contextmanager

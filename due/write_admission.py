@@ -26,8 +26,8 @@ _SHORTEST_VISIT = 0.001
 class WriteAdmission:
     """Applies assignments to the key writers of one engine."""
 
-    def __init__(self, keeper: HeartbeatThread, publisher: Publisher, hold_bytes: int) -> None:
-        self._keeper = keeper
+    def __init__(self, heartbeats: HeartbeatThread, publisher: Publisher, hold_bytes: int) -> None:
+        self._heartbeats = heartbeats
         self._publisher = publisher
         self._hold_bytes = hold_bytes
         self._changed = threading.Condition()
@@ -47,56 +47,56 @@ class WriteAdmission:
         with self._changed:
             self._changed.notify_all()
 
-    def write(self, outlet: KeyWriter, item: Waiting) -> bool:
+    def write(self, writer: KeyWriter, item: Waiting) -> bool:
         """Handle one item under the current assignments; see `Engine.write` for the result."""
-        self.review(outlet)
-        return self._place(outlet, item)
+        self.review(writer)
+        return self._place(writer, item)
 
-    def review(self, outlet: KeyWriter) -> None:
+    def review(self, writer: KeyWriter) -> None:
         """Apply the current assignments; releases items that were held for them."""
-        if outlet.fast or outlet.retired:
+        if writer.fast or writer.retired:
             return
-        outlet.fast = True
-        with self._keeper.lock:
-            permission = self._keeper.member.permission(outlet.key)
-            outlet.epoch = self._keeper.member.epoch
+        writer.fast = True
+        with self._heartbeats.lock:
+            permission = self._heartbeats.member.permission(writer.key)
+            writer.epoch = self._heartbeats.member.epoch
         capability = permission.capability
-        outlet.permission = permission
-        outlet.reliable = capability is not None and capability.delivery == "reliable"
-        outlet.index = capability is not None and capability.index
+        writer.permission = permission
+        writer.reliable = capability is not None and capability.delivery == "reliable"
+        writer.index = capability is not None and capability.index
         self._set_pace(
-            outlet, permission.frequency, queue=capability is not None and capability.pacing == "queue"
+            writer, permission.frequency, queue=capability is not None and capability.pacing == "queue"
         )
-        if permission.verdict is not Verdict.BUFFER and outlet.held:
-            held, outlet.held = outlet.held, deque()
-            self._held_bytes -= outlet.held_bytes
-            outlet.held_bytes = 0
+        if permission.verdict is not Verdict.BUFFER and writer.held:
+            held, writer.held = writer.held, deque()
+            self._held_bytes -= writer.held_bytes
+            writer.held_bytes = 0
             if permission.verdict is Verdict.REFUSED:
                 self.taken_back += sum(not item[1] & ARCHIVE for item in held)
             for item in held:
-                self._place(outlet, item)
-        if permission.verdict is not Verdict.OPEN or outlet.pacer is not None:
-            outlet.fast = False
+                self._place(writer, item)
+        if permission.verdict is not Verdict.OPEN or writer.pacer is not None:
+            writer.fast = False
 
-    def blocked(self, outlet: KeyWriter) -> bool:
+    def blocked(self, writer: KeyWriter) -> bool:
         """Whether sending would wait for readers."""
-        return outlet.reliable and not self._publisher.has_room(outlet.key.path)
+        return writer.reliable and not self._publisher.has_room(writer.key.path)
 
-    def service(self, outlet: KeyWriter, now: int) -> float | None:
+    def service(self, writer: KeyWriter, now: int) -> float | None:
         """A flush by the sender thread; returns seconds until the next, None: after the next write."""
-        self.review(outlet)
-        pacer = outlet.pacer
+        self.review(writer)
+        pacer = writer.pacer
         while pacer is not None and (item := pacer.release(now)) is not None:
-            _put(outlet, item)
-        outlet.cut()
+            _put(writer, item)
+        writer.cut()
         due = pacer.due() if pacer is not None else None
         return None if due is None else max(_SHORTEST_VISIT, (due - now) / 1e9)
 
-    def _place(self, outlet: KeyWriter, item: Waiting) -> bool:
-        permission = outlet.permission
+    def _place(self, writer: KeyWriter, item: Waiting) -> bool:
+        permission = writer.permission
         verdict = permission.verdict
         if verdict is Verdict.BUFFER:
-            return self._hold(outlet, item)
+            return self._hold(writer, item)
         if verdict is Verdict.REFUSED:
             self.counts["refused"] += 1
             self.not_kept += bool(item[1] & ARCHIVE)
@@ -105,66 +105,66 @@ class WriteAdmission:
             self.counts["unwanted"] += 1
             capability = permission.capability
             if capability is not None and capability.archive == "always" and item[1] & ARCHIVE:
-                outlet.put(item[0], ARCHIVE, item[3], item[4])
+                writer.put(item[0], ARCHIVE, item[3], item[4])
             return False
-        if outlet.pacer is not None:
-            return self._pace(outlet, outlet.pacer, item)
-        _put(outlet, item)
+        if writer.pacer is not None:
+            return self._pace(writer, writer.pacer, item)
+        _put(writer, item)
         return True
 
-    def _hold(self, outlet: KeyWriter, item: Waiting) -> bool:
+    def _hold(self, writer: KeyWriter, item: Waiting) -> bool:
         """Hold an item until the assignments are known; wait if too much is held already."""
         self.counts["held_for_permission"] += 1
         while self._held_bytes > self._hold_bytes:
-            if not (outlet.reliable or self._keeper.connected):
+            if not (writer.reliable or self._heartbeats.connected):
                 self.lost += 1
                 return True
             with self._changed:
                 self._changed.wait(0.05)
             self.failed()
-            outlet.fast = False
-            self.review(outlet)
-            if outlet.permission.verdict is not Verdict.BUFFER:
-                return self._place(outlet, item)
+            writer.fast = False
+            self.review(writer)
+            if writer.permission.verdict is not Verdict.BUFFER:
+                return self._place(writer, item)
         size = _size(item[0])
-        outlet.held.append(item)
-        outlet.held_bytes += size
+        writer.held.append(item)
+        writer.held_bytes += size
         self._held_bytes += size
         return True
 
-    def _pace(self, outlet: KeyWriter, pacer: Pacer[Waiting], item: Waiting) -> bool:
+    def _pace(self, writer: KeyWriter, pacer: Pacer[Waiting], item: Waiting) -> bool:
         while pacer.full:
             time.sleep(min(0.05, 1 / pacer.frequency))
             released = pacer.release(time.time_ns())
             if released is not None:
-                _put(outlet, released)
-                outlet.cut()
+                _put(writer, released)
+                writer.cut()
         before = pacer.replaced
         leaves = pacer.offer(item, time.time_ns())
         self.counts["replaced"] += pacer.replaced - before
         if leaves is None:
-            outlet.dirty()
+            writer.dirty()
         else:
-            _put(outlet, leaves)
+            _put(writer, leaves)
         return True
 
-    def _set_pace(self, outlet: KeyWriter, frequency: float | None, *, queue: bool) -> None:
-        old = outlet.pacer
+    def _set_pace(self, writer: KeyWriter, frequency: float | None, *, queue: bool) -> None:
+        old = writer.pacer
         if old is not None and (old.frequency, old.queue) == (frequency, queue):
             return
-        outlet.pacer = Pacer(frequency, queue=queue) if frequency else None
+        writer.pacer = Pacer(frequency, queue=queue) if frequency else None
         for item in old.drain() if old is not None else ():
-            if outlet.pacer is None:
-                _put(outlet, item)
+            if writer.pacer is None:
+                _put(writer, item)
             else:
-                self._pace(outlet, outlet.pacer, item)
+                self._pace(writer, writer.pacer, item)
 
 
-def _put(outlet: KeyWriter, item: Waiting) -> None:
+def _put(writer: KeyWriter, item: Waiting) -> None:
     value, mode, no_wait, event_time, now = item
-    outlet.put(value, mode, event_time, now, stays=not no_wait)
+    writer.put(value, mode, event_time, now, stays=not no_wait)
     if no_wait:
-        outlet.cut()
+        writer.cut()
 
 
 def _size(value: Any) -> int:

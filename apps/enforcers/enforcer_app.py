@@ -12,7 +12,7 @@ from apps.enforcement import ALLOWED, CONFIRMED, ENFORCED, EnforcementReport
 from apps.enforcers.arrivals import DECISIONS, allowed_in, decision_in, last_of_each
 from apps.enforcers.enforcement_worker import EnforcementWorker, Spoken
 from apps.enforcers.enforcer import Enforcer
-from apps.messages import LONGEST_BLOCK_S, Confirmation, Decision, Intake, one_line, youngest
+from apps.messages import LONGEST_BLOCK_S, Confirmation, Decision, Intake, one_line, read_latest
 from due import Capability, DueError, Engine, Interest, Item
 
 ENFORCER_WANTS: Final = (*(Interest(key) for key in DECISIONS), Interest(ALLOWED))
@@ -142,7 +142,7 @@ class EnforcerApp:
 
     def _read(self, query: str | dict[str, Any], since: int, most: int) -> list[Item]:
         try:
-            return youngest(
+            return read_latest(
                 self._engine, {"dataKey": query} if isinstance(query, str) else query, since, most
             )
         except DueError as error:

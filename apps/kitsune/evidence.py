@@ -121,7 +121,8 @@ class _Told(NamedTuple):
 
     @property
     def usual(self) -> str:
-        return f"at most {self.finding.usual:,.0f} in training"
+        most = f"{self.finding.usual:,.0f}"
+        return "none in training" if most == "0" else f"at most {most} in training"
 
     def counted(self, nouns: str, noun: str = "") -> str:
         return _counted(math.ceil(self.finding.count), nouns, noun)
@@ -147,7 +148,7 @@ _TEXTS: Final[dict[Statistic, Callable[[_Told], str]]] = {
     ),
     "callbacks": lambda told: (
         f"{told.victim} connected back to {told.who} {told.finding.window_s:.1f} s after its login to {told.service};"
-        f" {_counted(round(told.finding.usual), 'hosts')} did so in training"
+        f" {_counted(round(told.finding.usual), 'hosts') if told.finding.usual >= 0.5 else 'no host'} did so in training"
     ),
     "one_way": lambda told: (
         f"{told.who} sent {told.counted('packets')} a second to {told.victim}, which does not answer; {told.usual}"

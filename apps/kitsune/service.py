@@ -27,7 +27,7 @@ from apps.kitsune.detector import Detector, DetectorSettings, Scored
 from apps.kitsune.kept_model import KeptModel, trained_for
 from apps.kitsune.kernel import PACKET_FIELDS, load_kernel
 from apps.kitsune.model_file import ModelFileError, load_model
-from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder, late, order_in
+from apps.kitsune.model_instructions import ANSWER, INSTRUCTIONS, ModelInstruction, instruction_in, late
 from apps.kitsune.packed_arrays import CheckpointError
 from apps.kitsune.plain_values import Kinds, built, read, restore
 from apps.kitsune.successor import Comparison, Successor
@@ -48,7 +48,7 @@ TRAINING_KEY: Final = f"{TRAINING}.kitsune"
 DRIFT_KEY: Final = f"{DRIFT}.kitsune"
 TALKERS_KEY: Final = f"{TALKERS}.kitsune"
 
-INTERESTS = (Interest(PACKETS), Interest(BLOCKS), Interest(SWITCHES), Interest(ORDERS))
+INTERESTS = (Interest(PACKETS), Interest(BLOCKS), Interest(SWITCHES), Interest(INSTRUCTIONS))
 CAPABILITIES = (
     Capability(SCORE, delivery="reliable", archive="always"),
     Capability(ALERT, delivery="reliable", archive="always"),
@@ -188,7 +188,7 @@ class KitsuneService:
             observe(BLOCKS).subscribe(reading(BLOCKS, Decision.from_item, self._on_decision)),
             observe(PACKETS).subscribe(reading(PACKETS, packets_in, self.score)),
             observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self.hear_tick)),
-            observe(ORDERS).subscribe(reading(ORDERS, order_in, self._on_order)),
+            observe(INSTRUCTIONS).subscribe(reading(INSTRUCTIONS, instruction_in, self._on_instruction)),
         ]
         if self._kept is not None:
             _log.info("%s", self._kept.text)
@@ -330,11 +330,11 @@ class KitsuneService:
         """Capture time by packets and by the clocks of switches."""
         return max([self._time.now or 0, *(tick.event_time // 1_000 for tick in list(self._ticks.values()))])
 
-    def _on_order(self, _: Item, order: ModelOrder) -> None:
+    def _on_instruction(self, _: Item, instruction: ModelInstruction) -> None:
         """An operator wants another model."""
         with self._lock:
-            train = self._renew if order.verb == "renew" else self._retrain
-            answer = late(order, time.time_ns()) or Answer(id=order.id, done=True, text=train())
+            train = self._renew if instruction.verb == "renew" else self._retrain
+            answer = late(instruction, time.time_ns()) or Answer(id=instruction.id, done=True, text=train())
         self._engine.write(ANSWER, answer.to_value(), [NO_WAIT])
 
     def _renew(self) -> str:

@@ -21,7 +21,7 @@ import msgspec
 from apps.intake import Intake
 from apps.kitsune.blocked import Blocked
 from apps.kitsune.checkpoint_store import CheckpointStore
-from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder, order_in
+from apps.kitsune.model_instructions import ANSWER, INSTRUCTIONS, ModelInstruction, instruction_in
 from apps.kitsune.packed_arrays import CheckpointError
 from apps.kitsune.service import (
     BLOCKS,
@@ -33,7 +33,7 @@ from apps.kitsune.service import (
     packets_in,
     tick_in,
 )
-from apps.messages import Answer, Decision, MessageError, youngest
+from apps.messages import Answer, Decision, MessageError, read_latest
 from due import NO_WAIT, Engine, Item, RecordBatch
 from due.errors import BackendError
 from due.shards import Place
@@ -44,8 +44,8 @@ _MOST_BLOCKS: Final = 4_096
 _BLOCKS_EVERY_S: Final = 1.0
 _OVERLAP_NS: Final = 10_000_000_000
 """Decisions are read again for this long: others' clocks may be behind."""
-_NO_ORDERS: Final = (
-    "this Kitsune has a detector for each switch, divided among its instances; orders about the model are for "
+_NOT_HERE: Final = (
+    "this Kitsune has a detector for each switch, divided among its instances; instructions about the model are for "
     'instances = "standby"'
 )
 
@@ -79,7 +79,7 @@ class ShardedKitsune:
         observe, reading = self._engine.observe, self._intake.reading
         observe(PACKETS).subscribe(reading(PACKETS, packets_in, self._score))
         observe(SWITCHES).subscribe(reading(SWITCHES, tick_in, self._on_tick))
-        observe(ORDERS).subscribe(reading(ORDERS, order_in, self._on_order))
+        observe(INSTRUCTIONS).subscribe(reading(INSTRUCTIONS, instruction_in, self._on_instruction))
 
     def tick(self) -> None:
         """Read new blocks, once a second."""
@@ -147,14 +147,14 @@ class ShardedKitsune:
         if work is not None:
             work.hear_tick(item, tick)
 
-    def _on_order(self, _: Item, order: ModelOrder) -> None:
-        answer = Answer(id=order.id, done=False, text=_NO_ORDERS)
+    def _on_instruction(self, _: Item, instruction: ModelInstruction) -> None:
+        answer = Answer(id=instruction.id, done=False, text=_NOT_HERE)
         self._engine.write(ANSWER, answer.to_value(), [NO_WAIT])
 
     def _read_blocks(self) -> None:
         try:
             since = max(0, self._blocks_since - _OVERLAP_NS)
-            found = youngest(self._engine, {"dataKey": BLOCKS}, since, _MOST_BLOCKS)
+            found = read_latest(self._engine, {"dataKey": BLOCKS}, since, _MOST_BLOCKS)
         except BackendError as error:
             if not self._archive_away:
                 _log.warning("which blocks there are cannot be read: %s; tried again", error)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import due.service
-from apps.messages import Decision, Intake, MessageError, TableCommand, youngest
+from apps.messages import Decision, Intake, MessageError, TableCommand, read_latest
 from apps.p4runtime_ctrl.arrivals import (
     ClockReached,
     FramesToSend,
@@ -283,10 +283,10 @@ class P4RuntimeCtrlService:
     def _take_up_offers(self) -> None:
         query, since = {"dataKey": _OFFERS}, self._settings.restore_since
         take = self._intake.reading("offer", offer_in, self._take_offer)
-        for item in youngest(self._engine, query, since, _OFFERS_READ):
+        for item in read_latest(self._engine, query, since, _OFFERS_READ):
             take(item)
         take = self._intake.reading("command", command_and_requests_in, self._take_requests)
-        for item in youngest(self._engine, {"dataKey": _COMMANDS}, since, _OFFERS_READ):
+        for item in read_latest(self._engine, {"dataKey": _COMMANDS}, since, _OFFERS_READ):
             take(item)
 
     def _take_requests(self, item: Item, told: tuple[TableCommand, str, tuple[Offer, ...]]) -> None:

@@ -4,7 +4,7 @@ import time
 from collections import deque
 from typing import Final
 
-from apps.messages import Decision, Intake, TableCommand, youngest
+from apps.messages import Decision, Intake, TableCommand, read_latest
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, as_remembered, commands_of, decisions_for
 from due import Engine, Item
@@ -55,4 +55,4 @@ class SwitchHistory:
         return [] if self._mine.mirror else decisions, [*commands, *self._commands]
 
     def _archived(self, key: str, since: int) -> list[Item]:
-        return youngest(self._engine, {"dataKey": key}, since, _RESTORED)
+        return read_latest(self._engine, {"dataKey": key}, since, _RESTORED)

@@ -23,7 +23,7 @@ import numpy as np
 
 import due.service
 from apps.evidence import TRAINING, Evidence, TrainingState
-from apps.messages import Intake, MessageError, TableCommand, TableUpdate, one_line, youngest
+from apps.messages import Intake, MessageError, TableCommand, TableUpdate, one_line, read_latest
 from apps.packets import SteadyTime
 from apps.sonata_adapter.arrivals import (
     SwitchPrograms,
@@ -103,7 +103,7 @@ _LOG = logging.getLogger(__name__)
 MOST_SWITCHES: Final = 256
 _STATES_READ: Final = 2_000
 _COMMANDS_READ: Final = 20_000
-"""Most archived items that are read at start, the youngest."""
+"""Most archived items that are read at start, the latest."""
 _TRAININGS_READ: Final = 100
 _BASELINES_READ: Final = 50
 _STEP_US: Final = 3_600_000_000
@@ -179,11 +179,11 @@ class SonataAdapterService:
     def start(self) -> None:
         """Subscribe to assignments and to the states of switches."""
         on_switch = self._intake.reading("switch", state_in, self._on_switch)
-        for item in youngest(self._engine, {"dataKey": SWITCHES}, 0, _STATES_READ):
+        for item in read_latest(self._engine, {"dataKey": SWITCHES}, 0, _STATES_READ):
             on_switch(item)
         self._engine.observe(SWITCHES).subscribe(on_switch)
         on_training = self._intake.reading("training", training_in, self._on_training)
-        for item in youngest(self._engine, {"dataKey": TRAININGS}, 0, _TRAININGS_READ):
+        for item in read_latest(self._engine, {"dataKey": TRAININGS}, 0, _TRAININGS_READ):
             on_training(item)
         self._engine.observe(TRAININGS).subscribe(on_training)
         self._engine.on_assignments(self._on_assignments)
@@ -314,7 +314,7 @@ class SonataAdapterService:
         """Once active, remove the entries that a killed instance left in the switches."""
         for switch in sorted(self._switches.keys() - self._swept) if self._active else ():
             self._swept.add(switch)
-            archived = youngest(self._engine, {"dataKey": f"{COMMAND}.{switch}"}, 0, _COMMANDS_READ)
+            archived = read_latest(self._engine, {"dataKey": f"{COMMAND}.{switch}"}, 0, _COMMANDS_READ)
             past = (self._intake.read("command", command_in, item) for item in archived)
             self._command(switch, leftovers(command.updates for command in past if command is not None))
 
@@ -354,7 +354,9 @@ class SonataAdapterService:
 
     def _stored(self, query: str, text: str) -> CountBaseline | None:
         """The newest baseline in the archive of a query of this name that counts just this."""
-        for item in reversed(youngest(self._engine, {"dataKey": f"{BASELINE}.{query}"}, 0, _BASELINES_READ)):
+        for item in reversed(
+            read_latest(self._engine, {"dataKey": f"{BASELINE}.{query}"}, 0, _BASELINES_READ)
+        ):
             found = self._intake.read("baseline", baseline_in, item)
             if found is not None and found.text == text:
                 return found

@@ -18,7 +18,7 @@ import msgspec
 
 import due.service
 from apps.intake import Intake
-from apps.messages import LATEST_NS, MessageError, sender_of, youngest
+from apps.messages import LATEST_NS, MessageError, read_latest, sender_of
 from apps.sonata_adapter.arrivals import SwitchPrograms, data_in, state_in
 from apps.sonata_adapter.errors import InvalidRequest, SonataError
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
@@ -137,7 +137,7 @@ class SonataSparkService:
             raise InvalidOption(str(error)) from None
         self._engine.declare(interests=(Interest(SWITCHES), Interest(self._source.pattern)))
         on_switch = self._intake.reading("switch", state_in, self._on_switch)
-        for item in youngest(self._engine, {"dataKey": SWITCHES}, 0, _STATES_READ):
+        for item in read_latest(self._engine, {"dataKey": SWITCHES}, 0, _STATES_READ):
             on_switch(item)
         self._engine.observe(SWITCHES).subscribe(on_switch)
 

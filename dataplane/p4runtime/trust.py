@@ -55,6 +55,10 @@ def read_program(bmv2_json: Path, p4info: Path | None = None) -> Any:
         config.p4_device_config = bmv2_json.read_bytes()
         text_format.Parse(described.read_text(encoding="utf-8"), config.p4info)
     except (OSError, UnicodeError, text_format.ParseError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise TrustError(
+                f"{error.filename}: no such file; p4c writes a BMv2 JSON and its p4info"
+            ) from None
         raise TrustError(
             f"{bmv2_json} with {described}: {error}; give the BMv2 JSON that p4c wrote, its p4info beside it"
         ) from error

@@ -56,7 +56,7 @@ class ArchiveDriver(Protocol):
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
         """Items that match a MongoDB-dialect query, oldest first (timestamp, then sequence).
 
-        With a `limit` only the youngest are read and returned.
+        With a `limit` only the latest are read and returned.
 
         A plain string under `dataKey` is a DUE key: wildcards allowed, fewer specs match more items
         (`due.keys.Key.matches`).  Times are int ns or datetime (naive = UTC).
@@ -173,7 +173,7 @@ class Publisher(Protocol):
 
     @property
     def answered(self) -> int:
-        """The `now` of the youngest `probe` that the server has answered, as far as replies were read; 0: none."""
+        """The `now` of the latest `probe` that the server has answered, as far as replies were read; 0: none."""
         ...
 
     def statistics(self) -> dict[str, int]:

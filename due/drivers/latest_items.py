@@ -1,4 +1,4 @@
-"""The youngest items of a large archive without reading all of it.  Pure: the driver reads rows."""
+"""The latest items of a large archive without reading all of it.  Pure: the driver reads rows."""
 
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
@@ -15,7 +15,7 @@ by_age = attrgetter("timestamp", "sequence", "instance_id", "key")
 def latest_items(
     heads: Iterable[tuple[int, R]], read: Callable[[Sequence[R]], Iterable[Item]], limit: int
 ) -> list[Item]:
-    """The youngest `limit` items, oldest first.
+    """The latest `limit` items, oldest first.
 
     `heads`: for each candidate row its greatest timestamp (ns) and its name for `read`.
     """

@@ -91,7 +91,7 @@ class MemoryArchive:
                 self._store.add(frame)
 
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
-        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
+        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the latest."""
         parsed = parse(query)
         keys = [condition.operand for condition in parsed.conditions("dataKey") if _plain(condition)]
         with self._open().lock:

@@ -101,7 +101,7 @@ class MongoArchive:
             self._insert(documents, frames)
 
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
-        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
+        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the latest."""
         parsed = parse(query)
         with self.errors():
             criteria = self._criteria(parsed)

@@ -31,8 +31,8 @@ from due.drivers.redis_streams import (
     NOBODY,
     NOTHING,
     PRODUCERS,
+    SendWindow,
     StreamEntry,
-    StreamLedger,
     announced_name,
     next_pause,
     parse_id,
@@ -62,8 +62,8 @@ _MESSAGE = "message"
 """A best-effort message whose reply is pending; lost with the connection."""
 _COMMAND = "command"
 """A command of our own whose reply is pending."""
-_Awaited = StreamEntry | StreamLedger | Question | ReplicaQuestion | str | int
-"""What a reply belongs to: a number is the `now` of a probe, a ledger awaits how many heard of its stream."""
+_Awaited = StreamEntry | SendWindow | Question | ReplicaQuestion | str | int
+"""What a reply belongs to: a number is the `now` of a probe; a window waits for the number of readers that heard of its stream."""
 
 
 class RedisUpdates:
@@ -112,7 +112,7 @@ class RedisPublisher:
         self._lock = threading.RLock()
         self._wire: Wire | None = None
         self._outstanding: deque[_Awaited] = deque()
-        self._ledgers: dict[str, StreamLedger] = {}
+        self._windows: dict[str, SendWindow] = {}
         self._channels: dict[str, bytes] = {}
         self._life = b""
         self._backoff = backoff_for(url)
@@ -148,20 +148,20 @@ class RedisPublisher:
 
     def append(self, path: str, payload: bytes) -> None:
         """See `Publisher.append`."""
-        ledger = self._ledgers.get(path) or self._announce(path)
-        if not self._append(ledger, payload):
+        window = self._windows.get(path) or self._announce(path)
+        if not self._append(window, payload):
             self._counts["held_back"] += 1
-            self._wait_for_readers(ledger)
-            self._append(ledger, payload, anyway=True)
-        if not ledger.lasting:
-            self._put_off(ledger)
-        if ledger.half_full and ledger.ask_again(time.monotonic(), _ASK_SECONDS):
-            self._ask(ledger)
+            self._wait_for_readers(window)
+            self._append(window, payload, anyway=True)
+        if not window.lasting:
+            self._put_off(window)
+        if window.half_full and window.ask_again(time.monotonic(), _ASK_SECONDS):
+            self._ask(window)
 
     def has_room(self, path: str) -> bool:
         """See `Publisher.has_room`."""
-        ledger = self._ledgers.get(path)
-        return ledger is None or (not ledger.waiting and ledger.has_room(0))
+        window = self._windows.get(path)
+        return window is None or (not window.waiting and window.has_room(0))
 
     def settle(self, timeout: float | None = None) -> None:
         """See `Publisher.settle`."""
@@ -215,9 +215,9 @@ class RedisPublisher:
             except UpdatesUnavailable as error:
                 self._lose(error)
             now = time.monotonic()
-            for ledger in list(self._ledgers.values()):
-                if ledger.ask_again(now, _POLL_SECONDS / 2):
-                    self._ask(ledger)
+            for window in list(self._windows.values()):
+                if window.ask_again(now, _POLL_SECONDS / 2):
+                    self._ask(window)
             if now >= self._care_at:
                 self._care(now)
         return _POLL_SECONDS
@@ -243,8 +243,8 @@ class RedisPublisher:
             return {
                 **self._counts,
                 "connected": connected,
-                "kept_bytes": sum(x.kept_bytes for x in self._ledgers.values()),
-                "streams": len(self._ledgers),
+                "kept_bytes": sum(x.kept_bytes for x in self._windows.values()),
+                "streams": len(self._windows),
                 **confirmed,
             }
 
@@ -263,14 +263,14 @@ class RedisPublisher:
             self._channels.clear()
         return self._channels.setdefault(path, channel_name(path))
 
-    def _announce(self, path: str) -> StreamLedger:
+    def _announce(self, path: str) -> SendWindow:
         with self._lock:
-            ledger = self._ledgers.get(path)
-            if ledger is None:
-                ledger = self._ledgers[path] = StreamLedger(path, *self._limits)
+            window = self._windows.get(path)
+            if window is None:
+                window = self._windows[path] = SendWindow(path, *self._limits)
                 if self._wire is not None:
                     self._wire.make_room()
-            return ledger
+            return window
 
     def _command(self, *arguments: bytes | str | int, awaited: _Awaited = _COMMAND) -> None:
         """Send a command of our own; its reply is taken later."""
@@ -281,22 +281,22 @@ class RedisPublisher:
     def _care(self, now: float) -> None:
         """Renew the expiry of streams in use; the others are announced again at their next use."""
         self._care_at = now + CARE_SECONDS
-        for ledger in self._ledgers.values():
-            ledger.lasting = False
-            if ledger.kept or ledger.written:
-                self._put_off(ledger)
-            ledger.written = False
-            self._turn_away(ledger)
+        for window in self._windows.values():
+            window.lasting = False
+            if window.kept or window.written:
+                self._put_off(window)
+            window.written = False
+            self._turn_away(window)
 
-    def _turn_away(self, ledger: StreamLedger) -> None:
+    def _turn_away(self, window: SendWindow) -> None:
         """Remove names of readers that do not read: whoever may read can add as many as it likes."""
-        if ledger.strangers and self._wire is not None:
+        if window.strangers and self._wire is not None:
             try:
-                self._command(b"SREM", readers_name(ledger.path), *ledger.strangers)
+                self._command(b"SREM", readers_name(window.path), *window.strangers)
             except UpdatesUnavailable as error:
                 self._lose(error)
 
-    def _put_off(self, ledger: StreamLedger) -> None:
+    def _put_off(self, window: SendWindow) -> None:
         """Announce the stream and renew its expiry; streams of lost producers expire."""
         with self._lock:
             if self._wire is None:
@@ -304,16 +304,16 @@ class RedisPublisher:
             try:
                 self._command(b"SADD", PRODUCERS, self._app)
                 now = int(time.time())
-                self._command(b"ZADD", self._announced, now, ledger.path)
+                self._command(b"ZADD", self._announced, now, window.path)
                 self._command(b"ZREMRANGEBYSCORE", self._announced, b"-inf", now - LIFETIME_S)
-                self._command(b"PUBLISH", self._announced, ledger.path, awaited=ledger)
+                self._command(b"PUBLISH", self._announced, window.path, awaited=window)
                 self._command(b"EXPIRE", self._announced, LIFETIME_S)
-                self._command(b"EXPIRE", stream_name(ledger.path), LIFETIME_S)
-                self._command(b"EXPIRE", readers_name(ledger.path), LIFETIME_S)
+                self._command(b"EXPIRE", stream_name(window.path), LIFETIME_S)
+                self._command(b"EXPIRE", readers_name(window.path), LIFETIME_S)
             except UpdatesUnavailable as error:
                 self._lose(error)
                 return
-            ledger.lasting = True
+            window.lasting = True
 
     def _send_entry(self, entry: StreamEntry) -> None:
         if self._wire is None:
@@ -324,39 +324,39 @@ class RedisPublisher:
         except UpdatesUnavailable as error:
             self._lose(error)
 
-    def _append(self, ledger: StreamLedger, payload: bytes, *, anyway: bool = False) -> bool:
+    def _append(self, window: SendWindow, payload: bytes, *, anyway: bool = False) -> bool:
         with self._lock:
             if self._closed:
                 raise UpdatesUnavailable("the engine is closed")
-            if not anyway and not ledger.has_room(len(payload)):
+            if not anyway and not window.has_room(len(payload)):
                 return False
-            self._send_entry(ledger.add(payload))
+            self._send_entry(window.add(payload))
             return True
 
-    def _wait_for_readers(self, ledger: StreamLedger) -> None:
+    def _wait_for_readers(self, window: SendWindow) -> None:
         """Back-pressure: wait until half of the window is free, or more if the readers are slow.
 
         Each question costs wake-ups.  If the last wait was long, sleep for half of that time, and then for as
         long as the readers' rate suggests, instead of waking up for each reply.
         """
         began = looked = time.monotonic()
-        long = ledger.patience > _ASK_SECONDS
-        longest, share = (ledger.patience, _LONG_WAIT_SHARE) if long else (_ASK_SECONDS, 0.5)
-        pause, kept = max(LEAST_PAUSE, ledger.patience), ledger.kept_bytes
-        ledger.waiting = True
+        long = window.patience > _ASK_SECONDS
+        longest, share = (window.patience, _LONG_WAIT_SHARE) if long else (_ASK_SECONDS, 0.5)
+        pause, kept = max(LEAST_PAUSE, window.patience), window.kept_bytes
+        window.waiting = True
         try:
-            while ledger.excess(share) and not self._closed:
-                connected = self._await_answer(ledger, asleep=pause if long else 0.0)
-                if ledger.excess(share) and not (long and connected):
+            while window.excess(share) and not self._closed:
+                connected = self._await_answer(window, asleep=pause if long else 0.0)
+                if window.excess(share) and not (long and connected):
                     time.sleep(pause)
                 now = time.monotonic()
-                pause = next_pause(now - looked, kept - ledger.kept_bytes, ledger.excess(share), longest)
-                looked, kept = now, ledger.kept_bytes
+                pause = next_pause(now - looked, kept - window.kept_bytes, window.excess(share), longest)
+                looked, kept = now, window.kept_bytes
         finally:
-            ledger.waiting = False
-            ledger.patience = min(_LONGEST_PAUSE, (time.monotonic() - began) / 2)
+            window.waiting = False
+            window.patience = min(_LONGEST_PAUSE, (time.monotonic() - began) / 2)
 
-    def _await_answer(self, ledger: StreamLedger, *, asleep: float) -> bool:
+    def _await_answer(self, window: SendWindow, *, asleep: float) -> bool:
         """Ask for the readers' progress and wait for the answer, without blocking other threads.
 
         Returns whether there is a connection.
@@ -368,7 +368,7 @@ class RedisPublisher:
             if wire is None:
                 return False
             self._guarded_take(wire)  # a new question is more informative than the answer to an earlier one
-            self._ask(ledger)
+            self._ask(window)
             if self._wire is None:  # lost while asking
                 return False
             number = wire.fileno()  # taken here: another thread may close the connection while we wait
@@ -383,18 +383,18 @@ class RedisPublisher:
                 self._guarded_take(wire)
         return True
 
-    def _ask(self, ledger: StreamLedger) -> None:
+    def _ask(self, window: SendWindow) -> None:
         with self._lock:
-            if self._wire is None or ledger.asked:
+            if self._wire is None or window.asked:
                 return
-            question = Question(ledger)
+            question = Question(window)
             try:
                 self._ask_replicas()  # first, so that the answer to the question may count
                 self._wire.send_packed(question.command())
             except UpdatesUnavailable as error:
                 self._lose(error)
                 return
-            ledger.asking(time.monotonic())
+            window.asking(time.monotonic())
             self._outstanding.extend([question] * question.size)
 
     def _ask_replicas(self) -> None:
@@ -405,19 +405,19 @@ class RedisPublisher:
 
     def _acknowledged(self, question: Question) -> None:
         """Forget what the readers have acknowledged, here and on the server."""
-        ledger = question.ledger
-        ledger.asked = False
+        window = question.window
+        window.asked = False
         up_to = question.answer()
-        early = up_to == NOBODY and ledger.awaits_readers(time.monotonic())
-        ledger.acknowledged(NOTHING if early else up_to, self._replicas.confirmed)
-        for group in question.placed & ledger.places:
-            ledger.places.discard(group)
-            self._command(b"XGROUP", b"DESTROY", stream_name(ledger.path), group)
+        early = up_to == NOBODY and window.awaits_readers(time.monotonic())
+        window.acknowledged(NOTHING if early else up_to, self._replicas.confirmed)
+        for group in question.placed & window.places:
+            window.places.discard(group)
+            self._command(b"XGROUP", b"DESTROY", stream_name(window.path), group)
         if question.surprised:
-            self._ask(ledger)
-        point = ledger.trim_point(len(self._ledgers))
+            self._ask(window)
+        point = window.trim_point(len(self._windows))
         if point is not None and self._wire is not None:
-            command = (b"XTRIM", stream_name(ledger.path), b"MINID", b"~", f"{point[0]}-{point[1]}")
+            command = (b"XTRIM", stream_name(window.path), b"MINID", b"~", f"{point[0]}-{point[1]}")
             self._wire.send(*command)
             self._outstanding.append(_COMMAND)
 
@@ -459,7 +459,7 @@ class RedisPublisher:
                 self._refused(reply, awaited)
             elif isinstance(awaited, StreamEntry):
                 awaited.id = parse_id(reply)
-            elif isinstance(awaited, StreamLedger):
+            elif isinstance(awaited, SendWindow):
                 awaited.announced(int(reply), time.monotonic())
 
     def _refused(self, reply: Exception, awaited: _Awaited) -> None:
@@ -479,7 +479,7 @@ class RedisPublisher:
         self._counts["denied"] += 1
         what = f"an entry of {awaited.path}" if isinstance(awaited, StreamEntry) else "a message"
         if isinstance(awaited, StreamEntry):
-            self._ledgers[awaited.path].discard(awaited)
+            self._windows[awaited.path].discard(awaited)
         if what not in self._denied and len(self._denied) < _DENIED_TOLD:
             self._denied.add(what)
             log.error(NO_RIGHT, self._app, what, reply)
@@ -493,8 +493,8 @@ class RedisPublisher:
         self._outstanding.clear()
         self._probing = False
         self._replicas.lost()
-        for ledger in self._ledgers.values():
-            ledger.asked = False
+        for window in self._windows.values():
+            window.asked = False
         delay = self._backoff.failed(time.monotonic())
         log.warning("lost Data Updates at %s: %s; retrying in %.2f s", self._place, error, delay)
 
@@ -532,45 +532,45 @@ class RedisPublisher:
             self._counts["reconnects"] += 1
             log.warning("reconnected to Data Updates at %s", self._place)
         try:
-            for ledger in self._ledgers.values():
-                self._restore(wire, ledger, restarted=life != self._life)
+            for window in self._windows.values():
+                self._restore(wire, window, restarted=life != self._life)
             self._life = life
         except UpdatesUnavailable as error:
             self._lose(error)
 
-    def _restore(self, wire: Wire, ledger: StreamLedger, *, restarted: bool) -> None:
+    def _restore(self, wire: Wire, window: SendWindow, *, restarted: bool) -> None:
         """Resend what the server may not have; readers recognise repeats.
 
-        A replica that has become the primary may lack the youngest entries: it gets all that somebody still has to
+        A replica that has become the primary may lack the latest entries: it gets all that somebody still has to
         read. Those that all have read are missed by nobody, unless the stream is gone.
         """
         self._guarded_settle(wire)
         wire.make_room()
-        ledger.lasting = False
+        window.lasting = False
         if restarted:
-            ledger.forget_ids(time.monotonic())
-            there = self._called(wire, "EXISTS", stream_name(ledger.path))
+            window.forget_ids(time.monotonic())
+            there = self._called(wire, "EXISTS", stream_name(window.path))
             done = 0
             if not there:
-                done = len(ledger.retained)
-                self._resend(wire, list(ledger.retained))
-            self._restore_groups(wire, ledger, done)
-        self._resend(wire, [entry for entry in ledger.kept if entry.id is None])
-        if ledger.kept or ledger.retained:
-            self._put_off(ledger)
+                done = len(window.retained)
+                self._resend(wire, list(window.retained))
+            self._restore_groups(wire, window, done)
+        self._resend(wire, [entry for entry in window.kept if entry.id is None])
+        if window.kept or window.retained:
+            self._put_off(window)
 
-    def _restore_groups(self, wire: Wire, ledger: StreamLedger, done: int) -> None:
+    def _restore_groups(self, wire: Wire, window: SendWindow, done: int) -> None:
         """The groups that lived go on behind what they had all done, whether or not a member of them still lives.
 
         Their work lists are theirs alone to make; a place on the stream tells their next member where to begin, which
         otherwise would begin with what comes after it.
         """
-        groups = sorted(ledger.living_groups())
+        groups = sorted(window.living_groups())
         if groups:
-            name = stream_name(ledger.path)
+            name = stream_name(window.path)
             # what others have appended already may be new to the group
             start = "$" if self._called(wire, "XLEN", name) == done else "0"
-            ledger.places.update(groups)
+            window.places.update(groups)
             for group in groups:
                 # refused for a group whose place another producer was quicker to restore
                 self._called(wire, "XGROUP", "CREATE", name, group, start, "MKSTREAM")
@@ -582,7 +582,7 @@ class RedisPublisher:
             self._collect()
 
     def _send_kept(self, wire: Wire, entry: StreamEntry) -> None:
-        """Send an entry of a ledger; its id and its replicas are told later."""
+        """Send an entry of a window; its id, and which replicas have it, are learnt later."""
         wire.send(b"XADD", stream_name(entry.path), b"*", b"f", entry.payload)
         entry.number = self._replicas.number()
         self._outstanding.append(entry)

@@ -21,7 +21,7 @@ def aside_name(app: str) -> str:
 
 
 class Aside:
-    """Payloads set aside for one app: the youngest thousand or 16 MiB; deleted after an idle week."""
+    """Payloads set aside for one app: the latest thousand or 16 MiB; deleted after an idle week."""
 
     def __init__(self, commands: Any, app: str) -> None:
         self._commands = commands  # Any: redis-py types an answer by options it cannot see

@@ -12,7 +12,7 @@ from typing import Any
 import hiredis
 
 from due.drivers.redis_leases import lease_field, lease_name
-from due.drivers.redis_streams import NOBODY, NOTHING, StreamLedger, parse_id, readers_name, work_name
+from due.drivers.redis_streams import NOBODY, NOTHING, SendWindow, parse_id, readers_name, work_name
 from due.drivers.redis_wire import pack, understood
 
 _MOST_GROUPS = 1024
@@ -26,9 +26,9 @@ _OF_A_GROUP = 2
 class Question:
     """One question about one stream, and the replies so far."""
 
-    def __init__(self, ledger: StreamLedger) -> None:
-        self.ledger = ledger
-        self._known, self._groups = ledger.known, ledger.groups
+    def __init__(self, window: SendWindow) -> None:
+        self.window = window
+        self._known, self._groups = window.known, window.groups
         self._replies: list[Any] = []
         self.size = 1 + len(self._known) + _OF_A_GROUP * len(self._groups)
         """Replies to come."""
@@ -39,7 +39,7 @@ class Question:
 
     def command(self) -> bytes:
         """What to send."""
-        path = self.ledger.path
+        path = self.window.path
         leases = [pack((b"HGETALL", lease_name(_text(group), path))) for group in self._known]
         works = [(work_name(_text(group), path), group) for group in self._groups]
         asked = [pack(one) for name, group in works for one in _about(name, group)]
@@ -53,7 +53,7 @@ class Question:
     def answer(self) -> tuple[int, int]:
         """The id up to which every live group has acknowledged; `NOBODY` where there is none.
 
-        Tells the ledger which groups to ask about next time.  Raises `UpdatesUnavailable` for a nonsensical answer.
+        Tells the window which groups to ask about next time.  Raises `UpdatesUnavailable` for a nonsensical answer.
         """
         with understood("the question how far readers are"):
             return self._answer()
@@ -70,7 +70,7 @@ class Question:
             for consumer, value in theirs.items()
         }
         # asked_at: the answer may have lain in the socket while this process was stopped
-        live = self.ledger.live_groups(leases, self.ledger.asked_at, time.monotonic())
+        live = self.window.live_groups(leases, self.window.asked_at, time.monotonic())
         self._ask_next_time(live, _names(names), found)
         positions = dict(
             zip(self._groups, map(_position, self._groups, works[::2], works[1::2]), strict=True)
@@ -81,16 +81,16 @@ class Question:
         return min((positions[group] or NOTHING for group in live), default=NOBODY)
 
     def _ask_next_time(self, live: set[bytes], names: list[bytes], leases: dict[bytes, Any]) -> None:
-        ledger = self.ledger
-        ledger.groups = tuple(sorted(live))
-        ledger.known = tuple(dict.fromkeys((*ledger.groups, *names)))[:_MOST_GROUPS]
+        window = self.window
+        window.groups = tuple(sorted(live))
+        window.known = tuple(dict.fromkeys((*window.groups, *names)))[:_MOST_GROUPS]
         # what is left of a crowd goes, too, however few they are
-        ledger.crowded = len(names) >= _CROWD or (
-            ledger.crowded and any(not leases.get(name) for name in names)
+        window.crowded = len(names) >= _CROWD or (
+            window.crowded and any(not leases.get(name) for name in names)
         )
-        ledger.strangers = tuple(name for name in names if ledger.crowded and leases.get(name) == {})
+        window.strangers = tuple(name for name in names if window.crowded and leases.get(name) == {})
         # of a crowd each answer names others
-        fresh = set() if len(names) >= _MOST_GROUPS else set(ledger.known) - set(self._known)
+        fresh = set() if len(names) >= _MOST_GROUPS else set(window.known) - set(self._known)
         self.surprised = bool(fresh or live - set(self._groups))
 
 

@@ -7,7 +7,7 @@ the window, and that bound is the back-pressure.  Behind sentinels it also stays
 (`redis_replicas`).  A group lives while one of its instances renews its
 lease: until this producer has watched all of them unchanged for `group_timeout` (see `redis_leases`).
 If the server comes back empty, retained and kept payloads are sent again; if another server takes its place, which
-may lack the youngest entries, what has not been read by all.  Readers recognise repeats.  The groups
+may lack the latest entries, what has not been read by all.  Readers recognise repeats.  The groups
 that lived are made again between the two: a member that died, too, is followed by one that has never read.
 A stream without writer and reader for `LIFETIME_S` expires, with its groups and leases.
 """
@@ -78,16 +78,23 @@ class StreamEntry:
         return len(self.payload) + _OVERHEAD
 
 
-class StreamLedger:
-    """What one producer has written to one stream and still keeps.  Not thread-safe."""
+class SendWindow:
+    """What one producer has written to one stream and still keeps.  Not thread-safe.
 
-    def __init__(self, path: str, window: int, retain: int, group_timeout: float) -> None:
+    Args:
+        path: of the stream.
+        size: most bytes that may wait for acknowledgement.
+        retain: bytes of acknowledged payloads kept for a server that comes back empty, shared by all streams.
+        group_timeout: see above, s.
+    """
+
+    def __init__(self, path: str, size: int, retain: int, group_timeout: float) -> None:
         self.path = path
         self.kept: deque[StreamEntry] = deque()
         self.kept_bytes = 0
         self.retained: deque[StreamEntry] = deque()
         self._retained_bytes = 0
-        self._window = window
+        self._size = size
         self._retain = retain
         self._group_timeout = group_timeout
         self._leases = LeaseWatch(group_timeout)
@@ -122,7 +129,7 @@ class StreamLedger:
         """Whether to ask for the readers' progress: after `seconds`, or after many new bytes."""
         if self.asked or not self.kept:
             return False
-        return now - self.asked_at > seconds or (self.kept_bytes - self._asked_bytes) * 4 > self._window
+        return now - self.asked_at > seconds or (self.kept_bytes - self._asked_bytes) * 4 > self._size
 
     def asking(self, now: float) -> None:
         """A question is being sent."""
@@ -130,11 +137,11 @@ class StreamLedger:
 
     def has_room(self, size: int) -> bool:
         """Whether a payload of this size fits into the window; into an empty one any payload does."""
-        return not self.kept or self.kept_bytes + size + _OVERHEAD <= self._window
+        return not self.kept or self.kept_bytes + size + _OVERHEAD <= self._size
 
     def excess(self, share: float) -> int:
         """Bytes that are kept beyond this share of the window."""
-        return max(0, self.kept_bytes - int(share * self._window)) if self.kept else 0
+        return max(0, self.kept_bytes - int(share * self._size)) if self.kept else 0
 
     def announced(self, listeners: int, now: float) -> None:
         """An announcement was published; only the first one is news.  `now`: s, monotonic."""
@@ -154,7 +161,7 @@ class StreamLedger:
     @property
     def half_full(self) -> bool:
         """Whether it is time to ask for the readers' progress."""
-        return self.kept_bytes * 2 > self._window
+        return self.kept_bytes * 2 > self._size
 
     def add(self, payload: bytes) -> StreamEntry:
         """Keep a payload that is about to be sent."""

@@ -109,7 +109,7 @@ class SqliteArchive:
                 self._widen(connection, row)
 
     def find(self, query: Mapping[str, Any], *, limit: int | None = None) -> list[Item]:
-        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the youngest."""
+        """Items that match, oldest first (timestamp, then sequence); of more than `limit` the latest."""
         parsed = parse(query)
         with self._file.reading() as connection, _interrupted_in_time(connection):
             text, parameters = self._where(connection, parsed)
@@ -244,7 +244,7 @@ class SqliteArchive:
 
 
 def _head(head: tuple[Any, int]) -> tuple[int, int]:
-    """A row whose time is damaged is read with the youngest: reading it finds the damage."""
+    """A row whose time is damaged is read with the latest: reading it finds the damage."""
     time, number = head
     return (time if isinstance(time, int) else INT64 - 1), number
 

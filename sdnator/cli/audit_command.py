@@ -41,7 +41,7 @@ def audit(
     if as_json:
         print(json.dumps({"deeds": deeds}))
     elif not deeds:
-        print("nothing was done in that time")
+        print("nothing was recorded in that time")
     else:
         rows = ((_clock(one["time"]), one["who"], one["source"] or "-", one["deed"]) for one in deeds)
         print(plain_table(("time", "who", "from", "what"), rows))

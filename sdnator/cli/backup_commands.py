@@ -144,8 +144,9 @@ def restore(
     """Restore archive, configuration and models from a backup.
 
     The archive goes into the data folder, the configuration into the configuration folder, models
-    beside the archive, and the kept model into the state folder. Existing files are kept with `.before-restore` appended to their names. An archive
-    of an older version is migrated; one of a newer version is refused. No pipeline may be running.
+    beside the archive, and the kept model into the state folder. Existing files are kept, with
+    `.before-restore` appended to their names. An archive of an older version is migrated; one of a
+    newer version is refused. No pipeline may be running.
     Exit codes: 0 restored, 1 a pipeline runs or something cannot be written, 2 the file cannot be used.
 
     Example: sdnator restore sdnator-backup.tar.gz

@@ -63,7 +63,7 @@ def list_blocks(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Decisions in force, from Data Archives.
+    """List the decisions in force, from Data Archives.
 
     Example: sdnator blocks list
     """
@@ -94,7 +94,7 @@ def why(
     archive: Archive = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Why a decision was made, in five lines; then its history, earlier offences, confirmations, drops.
+    """Explain a decision in five lines; then show its history, earlier offences, confirmations, drops.
 
     Example: sdnator blocks why 1f0c2a9be771
     """
@@ -104,7 +104,12 @@ def why(
 
 @blocks.command("add")
 def add_block(
-    address: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC|MAC@PORT")],
+    address: Annotated[
+        str,
+        typer.Argument(
+            metavar="ADDRESS|PREFIX|MAC|MAC@PORT", help="What to block; @PORT: on that port only."
+        ),
+    ],
     *,
     reason: ReasonOption = "",
     seconds: Annotated[int, typer.Option(help="Length of the block in seconds.", min=1)] = 600,
@@ -120,7 +125,10 @@ def add_block(
 
 @blocks.command("remove")
 def remove_block(
-    subject: Annotated[str, typer.Argument(metavar="ID|ADDRESS")],
+    subject: Annotated[
+        str,
+        typer.Argument(metavar="ID|ADDRESS", help="ID of a decision, or what it blocks, guards or limits."),
+    ],
     *,
     reason: ReasonOption = "",
     updates: Updates = "",
@@ -229,7 +237,7 @@ def _lift_in_archive(archive: str) -> list[tuple[str, int]]:
 
 @allow.command("add")
 def allow_add(
-    entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC")],
+    entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC", help="Entry of the allow-list.")],
     *,
     reason: ReasonOption = "",
     updates: Updates = "",
@@ -244,7 +252,7 @@ def allow_add(
 
 @allow.command("remove")
 def allow_remove(
-    entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC")],
+    entry: Annotated[str, typer.Argument(metavar="ADDRESS|PREFIX|MAC", help="Entry of the allow-list.")],
     *,
     reason: ReasonOption = "",
     updates: Updates = "",
@@ -259,7 +267,7 @@ def allow_remove(
 
 @allow.command("list")
 def allow_list(*, archive: Archive = "") -> None:
-    """Entries that operators have added; those of the firewall's settings are not listed.
+    """List the entries that operators have added; those of the firewall's settings are not listed.
 
     Example: sdnator allow list
     """

@@ -230,7 +230,7 @@ def replay(
     reaction: Annotated[
         float,
         typer.Option(
-            help="Most capture seconds from the packet that makes a block due to the first that it drops.",
+            help="Capture time that may pass from the packet that makes a block due to the first that it drops.",
             min=0.001,
             max=60.0,
             metavar="SECONDS",
@@ -240,7 +240,7 @@ def replay(
         bool,
         typer.Option(
             "--reproducible",
-            help="Behind the first block send nothing later than the reaction time behind the oldest undecided packet.",
+            help="Drop the same packets in every replay, on any machine and with any --window; slower.",
         ),
     ] = False,
     telemetry: Annotated[

@@ -11,7 +11,7 @@ import typer
 
 from apps.kitsune.kept_model import models_aside, set_aside
 from apps.kitsune.model_file import ModelFileError, load_model
-from apps.kitsune.model_orders import ANSWER, ORDERS, ModelOrder
+from apps.kitsune.model_instructions import ANSWER, INSTRUCTIONS, ModelInstruction
 from sdnator.app_requests import AppRequest, ask
 from sdnator.errors import BadInput, PipelineError
 from sdnator.model_words import model_lines, model_of
@@ -89,12 +89,12 @@ def retrain(
             else f"no model is kept in {path}; the next `sdnator up` trains"
         )
         return
-    order = ModelOrder(
+    instruction = ModelInstruction(
         id=uuid4().hex[:12],
         verb="renew" if beside else "retrain",
         expires=time.time_ns() + round(_ANSWER_SECONDS * 1e9),
     )
-    question = AppRequest("detector", ORDERS, ANSWER, order.id, order.to_value())
+    question = AppRequest("detector", INSTRUCTIONS, ANSWER, instruction.id, instruction.to_value())
     typer.echo(ask(question, "", running.archive_url(""), _ANSWER_SECONDS))
 
 

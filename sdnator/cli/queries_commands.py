@@ -259,7 +259,7 @@ def run_query(
 ) -> None:
     """Run a query over captures or the archive; results are the same as live.
 
-    On Spark archived packets are exported to Parquet first, as by `sdnator archive export`.
+    With --engine spark, archived packets are first exported to Parquet, as by `sdnator archive export`.
 
     Example: sdnator queries run network.traffic_query.sonata.new_tcp:threshold=20 --capture day.pcap
     """

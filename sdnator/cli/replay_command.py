@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 
 from rich.console import Console
 from rich.markup import escape
+from rich.padding import Padding
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -251,12 +252,12 @@ def show(found: dict[str, Any]) -> None:
         out.print(
             f"[bold red]blocked[/] {block['address']} at packet {block['packet']:,} ({escape(block['handle'])})"
         )
-        out.print(f"        {escape(block['reason'])}")
+        out.print(_indented(block["reason"]))
     for guard in found["guards"]:
         out.print(
             f"[bold yellow]would guard[/] {guard['address']}:{guard['port']} from packet {guard['packet']:,} on"
         )
-        out.print(f"        {escape(guard['reason'])}")
+        out.print(_indented(guard["reason"]))
     for limit in found["limits"]:
         words = "would limit" if limit["effect"] == "would limit" else "limited"
         dropped = limit["packets_dropped"] or limit["packets_would_be_dropped"]
@@ -264,9 +265,13 @@ def show(found: dict[str, Any]) -> None:
             f"[bold yellow]{words}[/] {escape(limit['packets'])} towards {limit['address']} to {limit['rate']:,}/s "
             f"from packet {limit['packet']:,} on: {dropped:,} over it"
         )
-        out.print(f"        {escape(limit['reason'])}")
+        out.print(_indented(limit["reason"]))
     if "report" in found:
         out.print(f"report: {found['report']}")
+
+
+def _indented(reason: str) -> Padding:
+    return Padding(escape(reason), (0, 0, 0, 8), expand=False)
 
 
 def _rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -100,7 +100,7 @@ def _idle_enforcers(board: Board) -> str:
 
 def _undelivered(board: Board) -> Iterator[str]:
     """Events that no collector will get, by the way on which they were lost."""
-    for one in board.health.get("firewall", {}).get("app", {}).get("outlets", ()):
+    for one in board.health.get("firewall", {}).get("app", {}).get("sinks", ()):
         if count := int(one.get("lost") or 0):
             yield f"{counted(count, 'event')} not delivered by {one.get('name')}"
 

@@ -246,7 +246,7 @@ class DashboardService:
             waiting(answer)
 
     def find(self, key: str, start: int, end: int, limit: int) -> tuple[list[Item], bool]:
-        """The youngest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
+        """The latest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
         from sdnator.northbound import latest
 
         return latest(self._engine.get, {"dataKey": key}, start, end, limit)

@@ -174,7 +174,7 @@ def test_wrong_questions_are_explained(client: httpx.Client, query: str) -> None
     assert answer.json()["detail"]
 
 
-def test_an_answer_is_bounded_and_brings_the_youngest(
+def test_an_answer_is_bounded_and_brings_the_latest(
     client: httpx.Client, engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for n in range(5):

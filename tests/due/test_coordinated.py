@@ -125,10 +125,10 @@ def test_an_app_that_was_stopped_for_a_moment_is_not_told_that_nothing_is_wanted
     script.assign("stopped", active=engine.instance_id, assignments=_wants("t.stopped"))
     wait_for(lambda: engine.health()["phase"] == "coordinated")
     engine.on_assignments(lambda wanted: changes.append([a.key for a in wanted]))
-    keeper = engine._session.keeper
-    with keeper.lock:
-        assert keeper.member.paused(time.monotonic())
-    keeper.wake()
+    heartbeats = engine._session.heartbeats
+    with heartbeats.lock:
+        assert heartbeats.member.paused(time.monotonic())
+    heartbeats.wake()
     wait_for(lambda: not engine.health()["asking"])
     script.assign("stopped", assignments=_wants("t.other"))
     wait_for(lambda: changes[-1:] == [["t.other"]])

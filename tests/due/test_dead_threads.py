@@ -10,7 +10,7 @@ from due import CONSUMER, NO_WAIT, PRODUCER, Capability
 from due.errors import EngineFailed, UnsupportedValue
 from tests.due.conftest import wait_for
 
-THREADS = ("due-dispatcher", "due-keeper", "due-sender", "due-archiver")
+THREADS = ("due-dispatcher", "due-heartbeat", "due-sender", "due-archiver")
 
 
 def _kill(engine, name, monkeypatch):
@@ -18,7 +18,7 @@ def _kill(engine, name, monkeypatch):
     session = engine._session
     part, method = {
         "due-dispatcher": (session.dispatcher.receiver, "receive"),
-        "due-keeper": (session.keeper.member, "tick"),
+        "due-heartbeat": (session.heartbeats.member, "tick"),
         "due-sender": (session.sender, "_visit"),
         "due-archiver": (session._archiver, "_insert"),
     }[name]
@@ -79,7 +79,7 @@ def test_what_a_dead_engine_has_not_handled_stays_in_the_stream(make_engine, mon
     consumer.observe("dead.kept").subscribe(handle)
     producer.write("dead.kept", 1, [NO_WAIT])
     assert dead.wait(60)
-    _kill(consumer, "due-keeper", monkeypatch)
+    _kill(consumer, "due-heartbeat", monkeypatch)
     wait_for(lambda: consumer.failed is not None)
     go_on.set()
     consumer.close()

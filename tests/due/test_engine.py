@@ -308,8 +308,8 @@ def _a_millisecond_later() -> int:
     return time.time_ns()
 
 
-def test_idle_outlets_are_put_away_and_their_numbers_go_on(make_engine, monkeypatch):
-    monkeypatch.setattr("due.session._MOST_OUTLETS", 50)
+def test_idle_writers_are_put_away_and_their_numbers_go_on(make_engine, monkeypatch):
+    monkeypatch.setattr("due.session._MOST_WRITERS", 50)
     engine = make_engine("many")
     got = []
     engine.observe("t.many.*").subscribe(lambda item: got.append((item.key, item.sequence, item.value)))
@@ -321,7 +321,7 @@ def test_idle_outlets_are_put_away_and_their_numbers_go_on(make_engine, monkeypa
         mine = [(sequence, value) for key, sequence, value in got if key == f"t.many.k{number}"]
         assert mine == [(1, 0), (2, 1), (3, 2)]
     health = engine.health()
-    assert health["outlets"] <= 60
+    assert health["key_writers"] <= 60
     assert health["written"] == 600
     assert health["receiving"]["gaps"] == health["receiving"]["repeats"] == 0
 

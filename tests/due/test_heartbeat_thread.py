@@ -1,4 +1,4 @@
-"""The keeper gets up often only where somebody may need it."""
+"""The heartbeat thread wakes up often only where somebody may need it."""
 
 import pytest
 

@@ -60,10 +60,10 @@ def test_a_thread_that_hangs_outside_of_callbacks_is_stalled(make_engine, monkey
     wait_for(lambda: engine.liveness.state()["status"] == "ok")
 
 
-def test_a_keeper_that_does_not_go_round_is_stalled(make_engine, monkeypatch):
+def test_a_heartbeat_thread_that_does_not_go_round_is_stalled(make_engine, monkeypatch):
     engine = make_engine("unkept")
     monkeypatch.setattr(module, "STALLED_SECONDS", 1.0)
-    with engine._session.keeper.lock:
+    with engine._session.heartbeats.lock:
         wait_for(lambda: engine._session.liveness.state()["status"] == "stalled")
         assert not engine._session.liveness.beat()
     wait_for(lambda: engine.liveness.state()["status"] == "ok")

@@ -6,7 +6,7 @@ from due.metrics import render
 
 ENGINE = {
     "app": "x", "instance": "i1", "phase": "alone", "active": True, "written": 7,
-    "updates": {"kept_bytes": 12}, "receiving": {"gaps": 3, "misplaced": 4}, "liveness": {"status": "ok", "keeper_s": 0.5}, "archive": {"backlog": 2},
+    "updates": {"kept_bytes": 12}, "receiving": {"gaps": 3, "misplaced": 4}, "liveness": {"status": "ok", "heartbeat_s": 0.5}, "archive": {"backlog": 2},
 }  # fmt: skip
 
 
@@ -27,7 +27,7 @@ def test_the_engine_is_described_with_types_and_units():
     assert found["due_missing_items_total{}"] == 3
     assert found["due_archive_backlog_frames{}"] == 2
     assert found["due_misplaced_frames_total{}"] == 4
-    assert found["due_keeper_silent_seconds{}"] == 0.5
+    assert found["due_heartbeat_silent_seconds{}"] == 0.5
     assert found["due_active{}"] == 1
     assert found["due_phase{'phase': 'alone'}"] == 1
     kinds = {f.name: f.type for f in text_string_to_metric_families(render("x", ENGINE, {}))}

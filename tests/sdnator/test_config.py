@@ -54,6 +54,11 @@ def test_all_faults_are_named_at_once(tmp_path):
     assert [fault.split(": ")[1] for fault in found] == ["kitsune.max_a", "kitsune.ad_grace", "logs"]
 
 
+def test_a_misspelt_option_hides_no_fault_of_another_section(tmp_path):
+    found = faults(tmp_path, '[kitsune]\nmax_a = 1\n[up]\nquota = 0\n[[switches]]\nname = "a b"\n')
+    assert [fault.split(": ")[1] for fault in found] == ["kitsune.max_a", "up.quota", "switches[0].name"]
+
+
 def test_what_a_part_says_of_its_values_is_said_before_it_starts(tmp_path):
     (fault,) = faults(tmp_path, '[firewall]\nrules.allow = [\n "10.0.0.0/24",\n "nonsense"]')
     assert fault.startswith("FILE:2: firewall.rules.allow: allow-list entry 'nonsense'")

@@ -45,8 +45,8 @@ class Announcer:
 
     def event(self, line: str, *, important: bool = False) -> None:
         """An EVE line."""
-        for outlet in (*self._every, *(self._important if important else ())):
-            outlet.put(line)
+        for sink in (*self._every, *(self._important if important else ())):
+            sink.put(line)
 
     def say(self, notice: OperatorNotice, level: int = logging.WARNING) -> None:
         """Publish a notice for operators; below a warning it is no event."""
@@ -65,15 +65,13 @@ class Announcer:
 
     def close(self) -> None:
         """Deliver what is queued."""
-        for outlet in (*self._every, *self._important):
-            outlet.close()
+        for sink in (*self._every, *self._important):
+            sink.close()
 
     def health(self) -> dict[str, Any]:
         """Counters by sink."""
-        outlets = (*self._every, *self._important)
+        sinks = (*self._every, *self._important)
         return {
-            "events_lost": sum(each.lost for each in outlets),
-            "outlets": [
-                {"name": each.name, "delivered": each.delivered, "lost": each.lost} for each in outlets
-            ],
+            "events_lost": sum(each.lost for each in sinks),
+            "sinks": [{"name": each.name, "delivered": each.delivered, "lost": each.lost} for each in sinks],
         }

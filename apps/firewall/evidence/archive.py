@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
-from apps.messages import youngest
+from apps.messages import read_latest
 from due import Engine, Item
 from due.errors import DueError
 
@@ -33,7 +33,7 @@ class _Question(threading.Thread):
 
     def run(self) -> None:
         try:
-            self.items = youngest(self._engine, *self._asked)
+            self.items = read_latest(self._engine, *self._asked)
         except DueError as error:
             self.problem = str(error)
 

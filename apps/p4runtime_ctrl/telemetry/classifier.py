@@ -87,8 +87,8 @@ class Classifier:
         conditions = [self._assign(request) for request in requests]
         found = EntrySet([self._active_entry(requests)])
         for table in self._tables:
-            boxes = [given.get(table.id) for given in conditions]
-            self._fill(found, table, list(zip(requests, boxes, strict=True)))
+            regions = [given.get(table.id) for given in conditions]
+            self._fill(found, table, list(zip(requests, regions, strict=True)))
         return found
 
     def transition(
@@ -134,14 +134,14 @@ class Classifier:
                     f"request {request.name}: no condition {name!r}; there are {', '.join(known)}"
                 )
             given.setdefault(table.id, {})[name] = value
-        return {table_id: self._shapes[table_id].box(match) for table_id, match in given.items()}
+        return {table_id: self._shapes[table_id].region(match) for table_id, match in given.items()}
 
     def _fill(
         self, found: EntrySet, table: TableInfo, wanted: list[tuple[TelemetryRequest, MatchRegion | None]]
     ) -> None:
         action = table.actions[0]
         name = action.params[0].name
-        everywhere = [request for request, box in wanted if box is None]
+        everywhere = [request for request, region in wanted if region is None]
 
         def update(
             match: Mapping[str, Any], bits: int, priority: int = 0, *, default: bool = False
@@ -160,13 +160,13 @@ class Classifier:
         shape = self._shapes[table.id]
         everywhere_bits = _map(everywhere)
         bits: dict[MatchRegion, int] = {}
-        for request, box in wanted:
-            if box is not None:
-                bits[box] = bits.get(box, 0) | 1 << request.bit
+        for request, region in wanted:
+            if region is not None:
+                bits[region] = bits.get(region, 0) | 1 << request.bit
         covering = Covering(bits)
-        for box in self._closures[table.id].of(bits):
-            priority = shape.priority(box) if table.has_priority else 0
-            entry = update(shape.match(box), everywhere_bits | covering.bits(box), priority)
+        for region in self._closures[table.id].of(bits):
+            priority = shape.priority(region) if table.has_priority else 0
+            entry = update(shape.match(region), everywhere_bits | covering.bits(region), priority)
             found.put(self._program.entry(entry))
 
 

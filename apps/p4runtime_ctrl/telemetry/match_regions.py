@@ -97,7 +97,7 @@ class Shape:
     def __init__(self, table: TableInfo) -> None:
         self._table = table
 
-    def box(self, match: Mapping[str, Any]) -> MatchRegion:
+    def region(self, match: Mapping[str, Any]) -> MatchRegion:
         """The region of conditions by field name; raises `EntryError` if one cannot be expressed."""
         given = dict(match)
         _add_family(self._table, given)
@@ -129,10 +129,10 @@ class Shape:
         first, mask = _pair(value, full, where)
         return TernaryMatch(*values.parse_masked(first, mask, field.width, where=where))
 
-    def match(self, box: MatchRegion) -> dict[str, Any]:
+    def match(self, region: MatchRegion) -> dict[str, Any]:
         """The region in the notation of `TableUpdate.match`."""
         found: dict[str, Any] = {}
-        for field, side in zip(self._table.fields, box.sides, strict=True):
+        for field, side in zip(self._table.fields, region.sides, strict=True):
             if isinstance(side, RangeMatch):
                 found[field.name] = [side.low, side.high]
             elif field.kind == LPM:
@@ -143,9 +143,9 @@ class Shape:
                 found[field.name] = [side.value, side.mask]
         return found
 
-    def priority(self, box: MatchRegion) -> int:
+    def priority(self, region: MatchRegion) -> int:
         """Priority of an entry: higher for every region that lies inside another."""
-        return 1 + sum(int(side.narrowness()) for side in box.sides)
+        return 1 + sum(int(side.narrowness()) for side in region.sides)
 
 
 def _pair(value: Any, default: Any, where: str) -> tuple[Any, Any]:
@@ -177,21 +177,21 @@ class Closure:
         self._asked: set[MatchRegion] = set()
         self._found: dict[MatchRegion, None] = {}
 
-    def of(self, boxes: Iterable[MatchRegion]) -> list[MatchRegion]:
+    def of(self, regions: Iterable[MatchRegion]) -> list[MatchRegion]:
         """Raises `TelemetryError` if they exceed the table's size."""
-        asked = set(boxes)
+        asked = set(regions)
         if not asked >= self._asked:
             self._asked, self._found = set(), {}
         found = dict(self._found)
-        waiting = [box for box in asked if box not in found]
+        waiting = [region for region in asked if region not in found]
         while waiting:
-            box = waiting.pop()
-            if box in found:
+            region = waiting.pop()
+            if region in found:
                 continue
             waiting.extend(
-                met for other in found if (met := box.meet(other)) is not None and met not in found
+                met for other in found if (met := region.meet(other)) is not None and met not in found
             )
-            found[box] = None
+            found[region] = None
             if len(found) > self._limit:
                 raise TelemetryError(
                     f"{self._where} has room for {self._limit} conditions and their overlaps, and more are"
@@ -204,17 +204,17 @@ class Closure:
 class Covering:
     """Finds the regions that cover another: one look-up for each combination of masks."""
 
-    def __init__(self, boxes: Mapping[MatchRegion, int]) -> None:
+    def __init__(self, regions: Mapping[MatchRegion, int]) -> None:
         self._groups: dict[tuple[Any, ...], dict[tuple[Any, ...], int]] = {}
-        for box, bits in boxes.items():
-            group = self._groups.setdefault(tuple(side.shape for side in box.sides), {})
-            key = tuple(side.place for side in box.sides)
+        for region, bits in regions.items():
+            group = self._groups.setdefault(tuple(side.shape for side in region.sides), {})
+            key = tuple(side.place for side in region.sides)
             group[key] = group.get(key, 0) | bits
 
-    def bits(self, box: MatchRegion) -> int:
+    def bits(self, region: MatchRegion) -> int:
         """The bits of all regions that cover this one, or-ed."""
         found = 0
         for shapes, group in self._groups.items():
-            key = tuple(side.seen_through(shape) for side, shape in zip(box.sides, shapes, strict=True))
+            key = tuple(side.seen_through(shape) for side, shape in zip(region.sides, shapes, strict=True))
             found |= group.get(key, 0)
         return found

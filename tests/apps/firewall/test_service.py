@@ -332,7 +332,7 @@ def test_events_go_to_the_file_and_health_is_numbers(tmp_path):
     assert [event["alert"]["metadata"]["event"] for event in events] == [["opened"], ["decided"]]
     assert len({event["flow_id"] for event in events}) == 1
     health = desk.service.health()
-    assert health["outlets"] == [{"name": "eve_file", "delivered": 2, "lost": 0}]
+    assert health["sinks"] == [{"name": "eve_file", "delivered": 2, "lost": 0}]
     assert health["events_lost"] == 0
 
 

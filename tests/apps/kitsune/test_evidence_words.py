@@ -39,8 +39,14 @@ def test_a_sweep_by_pings_is_told_by_what_does_not_answer():
     assert "192.168.2.5 got no echo reply from 4 new hosts within 10 s" in words("targets", 4, UNANSWERED)
 
 
-def test_one_host_did_so():
-    assert "1 host did so in training" in words("callbacks", 1, 0, usual=1.0)
+@pytest.mark.parametrize(("usual", "said"), [(0.0, "no host"), (1.0, "1 host"), (2.0, "2 hosts")])
+def test_hosts_that_did_so_are_counted_in_words(usual, said):
+    assert words("callbacks", 1, 0, usual=usual).endswith(f"; {said} did so in training")
+
+
+@pytest.mark.parametrize(("usual", "said"), [(0.0, "none in training"), (7.0, "at most 7 in training")])
+def test_what_training_saw_is_said_without_a_zero(usual, said):
+    assert words("one_way", 33, usual=usual).endswith(f"; {said}")
 
 
 def test_a_flood_says_what_came_to_its_victim_in_training():

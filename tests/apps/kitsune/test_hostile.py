@@ -7,7 +7,7 @@ from hypothesis import settings as examples
 
 from apps.kitsune.afterimage import AfterImage
 from apps.kitsune.kernel import ColumnError
-from apps.kitsune.model_orders import ORDERS
+from apps.kitsune.model_instructions import INSTRUCTIONS
 from apps.kitsune.service import BLOCKS, INTERESTS, PACKETS, SCORE, SWITCHES, KitsuneService, Settings
 from sdnator.testing.packet_rows import blank, part
 from tests.apps.firewall.enforcement.test_eve import decision
@@ -21,7 +21,7 @@ ROWS = 20
 GENUINE = {
     PACKETS: (KEY, blank(ROWS, time_us=np.full(ROWS, NOW // 1000))),
     BLOCKS: (BLOCK, decision().to_value()),
-    ORDERS: (ORDERS, {"id": "o1", "verb": "retrain"}),
+    INSTRUCTIONS: (INSTRUCTIONS, {"id": "o1", "verb": "retrain"}),
     SWITCHES: (SWITCH, {"switch": "s1", "event_time": NOW, "arrival": 3}),
 }
 

@@ -9,7 +9,7 @@ import pytest
 
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kept_model import MOST_ASIDE, KeptModel, models_aside, set_aside, trained_for
-from apps.kitsune.model_orders import ANSWER, ORDERS
+from apps.kitsune.model_instructions import ANSWER, INSTRUCTIONS
 from apps.kitsune.service import PACKETS, SCORE, TRAINING_KEY, KitsuneService, Settings
 from due import Engine, RecordBatch
 from sdnator.testing.packet_rows import part
@@ -132,14 +132,14 @@ def test_training_is_told_in_small_steps(tmp_path):
 
 
 def test_an_operator_has_it_trained_anew(tmp_path):
-    """At once, and the old model stays beside; a late order, or another app's, does nothing."""
+    """At once, and the old model stays beside; a late instruction, or another app's, does nothing."""
     engine = Hands()
     made = service(tmp_path, engine)
     fed(engine, mixed(400))
-    engine.hand(ORDERS, ORDERS, {"id": "o0", "verb": "retrain"}, app="intruder")
-    engine.hand(ORDERS, ORDERS, {"id": "o1", "verb": "retrain", "expires": 1})
+    engine.hand(INSTRUCTIONS, INSTRUCTIONS, {"id": "o0", "verb": "retrain"}, app="intruder")
+    engine.hand(INSTRUCTIONS, INSTRUCTIONS, {"id": "o1", "verb": "retrain", "expires": 1})
     assert made.health()["model"]["done"]
-    engine.hand(ORDERS, ORDERS, {"id": "o2", "verb": "retrain"})
+    engine.hand(INSTRUCTIONS, INSTRUCTIONS, {"id": "o2", "verb": "retrain"})
     assert [each["done"] for each in engine.values(ANSWER)] == [False, True]
     assert made.health()["model"]["packets"] == 0
     assert len(models_aside(tmp_path / "model" / "kitsune.npz")) == 1
@@ -154,7 +154,7 @@ def test_another_model_trains_beside_the_one_in_use_and_takes_over(tmp_path):
     made = service(tmp_path, engine)
     fed(engine, part(whole, 0, 400))
     trained_at = made.health()["model"]["trained_at_us"]
-    engine.hand(ORDERS, ORDERS, {"id": "o1", "verb": "renew"})
+    engine.hand(INSTRUCTIONS, INSTRUCTIONS, {"id": "o1", "verb": "renew"})
     assert "if it is no worse" in engine.values(ANSWER)[-1]["text"]
     fed(engine, part(whole, 400, 600))
     model = made.health()["model"]
@@ -176,7 +176,7 @@ def test_a_model_that_is_worse_does_not_take_over(tmp_path, caplog):
     made = service(tmp_path, engine)
     fed(engine, part(whole, 0, 400))
     before = made.health()["model"]["trained_at_us"]
-    engine.hand(ORDERS, ORDERS, {"id": "o1", "verb": "renew"})
+    engine.hand(INSTRUCTIONS, INSTRUCTIONS, {"id": "o1", "verb": "renew"})
     alike = part(whole, 400, 621)
     fed(engine, RecordBatch({**alike, "length": np.full(221, 60)}), 221)
     # an hour later nothing is left of the statistics of those

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from apps.kitsune.model_orders import ANSWER
+from apps.kitsune.model_instructions import ANSWER
 from apps.kitsune.service import (
     ALERT,
     CAPABILITIES,

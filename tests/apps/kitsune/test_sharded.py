@@ -7,7 +7,7 @@ import pytest
 from apps.kitsune.checkpoint import dump
 from apps.kitsune.checkpoint_store import PART_BYTES, CheckpointStore
 from apps.kitsune.detector import Detector, DetectorSettings
-from apps.kitsune.model_orders import ANSWER, ORDERS
+from apps.kitsune.model_instructions import ANSWER, INSTRUCTIONS
 from apps.kitsune.packed_arrays import CheckpointError
 from apps.kitsune.service import BLOCKS, KitsuneService, Settings
 from apps.kitsune.sharded import CHECKPOINT, ShardedKitsune
@@ -196,10 +196,10 @@ def test_every_instance_heeds_all_blocks():
     assert made._works[PATHS[0]]._detector.senders.blocked is made._blocked
 
 
-def test_orders_about_the_model_are_refused_with_the_reason():
+def test_instructions_about_the_model_are_refused_with_the_reason():
     engine = ArchivingHands()
     instance(engine)
-    engine.hand(ORDERS, ORDERS, {"id": "o1", "verb": "retrain"})
+    engine.hand(INSTRUCTIONS, INSTRUCTIONS, {"id": "o1", "verb": "retrain"})
     (answer,) = [item.value for item in engine.items if item.key == ANSWER]
     assert not answer["done"]
     assert 'instances = "standby"' in answer["text"]
@@ -207,10 +207,10 @@ def test_orders_about_the_model_are_refused_with_the_reason():
 
 def test_the_place_of_a_path_without_packets_is_kept():
     made = instance(ArchivingHands())
-    assert made.load(ORDERS) is None
-    made.save(ORDERS, PLACE)
-    assert made.load(ORDERS) == PLACE
-    made.drop(ORDERS)
+    assert made.load(INSTRUCTIONS) is None
+    made.save(INSTRUCTIONS, PLACE)
+    assert made.load(INSTRUCTIONS) == PLACE
+    made.drop(INSTRUCTIONS)
 
 
 def test_a_service_refuses_what_is_no_checkpoint_of_one():

@@ -9,7 +9,7 @@ from tests.apps.p4runtime_ctrl.southbound.test_digest_in import QUOTED, SYN, dig
 ALL = key_of("packets", "s1", "all")
 
 
-def outbound(*keys, offers=None, **options):
+def publisher(*keys, offers=None, **options):
     written = []
     made = PacketPublisher("s1", program(), 1_000_000, lambda *item: written.append(item), **options)
     by_digest = options.get("by_digest", False)
@@ -19,7 +19,7 @@ def outbound(*keys, offers=None, **options):
 
 def test_packets_go_where_they_are_wanted():
     offers = {"one": Offer(name="one", bit=1)}
-    made, written = outbound(
+    made, written = publisher(
         ALL, key_of("packets", "s1", "one"), key_of("frames", "s1", "one"), offers=offers
     )
     made.packets([packet_in(1, frame=frame(1), timestamp=5, queries=EVERY_PACKET | 2)])
@@ -35,26 +35,26 @@ def test_packets_go_where_they_are_wanted():
 
 
 def test_nothing_is_written_that_nobody_wants():
-    made, written = outbound()
+    made, written = publisher()
     made.packets([packet_in(1, frame=frame(1))])
     made.digests([digest_list(SYN)])
     assert not written
 
 
 def test_records_come_from_digests_where_that_is_chosen():
-    made, written = outbound(ALL, by_digest=True)
+    made, written = publisher(ALL, by_digest=True)
     made.digests([digest_list(SYN, QUOTED)])
     assert not written, "numbers 1 to 3 may still come"
     made.settle()
     made.settle()
     assert [(key, value["arrival"].tolist()) for key, value, _ in written] == [(ALL, [3])]
-    made, written = outbound(key_of("digests", "s1", "q"), offers={"q": Offer(name="q", bit=3, copy=False)})
+    made, written = publisher(key_of("digests", "s1", "q"), offers={"q": Offer(name="q", bit=3, copy=False)})
     made.digests([digest_list(SYN, QUOTED)])
     assert [value["crossed"].tolist() for _, value, _ in written] == [[1]]
 
 
 def test_a_frame_that_its_digest_does_not_tell_comes_from_its_copy():
-    made, written = outbound(ALL, by_digest=True)
+    made, written = publisher(ALL, by_digest=True)
     made.digests([digest_list({**SYN, "sequence": 1, "arrival": 0}, {**SYN, "sequence": 2, "l4_valid": 0})])
     assert [value["sequence"].tolist() for _, value, _ in written] == [[1]]
     made.packets([packet_in(2, frame=frame(1), timestamp=9)])

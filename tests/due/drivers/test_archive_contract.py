@@ -178,9 +178,7 @@ def test_record_batches_are_found_by_key_and_time(archive: ArchiveDriver) -> Non
 
 
 @pytest.mark.parametrize("limit", [1, 3, 30, 100, 1000])
-def test_of_more_than_the_limit_the_youngest_are_found_oldest_first(
-    archive: ArchiveDriver, limit: int
-) -> None:
+def test_of_more_than_the_limit_the_latest_are_found_oldest_first(archive: ArchiveDriver, limit: int) -> None:
     # frames of two instances that overlap in time, and single items between them
     for first in range(0, 200, 20):
         archive.insert_frames([pack([item(n=first + k + 1) for k in range(20)])])

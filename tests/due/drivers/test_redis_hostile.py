@@ -73,7 +73,7 @@ def test_what_is_set_aside_is_bounded_in_bytes(server):
     for number in range(30):
         aside.put("a.b", b"%03d" % number + bytes(1 << 20), "failed")
         assert commands.memory_usage(aside_name("bounded"), samples=0) <= _MOST_BYTES
-    assert aside.all()[-1][0].startswith(b"029"), "the youngest stay"
+    assert aside.all()[-1][0].startswith(b"029"), "the latest stay"
     aside.put("a.b", bytes(5 << 20), "failed")
     assert aside.counts == {"set_aside": 31, "set_aside_cut": 1, "set_aside_failed": 0}
     assert all(len(payload) < 5 << 20 for payload, _ in aside.all()), "what was cut cannot be read"

@@ -17,7 +17,7 @@ from due.drivers.redis import RedisUpdates
 from due.drivers.redis_primary import PrimaryWatch
 from due.drivers.redis_replicas import Confirmations
 from due.drivers.redis_sentinel import parse_sentinel_url
-from due.drivers.redis_streams import NOBODY, StreamLedger
+from due.drivers.redis_streams import NOBODY, SendWindow
 from due.drivers.redis_wire import Wire, as_user, client, pack
 from due.errors import InvalidOption, Timeout, UpdatesUnavailable
 from due.logs import without_passwords
@@ -199,14 +199,14 @@ def test_a_lost_connection_is_asked_again():
 
 
 def test_what_no_replica_has_stays_kept():
-    ledger, replicas = StreamLedger("a.b", 5000, 5000, 30.0), Confirmations(1, "here")
+    window, replicas = SendWindow("a.b", 5000, 5000, 30.0), Confirmations(1, "here")
     for number in range(1, 4):
-        entry = ledger.add(b"x")
+        entry = window.add(b"x")
         entry.id, entry.number = (number, 0), replicas.number()
-    ledger.acknowledged(NOBODY, 2)
-    assert [entry.id for entry in ledger.kept] == [(3, 0)]
-    ledger.acknowledged(NOBODY, 3)
-    assert not ledger.kept
+    window.acknowledged(NOBODY, 2)
+    assert [entry.id for entry in window.kept] == [(3, 0)]
+    window.acknowledged(NOBODY, 3)
+    assert not window.kept
 
 
 def test_flush_tells_that_no_replica_confirms(tmp_path, caplog):

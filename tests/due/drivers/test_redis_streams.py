@@ -1,82 +1,82 @@
-"""The ledger keeps what readers still need, within the window, and knows who is alive."""
+"""A send window keeps what readers still need, within its size, and knows who is alive."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from due.drivers.redis_progress import Question
-from due.drivers.redis_streams import LEAST_PAUSE, NOBODY, NOTHING, StreamLedger, next_pause, parse_id
+from due.drivers.redis_streams import LEAST_PAUSE, NOBODY, NOTHING, SendWindow, next_pause, parse_id
 from due.errors import UpdatesUnavailable
 
 
-def _ledger(**changes):
-    fields = {"window": 5000, "retain": 2000, "group_timeout": 30.0, **changes}
-    return StreamLedger("a.b", **fields)
+def _window(**changes):
+    fields = {"size": 5000, "retain": 2000, "group_timeout": 30.0, **changes}
+    return SendWindow("a.b", **fields)
 
 
-def _add(ledger, count, size=300):
+def _add(window, count, size=300):
     for _ in range(count):
-        entry = ledger.add(bytes(size))
-        entry.id = (len(ledger.kept) + len(ledger.retained), 0)
+        entry = window.add(bytes(size))
+        entry.id = (len(window.kept) + len(window.retained), 0)
 
 
 def test_the_window_bounds_what_is_kept():
-    ledger = _ledger()
-    while ledger.has_room(300):
-        _add(ledger, 1)
-    assert ledger.kept_bytes <= 5000
-    assert ledger.half_full
+    window = _window()
+    while window.has_room(300):
+        _add(window, 1)
+    assert window.kept_bytes <= 5000
+    assert window.half_full
 
 
 def test_a_lone_payload_larger_than_the_window_passes():
-    assert _ledger().has_room(10**9)
+    assert _window().has_room(10**9)
 
 
 def test_acknowledged_payloads_are_retained_up_to_a_limit_then_trimmed():
-    ledger = _ledger()
-    _add(ledger, 8)
-    ledger.acknowledged((6, 0))
-    assert [e.id for e in ledger.kept] == [(7, 0), (8, 0)]
-    assert ledger.trim_point() == (3, 0)
-    assert [e.id for e in ledger.retained] == [(3, 0), (4, 0), (5, 0), (6, 0)]
-    assert ledger.trim_point() is None
-    assert ledger.trim_point(streams=2) == (5, 0), "streams of one process share the limit"
+    window = _window()
+    _add(window, 8)
+    window.acknowledged((6, 0))
+    assert [e.id for e in window.kept] == [(7, 0), (8, 0)]
+    assert window.trim_point() == (3, 0)
+    assert [e.id for e in window.retained] == [(3, 0), (4, 0), (5, 0), (6, 0)]
+    assert window.trim_point() is None
+    assert window.trim_point(streams=2) == (5, 0), "streams of one process share the limit"
 
 
 def test_what_a_late_group_has_not_read_is_not_behind_it_after_a_restart():
     """While nobody seems to read, payloads are retained; a group may be found that still reads them."""
-    ledger = StreamLedger("a.b", 1000, 10_000, 30.0)
+    window = SendWindow("a.b", 1000, 10_000, 30.0)
     for number in range(1, 6):
-        ledger.add(b"x").id = (number, 0)
-    ledger.acknowledged(NOBODY)
-    assert ledger.unread() == 0
-    ledger.acknowledged(NOTHING)
-    assert ledger.unread() == 5, "a group was found, not known how far it is"
-    ledger.acknowledged((2, 0))
-    assert ledger.unread() == 3
-    ledger.acknowledged(NOTHING)
-    assert ledger.unread() == 3, "an answer that says nothing changes nothing"
-    ledger.forget_ids(100.0)
-    assert (len(ledger.retained), len(ledger.kept)) == (2, 3)
-    ledger.forget_ids(100.0)
-    assert len(ledger.kept) == 3, "the server restarts again before it has been told everything"
-    assert ledger.awaits_readers(102.0), "others may have begun to read as well"
-    assert not ledger.awaits_readers(104.0)
+        window.add(b"x").id = (number, 0)
+    window.acknowledged(NOBODY)
+    assert window.unread() == 0
+    window.acknowledged(NOTHING)
+    assert window.unread() == 5, "a group was found, not known how far it is"
+    window.acknowledged((2, 0))
+    assert window.unread() == 3
+    window.acknowledged(NOTHING)
+    assert window.unread() == 3, "an answer that says nothing changes nothing"
+    window.forget_ids(100.0)
+    assert (len(window.retained), len(window.kept)) == (2, 3)
+    window.forget_ids(100.0)
+    assert len(window.kept) == 3, "the server restarts again before it has been told everything"
+    assert window.awaits_readers(102.0), "others may have begun to read as well"
+    assert not window.awaits_readers(104.0)
 
 
 def test_what_the_server_has_not_answered_is_never_forgotten():
-    ledger = _ledger()
-    ledger.add(b"")
-    ledger.acknowledged((2**63, 0))
-    assert len(ledger.kept) == 1
+    window = _window()
+    window.add(b"")
+    window.acknowledged((2**63, 0))
+    assert len(window.kept) == 1
 
 
 def test_groups_live_by_their_leases_even_after_the_server_lost_them():
-    ledger, seconds = _ledger(group_timeout=3.0), iter(range(100, 200))
+    window, seconds = _window(group_timeout=3.0), iter(range(100, 200))
 
     def look(**leases):
         now = float(next(seconds))
-        return ledger.live_groups({f.replace("_", "/").encode(): v for f, v in leases.items()}, now, now)
+        return window.live_groups({f.replace("_", "/").encode(): v for f, v in leases.items()}, now, now)
 
     assert look(kitsune_1=b"7", gone_1=b"5", left_1=b"0") == {b"kitsune", b"gone"}
     for number in range(3):
@@ -89,13 +89,13 @@ def test_groups_live_by_their_leases_even_after_the_server_lost_them():
 
 def test_ids_of_an_earlier_life_of_the_server_trim_nothing():
     """Its clock may be behind them: what is new would be deleted."""
-    ledger = _ledger()
-    _add(ledger, 8)
-    ledger.acknowledged((8, 0))
-    ledger.forget_ids(0.0)
-    assert ledger.trim_point() is None
-    ledger.acknowledged((2**63, 0))
-    assert not ledger.kept
+    window = _window()
+    _add(window, 8)
+    window.acknowledged((8, 0))
+    window.forget_ids(0.0)
+    assert window.trim_point() is None
+    window.acknowledged((2**63, 0))
+    assert not window.kept
 
 
 def test_ids_compare_as_numbers():
@@ -104,11 +104,11 @@ def test_ids_compare_as_numbers():
 
 
 def test_excess_is_what_is_kept_beyond_a_share_of_the_window():
-    ledger = _ledger()
-    assert ledger.excess(0.0) == 0, "nothing is kept"
-    _add(ledger, 8)
-    assert ledger.excess(0.5) == ledger.kept_bytes - 2500
-    assert ledger.excess(1.0) == 0
+    window = _window()
+    assert window.excess(0.0) == 0, "nothing is kept"
+    _add(window, 8)
+    assert window.excess(0.5) == window.kept_bytes - 2500
+    assert window.excess(1.0) == 0
 
 
 @pytest.mark.parametrize(
@@ -136,19 +136,19 @@ _REPLIES = st.recursive(
 
 @given(st.lists(_REPLIES, min_size=4, max_size=4))
 def test_whatever_the_server_answers_nothing_is_forgotten_by_mistake(replies):
-    ledger = _ledger()
-    ledger.groups = ledger.known = (b"group",)
-    _add(ledger, 3)
-    question = Question(ledger)
-    ledger.asking(0.0)
+    window = _window()
+    window.groups = window.known = (b"group",)
+    _add(window, 3)
+    question = Question(window)
+    window.asking(0.0)
     for reply in replies:
         question.take(reply)
     try:
         position = question.answer()
     except UpdatesUnavailable:
         return
-    ledger.acknowledged(position)
-    assert len(ledger.kept) + len(ledger.retained) == 3
+    window.acknowledged(position)
+    assert len(window.kept) + len(window.retained) == 3
 
 
 @given(_REPLIES)

@@ -78,7 +78,7 @@ def test_times_as_people_write_them():
     length=st.integers(0, 3 * 86_400 * 10**9),
     limit=st.integers(1, 40),
 )
-def test_the_youngest_are_those_of_looking_at_all(times, start, length, limit):
+def test_the_latest_are_those_of_looking_at_all(times, start, length, limit):
     """Looking farther and farther back finds what one look at everything finds."""
     end = start + length
     items = [make_item(number, when) for number, when in enumerate(sorted(times), 1)]

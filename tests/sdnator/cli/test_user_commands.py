@@ -126,7 +126,7 @@ def test_who_did_what_is_read_from_the_archive(tmp_path):
         ("operator", "", "panic (now)"),
     ]
     assert "unblock x" in run("audit", "--archive", archive, "--who", "ada")
-    assert run("audit", "--archive", archive, "--who", "bob") == "nothing was done in that time\n"
+    assert run("audit", "--archive", archive, "--who", "bob") == "nothing was recorded in that time\n"
 
 
 _WAY_IN = """

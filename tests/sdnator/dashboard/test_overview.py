@@ -64,8 +64,8 @@ def test_an_enforcer_that_cannot_work_and_lost_events_are_said():
     assert told.level == "trouble"
     assert told.text == "Blocks are not carried out everywhere: nftables gateway: no CAP_NET_ADMIN."
     found.healthy("nftables", {"app": idle | {"working": True}}, 3.0)
-    outlets = [{"name": "syslog", "delivered": 5, "lost": 2}, {"name": "eve_file", "delivered": 7, "lost": 0}]
-    found.healthy("firewall", {"app": {"outlets": outlets}}, 3.0)
+    sinks = [{"name": "syslog", "delivered": 5, "lost": 2}, {"name": "eve_file", "delivered": 7, "lost": 0}]
+    found.healthy("firewall", {"app": {"sinks": sinks}}, 3.0)
     told = health(found)
     assert (told.level, "2 events not delivered by syslog" in told.text) == ("notice", True)
     assert "eve_file" not in told.text

@@ -56,8 +56,8 @@ def test_apps_write_collections_of_their_own_and_read_all_that_they_may(server: 
         (name, number) for name in sorted(archives) for number in (1, 2, 3)
     ]
     assert [item.timestamp for item in found] == sorted(item.timestamp for item in found)
-    youngest = reader.find({"dataKey": "network.x.*"}, limit=3)
-    assert {item.timestamp for item in youngest} == {T0 + 3}
+    latest = reader.find({"dataKey": "network.x.*"}, limit=3)
+    assert {item.timestamp for item in latest} == {T0 + 3}
     assert reader.prune(before=T0 + 2) == 3
     assert reader.prune(max_bytes=0) == 6
     assert reader.find({"dataKey": "network.x.*"}) == []

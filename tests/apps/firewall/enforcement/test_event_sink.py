@@ -72,26 +72,26 @@ class Take(BaseHTTPRequestHandler):
 def test_webhook_is_tried_again_until_it_takes_it():
     """In order, as JSON, with its token; each once."""
     with Hook(refusals=2) as hook:
-        outlet = EventSink("webhook", to_webhook(hook.url, "secret"))
+        sink = EventSink("webhook", to_webhook(hook.url, "secret"))
         for number in range(3):
-            outlet.put(json.dumps({"number": number}))
-        outlet.close(PATIENCE)
+            sink.put(json.dumps({"number": number}))
+        sink.close(PATIENCE)
         assert [json.loads(body)["number"] for body in hook.bodies] == [0, 1, 2]
         assert hook.tried == 5
         assert hook.headers["Content-Type"] == "application/json"
         assert hook.headers["Authorization"] == "Bearer secret"
-        assert (outlet.delivered, outlet.lost) == (3, 0)
+        assert (sink.delivered, sink.lost) == (3, 0)
 
 
 def test_what_is_refused_every_time_is_lost_and_the_next_goes_on():
     """Counted; the number of attempts is bounded."""
     with Hook(refusals=2) as hook:
-        outlet = EventSink("webhook", to_webhook(hook.url), attempts=2)
-        outlet.put("1")
-        outlet.put("2")
-        outlet.close(PATIENCE)
+        sink = EventSink("webhook", to_webhook(hook.url), attempts=2)
+        sink.put("1")
+        sink.put("2")
+        sink.close(PATIENCE)
         assert hook.bodies == ["2"]
-        assert (outlet.delivered, outlet.lost) == (1, 1)
+        assert (sink.delivered, sink.lost) == (1, 1)
 
 
 def test_nobody_waits_for_a_taker_that_hangs():
@@ -102,26 +102,26 @@ def test_nobody_waits_for_a_taker_that_hangs():
         hangs.set()
         goes_on.wait(PATIENCE)
 
-    outlet = EventSink("slow", deliver, size=2)
-    outlet.put("1")
+    sink = EventSink("slow", deliver, size=2)
+    sink.put("1")
     assert hangs.wait(PATIENCE)
     for number in range(5):
-        outlet.put(str(number))
-    assert outlet.lost == 3
-    outlet.close(0.1)
+        sink.put(str(number))
+    assert sink.lost == 3
+    sink.close(0.1)
     goes_on.set()
-    outlet._thread.join(PATIENCE)
-    assert (outlet.delivered, outlet.lost) == (1, 5)
+    sink._thread.join(PATIENCE)
+    assert (sink.delivered, sink.lost) == (1, 5)
 
 
 def test_redis_list_is_bounded_and_in_order(tmp_path, monkeypatch):
     """The oldest go."""
     monkeypatch.setattr("apps.firewall.enforcement.event_sink.LIST_LENGTH", 3)
     with EmbeddedServer(tmp_path / "redis") as server:
-        outlet = EventSink("eve_redis", to_redis_list(server.url, "events"))
+        sink = EventSink("eve_redis", to_redis_list(server.url, "events"))
         for number in range(5):
-            outlet.put(str(number))
-        outlet.close(PATIENCE)
+            sink.put(str(number))
+        sink.close(PATIENCE)
         reader = client(server.url)
         assert reader.lrange("events", 0, -1) == [b"2", b"3", b"4"]
         reader.close()
@@ -131,11 +131,11 @@ def test_redis_list_is_bounded_and_in_order(tmp_path, monkeypatch):
 def test_file_may_be_rotated_and_come_late(tmp_path):
     """It is opened for each line; a missing folder is tried again."""
     path = tmp_path / "later" / "eve.json"
-    outlet = EventSink("eve_file", to_file(str(path)))
-    outlet.put("1")
+    sink = EventSink("eve_file", to_file(str(path)))
+    sink.put("1")
     path.parent.mkdir()
-    outlet.put("2")
-    outlet.close(PATIENCE)
+    sink.put("2")
+    sink.close(PATIENCE)
     assert path.read_text() == "1\n2\n"
 
 

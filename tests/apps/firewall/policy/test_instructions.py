@@ -23,11 +23,11 @@ SAID = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary
 
 def desk(*allowed: str) -> Desk:
     lifecycle = BlockLifecycle(Rules())
-    syn = SynDefence(ledger_rules(), (), lifecycle, AllowList(), KnownSources(10))
+    syn = SynDefence(strict_rules(), (), lifecycle, AllowList(), KnownSources(10))
     return Desk(lifecycle, syn, RateLimits(Rules()), allowed, FalseAlarms(90))
 
 
-def ledger_rules() -> SynRules:
+def strict_rules() -> SynRules:
     return SynRules()
 
 
@@ -113,7 +113,7 @@ def test_wrong_allow_entry_changes_nothing():
 def test_panic_lifts_blocks_and_guards():
     """Everything that was not in the settings."""
     lifecycle = BlockLifecycle(Rules())
-    syn = SynDefence(ledger_rules(), (), lifecycle, AllowList(), KnownSources(10))
+    syn = SynDefence(strict_rules(), (), lifecycle, AllowList(), KnownSources(10))
     syn.recent.add(batch(*[(1, f"77.0.{n // 256}.{n % 256}", WEB.address, WEB.port) for n in range(600)]))
     decided(syn, syn.suspect(Suspicion(WEB.address, SAID, NOW, 0)))
     made = Desk(lifecycle, syn, RateLimits(Rules()), (), FalseAlarms(90))

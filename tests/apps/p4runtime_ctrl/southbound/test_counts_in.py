@@ -12,7 +12,7 @@ from apps.p4runtime_ctrl.telemetry.demand import Offer, key_of
 from p4rt import p4runtime
 from sdnator.testing.product_program import program, without
 from tests.apps.p4runtime_ctrl.southbound.test_digest_in import QUOTED, digest_list
-from tests.apps.p4runtime_ctrl.test_packet_publisher import outbound
+from tests.apps.p4runtime_ctrl.test_packet_publisher import publisher
 
 HOST = {"query": 3, "window": 8, "count": 5, "src": 0x0A000001, "timestamp": 9}
 SIX = {
@@ -49,7 +49,7 @@ def test_columns():
 def test_counts_go_to_who_wants_their_query():
     offers = {"q": Offer(name="q", bit=3, copy=False)}
     key = key_of("counts", "s1", "q")
-    made, written = outbound(key, key_of("digests", "s1", "q"), offers=offers)
+    made, written = publisher(key, key_of("digests", "s1", "q"), offers=offers)
     made.digests([count_list(HOST, SIX), digest_list(QUOTED), count_list({**HOST, "timestamp": 20})])
     (_, frames, _), (name, counts, time_ns) = written
     assert frames["crossed"].tolist() == [1]
@@ -58,7 +58,7 @@ def test_counts_go_to_who_wants_their_query():
 
 
 def test_counts_that_nobody_wants_are_counted_only():
-    made, written = outbound()
+    made, written = publisher()
     made.digests([count_list(HOST)])
     assert (written, made.counts_reported, made.second) == ([], 1, 1)
 
@@ -83,7 +83,7 @@ def test_no_counts_are_no_time():
 
 def test_a_report_about_a_far_time_moves_no_clock():
     """Who asks what waits as of a far time is told with that time; the switch's own time stays what it was."""
-    made, _ = outbound()
+    made, _ = publisher()
     made.digests([count_list(HOST)])
     for _ in range(9):
         made.digests([count_list({**HOST, "timestamp": 1 << 47})])

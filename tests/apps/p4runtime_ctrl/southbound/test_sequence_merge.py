@@ -22,49 +22,49 @@ def told(found):
 
 
 def test_covered_digests_wait_for_nothing():
-    unison = SequenceMerger()
-    assert told(unison.digests(rows(range(1, 6)))) == [1, 2, 3, 4, 5]
-    assert (len(unison), unison.waits_for) == (0, 0)
+    merger = SequenceMerger()
+    assert told(merger.digests(rows(range(1, 6)))) == [1, 2, 3, 4, 5]
+    assert (len(merger), merger.waits_for) == (0, 0)
 
 
 def test_a_frame_that_came_as_a_copy_only_takes_its_place():
-    unison = SequenceMerger()
-    assert told(unison.digests(rows([1, 2, 3, 5, 6]))) == [1, 2, 3]
-    assert unison.waits_for == 4
-    assert told(unison.packets(rows([4]))) == [4, 5, 6]
-    assert unison.copies == 1
+    merger = SequenceMerger()
+    assert told(merger.digests(rows([1, 2, 3, 5, 6]))) == [1, 2, 3]
+    assert merger.waits_for == 4
+    assert told(merger.packets(rows([4]))) == [4, 5, 6]
+    assert merger.copies == 1
 
 
 def test_a_copy_stands_for_a_digest_that_does_not_say_all():
-    unison = SequenceMerger()
-    assert told(unison.digests(rows([1, 2, 3], whole=[True, False, True]))) == [1]
-    found = unison.packets(rows([2], mark=1))
+    merger = SequenceMerger()
+    assert told(merger.digests(rows([1, 2, 3], whole=[True, False, True]))) == [1]
+    found = merger.packets(rows([2], mark=1))
     assert told(found) == [2, 3]
     assert [each["mark"].tolist() for each in (f.matching(BIT) for f in found)] == [[1, 0]]
 
 
 def test_a_lost_copy_is_not_waited_for_when_its_stream_has_passed():
-    unison = SequenceMerger()
-    assert told(unison.digests(rows([1, 2, 3, 4], whole=[True, False, True, False]))) == [1]
-    assert told(unison.packets(rows([4]))) == [2, 3, 4]
+    merger = SequenceMerger()
+    assert told(merger.digests(rows([1, 2, 3, 4], whole=[True, False, True, False]))) == [1]
+    assert told(merger.packets(rows([4]))) == [2, 3, 4]
 
 
 def test_what_waits_is_told_when_nothing_more_comes():
-    unison = SequenceMerger()
-    assert not unison.digests(rows([5, 6]))
-    assert told(unison.flush()) == [5, 6]
-    assert not unison.packets(rows([5]))
-    assert not unison.digests(rows([8, 10]))
-    assert told(unison.flush()) == [8, 10]
-    assert unison.skipped == 2
+    merger = SequenceMerger()
+    assert not merger.digests(rows([5, 6]))
+    assert told(merger.flush()) == [5, 6]
+    assert not merger.packets(rows([5]))
+    assert not merger.digests(rows([8, 10]))
+    assert told(merger.flush()) == [8, 10]
+    assert merger.skipped == 2
 
 
 def test_a_switch_that_counts_from_one_again():
-    unison = SequenceMerger()
-    assert told(unison.digests(rows([1, 2, 4]))) == [1, 2]
-    assert told(unison.digests(rows([5, 1, 2]))) == [4, 5, 1, 2]
-    assert told(unison.packets(rows([3]))) == [3]
-    assert not unison.digests(rows([0, 0]))
+    merger = SequenceMerger()
+    assert told(merger.digests(rows([1, 2, 4]))) == [1, 2]
+    assert told(merger.digests(rows([5, 1, 2]))) == [4, 5, 1, 2]
+    assert told(merger.packets(rows([3]))) == [3]
+    assert not merger.digests(rows([0, 0]))
 
 
 @given(
@@ -78,34 +78,34 @@ def test_any_interleaving_tells_the_same(kinds, turns):
             streams[True].append((number, kind != "unread"))
         if kind in ("copy", "both", "unread"):
             streams[False].append((number, True))
-    unison, got = SequenceMerger(), []
+    merger, got = SequenceMerger(), []
     everything = [*turns, *[(True, 60), (False, 60)]]
     for digests, count in everything:
         taken, streams[digests] = streams[digests][:count], streams[digests][count:]
         if taken:
             numbers, whole = zip(*taken, strict=True)
-            take = unison.digests if digests else unison.packets
+            take = merger.digests if digests else merger.packets
             got += told(take(rows(numbers, whole=list(whole))))
-    got += told(unison.flush())
+    got += told(merger.flush())
     assert got == [number for number, kind in enumerate(kinds, start=1) if kind != "lost"]
-    assert len(unison) == 0
+    assert len(merger) == 0
 
 
 def test_behind_another_controller_the_next_number_waits_for_nothing():
-    unison = SequenceMerger()
-    unison.follow(5_000)
-    assert told(unison.digests(rows([5_001, 5_002]))) == [5_001, 5_002]
-    unison.begin_anew()
-    unison.follow(9_000)
-    assert told(unison.digests(rows([9_001, 9_002]))) == [9_001, 9_002]
+    merger = SequenceMerger()
+    merger.follow(5_000)
+    assert told(merger.digests(rows([5_001, 5_002]))) == [5_001, 5_002]
+    merger.begin_anew()
+    merger.follow(9_000)
+    assert told(merger.digests(rows([9_001, 9_002]))) == [9_001, 9_002]
 
 
 def test_numbers_that_the_controller_before_may_have_told_are_not_called_skipped():
-    unison = SequenceMerger()
-    assert not unison.digests(rows([5_010, 5_011]))
-    unison.follow(5_000)
-    assert told(unison.flush()) == [5_010, 5_011]
-    assert unison.skipped == 0
-    assert not unison.digests(rows([5_014]))
-    assert told(unison.flush()) == [5_014]
-    assert unison.skipped == 2
+    merger = SequenceMerger()
+    assert not merger.digests(rows([5_010, 5_011]))
+    merger.follow(5_000)
+    assert told(merger.flush()) == [5_010, 5_011]
+    assert merger.skipped == 0
+    assert not merger.digests(rows([5_014]))
+    assert told(merger.flush()) == [5_014]
+    assert merger.skipped == 2

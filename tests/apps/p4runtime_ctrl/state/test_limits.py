@@ -52,39 +52,39 @@ def test_pings_over_ipv6_have_another_protocol_and_type():
 
 
 def test_all_parts_are_there_before_the_limit_and_go_after_it():
-    orders = book()
-    made = orders.of_decision(decision(spared=("192.0.2.53",), spared_rate=60))
+    updates = book()
+    made = updates.of_decision(decision(spared=("192.0.2.53",), spared_rate=60))
     names = [each.partition("[")[0] for each in handles(made)]
     assert names == ["limit_over", "limit_spared", "limit", "limit"]  # the first for later fragments
     rates = [each.entry.meter_config.pir for each in made.changes]
     assert rates == [0, 60, 40, 40]
-    lifted = orders.of_decision(decision("unmeter", spared=("192.0.2.53",), spared_rate=60))
+    lifted = updates.of_decision(decision("unmeter", spared=("192.0.2.53",), spared_rate=60))
     assert handles(lifted) == handles(made)[::-1]
     assert lifted.main.entry.match == made.main.entry.match
 
 
 def test_open_ports_come_before_a_limit_of_syns_and_have_a_meter_that_nothing_exceeds():
-    orders = book()
+    updates = book()
     scanned = {"kind": "syn", "port": None, "open_ports": (22, 443)}
-    made = orders.of_decision(decision(**scanned))
+    made = updates.of_decision(decision(**scanned))
     found = handles(made)
     assert [each.rpartition("@")[2] for each in found[1:]] == ["1001", "1001", "1000"]
     assert {"dport=22" in each for each in found[1:3]} == {True, False}
     rates = [each.entry.meter_config.pir for each in made.changes]
     assert rates == [0, 1 << 31, 1 << 31, 40]
-    assert handles(orders.of_decision(decision("unmeter", **scanned))) == found[::-1]
+    assert handles(updates.of_decision(decision("unmeter", **scanned))) == found[::-1]
 
 
 def test_slots_are_kept_freed_and_end():
-    orders = book()
+    updates = book()
     for number in range(SLOTS):
-        orders.of_decision(decision(address=f"10.0.1.{number}"))
+        updates.of_decision(decision(address=f"10.0.1.{number}"))
     with pytest.raises(EntryError, match="256 rate limits are in force already"):
-        orders.of_decision(decision())
-    orders.of_decision(decision("unmeter", address="10.0.1.7"))
-    assert orders.of_decision(decision()).main.entry.action.action.params[0].value == bytes([7])
-    orders.give_up(orders.of_decision(decision()))
-    assert orders.of_decision(decision(port=123)).main.entry.action.action.params[0].value == bytes([7])
+        updates.of_decision(decision())
+    updates.of_decision(decision("unmeter", address="10.0.1.7"))
+    assert updates.of_decision(decision()).main.entry.action.action.params[0].value == bytes([7])
+    updates.give_up(updates.of_decision(decision()))
+    assert updates.of_decision(decision(port=123)).main.entry.action.action.params[0].value == bytes([7])
 
 
 def test_what_is_not_in_force_cannot_be_lifted():

@@ -1,4 +1,4 @@
-"""Boxes cover, meet and are ordered as sets of packets are; their closure has every intersection."""
+"""Match regions cover, meet and are ordered as sets of packets are; their closure has every intersection."""
 
 import pytest
 from hypothesis import given
@@ -20,12 +20,12 @@ bits = st.tuples(st.integers(0, 15), st.integers(0, 15)).map(
     lambda pair: TernaryMatch(pair[0] & pair[1], pair[1])
 )
 spans = st.tuples(st.integers(0, 15), st.integers(0, 15)).map(lambda p: RangeMatch(min(p), max(p), 4))
-boxes = st.tuples(bits, spans).map(MatchRegion)
+regions = st.tuples(bits, spans).map(MatchRegion)
 
 
-def inside(box):
-    """The naive set of the packets in a box."""
-    first, second = box.sides
+def inside(region):
+    """The naive set of the packets in a region."""
+    first, second = region.sides
     return {
         (a, b)
         for a in VALUES
@@ -34,20 +34,20 @@ def inside(box):
     }
 
 
-@given(boxes, boxes)
+@given(regions, regions)
 def test_covering_and_meeting_are_those_of_sets(one, other):
     assert one.covers(other) == (inside(one) >= inside(other))
     met = one.meet(other)
     assert (inside(met) if met else set()) == inside(one) & inside(other)
 
 
-@given(boxes, boxes)
-def test_a_box_inside_another_is_narrower(one, other):
+@given(regions, regions)
+def test_a_region_inside_another_is_narrower(one, other):
     if inside(one) < inside(other):
         assert sum(s.narrowness() for s in one.sides) > sum(s.narrowness() for s in other.sides)
 
 
-@given(st.lists(boxes, max_size=5), st.integers(0, 5))
+@given(st.lists(regions, max_size=5), st.integers(0, 5))
 def test_the_closure_holds_every_intersection_however_it_came_about(some, first):
     growing = Closure(limit=10_000, where="here")
     growing.of(some[:first])
@@ -55,17 +55,17 @@ def test_the_closure_holds_every_intersection_however_it_came_about(some, first)
     assert set(Closure(limit=10_000, where="here").of(some)) == set(found)
     assert growing.of(some[first:]) is not None
     assert set(growing.of(some)) == set(found)
-    sets = {frozenset(inside(box)) for box in found}
+    sets = {frozenset(inside(region)) for region in found}
     assert all(not (a & b) or a & b in sets for a in sets for b in sets)
-    assert all(frozenset(inside(box)) in sets for box in some)
+    assert all(frozenset(inside(region)) in sets for region in some)
     assert len(found) == len(set(found))
 
 
-@given(st.lists(boxes, max_size=8, unique=True), boxes)
-def test_covering_finds_the_same_as_looking_at_each(some, box):
+@given(st.lists(regions, max_size=8, unique=True), regions)
+def test_covering_finds_the_same_as_looking_at_each(some, region):
     bits = {each: 1 << place for place, each in enumerate(some)}
-    naive = sum(bit for each, bit in bits.items() if each.covers(box))
-    assert Covering(bits).bits(box) == naive
+    naive = sum(bit for each, bit in bits.items() if each.covers(region))
+    assert Covering(bits).bits(region) == naive
 
 
 def test_a_table_that_is_too_small_is_named():
@@ -81,8 +81,8 @@ def test_shapes_speak_the_notation_of_table_updates():
         ({"src": ["10.0.0.1", 32]}, {"is_ipv4": 1, "src": [0x0A000001, 128]}),
         ({"is_ipv4": 1}, {"is_ipv4": 1, "src": [0, 0]}),
     ):
-        assert shape.match(shape.box(given_match)) == match
+        assert shape.match(shape.region(given_match)) == match
     ports = Shape(program().table("telemetry_dport"))
-    assert ports.match(ports.box({"dport": 80})) == {"dport": [80, 80]}
+    assert ports.match(ports.region({"dport": 80})) == {"dport": [80, 80]}
     with pytest.raises(EntryError, match=r"range 9\.\.3 is empty"):
-        ports.box({"dport": [9, 3]})
+        ports.region({"dport": [9, 3]})

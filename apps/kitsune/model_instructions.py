@@ -5,12 +5,12 @@ from typing import Final, Literal
 from apps.messages import Answer, Message, Name, sender_of
 from due import Item
 
-ORDERS: Final = "network.instruction.operator.kitsune"
+INSTRUCTIONS: Final = "network.instruction.operator.kitsune"
 """Only the command line's own key is heard: no other app may throw a model away."""
 ANSWER: Final = "network.answer.kitsune.operator"
 
 
-class ModelOrder(Message, frozen=True, kw_only=True):
+class ModelInstruction(Message, frozen=True, kw_only=True):
     """`network.instruction.operator.kitsune`."""
 
     id: Name
@@ -20,16 +20,16 @@ class ModelOrder(Message, frozen=True, kw_only=True):
     """Wall time, ns since the epoch, after which it must not be carried out any more; 0 = never."""
 
 
-def order_in(item: Item) -> ModelOrder:
-    """An order, written by the operator's app; raises `MessageError`."""
+def instruction_in(item: Item) -> ModelInstruction:
+    """An instruction, written by the operator's app; raises `MessageError`."""
     sender_of(item)
-    return ModelOrder.from_value(item.value)
+    return ModelInstruction.from_value(item.value)
 
 
-def late(order: ModelOrder, wall_ns: int) -> Answer | None:
-    """The answer to an order that is too old; None if it may be carried out."""
-    if not 0 < order.expires < wall_ns:
+def late(instruction: ModelInstruction, wall_ns: int) -> Answer | None:
+    """The answer to an instruction that is too old; None if it may be carried out."""
+    if not 0 < instruction.expires < wall_ns:
         return None
     return Answer(
-        id=order.id, done=False, text="the instruction came too late and was not carried out; ask again"
+        id=instruction.id, done=False, text="the instruction came too late and was not carried out; ask again"
     )
