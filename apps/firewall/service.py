@@ -197,7 +197,6 @@ class FirewallService:
         self._stored = StoredAnswers(engine, threading.Lock())
         self._panics: deque[str] = deque(maxlen=1000)
         """Ids of archived panics that were carried out."""
-        self._words_since = time.time_ns()
         self._time = SteadyTime(STEP_S * 1_000_000_000)
         """Capture time last reported by the switches, ns."""
         self._row_time = SteadyTime(STEP_S * 1_000_000)
@@ -386,10 +385,9 @@ class FirewallService:
     def _read_archived_words(self) -> None:
         """A `blocks panic` while Data Updates were unreachable is in the archive only."""
         # the writer's clock may be behind ours, or ours may have been set back
-        items = self._archive.look(PANICS, self._words_since - CLOCKS_DIFFER_NS, ARCHIVED_WORD_S)
+        items = self._archive.look(PANICS, CLOCKS_DIFFER_NS, ARCHIVED_WORD_S)
         with self._lock:
             for item in items:
-                self._words_since = max(self._words_since, min(item.timestamp, time.time_ns()))
                 said = self._intake.read(history.INSTRUCTIONS, Instruction.from_item, item)
                 if said is None or said.id in self._panics:
                     continue
