@@ -19,6 +19,7 @@ def open_updates(url: str, options: Options) -> UpdatesDriver:
             url,
             window=options.window_bytes,
             retain=options.retain_bytes,
+            retain_s=options.retain_seconds,
             group_timeout=options.group_timeout,
             backlog=options.backlog_bytes,
         )
@@ -40,6 +41,7 @@ def open_updates(url: str, options: Options) -> UpdatesDriver:
         url,
         window=options.window_bytes,
         retain=options.retain_bytes,
+        retain_s=options.retain_seconds,
         group_timeout=options.group_timeout,
         backlog=options.backlog_bytes,
         observable=options.observable,

@@ -39,6 +39,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Unacknowledged bytes that a producer keeps per reliable stream; beyond that `write` waits."""
     retain_bytes: int = 16 << 20
     """Acknowledged bytes kept to be resent to a server that restarts empty, shared equally by the reliable streams of a process."""
+    retain_seconds: float = 3600.0
+    """Of these, entries older than the stream's newest by more than this are not kept, seconds."""
     group_timeout: float = 30.0
     """Readers whose lease has not changed for this long no longer hold a producer back, seconds."""
     backlog_bytes: int = 32 << 20
@@ -131,7 +133,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         """
         least = {
             "frame_bytes": 1, "single_bytes": 1, "window_bytes": 1, "tries": 1, "archive_batch": 1,
-            "heartbeat": 0.01, "handshake_timeout": 0.0, "linger": 0.0, "spool_reserve_bytes": 0,
+            "heartbeat": 0.01, "handshake_timeout": 0.0, "linger": 0.0, "retain_seconds": 0.0,
+            "spool_reserve_bytes": 0,
         }  # fmt: skip
         for name, bound in least.items():
             if not getattr(self, name) >= bound:  # not a number is refused too

@@ -73,7 +73,6 @@ class InstructionHandler:
         self._stored = StoredAnswers(engine, threading.Lock())
         self._panics: deque[str] = deque(maxlen=PANICS_KEPT)
         """Ids of archived panics that were carried out."""
-        self._words_since = time.time_ns()
 
     def restore(self) -> None:
         """Take up what earlier runs were told, and what they answered."""
@@ -108,10 +107,9 @@ class InstructionHandler:
     def read_archived_words(self) -> None:
         """A `blocks panic` while Data Updates were unreachable is in the archive only."""
         # the writer's clock may be behind ours, or ours may have been set back
-        items = self._archive.look(PANICS, self._words_since - CLOCKS_DIFFER_NS, ARCHIVED_WORD_S)
+        items = self._archive.look(PANICS, CLOCKS_DIFFER_NS, ARCHIVED_WORD_S)
         with self._lock:
             for item in items:
-                self._words_since = max(self._words_since, min(item.timestamp, time.time_ns()))
                 said = self._intake.read(history.INSTRUCTIONS, Instruction.from_item, item)
                 if said is None or said.id in self._panics:
                     continue

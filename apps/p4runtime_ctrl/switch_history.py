@@ -6,12 +6,12 @@ from typing import Final
 
 from apps.messages import Decision, Intake, TableCommand, read_latest
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
-from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, as_remembered, commands_of, decisions_for
+from apps.p4runtime_ctrl.state.heard_decisions import HeardDecisions
+from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
 from due import Engine, Item
 
 _RESTORED: Final = 100_000
 """Most archived decisions of a kind, and commands, that are read at a start, the newest."""
-_DECISIONS: Final = 10_000
 _COMMANDS: Final = 1_000
 """Heard live, which the archive need not have yet."""
 
@@ -31,12 +31,12 @@ class SwitchHistory:
         self._settings = settings
         self._mine = mine
         self._intake = intake
-        self._decisions: deque[Decision] = deque(maxlen=_DECISIONS)
+        self._decisions = HeardDecisions()
         self._commands: deque[TableCommand] = deque(maxlen=_COMMANDS)
 
     def heard(self, decision: Decision) -> None:
         """Note a decision that was heard live."""
-        self._decisions.append(as_remembered(decision))
+        self._decisions.hear(decision)
 
     def heard_command(self, command: TableCommand) -> None:
         """Note a command that was heard live, where the archive may be behind it."""

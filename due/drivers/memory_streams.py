@@ -2,8 +2,9 @@
 
     append ──► MemoryStream.entries ──► ReaderGroup: position, pending ──► a member's deliveries ──► acknowledged
 
-A payload is kept until every living group has acknowledged it, then up to `retain` bytes for replay.  A group
-lives while it has a member, and `group_timeout` seconds longer.  No I/O; callers hold the space's lock; time is
+A payload is kept until every living group has acknowledged it, then up to `retain` bytes for replay, and for as
+long as it is at most `retain_s` seconds older than the newest.  A group lives while it has a member, and `group_timeout`
+seconds longer.  No I/O; callers hold the space's lock; time is
 an argument (seconds, monotonic).
 """
 
@@ -94,9 +95,10 @@ class ReaderGroup:
 class MemoryStream:
     """The entries of one path and the groups that read them."""
 
-    def __init__(self, window: int, retain: int, group_timeout: float) -> None:
+    def __init__(self, window: int, retain: int, group_timeout: float, retain_s: float) -> None:
         self.groups: dict[str, ReaderGroup] = {}
         self._window, self._retain, self._timeout = window, retain, group_timeout
+        self._retain_ms = retain_s * 1000
         self._entries: list[HeldEntry] = []
         self._head = 0
         """Index into `_entries`; entries before it are forgotten."""
@@ -129,7 +131,9 @@ class MemoryStream:
                 del self.groups[name]
         floor, entries = self._floor(now), self._entries
         while self._head < len(entries) and entries[self._head].id <= floor:
-            if self._given - entries[self._head].before <= self._retain:
+            oldest = entries[self._head]
+            young = self._last[0] - oldest.id[0] <= self._retain_ms
+            if young and self._given - oldest.before <= self._retain:
                 break
             self._head += 1
         if self._head > max(_COMPACT_AT, len(entries) // 2):

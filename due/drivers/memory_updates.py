@@ -51,11 +51,12 @@ class MemoryUpdates:
         *,
         window: int = 16 << 20,
         retain: int = 16 << 20,
+        retain_s: float = 3600.0,
         group_timeout: float = 30.0,
         backlog: int = 32 << 20,
     ) -> None:
         self.url = url
-        self._limits = (window, retain, group_timeout)
+        self._limits = (window, retain, group_timeout, retain_s)
         self._backlog = backlog
         with _spaces_lock:
             self._space = _spaces.setdefault(memory_name(url), MemorySpace())
@@ -75,7 +76,7 @@ class MemoryUpdates:
 class MemoryPublisher:
     """See `due.drivers.base.Publisher`."""
 
-    def __init__(self, space: MemorySpace, limits: tuple[int, int, float]) -> None:
+    def __init__(self, space: MemorySpace, limits: tuple[int, int, float, float]) -> None:
         self._space = space
         self._limits = limits
         self._written: set[str] = set()

@@ -75,21 +75,20 @@ class RedisUpdates:
         *,
         window: int = 16 << 20,
         retain: int = 16 << 20,
+        retain_s: float = 3600.0,
         group_timeout: float = 30.0,
         backlog: int = 32 << 20,
         observable: tuple[str, ...] = (),
     ) -> None:
         self.url = url
         self._observable = observable
-        self._window = window
-        self._retain = retain
-        self._group_timeout = group_timeout
+        self._limits = (window, retain, group_timeout, retain_s)
         self._backlog = backlog
         client(url).close()  # report a wrong URL now
 
     def publisher(self, app: str) -> "RedisPublisher":
         """A new sending half."""
-        return RedisPublisher(self.url, app, self._window, self._retain, self._group_timeout)
+        return RedisPublisher(self.url, app, self._limits)
 
     def receiver(self, group: str, consumer: str, *, shared: bool = False) -> RedisReceiver:
         """A new receiving half."""
@@ -104,11 +103,11 @@ class RedisUpdates:
 class RedisPublisher:
     """One pipelined connection; see `due.drivers.base.Publisher`."""
 
-    def __init__(self, url: str, app: str, window: int, retain: int, group_timeout: float) -> None:
+    def __init__(self, url: str, app: str, limits: tuple[int, int, float, float]) -> None:
         self._url, self._place = url, without_passwords(url)
         self._app = app
         self._announced = announced_name(app)
-        self._limits = (window, retain, group_timeout)
+        self._limits = limits
         self._lock = threading.RLock()
         self._wire: Wire | None = None
         self._outstanding: deque[_Awaited] = deque()

@@ -4,7 +4,8 @@
 
 A payload stays in `kept` until every live group of readers has acknowledged it; `kept` is bounded by
 the window, and that bound is the back-pressure.  Behind sentinels it also stays until enough replicas have it
-(`redis_replicas`).  A group lives while one of its instances renews its
+(`redis_replicas`).  What is retained is bounded by bytes, and by time: a path with few items would else take hours to
+come to its bytes, here and on the server.  A group lives while one of its instances renews its
 lease: until this producer has watched all of them unchanged for `group_timeout` (see `redis_leases`).
 If the server comes back empty, retained and kept payloads are sent again; if another server takes its place, which
 may lack the latest entries, what has not been read by all.  Readers recognise repeats.  The groups
@@ -86,9 +87,12 @@ class SendWindow:
         size: most bytes that may wait for acknowledgement.
         retain: bytes of acknowledged payloads kept for a server that comes back empty, shared by all streams.
         group_timeout: see above, s.
+        retain_s: acknowledged payloads that are older than the newest by more than this are not kept.
     """
 
-    def __init__(self, path: str, size: int, retain: int, group_timeout: float) -> None:
+    def __init__(
+        self, path: str, size: int, retain: int, group_timeout: float, retain_s: float = 3600.0
+    ) -> None:
         self.path = path
         self.kept: deque[StreamEntry] = deque()
         self.kept_bytes = 0
@@ -96,6 +100,7 @@ class SendWindow:
         self._retained_bytes = 0
         self._size = size
         self._retain = retain
+        self._retain_ms = retain_s * 1000
         self._group_timeout = group_timeout
         self._leases = LeaseWatch(group_timeout)
         self.lasting = False
@@ -213,15 +218,21 @@ class SendWindow:
             entry.id = None
 
     def trim_point(self, streams: int = 1) -> tuple[int, int] | None:
-        """Forget the oldest retained payloads over the share of one of `streams`; the id from which to keep.
+        """Forget the oldest retained payloads over the share of one of `streams`, and those of too long ago.
 
-        None if nothing was forgotten, or if the id is from before a restart of the server.
+        Returns the id from which to keep; None if nothing was forgotten, or if the id is from before a restart of the
+        server.
         """
         trimmed = False
-        while len(self.retained) > 1 and self._retained_bytes > self._retain // streams:
+        while len(self.retained) > 1 and (self._retained_bytes > self._retain // streams or self._too_old()):
             self._retained_bytes -= self.retained.popleft().size
             trimmed = True
         return self.retained[0].id if trimmed else None
+
+    def _too_old(self) -> bool:
+        """Whether the newest retained payload was written long after the oldest, by the server's clock."""
+        oldest, newest = self.retained[0].id, self.retained[-1].id
+        return oldest is not None and newest is not None and newest[0] - oldest[0] > self._retain_ms
 
 
 def _is_done(entry: StreamEntry, up_to: tuple[int, int], confirmed: int) -> bool:

@@ -27,6 +27,7 @@ class _Question(threading.Thread):
         super().__init__(name="archive query", daemon=True)
         self._engine = engine
         self._asked = (query, since, most)
+        self.asked_at = time.time_ns()
         self.items: list[Item] | None = None
         self.problem = "no answer in time"
         self.start()
@@ -47,6 +48,8 @@ class Archive:
         self._asked: _Question | None = None
         self._looking: _Question | None = None
         self._look_after = time.monotonic()
+        self._looked_to = time.time_ns()
+        """Wall time of the last look that was answered; before the first, of the start."""
         self._quiet_until = float("-inf")
         self.unanswered = 0
         self.items_read = 0
@@ -83,14 +86,28 @@ class Archive:
         self.items_read += len(found or ())
         return found
 
-    def look(self, query: Mapping[str, Any], since: int, every_s: float) -> list[Item]:
-        """Results of the background query so far; starts a new query at intervals.  Never waits."""
+    def look(self, query: Mapping[str, Any], back_ns: int, every_s: float) -> list[Item]:
+        """Ask in the background for what is new, at intervals.  Never waits.
+
+        Args:
+            query: always the same one.
+            back_ns: so much before the last answered look, ns, an item's writer may have dated it.
+            every_s: seconds between two questions.
+
+        Returns:
+            What the last question has found, once; items of the last `back_ns` come again with each answer.
+        """
         if self._looking is not None:
             if self._looking.is_alive():
                 return []
-            found, self._looking = self._looking.items or [], None
-            return found
+            looked, self._looking = self._looking, None
+            if looked.items is None:
+                return []
+            self._looked_to = looked.asked_at
+            return looked.items
         if time.monotonic() >= self._look_after:
             self._look_after = time.monotonic() + every_s
+            # this machine's clock may have been ahead at that time
+            since = min(self._looked_to, time.time_ns()) - back_ns
             self._looking = _Question(self._engine, query, since, MOST)
         return []

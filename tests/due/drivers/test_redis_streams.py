@@ -43,6 +43,27 @@ def test_acknowledged_payloads_are_retained_up_to_a_limit_then_trimmed():
     assert window.trim_point(streams=2) == (5, 0), "streams of one process share the limit"
 
 
+def test_of_a_path_with_few_items_those_of_the_last_hour_are_retained():
+    """By the server's clock; they would take hours to come to their bytes, and memory would grow all the time."""
+    window = _window(retain=1 << 20, retain_s=3600.0)
+    minute_ms = 60_000
+    for minute in range(180):
+        window.add(b"x").id = (minute * minute_ms, 0)
+        window.acknowledged((minute * minute_ms, 0))
+        window.trim_point()
+    assert len(window.retained) == 61
+    assert window.retained[0].id == (119 * minute_ms, 0)
+
+
+def test_times_of_an_earlier_server_say_nothing():
+    window = _window(retain=1 << 20, retain_s=0.0)
+    _add(window, 3)
+    window.acknowledged((3, 0))
+    window.forget_ids(100.0)
+    assert window.trim_point() is None
+    assert len(window.retained) == 3
+
+
 def test_what_a_late_group_has_not_read_is_not_behind_it_after_a_restart():
     """While nobody seems to read, payloads are retained; a group may be found that still reads them."""
     window = SendWindow("a.b", 1000, 10_000, 30.0)
