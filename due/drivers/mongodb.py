@@ -5,7 +5,8 @@
     <collection>_keys    every dataKey, and how far apart the items of one of its documents may lie
     <collection>_parts   the rest of payloads that are larger than a document may be
 
-`?app=NAME` gives each app collections of its own: see `mongodb_apps`.
+`?app=NAME` gives each app collections of its own: see `mongodb_apps`.  What is sharded on a cluster, and by which key:
+`mongodb_sharding`.  What is deleted when: `mongodb_retention`.
 
 A query narrows on the server by index on key and time; `query.matches` decides item by item.
 """
@@ -26,11 +27,14 @@ from bson.errors import BSONError
 from pymongo import MongoClient
 from pymongo.collection import Collection
 from pymongo.cursor import Cursor
+from pymongo.database import Database
 from pymongo.errors import BulkWriteError, ConnectionFailure, ExecutionTimeout, PyMongoError
 from pymongo.uri_parser import parse_uri
 
 from due.codec import pack, unpack
 from due.drivers.latest_items import by_age, latest_items
+from due.drivers.mongodb_retention import MongoRetention, naming, number
+from due.drivers.mongodb_sharding import SHARD_KEYS, shard
 from due.drivers.query import ArchiveQuery, parse
 from due.drivers.query_time import in_time, time_left
 from due.drivers.query_tree import Condition
@@ -47,7 +51,6 @@ _DUPLICATE = 11000
 _DOCUMENT_OVERHEAD = 300
 _MAX_NAMED_KEYS = 1000
 _NOTE_SECONDS = 60.0
-_EMPTY_SECONDS = 600.0
 _INT64 = 2**63
 _SERVER_SELECTION_MS = "3000"
 
@@ -79,8 +82,7 @@ class MongoArchive:
         self._closed = False
         self._spans: dict[str, tuple[int, int]] = {}
         self._noted_at = 0.0
-        self._empty: dict[str, float] = {}
-        """Keys without a document, and since when that is known (s, monotonic)."""
+        self._retention = MongoRetention(self._table)
         self.damaged = 0
         """Documents that could not be decoded and are missing from results."""
 
@@ -106,9 +108,9 @@ class MongoArchive:
         with self.errors():
             criteria = self._criteria(parsed)
             if limit is not None:
-                found = in_time(self._find(criteria, {"lastTimestamp": 1}))
-                heads = [(_number(document, "lastTimestamp"), str(document["_id"])) for document in found]
-                return latest_items(heads, lambda names: self._read({"_id": {"$in": names}}, parsed), limit)
+                found = in_time(self._find(criteria, {"dataKey": 1, "timestamp": 1, "lastTimestamp": 1}))
+                heads = [(number(document, "lastTimestamp"), document) for document in found]
+                return latest_items(heads, lambda some: self._read(naming(some), parsed), limit)
             items = list(self._read(criteria, parsed))
         items.sort(key=by_age)
         return items
@@ -116,10 +118,10 @@ class MongoArchive:
     def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
         """Delete documents that are wholly older than `before`, then the oldest down to `max_bytes`."""
         with self.errors():
-            deleted = 0 if before is None else self._prune_older(before)
+            deleted = 0 if before is None else self._retention.older(before)
             if max_bytes is not None:
-                deleted += self._prune_larger(max_bytes)
-            self._prune_keys()
+                deleted += self._retention.larger(max_bytes)
+            self._retention.forget_keys()
             return deleted
 
     def close(self) -> None:
@@ -133,7 +135,10 @@ class MongoArchive:
     # --- connection ----------------------------------------------------------------------------
 
     def _table(self, companion: str = "") -> Collection[Document]:
-        return self._named("_".join(filter(None, (self._collection, companion))) + self._ending)
+        return self._named(self._name(companion))
+
+    def _name(self, companion: str = "") -> str:
+        return "_".join(filter(None, (self._collection, companion))) + self._ending
 
     def _named(self, name: str) -> Collection[Document]:
         if self._closed:
@@ -141,17 +146,20 @@ class MongoArchive:
         with self._lock:
             if self._client is None or self._pid != os.getpid():
                 self._client, self._pid, self._spans = client_of(self._url), os.getpid(), {}
-                self._make_indexes(self._client[self._database][self._collection + self._ending])
+                try:
+                    self._prepare(self._client[self._database])
+                except PyMongoError:
+                    self._client = None
+                    raise
             return self._client[self._database][name]
 
-    def _make_indexes(self, table: Collection[Document]) -> None:
-        try:
-            table.create_index([("dataKey", 1), ("timestamp", 1)])
-            table.create_index([("dataKey", 1), ("eventTime", 1)])
-            table.create_index([("instanceId", 1), ("dataKey", 1), ("lastSequence", 1)])
-        except PyMongoError:
-            self._client = None
-            raise
+    def _prepare(self, database: Database[Document]) -> None:
+        """Make indexes, and shard the collections on a cluster."""
+        table = database[self._name()]
+        table.create_index(list(SHARD_KEYS[""].items()))
+        table.create_index([("dataKey", 1), ("eventTime", 1)])
+        table.create_index([("instanceId", 1), ("dataKey", 1), ("lastSequence", 1)])
+        shard(database, {self._name(companion): key for companion, key in SHARD_KEYS.items()})
 
     @contextmanager
     def errors(self) -> Iterator[None]:
@@ -277,60 +285,6 @@ class MongoArchive:
         parts = {d["_id"]: d["payload"] for d in self._table("parts").find({"_id": {"$in": names}})}
         return document | {"payload": b"".join(parts[name] for name in names if name in parts)}
 
-    # --- retention -----------------------------------------------------------------------------
-
-    def _prune_older(self, before: int) -> int:
-        deleted = 0
-        for key in [document["_id"] for document in self._table("keys").find({})]:
-            old = {"dataKey": {"$eq": key}, "timestamp": {"$lt": before}, "lastTimestamp": {"$lt": before}}
-            deleted += self._delete(list(self._table().find(old, {"count": 1, "parts": 1})))
-        return deleted
-
-    def _prune_larger(self, max_bytes: int) -> int:
-        fields = {"timestamp": 1, "count": 1, "bytes": 1, "parts": 1}
-        documents = sorted(
-            self._table().find({}, fields), key=lambda document: _number(document, "timestamp")
-        )
-        excess = sum(_number(document, "bytes") for document in documents) - max_bytes
-        old = []
-        for document in documents:
-            if excess <= 0:
-                break
-            excess -= _number(document, "bytes")
-            old.append(document)
-        return self._delete(old)
-
-    def _prune_keys(self) -> None:
-        """Remove keys that have had no document for a while; writers record theirs again each minute."""
-        now, keys = time.monotonic(), list(self._table("keys").find({}))
-        empty = {}
-        for entry in keys:
-            name = {"dataKey": {"$eq": entry["_id"]}}
-            if self._table().find_one(name, {"_id": 1}) is not None:
-                continue
-            since = empty[entry["_id"]] = self._empty.get(entry["_id"], now)
-            if now - since < _EMPTY_SECONDS:
-                continue
-            self._table("keys").delete_one({"_id": {"$eq": entry["_id"]}})
-            if self._table().find_one(name, {"_id": 1}) is not None:  # written meanwhile
-                self._table("keys").replace_one({"_id": {"$eq": entry["_id"]}}, entry, upsert=True)
-        self._empty = empty
-
-    def _delete(self, documents: Sequence[Document]) -> int:
-        for start in range(0, len(documents), 1000):
-            names = [document["_id"] for document in documents[start : start + 1000]]
-            self._table().delete_many({"_id": {"$in": names}})
-        parts = [f"{d['_id']}#{n}" for d in documents for n in range(_number(d, "parts"))]
-        if parts:
-            self._table("parts").delete_many({"_id": {"$in": parts}})
-        return sum(_number(document, "count") for document in documents)
-
-
-def _number(document: Document, name: str) -> int:
-    """A number of a document; 0 if it is damaged."""
-    number = document.get(name)
-    return int(number) if isinstance(number, int) else 0
-
 
 def _check_options(url: str, shown: str) -> None:
     """Refuse unknown options, for which pymongo would only warn."""
@@ -378,8 +332,8 @@ def _split(document: Document) -> Iterator[Document]:
     payload, document["payload"] = document["payload"], b""
     starts = range(0, len(payload), _PART_BYTES)
     document["parts"] = len(starts)
-    for number, start in enumerate(starts):
-        yield {"_id": f"{document['_id']}#{number}", "payload": payload[start : start + _PART_BYTES]}
+    for part, start in enumerate(starts):
+        yield {"_id": f"{document['_id']}#{part}", "payload": payload[start : start + _PART_BYTES]}
 
 
 def _items(document: Document, query: ArchiveQuery) -> Iterator[Item]:
@@ -413,7 +367,8 @@ def _is_exact(value: Any, depth: int = 0) -> bool:
     if depth > 50:
         return False
     if kind is list:
-        return all(_is_exact(element, depth + 1) for element in value)
+        # FerretDB takes no list in a list
+        return all(type(element) is not list and _is_exact(element, depth + 1) for element in value)
     if kind is not dict:
         return False
     return all(_is_field(name) and _is_exact(element, depth + 1) for name, element in value.items())

@@ -118,7 +118,7 @@ class _Sized(MongoArchive):
     def size(self) -> int:
         """Bytes of all documents."""
         with self.errors():
-            return sum(int(one.get("bytes", 0)) for one in self._table().find({}, {"bytes": 1}))
+            return self._retention.size()
 
 
 class _OwnCollection(_Sized):

@@ -1,4 +1,7 @@
-"""A MongoDB-speaking server over a real connection: MONGODB_URI where set, else `nx-27017`."""
+"""A server that speaks MongoDB's protocol, over a real connection: that of $MONGODB_URL, else `nx-27017`.
+
+$MONGODB_URL is mongodb://[USER:PASSWORD@]HOST:PORT/DATABASE without options; tests make collections there, and empty them.
+"""
 
 import os
 import re
@@ -63,8 +66,8 @@ def _port(log: Path, process: "subprocess.Popen[bytes]") -> int:
 
 @contextmanager
 def mongo_server(folder: Path) -> Iterator[str]:
-    """MONGODB_URI, or a server of our own."""
-    given = os.environ.get("MONGODB_URI")
+    """$MONGODB_URL, or a server of our own."""
+    given = os.environ.get("MONGODB_URL")
     if given:
         yield given
         return

@@ -17,11 +17,12 @@ from due.codec import pack
 from due.drivers.base import ArchiveDriver
 from due.errors import BackendError, InvalidKey, InvalidQuery
 from due.messages import Item, RecordBatch
+from tests.due.drivers.mongo_router import mongo_router
 from tests.due.drivers.mongo_server import PATIENT, mongo_server
 from tests.naive.archive_query import naive_find
 
 T0 = 1_700_000_000_123_456_789
-DRIVERS = ("sqlite", "mongodb", "memory")
+DRIVERS = ("sqlite", "mongodb", "mongodb_cluster", "memory")
 Open = Callable[[], ArchiveDriver]
 
 
@@ -31,13 +32,21 @@ def mongo_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield url
 
 
+@pytest.fixture(scope="module")
+def mongo_cluster_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Of a double of mongos: no sharded cluster runs here."""
+    with mongo_router(tmp_path_factory.mktemp("mongo_cluster")) as (url, _):
+        yield url
+
+
 def _url(request: pytest.FixtureRequest, folder: Path) -> str:
     unique = abs(hash(request.node.nodeid))
     if request.param == "sqlite":
         return f"sqlite://{folder}/archive.db"
     if request.param == "memory":
         return f"memory://t{unique}"
-    return request.getfixturevalue("mongo_url") + f"?{PATIENT}&collection=t{unique}"
+    server = "mongo_url" if request.param == "mongodb" else "mongo_cluster_url"
+    return request.getfixturevalue(server) + f"?{PATIENT}&collection=t{unique}"
 
 
 @pytest.fixture(params=DRIVERS)
@@ -217,6 +226,23 @@ def test_retention_by_age(archive: ArchiveDriver) -> None:
     assert [i.sequence for i in archive.find({"dataKey": "a.b.c"})] == list(range(4, 11))
     assert archive.find({"dataKey": "f"}) == []
     assert archive.prune(before=T0) == 0
+
+
+def test_retention_by_age_keeps_a_frame_until_all_of_it_is_old(archive: ArchiveDriver) -> None:
+    archive.insert_frames([pack([item(n=n) for n in range(1, 11)])])
+    archive.insert([item(value=n, n=n) for n in range(11, 21)])
+    assert archive.prune(before=T0 + 5000) == 0
+    assert len(archive.find({})) == 20
+    assert archive.prune(before=T0 + 10_001) == 10
+    assert [i.value for i in archive.find({})] == list(range(11, 21))
+
+
+def test_retention_by_age_leaves_no_key_out(archive: ArchiveDriver) -> None:
+    for key in ("a.b", "a.b.c", "z"):
+        archive.insert([item(key, n=n) for n in (1, 3)])
+    assert archive.prune(before=T0 + 2000) == 3
+    assert sorted((i.key, i.sequence) for i in archive.find({})) == [("a.b", 3), ("a.b.c", 3), ("z", 3)]
+    assert archive.prune(before=T0 + 2000) == 0
 
 
 def test_retention_by_size_takes_the_oldest_first(archive: ArchiveDriver) -> None:

@@ -7,9 +7,9 @@ import pytest
 from pymongo import MongoClient
 
 from due.codec import pack
-from due.drivers import mongodb
+from due.drivers import mongodb, mongodb_retention
 from due.drivers.mongodb import MongoArchive
-from due.errors import ArchiveUnavailable, InvalidOption
+from due.errors import ArchiveUnavailable, BackendError, InvalidOption
 from due.messages import Item, PackedFrame
 from tests.due.conftest import wait_for
 from tests.due.drivers.mongo_server import PATIENT, mongo_server, nx_server
@@ -100,6 +100,35 @@ def test_payloads_beyond_a_documents_size_are_stored_in_parts(
     assert archive.find({}) == []
 
 
+def test_many_old_documents_are_deleted_some_at_a_time(
+    archive: MongoArchive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mongodb_retention, "_STEP", 7)
+    for key in ("a.b", "a.c"):
+        archive.insert(items(30, key=key))
+    assert archive.prune(before=T0 + 22) == 2 * 21
+    assert [item.sequence for item in archive.find({"dataKey": "a.b"})] == list(range(22, 31))
+    assert archive.prune(max_bytes=0) == 2 * 9
+
+
+def test_of_a_large_document_whose_deletion_is_interrupted_nothing_stays(
+    archive: MongoArchive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mongodb, "_PART_BYTES", 1000)
+    archive.insert([Item("a.large", bytes(5000), T0, T0, "app", "i", 1)])
+    with monkeypatch.context() as broken:
+        broken.setattr(mongodb_retention, "naming", _interrupted)
+        with pytest.raises(BackendError):
+            archive.prune(before=T0 + 1)
+    assert archive.prune(before=T0 + 1) == 1
+    for companion in ("", "parts"):
+        assert list(archive._table(companion).find({})) == []
+
+
+def _interrupted(_: object) -> None:
+    raise BackendError("interrupted")
+
+
 def test_other_clients_read_plain_documents(archive: MongoArchive, url: str) -> None:
     archive.insert_frames([pack(items(2), index=True)])
     client: MongoClient[dict[str, object]] = MongoClient(url.partition("?")[0])
@@ -159,7 +188,7 @@ def test_keys_go_a_while_after_their_last_document_and_come_back(
     keys = archive._table("keys")
     assert archive.prune(before=T0 + 100) == 3
     assert {key["_id"] for key in keys.find({})} == {"gone", "stays"}, "not at once"
-    monkeypatch.setattr(mongodb, "_EMPTY_SECONDS", 0.0)
+    monkeypatch.setattr(mongodb_retention, "_EMPTY_SECONDS", 0.0)
     monkeypatch.setattr(mongodb, "_NOTE_SECONDS", 0.0)
     archive.prune(before=T0 + 100)
     assert {key["_id"] for key in keys.find({})} == {"stays"}
