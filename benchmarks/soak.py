@@ -3,8 +3,9 @@
     office traffic ──► veth ──► pipeline of `sdnator up` ──► veth ──► what came
     an operator, a reader of scores and of a query ──┘ └── /proc of every process, each few seconds ──► samples
 
-Before it is measured the load trains Kitsune, and fills its tables with hosts that come once (`benchmarks.soak_fill`;
-`--no-fill` leaves that out): state that is bounded would grow for hours otherwise, and look like a leak.
+Before it is measured the load trains Kitsune, and fills its tables with hosts that come once, and those of the firewall and
+the controller with known sources (`benchmarks.soak_fill`; `--no-fill` leaves that out): state that is bounded would grow for
+hours otherwise, and look like a leak.
 
 Fields: `seconds`, `pps`; `fill_s`, `fill_frames` (0: not filled), `fill_scored` (of them, by Kitsune), `fill_tables`
 (entries and caps then); by process `slope_kb_per_hour` (of its anonymous memory, Theil-Sen over the medians of
@@ -32,7 +33,7 @@ from typing import Any
 from benchmarks.measure import machine, table, write_json
 from benchmarks.soak_client import SoakClient
 from benchmarks.soak_figures import figures, lost_in
-from benchmarks.soak_fill import PAIRS, TRAINED, fill_frames, fullness
+from benchmarks.soak_fill import FRAMES, TRAINED, fill_frames, fullness
 from benchmarks.soak_memory import folder_bytes, footprints
 from benchmarks.soak_traffic import LATE_S, OfficeLoad
 from benchmarks.worker import end_in_order
@@ -50,7 +51,7 @@ _TOLD_S = 15.0
 """Until frames are late, and apps have said how full they are."""
 _PROGRESS_S = 300.0
 _WARM_S = 3600.0
-"""Bounded state fills first: Kitsune keeps an idle stream for 3,000 s, producers retain up to 16 MiB."""
+"""Bounded state fills first: Kitsune keeps an idle stream for 3,000 s, producers retain up to 16 MiB of an hour."""
 
 
 class Ended(Exception):
@@ -184,11 +185,11 @@ class SoakRun:
         return carried
 
     def fill(self, pps: float) -> dict[str, Any]:
-        """Train Kitsune and fill its tables, at so many frames a second; what that took and came to."""
+        """Train Kitsune and fill tables, at so many frames a second; what that took and came to."""
         began, before = time.monotonic(), self.sample(0.0)
         self._send(TRAINED, pps)
         self.load.insert(fill_frames())
-        self._send(2 * PAIRS, pps)
+        self._send(FRAMES, pps)
         time.sleep(_TOLD_S)
         after = self.sample(0.0)
         found = {

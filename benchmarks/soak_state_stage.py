@@ -25,10 +25,8 @@ SPANS: Final = 60
 LOOKS: Final = 20 * SPANS
 """How often memory is looked at."""
 _MOST_OBJECTS: Final = 12
-_WINDOW: Final = Options().window_bytes
-_RETAIN: Final = 1 << 20
-"""Of what a producer keeps for a server that comes back empty.  In a pipeline it is `retain_bytes`, 16 MiB, and keys
-with few items take many hours to fill their share: that bound is known, and here it is reached within the hour."""
+_LIMITS: Final = Options()
+"""Of what a producer keeps for a server that comes back empty: full within the hour, since it keeps no longer."""
 _ARCHIVE_AT: Final = 200
 
 Written = Callable[[str, Any], None]
@@ -135,7 +133,7 @@ class FastEngine:
         self._numbers[key] += 1
         if path not in self._windows:
             kept = any(pattern.matches_path(path) for pattern in self._reliable)
-            self._windows[path] = SendWindow(path, _WINDOW, _RETAIN, 30.0) if kept else None
+            self._windows[path] = _window(path) if kept else None
         window = self._windows[path]
         if window is not None:
             entry = window.add(payload)
@@ -195,6 +193,16 @@ class FastEngine:
         return Item(
             key, value, now, now if event_time is None else event_time, app, f"{app}1", self._numbers[key]
         )
+
+
+def _window(path: str) -> SendWindow:
+    return SendWindow(
+        path,
+        _LIMITS.window_bytes,
+        _LIMITS.retain_bytes,
+        _LIMITS.group_timeout,
+        _LIMITS.retain_seconds,
+    )
 
 
 def watched(

@@ -2,15 +2,18 @@
 
 import numpy as np
 
+from apps.firewall.settings import Settings
+from apps.firewall.syn.syn_defence import SERVICES_LEARNT
 from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS, AfterImage
 from apps.kitsune.behaviour.contacts import MOST_CONTACTS
 from apps.kitsune.senders import MOST_CONVERSATIONS, MOST_SENDERS
 from apps.packets import read_frames
-from benchmarks.soak_fill import PAIRS, fill_frames, fullness
+from apps.sonata_adapter.host.handshake import Handshakes
+from benchmarks.soak_fill import FRAMES, HANDSHAKES, PAIRS, UNANSWERED, fill_frames, fullness
 
 
-def packets(pairs, unanswered=0):
-    sides, frames = zip(*fill_frames(pairs, unanswered), strict=True)
+def packets(pairs, unanswered=0, handshakes=0):
+    sides, frames = zip(*fill_frames(pairs, unanswered, handshakes), strict=True)
     numbers = np.arange(len(frames))
     return read_frames(
         frames,
@@ -40,11 +43,35 @@ def test_the_first_hosts_ask_twice_and_wait_in_vain_the_second_time():
     assert again == [(asked[0][0] + number, asked[0][0] + number + 1) for number in range(70)]
 
 
+def test_connections_make_known_sources_and_services_and_no_flood():
+    columns = packets(0, 0, 200)
+    assert ((columns["ip_src_lo"] - columns["ip_src_lo"].min()) % 2 + 1).tolist() == columns["port"].tolist()
+    found = Handshakes().process(columns)
+    assert len({each.source for each in found}) == len({each.service for each in found}) == 200
+    assert {each.port for each in found} == {443}
+
+
+def test_as_many_frames_are_sent_as_there_are():
+    assert len(list(fill_frames(130, 70, 100))) == 2 * 130 + 70 + 3 * 100
+    assert FRAMES == 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES
+
+
+def test_there_are_connections_enough_for_known_sources_and_services():
+    assert max(Settings().known_limit, SERVICES_LEARNT) < HANDSHAKES
+    assert HANDSHAKES < PAIRS
+
+
 def test_headers_are_valid():
-    for _, frame in fill_frames(3):
+    for _, frame in fill_frames(3, 1, 2):
         words = np.frombuffer(frame[14:34], ">u2").astype(int).sum()
         assert words % 0xFFFF == 0
         assert int.from_bytes(frame[16:18], "big") == len(frame) - 14
+
+
+def test_segments_have_their_checksum():
+    for _, frame in fill_frames(0, 0, 2):
+        words = np.frombuffer(frame[26:], ">u2").astype(int).sum() + 6 + len(frame) - 34
+        assert words % 0xFFFF == 0
 
 
 def test_tables_are_full_afterwards():
