@@ -106,7 +106,8 @@ def _packet(sender: int, receiver: int, protocol: int, content: bytes) -> bytes:
 
 def _checksum(words: bytes) -> int:
     """Of an even number of bytes (RFC 1071)."""
-    return ~(sum(struct.unpack(f"!{len(words) // 2}H", words)) % 0xFFFF) & 0xFFFF
+    total: int = sum(struct.unpack(f"!{len(words) // 2}H", words))
+    return ~(total % 0xFFFF) & 0xFFFF
 
 
 def _mac(host: int) -> bytes:
