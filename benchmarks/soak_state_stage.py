@@ -133,7 +133,7 @@ class FastEngine:
         self._numbers[key] += 1
         if path not in self._ledgers:
             kept = any(pattern.matches_path(path) for pattern in self._reliable)
-            self._ledgers[path] = _ledger(path) if kept else None
+            self._ledgers[path] = ledger_of(path) if kept else None
         ledger = self._ledgers[path]
         if ledger is not None:
             entry = ledger.add(payload)
@@ -195,7 +195,8 @@ class FastEngine:
         )
 
 
-def _ledger(path: str) -> StreamLedger:
+def ledger_of(path: str) -> StreamLedger:
+    """What a producer keeps of a path, by default."""
     return StreamLedger(
         path,
         _LIMITS.window_bytes,
