@@ -2,6 +2,7 @@
 
     office traffic, as in `benchmarks.soak` ──► time stamps of 4,000 packets a second ──► Detector
     what comes of it, and what a soak run's client asks for ──► services of firewall, Sonata adapter and Coordinator
+                                                             └► what the controller keeps of a switch
 
 A soak run of two hours ends while tables still fill; here hours of its traffic pass in minutes, in a process for each
 part.  `mib` is the process' anonymous memory in each span, `later_mib_per_hour` its slope over the last third, by the

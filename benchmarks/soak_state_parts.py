@@ -9,11 +9,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks import soak_state_adapter, soak_state_coordinator, soak_state_firewall
+from benchmarks import (
+    soak_state_adapter,
+    soak_state_controller,
+    soak_state_coordinator,
+    soak_state_firewall,
+)
 
 OTHERS: Final = {
     "firewall": soak_state_firewall.figures,
     "sonata_adapter": soak_state_adapter.figures,
+    "p4runtime_ctrl": soak_state_controller.figures,
     "coordinator": soak_state_coordinator.figures,
 }
 PARTS: Final = ("kitsune", *OTHERS)

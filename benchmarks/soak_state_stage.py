@@ -133,7 +133,7 @@ class FastEngine:
         self._numbers[key] += 1
         if path not in self._windows:
             kept = any(pattern.matches_path(path) for pattern in self._reliable)
-            self._windows[path] = _window(path) if kept else None
+            self._windows[path] = send_window(path) if kept else None
         window = self._windows[path]
         if window is not None:
             entry = window.add(payload)
@@ -195,7 +195,8 @@ class FastEngine:
         )
 
 
-def _window(path: str) -> SendWindow:
+def send_window(path: str) -> SendWindow:
+    """What a producer keeps of a path, by default."""
     return SendWindow(
         path,
         _LIMITS.window_bytes,

@@ -51,7 +51,8 @@ def clocks(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("part", "scale"), [("coordinator", "0.01"), ("firewall", "0.008"), ("sonata_adapter", "0.006")]
+    ("part", "scale"),
+    [("coordinator", "0.01"), ("firewall", "0.008"), ("p4runtime_ctrl", "0.02"), ("sonata_adapter", "0.006")],
 )
 @pytest.mark.usefixtures("clocks")
 def test_a_part_lives_through_its_minutes(part, scale, tmp_path, monkeypatch):
@@ -63,11 +64,19 @@ def test_a_part_lives_through_its_minutes(part, scale, tmp_path, monkeypatch):
     assert len(found["mib"]) == 60
     assert {"later_mib_per_hour", "noise", "growing", "more_objects"} <= found.keys()
     told = found["health"]["end"]
-    heard = {"coordinator": "heartbeats", "firewall": "evidence", "sonata_adapter": "results"}[part]
+    heard = {
+        "coordinator": "heartbeats",
+        "firewall": "evidence",
+        "p4runtime_ctrl": "confirmed",
+        "sonata_adapter": "results",
+    }[part]
     assert told[heard] > found["health"]["later"][heard] > 0
     if part == "firewall":
         assert told["handshakes"] > 0
         assert told["blocks"] == 12, "an operator's, each for two minutes, every ten seconds"
+    elif part == "p4runtime_ctrl":
+        assert told["blocks"] == 12
+        assert told["known_sources"] > 100
     elif part == "coordinator":
         assert told["pruned"] > 0
 
