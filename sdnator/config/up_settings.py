@@ -4,6 +4,8 @@ from typing import Literal
 
 import msgspec
 
+_MOST_PROCESSES = 64
+
 
 class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the pipeline keeps and shares its data."""
@@ -18,9 +20,16 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Keep Kitsune's model in the state folder, and use it again at the next start if switches, ports and settings
     are the same; off: train at every start, unless `kitsune.load_model` or `--model` names a model."""
 
+    processes: dict[str, int] = {}
+    """How many processes to run of an app whose instances divide the switches (`instances = "sharded"`), by its name;
+    one of each that is not named."""
+
     def __post_init__(self) -> None:
         if not self.quota >= 0.01:
             raise ValueError(f"quota={self.quota}: at least 0.01 GiB")
+        for name, count in self.processes.items():
+            if not 1 <= count <= _MOST_PROCESSES:
+                raise ValueError(f"processes={{{name}: {count}}}: 1 to {_MOST_PROCESSES} of each app")
 
 
 class GrantPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

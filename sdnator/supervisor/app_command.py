@@ -27,21 +27,28 @@ class Backends:
 
 
 def app_command(
-    name: str, folder: Path, backends: Backends, settings: Mapping[str, Any], *, directory: Path | None = None
+    name: str,
+    folder: Path,
+    backends: Backends,
+    settings: Mapping[str, Any],
+    *,
+    directory: Path | None = None,
+    part: str = "",
 ) -> list[str]:
-    """The arguments of `python -m`; writes NAME.settings.json and NAME.engine.json into the folder, mode 0600.
+    """The arguments of `python -m`; writes PART.settings.json and PART.engine.json into the folder, mode 0600.
 
     Args:
-        name: of the part.
+        name: of the app.
         folder: for both files.
         backends: of the engine.
         settings: of the app.
         directory: where the engine keeps its spool; None: its default.
+        part: name of the process, where an app has several; empty: the app's.
     """
     places = {"updates": backends.updates, "archive": backends.archive}
     if directory is not None:
         places["directory"] = str(directory)
-    engine = write_private_json(folder / f"{name}.engine.json", {**backends.options, **places})
-    chosen = write_private_json(folder / f"{name}.settings.json", settings)
+    engine = write_private_json(folder / f"{part or name}.engine.json", {**backends.options, **places})
+    chosen = write_private_json(folder / f"{part or name}.settings.json", settings)
     program = [MODULES[name]] if name in MODULES else ["sdnator.run_app", name]
     return [*program, "--engine", engine, "--settings", chosen]

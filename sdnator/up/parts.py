@@ -67,7 +67,7 @@ class UpParts:
         self.address_file = plan.state / "coordinator.url"
         self._stack = stack
         self._coordinator_token = kept_secret(plan.state / COORDINATOR_TOKEN)
-        self.granted = {name: granted(name, plan.grants) for name in plan.parts()}
+        self.granted = {name: granted(name, plan.grants) for name in plan.ids()}
         self.identities = made(plan.state, {name: one.rights for name, one in self.granted.items()})
         self.enforced = True
         """Whether the server takes users; otherwise all parts use the given credential."""
@@ -177,16 +177,17 @@ class UpParts:
             for each in self.plan.switches
             if _is_ours(each) and not self._programs[each.name].clock_goes_on
         )
-        after = {"coordinator": ours, "dashboard": ("coordinator", *self.plan.apps)}
+        others = tuple(part for part in self.plan.parts() if part != "dashboard")
+        after = {"coordinator": ours, "dashboard": others}
         return tuple(
             PartSpec(
                 name=name,
                 start=partial(self._app, name),
                 after=after.get(name, ("coordinator", *ours)),
                 needs=needs,
-                follows=follows if name == "p4runtime_ctrl" else (),
+                follows=follows if self.plan.app_of(name) == "p4runtime_ctrl" else (),
                 restart=self._restart(),
-                vital=name in _VITAL,
+                vital=self.plan.app_of(name) in _VITAL,
                 silence_s=self._silence_s(name),
             )
             for name in self.plan.parts()
@@ -194,17 +195,22 @@ class UpParts:
 
     def _silence_s(self, name: str) -> float:
         hung_s = self.plan.supervisor.hung_s
-        if hung_s and self.plan.settings_of(name).get("engine") == "spark":
+        if hung_s and self.plan.settings_of(self.plan.app_of(name)).get("engine") == "spark":
             # the first query on a slow machine waits for a JVM
             return max(hung_s, _SPARK_SECONDS)
         return hung_s
 
-    def _app(self, name: str) -> PartProcess:
-        """Start a DUE app with the current plan."""
+    def _app(self, part: str) -> PartProcess:
+        """Start a process of a DUE app with the current plan."""
         plan = self.plan
-        backends = self.backends(name)
+        name = plan.app_of(part)
         command = app_command(
-            name, plan.state, backends, self.settings(name), directory=plan.state / "due" / name
+            name,
+            plan.state,
+            self.backends(name),
+            self.settings(name),
+            directory=plan.state / "due" / part,
+            part=part,
         )
         command += ["--log", plan.log_level]
         if plan.log_format != "console":
@@ -213,7 +219,7 @@ class UpParts:
             command += ["--metrics", f"{plan.metrics_host}:0"]
             command += ["--metrics-token", plan.metrics_token_file] if plan.metrics_token_file else []
         environment = {_TOKEN: os.environ[_TOKEN]} if name == "dashboard" and _TOKEN in os.environ else {}
-        return Child(name, command, self.logs, heartbeat=True, environment=environment)
+        return Child(part, command, self.logs, heartbeat=True, environment=environment)
 
     def backends(self, name: str) -> Backends:
         """Places of both backends, with the app's own credential."""

@@ -40,6 +40,8 @@ class StandingPlan:
     """File for Prometheus' target list; empty: none."""
     apps: tuple[str, ...] = OURS
     """Ids of the apps to run, in the order in which they are started."""
+    processes: Mapping[str, int] = field(default_factory=dict)
+    """How many processes run of an app; one of each that is not named."""
     dashboard: Mapping[str, Any] | None = None
     """Options of the dashboard; None: there is none."""
     supervisor: SupervisorSettings = field(default_factory=SupervisorSettings)
@@ -48,9 +50,29 @@ class StandingPlan:
         """As they stand in the plan; empty where it has none."""
         return self.settings.get(name, {})
 
-    def parts(self) -> tuple[str, ...]:
-        """Parts that are apps of DUE."""
+    def ids(self) -> tuple[str, ...]:
+        """Ids of all apps of DUE that run."""
         return ("coordinator", *self.apps, *(("dashboard",) if self.dashboard is not None else ()))
+
+    def parts(self) -> tuple[str, ...]:
+        """Parts that are apps of DUE; further processes of an app are ID-2, ID-3, …"""
+        return tuple(self._apps())
+
+    def app_of(self, part: str) -> str:
+        """The app of which a part is a process.
+
+        Args:
+            part: one of `parts`.
+        """
+        return self._apps()[part]
+
+    def _apps(self) -> dict[str, str]:
+        counts = {name: self.processes.get(name, 1) for name in self.ids()}
+        return {
+            f"{name}-{number}" if number > 1 else name: name
+            for name, count in counts.items()
+            for number in range(1, count + 1)
+        }
 
 
 @dataclass(frozen=True)
@@ -73,7 +95,7 @@ def changes(old: StandingPlan, new: StandingPlan) -> PlanChanges:
         waits.append("dashboard.enabled: takes effect when the pipeline is restarted")
     again = [part for part in old.parts() if part in new.parts() and _differs(part, old, new)]
     if "kitsune" in again and not _has_model(new.settings_of("kitsune")):
-        again.remove("kitsune")
+        again = [part for part in again if new.app_of(part) != "kitsune"]
         waits.append(
             "kitsune: a restart would train it again; set kitsune.load_model, or restart the pipeline"
         )
@@ -90,6 +112,7 @@ _FOR_NEXT_START = (
     "archive",
     "switches",
     "apps",
+    "processes",
     "grants",
     "metrics_host",
     "metrics_token_file",
@@ -103,7 +126,8 @@ def _differs(part: str, old: StandingPlan, new: StandingPlan) -> bool:
         return True
     if part == "dashboard":
         return old.dashboard != new.dashboard
-    return _without_models(old.settings_of(part)) != _without_models(new.settings_of(part))
+    app = old.app_of(part)
+    return _without_models(old.settings_of(app)) != _without_models(new.settings_of(app))
 
 
 def _without_models(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -75,6 +75,7 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
         switches=switches,
         settings=settings,
         apps=installed,
+        processes=_processes(own.processes, settings),
         engine=config.section("due"),
         log_level=log.level,
         log_format=log.format,
@@ -84,6 +85,24 @@ def plan_for(given: Given, state: Path) -> StandingPlan:
         dashboard=_dashboard(config, state) if given.dashboard else None,
         supervisor=config.struct("supervisor"),
     )
+
+
+def _processes(
+    wanted: "Mapping[str, int]", settings: "Mapping[str, Mapping[str, Any]]"
+) -> "Mapping[str, int]":
+    """Checked; raises BadInput for an app that does not run, or of which all processes but one would only wait."""
+    for name, count in wanted.items():
+        if name not in settings or name == "coordinator":
+            raise BadInput(f"up.processes: no app {name!r} is run")
+        if count > 1 and settings[name].get("instances") != "sharded":
+            raise BadInput(
+                f"up.processes: {name} = {count}, but only instances that divide the switches all work: "
+                f'set instances = "sharded" in [{name}], if it can do so'
+            )
+        for number in range(2, count + 1):
+            if f"{name}-{number}" in settings:
+                raise BadInput(f"up.processes: {name} = {count}: there is an app {name}-{number}")
+    return wanted
 
 
 def _coordinator(config: "Config", quota: float, *, embedded: bool) -> dict[str, Any]:

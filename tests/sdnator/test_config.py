@@ -38,6 +38,7 @@ def faults(tmp_path, text, environment=None):
         ('[log]\nlevel = "loud"', "FILE:2: log.level: \"loud\" is none of 'debug', 'info', 'warning' or 'error'"),
         ("[firewall.rules]\ndry_rum = true", "FILE:2: firewall.rules.dry_rum: there is no such option; did you mean dry_run?"),
         ("[up]\nquota = 0", "FILE:2: up.quota: quota=0.0: at least 0.01 GiB"),
+        ("[up]\nprocesses = { kitsune = 0 }", "FILE:2: up.processes: processes={kitsune: 0}: 1 to 64 of each app"),
         ("[up]\nretain_every_s = 5", "FILE:2: up.retain_every_s: there is no such option; it belongs to coordinator.retain_every_s"),
         ("schema = 2", "FILE:1: schema: 2 is not supported; this version reads 1: see CHANGELOG for what changed"),
         ('[[switches]]\n[[switches]]\nname = "s1"', "FILE:3: switches[1].name: there are two switches named s1"),

@@ -2,12 +2,14 @@
 
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from due.codec import pack
 from due.drivers import mongodb
 from due.drivers.mongodb import MongoArchive
+from due.drivers.mongodb_sharding import SHARD_KEYS, commands
 from due.messages import Item
 from tests.due.drivers.mongo_router import MongoRouter, mongo_router
 
@@ -129,6 +131,13 @@ def test_a_server_that_is_no_cluster_is_not_asked_to_shard(
     archive.insert(items(1))
     assert not [one for one in router.commands if next(iter(one)) in ("enableSharding", "shardCollection")]
     archive.close()
+
+
+def test_the_documentation_has_the_commands() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "operations.md").read_text(encoding="utf-8")
+    keys = {"items": SHARD_KEYS[""], "items_parts": SHARD_KEYS["parts"]}
+    for line in list(commands("sdnator", keys))[1:]:
+        assert line + "\n" in text
 
 
 def _single_server() -> dict[str, object]:

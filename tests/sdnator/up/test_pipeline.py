@@ -61,6 +61,28 @@ def test_urls_reach_an_app_in_a_file_of_its_user_and_not_as_arguments(parts, tmp
     assert msgspec.json.decode(engine.read_bytes())["updates"] == SECRET
 
 
+def test_several_processes_of_an_app_share_its_credential_and_settings_but_no_file(
+    parts, tmp_path, monkeypatch
+):
+    seen = []
+    monkeypatch.setattr("sdnator.up.parts.Child", lambda *given, **_: seen.append(given))
+    settings = {"p4runtime_ctrl": {"instances": "sharded"}}
+    made = parts(settings=settings, processes={"p4runtime_ctrl": 2}, dashboard={})
+    specs = {spec.name: spec for spec in made.specs()}
+    assert specs["p4runtime_ctrl-2"].vital
+    assert "p4runtime_ctrl-2" in specs["dashboard"].after
+    for part in ("p4runtime_ctrl", "p4runtime_ctrl-2"):
+        specs[part].start()
+    assert [(given[0], given[1][0]) for given in seen] == [
+        (part, "apps.p4runtime_ctrl.service") for part in ("p4runtime_ctrl", "p4runtime_ctrl-2")
+    ]
+    engines = [msgspec.json.decode((tmp_path / f"{given[0]}.engine.json").read_bytes()) for given in seen]
+    assert engines[0]["updates"] == engines[1]["updates"]
+    assert engines[0]["directory"] != engines[1]["directory"]
+    first, second = ((tmp_path / f"{given[0]}.settings.json").read_bytes() for given in seen)
+    assert first == second
+
+
 def test_kitsune_goes_on_with_what_it_has_learnt(parts, tmp_path):
     """Started again after its training, it does not train anew over its own model."""
     model = tmp_path / "home.model"

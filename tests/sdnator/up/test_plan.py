@@ -24,6 +24,18 @@ def test_settings_of_a_part_start_it_again():
     assert taken_up(PLAN, new, found.again) == new
 
 
+def test_new_settings_are_for_all_processes_of_an_app_and_their_number_waits():
+    two = replace(PLAN, processes={"firewall": 2, "kitsune": 2})
+    assert two.parts()[-4:] == ("sonata_adapter", "firewall", "firewall-2", "dashboard")
+    found = changes(
+        two, replace(two, settings={"firewall": {"detect": False}, "kitsune": {"threshold": 2.0}})
+    )
+    assert found.again == ("firewall", "firewall-2")
+    found = changes(PLAN, two)
+    assert (found.again, found.waits) == ((), ("processes: takes effect when the pipeline is restarted",))
+    assert taken_up(PLAN, two, ()) == PLAN
+
+
 def test_what_the_switches_know_waits_for_the_next_start():
     new = replace(PLAN, updates="redis://x", switches=(PlannedSwitch(name="s2"),), dashboard=None)
     found = changes(PLAN, new)
