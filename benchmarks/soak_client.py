@@ -2,6 +2,8 @@
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
@@ -15,12 +17,14 @@ _DECISIONS = "network.block.firewall.*"
 _ANSWERS = "network.answer.firewall.soak_operator"
 _INSTRUCTION = INSTRUCTION.replace(".operator.", ".soak_operator.")
 _EVERY_S = 10.0
-_BLOCK_S = 120
+_HASTY_S = 0.3
+_STANDING = 12
+"""Blocks at a time: each ends as so many others have begun."""
 _ADDRESSES = 60_000
 
 
 class SoakClient:
-    """An app that observes what a page and a SIEM would, and gives an instruction every ten seconds.
+    """An app that observes what a page and a SIEM would, and gives an instruction every ten seconds, or more often.
 
     Args:
         folder: of its spool.
@@ -31,6 +35,8 @@ class SoakClient:
     def __init__(self, folder: Path, updates: str, archive: str) -> None:
         self.scores = self.results = self.asked = self.answered = self.refused = self.decisions = 0
         self.errors: list[str] = []
+        self.every_s = _EVERY_S
+        """Seconds between two instructions."""
         self._blocked: dict[str, None] = {}
         self._ended = threading.Event()
         self._engine = Engine(Options(directory=str(folder), updates=updates, archive=archive))
@@ -58,19 +64,28 @@ class SoakClient:
         self._thread.join()
         self._engine.close()
 
+    @contextmanager
+    def hasty(self) -> Iterator[None]:
+        """Many instructions meanwhile: what apps remember of the last thousand would take hours to fill."""
+        self.every_s = _HASTY_S
+        try:
+            yield
+        finally:
+            self.every_s = _EVERY_S
+
     def blocked(self) -> list[str]:
         """Addresses and MACs that decisions say are blocked."""
         return list(self._blocked)
 
     def _instruct(self) -> None:
-        while not self._ended.wait(_EVERY_S):
+        while not self._ended.wait(self.every_s):
             # benchmark addresses of RFC 2544: nobody in the traffic has one
             number = self.asked % _ADDRESSES
             said = Instruction(
                 id=uuid4().hex[:12],
                 verb="block",
                 subject=f"198.18.{number // 250}.{1 + number % 250}",
-                seconds=_BLOCK_S,
+                seconds=round(_STANDING * self.every_s),
             )
             try:
                 self._engine.write(_INSTRUCTION, said.to_value())
