@@ -131,7 +131,7 @@ class Session:
             try:
                 self._open_archiver()
             except BackendError as error:
-                log.warning("%s; tried again with the first item to be archived", error)
+                log.warning("%s; trying again with the first item to be archived", error)
 
     def check(self) -> None:
         """Raise `EngineFailed` if a thread has died."""

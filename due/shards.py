@@ -253,7 +253,7 @@ class ShardWork:
     def _failed(self, what: str, path: str, error: Exception) -> None:
         self.counts["shard_failures"] += 1
         if self.counts["shard_failures"] == 1:
-            log.warning("the state of %s could not be %s: %s; tried again, and counted", path, what, error)
+            log.warning("the state of %s could not be %s: %s; trying again", path, what, error)
 
 
 class _SavedPlace(msgspec.Struct, frozen=True):

@@ -74,7 +74,7 @@ class FloodReported(Message, frozen=True, kw_only=True):
 def training_in(item: Item) -> TrainingState:
     """`network.training.kitsune`: another app's word would move the bound that all evidence has to reach."""
     if sender_of(item) != "kitsune":
-        raise MessageError("sender", f"{item.key}: only Kitsune says how far training is")
+        raise MessageError("sender", f"{item.key}: only Kitsune reports the progress of training")
     return TrainingState.from_value(item.value)
 
 

@@ -174,7 +174,7 @@ def _renumber(detector: Detector) -> int:
 
 def _check_names(numbers: SwitchNumbers) -> None:
     if len(set(numbers.names)) != len(numbers.names) or len(numbers.names) > _MOST_SWITCHES:
-        raise ValueError("names of switches come twice")
+        raise ValueError("a switch is named twice")
 
 
 # ---- the network

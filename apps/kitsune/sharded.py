@@ -123,7 +123,7 @@ class ShardedKitsune:
                 work = KitsuneService.continued(self._engine, settings, found[0])
                 _log.info("switch %s: goes on from its checkpoint of %s bytes", switch, f"{len(found[0]):,}")
             except CheckpointError as error:
-                _log.error("switch %s: training again, its checkpoint is of no use: %s", switch, error)
+                _log.error("switch %s: its checkpoint cannot be used, training again: %s", switch, error)
         work = work or KitsuneService(self._engine, settings)
         work.block(self._blocked)
         self._works[path] = work
@@ -157,7 +157,7 @@ class ShardedKitsune:
             found = read_latest(self._engine, {"dataKey": BLOCKS}, since, _MOST_BLOCKS)
         except BackendError as error:
             if not self._archive_away:
-                _log.warning("which blocks there are cannot be read: %s; tried again", error)
+                _log.warning("the blocks in force cannot be read: %s; trying again", error)
             self._archive_away = True
             return
         self._archive_away = False

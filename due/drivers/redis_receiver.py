@@ -224,7 +224,7 @@ class RedisReceiver:
                 if key.matches_path(path) and _is_path(path):
                     self._reader.add(path, start, reset=reset)
         except redis.exceptions.NoPermissionError as error:
-            log.warning("streams of %s may not be listed: %s", pattern, error)
+            log.warning("no right to list the streams of %s: %s", pattern, error)
         except (UpdatesUnavailable, redis.RedisError, OSError) as error:
             log.warning("streams of %s cannot be listed now: %s", pattern, error)
             return False

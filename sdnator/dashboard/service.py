@@ -221,7 +221,7 @@ class DashboardService:
         try:
             self._engine.write(AUDIT, deed_done.to_value(), [NO_WAIT])
         except DueError as error:
-            log.warning("the audit trail lacks that %s: %s: %s", name, deed, error)
+            log.warning("not in the audit trail: %s: %s: %s", name, deed, error)
 
     def instruct(self, verb: Any, subject: str, who: str, answered: Callable[[Answer], None]) -> str:
         """Tell the firewall; `answered` is called in the engine's thread.  Returns the instruction's id."""

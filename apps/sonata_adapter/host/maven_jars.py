@@ -62,7 +62,7 @@ def _copy(folder: Path, pom: str, artifact: str) -> None:
     maven = shutil.which("mvn")
     if maven is None:
         raise MavenMissing(
-            f"Maven copies the jars of {artifact} (on Debian: maven); or give a folder with them"
+            f"Maven copies the jars of {artifact}, and it is not installed (on Debian: maven); or give a folder with them"
         )
     (folder / "pom.xml").write_text(pom, encoding="utf-8")
     copied = subprocess.run(

@@ -266,7 +266,7 @@ def _at_pace(entry: StageEntry, period_us: int) -> StageEntry:
 def clock_period(windows: Iterable[int], least: int) -> int:
     """How often the switch says the time for these windows, in ms: at the end of each and within it.
 
-    Where that would be oftener than `least`: at the ends of all only, or else every `least`.
+    Where that would be more often than `least`: at the ends of all only, or else every `least`.
     """
     common = gcd(*windows)
     parts = max(2, -(-common // _LONGEST_PERIOD_MS))
@@ -383,7 +383,7 @@ def _entries(request: QueryRequest, space: Space, limits: SwitchLimits) -> list[
 def _clock(request: QueryRequest, space: Space, limits: SwitchLimits) -> StageEntry:
     if request.query.window_ms < limits.read_window_ms:
         raise NotPlaced(
-            f"its result is known at the window's end only, and the switch says the time no oftener than every "
+            f"its result is known at the window's end only, and the switch reports the time no more often than every "
             f"{duration_text(limits.read_window_ms)}: it would come too late"
         )
     return space.clock()

@@ -131,7 +131,7 @@ def test_a_distinct_is_split_where_that_takes_no_querys_room():
     ],
 )
 def test_the_clock_ticks_at_the_end_of_every_window_and_within(windows, period):
-    """As seldom as that can be, but not less than every ten seconds, nor oftener than every second."""
+    """As seldom as that can be, but not less than every ten seconds, nor more often than every second."""
     assert clock_period(windows, 1000) == period
 
 
