@@ -30,7 +30,6 @@ from due.errors import DueError, InvalidKey, InvalidQuery
 from due.keys import Key
 
 _WIDTH = 256
-_CPU = 510
 _ITEMS = tuple(
     Item(
         f"network.packets.p4runtime_ctrl.s{n % 3}", {"a": n, "text": "x" * n, "list": [n]}, n, n, "p", "i", n

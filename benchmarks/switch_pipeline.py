@@ -36,7 +36,6 @@ _HOSTS = 1000
 _BAD_FRAMES = 1_000_000
 _ANY = Ternary(0, 0)
 _SYN, _SYN_ACK, _DATA = 0x02, 0x12, 0x18
-_FAMILIES = ((1, 2), (1, 5))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

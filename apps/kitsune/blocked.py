@@ -8,7 +8,6 @@ unsolicited.
 
 from apps.messages import Decision
 
-Address = tuple[int, int, int]
 MOST = 65_536
 """Most blocks that are remembered; beyond that the oldest is forgotten."""
 

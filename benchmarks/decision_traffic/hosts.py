@@ -77,11 +77,6 @@ def ip_number(text: str) -> int:
     return first << 24 | second << 16 | third << 8 | fourth
 
 
-def ip_text(ip: int) -> str:
-    """A number as 10.0.0.1."""
-    return ".".join(str(ip >> shift & 255) for shift in (24, 16, 8, 0))
-
-
 def mac_text(mac: int) -> str:
     """Lower case with colons."""
     return int(mac).to_bytes(6, "big").hex(":")

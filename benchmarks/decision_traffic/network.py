@@ -14,7 +14,6 @@ import numpy as np
 from benchmarks.decision_traffic.hosts import BROADCAST_MAC, Ends, Host
 from benchmarks.decision_traffic.schedule import Random, chance
 from benchmarks.decision_traffic.traffic import (
-    BASE_US,
     EMPTY,
     HOUR,
     SECOND,
@@ -116,11 +115,6 @@ class Network:
         for name, habit in self.habits.items():
             habit(Slice(tape, chance(self.seed, self.name, name, hour), hour * HOUR, (hour + 1) * HOUR))
         return tape.traffic()
-
-
-def start_us(start_s: float) -> int:
-    """Absolute time of a second of every network."""
-    return BASE_US + round(start_s * SECOND)
 
 
 def public_addresses(random: Random, count: int) -> Ints:

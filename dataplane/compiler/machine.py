@@ -200,11 +200,4 @@ def array_names(program: Program) -> tuple[str, ...]:
     return (*program.counters, *program.meters, *program.registers)
 
 
-INSTANCE_INGRESS_CLONE, INSTANCE_EGRESS_CLONE = 1, 2
-INSTANCE_RECIRCULATED, INSTANCE_REPLICATED, INSTANCE_RESUBMITTED = 4, 5, 6
-DROP_PORT = 511
-MAX_PASSES = 1024
-"""Passes through ingress or egress that one frame may cause; BMv2 would loop for ever."""
-MAX_FRAME = 65_535
 STATISTICS = ("frames", "parser_errors", "dropped", "no_such_port", "loop_drops", "oversized")
-COPIED, FORWARDED = 1, 2

@@ -3,18 +3,14 @@
     0x1a <len> 0x2a <len> ┌ 0x0a <len> 0x0a <len> value          (for each member, big endian, shortest)
     data       struct     └ members    bitstring
 
-The back ends write samples so at once: of a list of hundreds with thirty members each, nothing but the
+The back end writes samples so at once: of a list of hundreds with thirty members each, nothing but the
 joining is left to do (runtime_types.h has the same in C).
 """
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-
-_MOST_BYTES = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,13 +25,6 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.ends)
-
-    @classmethod
-    def of(cls, samples: Sequence[bytes]) -> Self:
-        """Of single ones."""
-        ends = np.cumsum(np.fromiter(map(len, samples), np.int64, len(samples)))
-        hashes = np.fromiter(map(hash, samples), np.int64, len(samples)).view(np.uint64)
-        return cls(b"".join(samples), ends, hashes)
 
     def each(self) -> list[bytes]:
         """One by one."""
@@ -62,24 +51,8 @@ def varint(value: int) -> bytes:
     return bytes(out)
 
 
-_PREFIXES = [bytes((0x0A, 2 + size, 0x0A, size)) for size in range(_MOST_BYTES + 1)]
-_SMALL = [_PREFIXES[1] + bytes([value]) for value in range(256)]
-
-
-def encode(values: Iterable[int]) -> bytes:
-    """A sample of these members, each below 2^512."""
-    members = b"".join([_SMALL[v] if v < 256 else _member(v) for v in values])
-    struct = b"".join((b"\x2a", varint(len(members)), members))
-    return b"".join((b"\x1a", varint(len(struct)), struct))
-
-
-def _member(value: int) -> bytes:
-    size = (value.bit_length() + 7) // 8
-    return _PREFIXES[size] + value.to_bytes(size, "big")
-
-
 def decode(sample: bytes) -> tuple[int, ...]:
-    """The members of a sample that `encode` or the C back end made."""
+    """The members of a sample that the back end made."""
     at = _behind_varint(sample, 1)
     at = _behind_varint(sample, at + 1)
     values = []

@@ -59,7 +59,6 @@ _POLL_SECONDS = 2.0
 _REFUSALS = 30
 """Refused sign-ins of a minute that are kept in the archive: guessing must not fill it."""
 _NAME_CHARACTERS = 64
-_ANSWER_SECONDS = 10.0
 _WAITING = 64
 _EXPLAINED = 16
 _REPORTS = 5_000

@@ -26,8 +26,6 @@ from sdnator.up import running
 
 UPDATES = "updates"
 FIRST_SWITCH = "s1"
-MOST_SWITCHES = 13
-"""An interface's name has a letter for each pair of interfaces."""
 _START_S = 300.0
 _STARTED_S = 10.0
 """After the start, until what it has left to do is done: the dashboard, for one, is busy for seconds."""
@@ -82,7 +80,7 @@ class MeasuredPipeline:
 
     Args:
         folder: for state, data and configuration.
-        switches: up to `MOST_SWITCHES`.
+        switches: up to 13: an interface's name has a letter for each pair of interfaces.
         train: packets on which Kitsune trains.
         ports: whether the switches have interfaces; without them nothing can be sent.
 

@@ -43,7 +43,6 @@ class PacketAccounting:
         self._by_digest = by_digest
         self._first_arrival: int | None = 0 if verdicts else None
         self._overtaken = 0
-        self._oldest = 0
         self.state: NDArray[np.uint8] = np.zeros(packets, np.uint8)
         self.score: NDArray[np.float64] = np.full(packets, np.nan)
         self.sent = 0
@@ -62,14 +61,6 @@ class PacketAccounting:
     def in_flight(self) -> int:
         """Packets sent that are neither scored, dropped nor known to be not copied."""
         return self.sent - self.decided
-
-    @property
-    def oldest_in_flight(self) -> int | None:
-        """Index of the first packet that is still in flight; None if none is."""
-        states = self.state[self._oldest : self.sent]
-        waiting = states == PacketState.IN_FLIGHT
-        self._oldest += int(waiting.argmax()) if waiting.any() else len(states)
-        return self._oldest if self._oldest < self.sent else None
 
     def send(self, packets: int) -> None:
         """Note that the next `packets` packets were sent."""

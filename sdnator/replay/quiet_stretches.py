@@ -116,11 +116,6 @@ class QuietStretches:
         self._held_until = -1
         self._begins, self._ends = self._spans()
 
-    @property
-    def is_foretelling(self) -> bool:
-        """Whether the quiet stretches of now are behind a block, so that the dry run may be wrong about them."""
-        return bool(self._decided)
-
     def end(self, index: int) -> int:
         """Where the quiet stretch that a packet is in ends.
 

@@ -10,7 +10,7 @@ import hashlib
 import ipaddress
 import re
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from apps.firewall.evidence.history import INSTRUCTIONS
@@ -38,6 +38,21 @@ _NEW_IDS = 256
 """Of decisions by hand within the second in which firewall time may stand still."""
 
 
+def drops_per_second(readings: Sequence[tuple[int, int]]) -> float:
+    """Packets that were dropped a second.
+
+    Args:
+        readings: capture time in ns and drop counter, oldest first.
+
+    Returns:
+        0.0 if there are fewer than two readings.
+    """
+    if len(readings) < 2:
+        return 0.0
+    (begun, first), (ended, last) = readings[0], readings[-1]
+    return (last - first) * SECOND / (ended - begun)
+
+
 @dataclass
 class Block:
     """One block in force."""
@@ -58,10 +73,7 @@ class Block:
     @property
     def drop_rate(self) -> float:
         """Dropped packets a second over the last minute."""
-        if len(self.readings) < 2:
-            return 0.0
-        (begun, first), (ended, last) = self.readings[0], self.readings[-1]
-        return (last - first) * SECOND / (ended - begun)
+        return drops_per_second(self.readings)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,14 @@ from typing import Final
 from msgspec import structs
 
 from apps.evidence import Evidence
-from apps.firewall.policy.block_lifecycle import MINUTE, NOTICES, SECOND, OperatorNotice, decision_id
+from apps.firewall.policy.block_lifecycle import (
+    MINUTE,
+    NOTICES,
+    SECOND,
+    OperatorNotice,
+    decision_id,
+    drops_per_second,
+)
 from apps.firewall.policy.rules import Rules
 from apps.messages import MOST_OPEN_PORTS, Confirmation, Decision, Exhibit, FloodKind, RateLimit, Target
 
@@ -114,10 +121,7 @@ class StandingLimit:
 
     def drop_rate(self) -> float:
         """Dropped packets a second since it was set or extended."""
-        if len(self.readings) < 2:
-            return 0.0
-        (begun, first), (ended, last) = self.readings[0], self.readings[-1]
-        return (last - first) * SECOND / (ended - begun)
+        return drops_per_second(self.readings)
 
 
 @dataclass

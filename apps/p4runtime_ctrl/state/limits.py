@@ -18,7 +18,6 @@ from p4rt import p4runtime
 LIMIT: Final = "ingress.limit"
 OVER: Final = "ingress.limit_over"
 SPARED: Final = "ingress.limit_spared"
-TABLES: Final = (LIMIT, SPARED, OVER)
 SLOTS: Final = 256
 _PRIORITY: Final = 1_000
 _FRAGMENTS: Final = 1

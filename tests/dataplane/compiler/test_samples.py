@@ -3,9 +3,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataplane.compiler.samples import decode, encode, varint
+from dataplane.compiler.samples import decode, varint
 from dataplane.p4runtime.bytestrings import encode as canonical
 from p4rt import p4runtime
+from tests.naive.p4.sample_encoding import encode_sample as encode
 
 
 @given(st.lists(st.integers(0, (1 << 512) - 1) | st.integers(0, 300), max_size=40))

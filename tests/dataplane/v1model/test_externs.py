@@ -5,10 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataplane.errors import DataplaneError, InvalidIndex
-from dataplane.v1model.externs import HASHES, CounterValue, MeterConfig
+from dataplane.v1model.externs import CounterValue, MeterConfig
 from dataplane.v1model.switch import Switch
 from sdnator.testing.switch_traffic import frame
 from tests.dataplane.loading import MAKERS, features, fields
+from tests.naive.p4.hashes import HASHES
 from tests.naive.p4.meter import GREEN, RED, YELLOW, Meter
 
 _CHECK = b"123456789"

@@ -5,12 +5,13 @@ import zlib
 import pytest
 
 from dataplane.compiler.machine import Digest
-from dataplane.compiler.samples import encode
-from dataplane.v1model.externs import MeterConfig, crc16, csum16
+from dataplane.v1model.externs import MeterConfig
 from dataplane.v1model.switch import Replica, Switch
 from dataplane.v1model.tables import Exact, Lpm, Range, TableEntry, Ternary
 from sdnator.testing.switch_traffic import ethernet, frame
 from tests.dataplane.loading import MAKERS, features, fields, shared
+from tests.naive.p4.hashes import crc16, csum16
+from tests.naive.p4.sample_encoding import encode_sample as encode
 
 
 @pytest.fixture(params=MAKERS)

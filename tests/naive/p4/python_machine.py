@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from dataplane.compiler import layout as layouts
 from dataplane.compiler import machine as m
-from dataplane.compiler import samples
 from dataplane.compiler.machine import BatchResult, Replicas
-from dataplane.v1model import externs
 from dataplane.v1model.tree import Program
+from tests.naive.p4.hashes import HASHES
 from tests.naive.p4.python_code import generate
 from tests.naive.p4.python_statements import NO_TRUNCATION, Slots
 from tests.naive.p4.python_tables import (
@@ -26,8 +25,16 @@ from tests.naive.p4.python_tables import (
     PythonRegisters,
     PythonTable,
 )
+from tests.naive.p4.sample_encoding import encode_sample
 
 _Packet = list[Any]
+INSTANCE_INGRESS_CLONE, INSTANCE_EGRESS_CLONE = 1, 2
+INSTANCE_RECIRCULATED, INSTANCE_REPLICATED, INSTANCE_RESUBMITTED = 4, 5, 6
+DROP_PORT = 511
+MAX_PASSES = 1024
+"""Passes through ingress or egress that one frame may cause; BMv2 would loop for ever."""
+MAX_FRAME = 65_535
+COPIED, FORWARDED = 1, 2
 
 
 def look(packet: bytes, offset: int, skip: int, width: int) -> int:
@@ -54,9 +61,9 @@ def sat_cast(value: int, width: int) -> int:
 
 def _names() -> dict[str, Any]:
     names: dict[str, Any] = {"from_bytes": int.from_bytes, "randint": randint, "look": look}
-    names |= {"Digest": m.Digest, "sample": samples.encode}
+    names |= {"Digest": m.Digest, "sample": encode_sample}
     names |= {"two_comp_mod": two_comp_mod, "usat_cast": usat_cast, "sat_cast": sat_cast}
-    return names | {f"hash_{name}": function for name, function in externs.HASHES.items()}
+    return names | {f"hash_{name}": function for name, function in HASHES.items()}
 
 
 class PythonMachine:
@@ -113,9 +120,9 @@ class PythonMachine:
         verdicts = bytearray()
         for frame, now in zip(frames, times_us, strict=True):
             self._verdict = 0
-            self._budget = m.MAX_PASSES
+            self._budget = MAX_PASSES
             self._counts["frames"] += 1
-            if len(frame) > m.MAX_FRAME:
+            if len(frame) > MAX_FRAME:
                 self._counts["oversized"] += 1
             else:
                 self._arrive(port, frame, now & 0xFFFFFFFFFFFF)
@@ -178,9 +185,9 @@ class PythonMachine:
         if p[at.RESUBMIT]:
             self._resubmit(p, port, length)
         elif at.mcast_grp and p[at.mcast_grp]:
-            p[at.instance_type] = m.INSTANCE_REPLICATED
+            p[at.instance_type] = INSTANCE_REPLICATED
             self._replicate(p, self._groups.get(p[at.mcast_grp], ()))
-        elif p[at.egress_spec] != m.DROP_PORT:
+        elif p[at.egress_spec] != DROP_PORT:
             p[at.instance_type] = 0
             self._egress_pass(p, p[at.egress_spec])
 
@@ -193,7 +200,7 @@ class PythonMachine:
         copy = self._fresh(p[at.PACKET], p[at.NOW], p[at.ARRIVED], length)
         copy[at.ingress_port] = port
         self._parse(copy)
-        self._keep(p, copy, p[at.CLONE_LIST], m.INSTANCE_INGRESS_CLONE)
+        self._keep(p, copy, p[at.CLONE_LIST], INSTANCE_INGRESS_CLONE)
         self._replicate(copy, session[0], session[1])
 
     def _keep(self, p: _Packet, copy: _Packet, field_list: int, instance: int) -> None:
@@ -222,7 +229,7 @@ class PythonMachine:
     def _resubmit(self, p: _Packet, port: int, length: int) -> None:
         at = self._at
         again = self._fresh(p[at.PACKET], p[at.NOW], p[at.ARRIVED], length)
-        self._keep(p, again, p[at.RESUBMIT], m.INSTANCE_RESUBMITTED)
+        self._keep(p, again, p[at.RESUBMIT], INSTANCE_RESUBMITTED)
         again[at.packet_length] = length
         self._pending.append((True, again, port))
 
@@ -239,7 +246,7 @@ class PythonMachine:
         p[at.packet_length] = p[at.LENGTH]
         self._egress(p)
         copy = self._clone_egress(p) if p[at.CLONE] else None
-        if p[at.egress_spec] != m.DROP_PORT:
+        if p[at.egress_spec] != DROP_PORT:
             frame = self._deparse(p)
             if p[at.RECIRCULATE]:
                 self._recirculate(p, frame)
@@ -256,23 +263,23 @@ class PythonMachine:
             return None
         copy = p.copy()
         copy[at.EXIT] = 0
-        self._keep(p, copy, p[at.CLONE_LIST], m.INSTANCE_EGRESS_CLONE)
+        self._keep(p, copy, p[at.CLONE_LIST], INSTANCE_EGRESS_CLONE)
         return copy, session[0], session[1]
 
     def _recirculate(self, p: _Packet, frame: bytes) -> None:
         at = self._at
         again = self._fresh(frame, p[at.NOW], len(frame), len(frame))
-        self._keep(p, again, p[at.RECIRCULATE], m.INSTANCE_RECIRCULATED)
+        self._keep(p, again, p[at.RECIRCULATE], INSTANCE_RECIRCULATED)
         again[at.packet_length] = len(frame)
         self._pending.append((True, again, again[at.ingress_port]))
 
     def _send(self, port: int, frame: bytes) -> None:
         if port == self.cpu_port:
             self._batch.packet_ins.append(frame)
-            self._verdict |= m.COPIED
+            self._verdict |= COPIED
         elif self._ports is None or port in self._ports:
             self._outputs.append((port, frame))
-            self._verdict |= m.FORWARDED
+            self._verdict |= FORWARDED
         else:
             self._counts["no_such_port"] += 1
 

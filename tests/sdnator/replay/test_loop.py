@@ -174,21 +174,6 @@ def test_replay_waits_until_evidence_is_judged_and_its_decisions_have_come():
     assert not observer.is_judging()
 
 
-def test_the_oldest_packet_in_flight_holds_up_later_ones():
-    """Dropped and scored ones do not; packets that were not sent are not in flight."""
-    flight = PacketAccounting(5)
-    assert flight.oldest_in_flight is None
-    flight.send(4)
-    assert flight.oldest_in_flight == 0
-    flight.judge(bytes([3, 0, 3, 3]))
-    _score(flight, 2)
-    assert flight.oldest_in_flight == 0
-    _score(flight, 0)
-    assert flight.oldest_in_flight == 3
-    _score(flight, 3)
-    assert flight.oldest_in_flight is None
-
-
 def _free_until(*, mitigate: bool, dry_run: PassResult | None = None) -> list[int]:
     """Of a packet a second, 11 for training, from packets 0, 11, 30 and 50 on."""
     nothing = np.zeros(60, np.uint32)
