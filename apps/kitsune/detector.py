@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,9 +18,9 @@ from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS
 from apps.kitsune.behaviour.findings import Finding
 from apps.kitsune.behaviour.fingerprints import SynFingerprints
 from apps.kitsune.behaviour.native import NativeBehaviour
-from apps.kitsune.behaviour.rows import parts_of
+from apps.kitsune.behaviour.rows import SenderId, parts_of
 from apps.kitsune.drift import BLOCK_S, TRAINING_BLOCKS, TRAINING_SAMPLE, Drift
-from apps.kitsune.evidence import evidence_of
+from apps.kitsune.evidence import SenderFacts, evidence_of, facts_of
 from apps.kitsune.kernel import Columns, Kernel, load_kernel
 from apps.kitsune.kernel_rows import KernelRows, RowRoom
 from apps.kitsune.kitnet import KitNet
@@ -29,7 +30,7 @@ from apps.kitsune.reasons import Explanation, explanations, reason
 from apps.kitsune.senders import AnomalousSecond, Senders
 from apps.kitsune.threshold import Benign, Calibration
 from apps.kitsune.training_check import TrainingCheck
-from apps.kitsune.victims import UsualTraffic, VictimRates
+from apps.kitsune.victims import VictimRates
 from apps.messages import Alert, Sender
 
 TRAIN: Final = 0
@@ -143,7 +144,7 @@ class Detector:
         self._room = RowRoom()
         self.senders = Senders(kernel)
         self.behaviour = NativeBehaviour(settings.fm_grace + settings.ad_grace + 1, kernel)
-        self.fingerprints = SynFingerprints()
+        self.fingerprints = SynFingerprints(kernel)
         self.victims = VictimRates(kernel)
         self._evidence: list[Evidence] = []
         self._tail: deque[npt.NDArray[np.float64]] = deque()
@@ -204,11 +205,13 @@ class Detector:
         state[:trained] = TRAIN
         threshold = self.threshold
 
-        def explain(chosen: npt.NDArray[np.int32]) -> list[Explanation]:
-            return explanations(self.model.moved_most(features, errors, chosen, trained))
-
         anomalous = self.senders.add(
-            rows, switch, scores=scores, trained=trained, threshold=threshold, evidence=explain
+            rows,
+            switch,
+            scores=scores,
+            trained=trained,
+            threshold=threshold,
+            evidence=partial(self._explanations, features, errors, trained),
         )
         self.victims.add(rows, trained)
         findings: list[Finding] = []
@@ -226,7 +229,7 @@ class Detector:
             if marked:  # in order of time: what comes first may decide
                 findings += filter(self._is_here, marked)
                 findings.sort(key=lambda finding: finding.time)
-        self._evidence += [self._as_evidence(finding) for finding in findings]
+        self._evidence += self._as_evidence(findings)
         self._follow_drift(rows, scores, trained, findings)
         scored = scores[trained:]
         over = int(np.count_nonzero(~(scored < threshold)))
@@ -240,6 +243,15 @@ class Detector:
         """What was found since the last call."""
         taken, self._evidence = self._evidence, []
         return taken
+
+    def _explanations(
+        self,
+        features: npt.NDArray[np.float64],
+        errors: npt.NDArray[np.float64],
+        trained: int,
+        chosen: npt.NDArray[np.int32],
+    ) -> list[Explanation]:
+        return explanations(self.model.moved_most(features, errors, chosen, trained))
 
     def _keep_tail(self, features: npt.NDArray[np.float64]) -> None:
         self._tail.append(features[-CALIBRATION_PACKETS:].copy())
@@ -290,29 +302,31 @@ class Detector:
         sender = finding.sender
         return sender is not None and not self.senders.roles.is_routed(sender[2], parts_of(sender[3]))
 
-    def _as_evidence(self, finding: Finding) -> Evidence:
-        rate = training_rate = 0.0
-        proven = forged = False
-        usual: UsualTraffic | None = None
-        if finding.sender is None:
-            usual = self.victims.usual(finding.victim, finding.service)
-            rate, training_rate = usual.rate, usual.training_rate
-        else:
-            if finding.statistic == "one_way":
+    def _as_evidence(self, findings: list[Finding]) -> list[Evidence]:
+        facts: dict[SenderId, SenderFacts] = {}
+        found = []
+        for finding in findings:
+            sender, usual = finding.sender, None
+            if sender is None:
                 usual = self.victims.usual(finding.victim, finding.service)
-            switch, port, mac, address = finding.sender
-            rate, training_rate = self.senders.rates((switch, port, mac, parts_of(address)))
-            proven = self.behaviour.proven(address)
-            forged = self.behaviour.forged(finding.sender)
-            forged |= self.senders.roles.is_borrowed(mac, parts_of(address))
-        return evidence_of(
-            finding,
+                known = SenderFacts(rate=usual.rate, training_rate=usual.training_rate)
+            else:
+                if finding.statistic == "one_way":
+                    usual = self.victims.usual(finding.victim, finding.service)
+                known = facts.get(sender) or facts.setdefault(sender, self._facts_of(sender))
+            found.append(evidence_of(finding, known, usual))
+        return found
+
+    def _facts_of(self, sender: SenderId) -> SenderFacts:
+        switch, port, mac, address = sender
+        rate, training_rate = self.senders.rates((switch, port, mac, parts_of(address)))
+        return facts_of(
+            sender,
             self.senders.roles,
-            proven=proven,
-            forged=forged,
+            proven=self.behaviour.proven(address),
+            forged=self.behaviour.forged(sender),
             rate=float(rate),
             training_rate=float(training_rate),
-            usual=usual,
         )
 
     def notes(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from apps.kitsune.behaviour.rows import SenderId, parts_of
 from apps.kitsune.names import ip_text, mac_text
 from apps.kitsune.roles import Roles
 from apps.kitsune.victims import UsualTraffic
-from apps.messages import Sender
+from apps.messages import Role, Sender
 
 KINDS: Final[dict[Statistic, Kind]] = {
     "contacts": "scan",
@@ -46,40 +46,71 @@ def sender_of(sender: SenderId) -> Sender:
     return Sender(switch=switch, port=port, mac=mac_text(mac), ip=address_text(address))
 
 
-def evidence_of(
-    finding: Finding,
-    roles: Roles,
-    *,
-    proven: bool,
-    forged: bool,
-    rate: float,
-    training_rate: float,
-    usual: UsualTraffic | None = None,
-) -> Evidence:
+class SenderFacts(NamedTuple):
+    """What evidence says of a sender; the same for all findings of a batch.  Without arguments: of nobody."""
+
+    sender: Sender | None = None
+    proven: bool = False
+    """Its address has completed a TCP handshake."""
+    forged: bool = False
+    """The address is not that of the sender: it belonged to another in training, or to nobody here."""
+    routed: bool = False
+    """It is behind a gateway of training."""
+    rate: float = 0.0
+    """Packets a second now ..."""
+    training_rate: float = 0.0
+    """... and the most of any second of training."""
+    mac_addresses: int = 0
+    """Addresses behind its MAC."""
+    role: Role = "host"
+
+
+def facts_of(
+    sender: SenderId, roles: Roles, *, proven: bool, forged: bool, rate: float, training_rate: float
+) -> SenderFacts:
+    """What is known of a sender, with what its MAC and address tell.
+
+    Args:
+        sender: an identity of `behaviour.rows`.
+        roles: of senders, and the addresses behind their MACs.
+        proven: as in `SenderFacts`.
+        forged: as in `SenderFacts`; an address that a host here borrows is forged, too.
+        rate: as in `SenderFacts`.
+        training_rate: as in `SenderFacts`.
+    """
+    mac, parts = sender[2], parts_of(sender[3])
+    return SenderFacts(
+        sender_of(sender),
+        proven,
+        forged or roles.is_borrowed(mac, parts),
+        roles.is_routed(mac, parts),
+        rate,
+        training_rate,
+        roles.addresses(mac),
+        roles.role(mac, parts),
+    )
+
+
+def evidence_of(finding: Finding, facts: SenderFacts, usual: UsualTraffic | None = None) -> Evidence:
     """The message of a finding.
 
     Args:
         finding: what was found.
-        roles: of senders, and the addresses behind their MACs.
-        proven: whether the sender's address has completed a TCP handshake.
-        forged: whether the address is not that of the sender: it belonged to another in training, or to nobody here.
-        rate: packets a second of the sender now.
-        training_rate: the highest of training.
+        facts: of its sender; of nobody, with the rates of the victim, where it has none.
         usual: what came to the victim of a flood in training.
     """
     sender = finding.sender
     at = round(finding.time * _SECOND)
     victim = address_text(finding.victim) if finding.victim else ""
     name = f"{finding.statistic}-{at}-{finding.arrival}"
-    mac, parts = (sender[2], parts_of(sender[3])) if sender is not None else (0, (0, 0, 0))
     return Evidence(
-        id=f"kitsune-{name}" if sender is None else f"kitsune-{name}-{mac:012x}",
+        id=f"kitsune-{name}" if sender is None else f"kitsune-{name}-{sender[2]:012x}",
         kind=KINDS[finding.statistic],
         source=_SOURCES.get(finding.statistic, finding.statistic),
-        sender=None if sender is None else sender_of(sender),
-        forgeable=not proven,
-        routed=sender is not None and roles.is_routed(mac, parts),
-        forged=forged,
+        sender=facts.sender,
+        forgeable=not facts.proven,
+        routed=facts.routed,
+        forged=facts.forged,
         supporting=finding.supporting,
         victims=(victim,) if victim else (),
         victim_count=1 if victim else 0,
@@ -89,13 +120,13 @@ def evidence_of(
         event_time=at,
         packets=max(1, round(finding.count)),
         first_packet=finding.arrival,
-        rate=rate,
-        training_rate=training_rate,
+        rate=facts.rate,
+        training_rate=facts.training_rate,
         usual_sources=tuple(map(address_text, usual.sources)) if usual is not None else (),
         usual_rate=usual.training_rate if usual is not None and sender is not None else 0.0,
         usual_share=min(1.0, usual.share) if usual is not None else 0.0,
-        mac_addresses=roles.addresses(mac) if sender is not None else 0,
-        role=roles.role(mac, parts) if sender is not None else "host",
+        mac_addresses=facts.mac_addresses,
+        role=facts.role,
         text=_words(finding, victim),
     )
 

@@ -15,7 +15,7 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 8
+VERSION: Final = 9
 """Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
@@ -66,6 +66,8 @@ _TRACKERS: Final = (
     void rows_read(const PacketRows *, long n, Row *);
     long rows_benign(const Row *, long first, long last, const double *scores, double threshold, const uint64_t *macs,
                      long m, double *out);
+    long rows_marked(const PacketRows *, const uint32_t *sequence, long n, long trained, long most, int32_t *rows,
+                     int32_t *by, int32_t *senders, int64_t *out);
     typedef struct {
         int32_t most_subjects, kept, most_contacts, calibration;
         double grace_s, least_nats, most_nats, least_step, least_share, deciding_nats, half_life_s,

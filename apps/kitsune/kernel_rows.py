@@ -7,7 +7,7 @@ import ipaddress
 import os
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,9 @@ _ANY_SWITCH: Final = 0xFFFF
 _LOW: Final = (1 << 64) - 1
 _SIX: Final = 1 << 16
 _VICTIM_SIX: Final = 1 << 17
+_NAMES: Final = tuple(name for name, _, _ in ROW_FIELDS)
+_KINDS: Final = tuple(kind for _, _, kind in ROW_FIELDS)
+_TYPES: Final = tuple(map(np.dtype, _KINDS))
 _POINTERS: Final = tuple(array_type(f"const {c_type}") for _, c_type, _ in ROW_FIELDS)
 Address = tuple[int, int, int]
 
@@ -38,6 +41,21 @@ class RowRoom:
         if len(self._bytes) < size:
             self._bytes = np.empty(size, np.uint8)
         return self._bytes
+
+
+class MarkedSyns(NamedTuple):
+    """SYNs that have their destination's address as sequence number."""
+
+    opening: int
+    """SYNs of training, without ACK."""
+    learnt: int
+    """Those of them that are marked."""
+    rows: npt.NDArray[np.int32]
+    """Of the marked ones after training the first, as many as are looked at."""
+    by: npt.NDArray[np.int32]
+    """Number of the sender of each, from 0 in the order in which they come."""
+    senders: npt.NDArray[np.int32]
+    """A row of each sender."""
 
 
 class KernelRows(CheckedColumns):
@@ -57,10 +75,9 @@ class KernelRows(CheckedColumns):
         try:
             self.seconds = seconds(batch)
             """Capture times."""
-            kept = [
-                self.seconds if name == "time" else contiguous(batch[name], kind)
-                for name, _, kind in ROW_FIELDS
-            ]
+            kept = [self.seconds if name == "time" else batch[name] for name in _NAMES]
+            if not _are_ready(kept):
+                kept = list(map(contiguous, kept, _KINDS))
         except KeyError as error:
             raise ColumnError(f"the batch has no column {error}") from None
         shapes = {column.shape for column in kept}
@@ -93,6 +110,25 @@ class KernelRows(CheckedColumns):
         count = kernel.lib.rows_benign(self.decoded, first, self.count, *given, found)
         return count, int(found[0]), found[1], found[2]
 
+    def marked(self, trained: int, most: int) -> "MarkedSyns":
+        """SYNs of IPv4 whose sequence number (`tcp_seq`) is the address of their destination.
+
+        Args:
+            trained: packets at the beginning that belong to training; of those such SYNs are only counted.
+            most: how many of the others are looked at.
+
+        Raises:
+            ColumnError: the sequence numbers are no column of this batch.
+        """
+        kernel, sequence = self._kernel, contiguous(self._batch["tcp_seq"], "u4")
+        if sequence.shape != self.seconds.shape:
+            raise ColumnError(f"tcp_seq has the shape {sequence.shape}, other columns {self.seconds.shape}")
+        found, counts = np.empty((3, most), np.int32), kernel.ffi.new("int64_t[3]")
+        given = (self.pointer, kernel.pointer("uint32_t", sequence), self.count, trained, most)
+        count = kernel.lib.rows_marked(*given, *(kernel.pointer("int32_t", each) for each in found), counts)
+        opening, marked, senders = counts
+        return MarkedSyns(opening, marked, found[0, :count], found[1, :count], found[2, :senders])
+
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         # every reader asks for seconds first
         return self.seconds if name == "time_s" else self._batch[name]
@@ -102,6 +138,17 @@ class KernelRows(CheckedColumns):
 
     def __len__(self) -> int:
         return len(self._batch)
+
+
+def _are_ready(columns: Sequence[Any]) -> bool:
+    """Whether `contiguous` would return each column as it is, which is what it does with those of a message."""
+    for column, dtype in zip(columns, _TYPES, strict=True):
+        if type(column) is not np.ndarray or column.dtype is not dtype:
+            return False
+        flags = column.flags
+        if not (flags.c_contiguous and flags.aligned):
+            return False
+    return True
 
 
 def rows_of(kernel: Kernel, batch: Columns) -> KernelRows:

@@ -72,6 +72,53 @@ void rows_read(const PacketRows *columns, long n, Row *rows)
         read_row(&c, i, &rows[i]);
 }
 
+/* ---- SYNs that carry their destination's address as sequence number: `behaviour/fingerprints.py` */
+
+static inline int opens(const PacketRows *c, long i)
+{
+    return c->tcp_sport[i] >= 0 && (c->tcp_flags[i] & (FIN | SYN | RST | ACK)) == SYN && !c->quoted[i];
+}
+
+static inline int is_marked(const PacketRows *c, const uint32_t *sequence, long i)
+{
+    return sequence[i] == c->ip_dst_lo[i] && c->ip_version[i] == 4;
+}
+
+/* By whom row `at` was sent: the number of a sender among `count`, by a row of each; `count` for another one. */
+static int32_t whose(const PacketRows *c, const int32_t *senders, int32_t count, long at)
+{
+    for (int32_t i = count - 1; i >= 0; i--) {
+        long row = senders[i];
+        if (c->eth_src[row] == c->eth_src[at] && c->ip_src_lo[row] == c->ip_src_lo[at] && c->port[row] == c->port[at])
+            return i;
+    }
+    return count;
+}
+
+/* Of the first `trained` of n rows: how many open a connection, and how many of those are marked, to out[0] and [1].
+ * Of the others the first marked ones, up to `most`: their numbers, the number of the sender of each, and one row of
+ * each sender (room for `most` each); the number of senders goes to out[2].  Returns how many rows there are. */
+long rows_marked(const PacketRows *columns, const uint32_t *sequence, long n, long trained, long most, int32_t *rows, int32_t *by, int32_t *senders, int64_t *out)
+{
+    const PacketRows c = *columns;
+    long found = 0, i = 0;
+    out[0] = out[1] = out[2] = 0;
+    for (; i < n && i < trained; i++)
+        if (opens(&c, i)) {
+            out[0]++;
+            out[1] += is_marked(&c, sequence, i);
+        }
+    for (; i < n && found < most; i++)
+        if (is_marked(&c, sequence, i) && opens(&c, i)) {
+            rows[found] = (int32_t)i;
+            by[found] = whose(&c, senders, (int32_t)out[2], i);
+            if (by[found] == out[2])
+                senders[out[2]++] = (int32_t)i;
+            found++;
+        }
+    return found;
+}
+
 static int is_among(const uint64_t *sorted, long n, uint64_t mac)
 {
     long low = 0;

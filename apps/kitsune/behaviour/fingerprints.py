@@ -18,25 +18,32 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from apps.kitsune.behaviour.baseline import FORGOTTEN_AT_A_TIME, MOST_EVENTS, MOST_SUBJECTS
 from apps.kitsune.behaviour.contacts import TCP
 from apps.kitsune.behaviour.findings import HALF_LIFE_S, MOST_NATS, Finding, FoundSoFar
 from apps.kitsune.behaviour.rows import SenderId
-from apps.kitsune.kernel import Columns
+from apps.kitsune.kernel import Columns, Kernel, load_kernel
+from apps.kitsune.kernel_rows import MarkedSyns, rows_of
 
 NUMBERS: Final = 1 << 32
 """Sequence numbers that a stack chooses from."""
 MOST_AT_A_TIME: Final = 256
 """Such SYNs of a batch that are looked at: a few decide."""
-_FIN, _SYN, _RST, _ACK = 0x01, 0x02, 0x04, 0x10
-_NAMES: Final = ("port", "eth_src", "ip_src_lo", "ip_dst_lo", "tcp_dport", "arrival")
+_WHOSE: Final = ("port", "eth_src", "ip_src_lo")
+_NAMES: Final = (*_WHOSE, "ip_dst_lo", "tcp_dport", "arrival")
 
 
 class SynFingerprints:
-    """Finds scanners by the sequence numbers of their SYNs; IPv4 only, as they are."""
+    """Finds scanners by the sequence numbers of their SYNs; IPv4 only, as they are.
 
-    def __init__(self) -> None:
+    Args:
+        kernel: None loads the one that was built.
+    """
+
+    def __init__(self, kernel: Kernel | None = None) -> None:
+        self._kernel = kernel or load_kernel()
         self.syns = 0
         """Of training."""
         self.marked = 0
@@ -65,16 +72,31 @@ class SynFingerprints:
         """
         if "tcp_seq" not in batch:
             return []
-        marked = (batch["tcp_seq"] == batch["ip_dst_lo"]) & (batch["tcp_sport"] >= 0)
-        if not trained and not marked.any():
+        syns = rows_of(self._kernel, batch).marked(trained, MOST_AT_A_TIME)
+        self.syns += syns.opening
+        self.marked += syns.learnt
+        if not len(syns.rows):
             return []
-        flags = batch["tcp_flags"] & (_FIN | _SYN | _RST | _ACK)
-        opening = (batch["tcp_sport"] >= 0) & (flags == _SYN) & (batch["quoted"] == 0)
-        marked &= opening & (batch["ip_version"] == 4)
-        self.syns += int(np.count_nonzero(opening[:trained]))
-        self.marked += int(np.count_nonzero(marked[:trained]))
-        rows = (np.flatnonzero(marked[trained:]) + trained)[:MOST_AT_A_TIME]
-        return self._findings(batch, rows, switch, self._nats(senders)) if len(rows) else []
+        times = batch["time_us"][syns.rows] / 1e6
+        if self._are_settled(batch, switch, syns, times):
+            return []
+        return self._findings(batch, syns.rows, switch, self._nats(senders))
+
+    def _are_settled(
+        self, batch: Columns, switch: str, syns: MarkedSyns, times: npt.NDArray[np.float64]
+    ) -> bool:
+        """Whether nothing can be worth a message, as in most batches of a scan; then the SYNs are counted."""
+        columns = (batch[name][syns.senders].tolist() for name in _WHOSE)
+        heard = []
+        for number, whose in enumerate(zip(*columns, strict=True)):
+            sender: SenderId = (switch, *whose)
+            own = times if len(syns.senders) == 1 else times[syns.by == number]
+            if not own.max() < self._settled.get(sender, 0.0):
+                return False
+            heard.append((self._times[sender], own))
+        for former, own in heard:
+            _extend(former, own)
+        return True
 
     def _nats(self, senders: int) -> float:
         expected = self.marked + max(1, self.syns) / NUMBERS
@@ -143,3 +165,12 @@ def _append(times: list[float], time: float) -> None:
     )  # two ports may deliver in another order
     if len(times) > MOST_EVENTS:
         del times[: MOST_EVENTS // 4]
+
+
+def _extend(times: list[float], more: npt.NDArray[np.float64]) -> None:
+    """As `_append` of each, where there are times."""
+    times += np.maximum(np.maximum.accumulate(more), times[-1]).tolist()
+    over = len(times) - MOST_EVENTS
+    if over > 0:
+        quarter = MOST_EVENTS // 4
+        del times[: -(-over // quarter) * quarter]

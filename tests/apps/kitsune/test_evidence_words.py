@@ -5,7 +5,7 @@ import pytest
 from apps.kitsune.behaviour.contacts import ARP, UDP, UNANSWERED
 from apps.kitsune.behaviour.findings import Finding
 from apps.kitsune.behaviour.rows import address_of
-from apps.kitsune.evidence import evidence_of
+from apps.kitsune.evidence import evidence_of, facts_of
 from apps.kitsune.roles import Roles
 from apps.kitsune.victims import UsualTraffic
 
@@ -17,11 +17,13 @@ def words(statistic, count, service=-1, usual=0.0):
 
 
 def told(statistic, count, service=-1, usual=0.0, came=None):
+    sender = ("s1", 1, 5, HOST)
     finding = Finding(
-        statistic=statistic, sender=("s1", 1, 5, HOST), victim=VICTIM, service=service, nats=3.0, total=3.0,
+        statistic=statistic, sender=sender, victim=VICTIM, service=service, nats=3.0, total=3.0,
         count=count, window_s=10.0, usual=usual, begun=98.5, time=100.0, arrival=7,
     )  # fmt: skip
-    return evidence_of(finding, Roles(), proven=False, forged=False, rate=1.0, training_rate=1.0, usual=came)
+    facts = facts_of(sender, Roles(), proven=False, forged=False, rate=1.0, training_rate=1.0)
+    return evidence_of(finding, facts, came)
 
 
 @pytest.mark.parametrize(

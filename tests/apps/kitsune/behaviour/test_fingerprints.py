@@ -4,9 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from apps.kitsune.behaviour.fingerprints import MOST_AT_A_TIME, NUMBERS, SynFingerprints
 from apps.kitsune.detector import Detector, DetectorSettings
+from apps.kitsune.kernel import ColumnError
 from apps.kitsune.model_file import load_model
 from tests.apps.kitsune.behaviour.test_behaviour import (
     ACK,
@@ -18,6 +21,8 @@ from tests.apps.kitsune.behaviour.test_behaviour import (
     handshake,
     packet,
 )  # fmt: skip
+from tests.apps.kitsune.random_traffic import FLAGS, traffic
+from tests.naive.kitsune.fingerprints import PythonSynFingerprints
 
 SENDERS = 40
 SYNS = 5_000
@@ -170,3 +175,41 @@ def test_who_falls_silent_is_forgotten():
     for later in range(24):
         found(fingerprints, marked(1_000.0 + 700 * later, ip_src_lo=100 + later))
     assert len(fingerprints) == 1
+
+
+def probes(random, count, start_s):
+    """Traffic in which many SYNs are those of a few scanners, some late."""
+    rows = dict(traffic(random, count, start_s).items())
+    chosen = random.random(count) < random.choice([0.1, 0.9])
+    scanner = random.integers(1, random.choice([2, 4, 400]), count)
+    for name in ("eth_src", "ip_src_lo"):
+        rows[name] = np.where(chosen, scanner, rows[name]).astype(rows[name].dtype)
+    rows["port"] = np.where(chosen, 1, rows["port"]).astype("u2")
+    rows["tcp_sport"] = np.where(chosen, 1_024, rows["tcp_sport"]).astype("i4")
+    rows["tcp_flags"] = np.where(random.random(count) < 0.9, SYN, random.choice(FLAGS, count)).astype("u1")
+    is_address = random.random(count) < 0.9
+    rows["tcp_seq"] = np.where(is_address, rows["ip_dst_lo"], random.integers(0, NUMBERS, count)).astype("u4")
+    return rows
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10, deadline=None)
+def test_findings_and_times_are_those_of_one_syn_after_the_other(seed):
+    """Whole batches of senders of whom nothing can be worth a message are taken at once, and leave the same behind."""
+    random = np.random.default_rng(seed)
+    sides, at, training = [PythonSynFingerprints(), SynFingerprints()], 100.0, 400
+    for _ in range(14):
+        count = int(random.integers(1, 700))
+        rows, trained = probes(random, count, at), min(count, training)
+        found = [side.add(rows, "s1", trained, SENDERS) for side in sides]
+        assert repr(found[0]) == repr(found[1])
+        kept = [(side.syns, side.marked, list(side._times.items()), side._settled) for side in sides]
+        assert kept[0] == kept[1]
+        training -= trained
+        at += float(random.choice([0.1, 5.0, 300.0, 700.0]))
+
+
+def test_sequence_numbers_of_other_packets_are_refused():
+    columns = dict(batch([marked(), marked()]).items())
+    with pytest.raises(ColumnError, match="tcp_seq"):
+        trained().add(columns | {"tcp_seq": columns["tcp_seq"][:1]}, "s1", 0, SENDERS)
