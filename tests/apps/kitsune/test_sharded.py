@@ -143,7 +143,7 @@ def test_each_switch_has_a_detector_and_its_state_comes_back():
 
 
 @pytest.mark.parametrize("damage", ["parts", "length", "bytes", "settings", "value"])
-def test_a_checkpoint_that_is_of_no_use_is_told_and_training_begins_anew(damage, caplog):
+def test_a_checkpoint_that_cannot_be_used_is_logged_and_training_begins_again(damage, caplog):
     engine = ArchivingHands()
     made = instance(engine)
     made.load(PATHS[0])
@@ -165,7 +165,7 @@ def test_a_checkpoint_that_is_of_no_use_is_told_and_training_begins_anew(damage,
         engine.items[0] = msgspec.structs.replace(part, value={"data": b"x" * len(part.value["data"])})
     other = instance(engine)
     assert other.load(PATHS[0]) == PLACE, "frames that the lost state contained are not sent again"
-    assert "s1: training again" in caplog.text
+    assert "s1: its checkpoint cannot be used, training again" in caplog.text
     assert other.health()["packets"] == 0
 
 
