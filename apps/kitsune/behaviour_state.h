@@ -231,28 +231,38 @@ static int32_t remember(Behaviour *b, const Key *contact)
     return at;
 }
 
+#define LEAST_DUES 1024
+
 static double grace_of(const Behaviour *b, const Key *contact)
 {
     return (int64_t)contact->subject.word[0] == ARP ? b->arp_grace : b->limits.grace_s;
 }
 
+/* Room for so many, a power of two; 1: there is no memory. */
+static int dues_resize(Dues *dues, int64_t room)
+{
+    Due *due = malloc((size_t)room * sizeof *due);
+    if (!due)
+        return 1;
+    for (int64_t i = 0; i < dues->count; i++)
+        due[i] = dues->due[(dues->from + i) & (dues->room - 1)];
+    free(dues->due);
+    dues->due = due;
+    dues->room = room;
+    dues->from = 0;
+    return 0;
+}
+
 static void push_due(Behaviour *b, double time, const Key *contact)
 {
     Dues *dues = &b->dues[(int64_t)contact->subject.word[0] != ARP];
-    if (dues->count == dues->room) {
-        int64_t room = dues->room ? dues->room * 2 : 1024;
-        Due *due = malloc((size_t)room * sizeof *due);
-        if (!due) {
-            b->failed = 1;
-            return;
-        }
-        for (int64_t i = 0; i < dues->count; i++)
-            due[i] = dues->due[(dues->from + i) & (dues->room - 1)];
-        free(dues->due);
-        dues->due = due;
-        dues->room = room;
-        dues->from = 0;
+    if (dues->count == dues->room && dues_resize(dues, dues->room ? dues->room * 2 : LEAST_DUES)) {
+        b->failed = 1;
+        return;
     }
+    /* else what a burst of contacts needed would be walked through, page by page, for hours after it */
+    if (dues->room > LEAST_DUES && dues->count < dues->room / 8)
+        (void)dues_resize(dues, dues->room / 2);
     Due *last = &dues->due[(dues->from + dues->count++) & (dues->room - 1)];
     last->deadline = time + grace_of(b, contact);
     last->contact = *contact;

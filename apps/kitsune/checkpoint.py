@@ -101,6 +101,7 @@ def load(data: bytes, settings: DetectorSettings, kernel: Kernel) -> tuple[Detec
         _restore_learnt(detector, header)
         _restore_rows(detector, header, arrays)
         switches = _renumber(detector)
+        detector.behaviour.check_names()
         _restore_kernel(detector, arrays, switches, kernel)
         _restore_kept(detector, header["kept"])
     except CheckpointError:

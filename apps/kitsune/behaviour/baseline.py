@@ -274,6 +274,10 @@ class Baseline:
         """Of the tails beyond a subject's own highest counts, and beyond everybody's, as shares of them."""
         return self._own_scale, self._shared_scale
 
+    def names(self) -> tuple[set[Any], set[Any]]:
+        """Names of the kinds, and of the subjects, that it knows or learns about."""
+        return {*self.shared, *self._kinds}, {*self.highest, *self._learning}
+
     def to_state(self) -> dict[str, Any]:
         """Plain values for the model file."""
         return {

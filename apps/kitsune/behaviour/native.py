@@ -328,6 +328,22 @@ class NativeBehaviour(Behaviour):
                 _WHAT,
             )
 
+    def check_names(self) -> None:
+        """Refuse names of subjects and kinds that cannot be handed to C, as a damaged checkpoint may have them.
+
+        Raises:
+            TypeError, ValueError, OverflowError: one of them is none.
+        """
+        known = len(self._switches.names)
+        for statistic in _COUNTED:
+            kinds, subjects = self._counters[statistic].baseline.names()
+            _keys(_kind_words(statistic, kind) for kind in kinds)
+            _keys(self._subject(statistic, whose) for whose in subjects)
+        _keys(map(self._words, self.senders))
+        _keys(_contact_words(*contact) for contact in self.contacts.trained)
+        if len(self._switches.names) != known:
+            raise ValueError("a baseline is about a switch that is not in the checkpoint")
+
     def _hand_over_names(self) -> None:
         """Senders, owners of addresses and contacts of a saved training, to C."""
         parts = (

@@ -137,6 +137,20 @@ def test_a_damaged_checkpoint_is_refused_or_works(data, stage):
         load(dump(detector), options, load_kernel())
 
 
+@pytest.mark.parametrize("name", [None, -1, [1, None], "s1", ["s9", 1, 2, 3]])
+@pytest.mark.parametrize("table", [0, 1], ids=["subjects", "kinds"])
+def test_names_that_mean_nothing_are_refused_before_training_ends(table, name):
+    """The end of training hands them to C: Kitsune died there, and again after each restart."""
+    header, arrays = unpack(checkpoints()[1], MARK, VERSION)
+    named = [tables[table] for tables in header["maxima"] if tables[table]]
+    assert named
+    for pairs in named:
+        pairs[0][0] = name
+    options = DetectorSettings(mode="bounded", **TRAINING, **SMALL)
+    with pytest.raises(CheckpointError):
+        load(pack(MARK, VERSION, header, arrays), options, load_kernel())
+
+
 WORDS = (0, 1, 2, -1, -2, 7, 255, 65_535, 2**31 - 1, -(2**31), 2**63 - 1, -(2**63))
 
 

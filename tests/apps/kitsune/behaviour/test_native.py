@@ -15,6 +15,7 @@ from apps.kitsune.blocked import Blocked
 from apps.kitsune.kernel import load_kernel
 from apps.messages import Target
 from tests.apps.firewall.enforcement.test_eve import decision
+from tests.apps.kitsune.behaviour.test_behaviour import SYN, batch, packet
 from tests.apps.kitsune.random_traffic import scores_of, traffic
 
 TRAINING = 900
@@ -107,3 +108,18 @@ def test_a_contact_that_is_forgotten_before_it_ends_ends_all_the_same(seed):
         assert plain(json.loads(json.dumps(sides[0].to_state()))) == plain(
             json.loads(json.dumps(sides[1].to_state()))
         )
+
+
+def test_the_queue_of_awaited_answers_loses_none_when_it_shrinks_after_a_burst():
+    """It has room for 8,192 after the burst; later a few hundred wait at a time."""
+    sides = [Behaviour(1), NativeBehaviour(1, load_kernel())]
+    begins = [0.0, *np.linspace(10, 10.5, 5_000), *np.linspace(30, 50, 4_000)]
+    rows = [packet(at, 0x0A000000 + n % 199, 0x0B000000 + n, flags=SYN) for n, at in enumerate(begins)]
+    for first in range(0, len(rows), 1_000):
+        columns = batch(rows[first : first + 1_000])
+        scores = np.zeros(len(columns))
+        found = [side.add(columns, "s1", scores, int(not first), lambda: np.zeros(1), 1.5) for side in sides]
+        assert repr(found[0]) == repr(found[1])
+    assert plain(json.loads(json.dumps(sides[0].to_state()))) == plain(
+        json.loads(json.dumps(sides[1].to_state()))
+    )
