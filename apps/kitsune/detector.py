@@ -201,7 +201,8 @@ class Detector:
             self._trained_at_us = int(rows["time_us"][trained - 1])
             self._keep_tail(features[:trained])
             self._keep_sample(features[:trained], before)
-        state = np.full(len(scores), SCORED, dtype=np.uint8)
+        state = np.empty(len(scores), np.uint8)
+        state.fill(SCORED)
         state[:trained] = TRAIN
         threshold = self.threshold
 

@@ -62,6 +62,7 @@ _TRACKERS: Final = (
     + "".join(f"const {c_type} *{name};" for name, c_type, _ in ROW_FIELDS)
     + """} PacketRows;
     typedef struct Row Row;
+    void seconds_of(const int64_t *nanoseconds, long n, double *out);
     long row_bytes(void);
     void rows_read(const PacketRows *, long n, Row *);
     long rows_benign(const Row *, long first, long last, const double *scores, double threshold, const uint64_t *macs,

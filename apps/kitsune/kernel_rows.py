@@ -26,6 +26,7 @@ _VICTIM_SIX: Final = 1 << 17
 _NAMES: Final = tuple(name for name, _, _ in ROW_FIELDS)
 _KINDS: Final = tuple(kind for _, _, kind in ROW_FIELDS)
 _TYPES: Final = tuple(map(np.dtype, _KINDS))
+_NANOSECONDS: Final = np.dtype("i8")
 _POINTERS: Final = tuple(array_type(f"const {c_type}") for _, c_type, _ in ROW_FIELDS)
 Address = tuple[int, int, int]
 
@@ -73,7 +74,7 @@ class KernelRows(CheckedColumns):
     def __init__(self, kernel: Kernel, batch: Columns, room: RowRoom | None = None) -> None:
         self._kernel, self._batch = kernel, batch
         try:
-            self.seconds = seconds(batch)
+            self.seconds = _seconds(kernel, batch)
             """Capture times."""
             kept = [self.seconds if name == "time" else batch[name] for name in _NAMES]
             if not _are_ready(kept):
@@ -149,6 +150,19 @@ def _are_ready(columns: Sequence[Any]) -> bool:
         if not (flags.c_contiguous and flags.aligned):
             return False
     return True
+
+
+def _seconds(kernel: Kernel, batch: Columns) -> npt.NDArray[np.float64]:
+    """As `seconds`; by C for the times of a message."""
+    if "time_s" in batch or "time_ns" not in batch:
+        return seconds(batch)
+    times = batch["time_ns"]
+    if type(times) is not np.ndarray or times.dtype is not _NANOSECONDS or times.ndim != 1:
+        return seconds(batch)
+    times = contiguous(times, "i8")
+    found = np.empty(len(times))
+    kernel.lib.seconds_of(kernel.pointer("int64_t", times), len(times), kernel.pointer("double", found))
+    return found
 
 
 def rows_of(kernel: Kernel, batch: Columns) -> KernelRows:

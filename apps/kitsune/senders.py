@@ -46,6 +46,7 @@ _EVENT: Final = np.dtype(
     ]
 )
 """A `SenderEvent` of C."""
+_ROW: Final = 3
 _MAC: Final = (1 << 48) - 1
 _WHAT: Final = "senders"
 
@@ -230,9 +231,10 @@ class Senders:
         if not count[0]:
             return seconds
         events = np.frombuffer(self._kernel.ffi.buffer(pointer, count[0] * _EVENT.itemsize), _EVENT)
-        peaks = events["row"][(events["what"] == _ANOMALOUS) & (events["row"] >= 0)]
-        proofs = iter(evidence(peaks) if len(peaks) else ())
-        for event in self._worth(events).tolist():
+        told = self._worth(events).tolist()
+        peaks = [event[_ROW] for event in told if event[0] == _ANOMALOUS and event[_ROW] >= 0]
+        proofs = iter(evidence(np.array(peaks, np.int32)) if peaks else ())
+        for event in told:
             what, kept_in, kept_at, row, ends, where, hi, lo, *numbers = event
             identity = self._identity((ends, where, hi, lo))
             if what == _SEEN:

@@ -59,6 +59,19 @@ static inline void read_row(const PacketRows *c, long i, Row *row)
     row->answer = arp_op == 2 || is_pong || (is_arp && c->arp_src_ip[i] == c->arp_dst_ip[i]) || base == OTHER;
 }
 
+/* As `afterimage.seconds` does it: whole seconds and the rest apart. */
+void seconds_of(const int64_t *nanoseconds, long n, double *out)
+{
+    for (long i = 0; i < n; i++) {
+        int64_t whole = nanoseconds[i] / 1000000000, rest = nanoseconds[i] % 1000000000;
+        if (rest < 0) {
+            rest += 1000000000;
+            whole--;
+        }
+        out[i] = (double)whole + (double)rest / 1e9;
+    }
+}
+
 /* Bytes that `rows_read` needs for each row. */
 long row_bytes(void)
 {

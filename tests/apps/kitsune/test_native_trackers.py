@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from apps.kitsune import senders as senders_module
 from apps.kitsune import victims as victims_module
 from apps.kitsune.accused import Accused
-from apps.kitsune.afterimage import AfterImage
+from apps.kitsune.afterimage import AfterImage, seconds
 from apps.kitsune.kernel import ColumnError, load_kernel
 from apps.kitsune.kernel_rows import KernelRows, RowRoom
 from apps.kitsune.senders import Senders
@@ -150,3 +150,16 @@ def test_benign_packets_are_counted_as_the_accused_are_left_out(accused):
         assert found == (int(left.sum()), above, times.min(), times.max())
     assert len(known.macs(3_600.0)) == 0
     assert KernelRows(kernel, batch, room).benign(40, scores, 0.5, known.macs(0.0))[0] == 0
+
+
+def test_nanoseconds_become_seconds_as_in_numpy():
+    """Before 1970, too, and whatever the layout."""
+    random = np.random.default_rng(4)
+    rows = dict(traffic(random, 999, 100.0).items())
+    for times in (
+        1_600_000_000_000_000_000 + random.integers(-(10**12), 10**12, 999),
+        random.integers(-(2**62), 2**62, 1_998)[::2],
+        np.arange(999, dtype="i4"),
+    ):
+        batch = rows | {"time_ns": times}
+        assert KernelRows(load_kernel(), batch).seconds.tobytes() == seconds(batch).tobytes()
