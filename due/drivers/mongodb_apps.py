@@ -17,10 +17,12 @@ from pymongo.errors import OperationFailure
 
 from due.drivers.latest_items import by_age
 from due.drivers.mongodb import Document, MongoArchive
+from due.drivers.mongodb_sharding import SHARD_KEYS, ShardKey
 from due.errors import ArchiveUnavailable, BackendError, InvalidOption
 from due.messages import Item, PackedFrame
 
 COLLECTION = "items"
+_COMPANIONS = ("", "keys", "parts")
 _JOINT = "__"
 _APP = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _LOOK_SECONDS = 5.0
@@ -31,7 +33,17 @@ _UNAUTHORIZED = 13
 def collections_of(app: str) -> tuple[str, ...]:
     """Names of an app's collections; an empty id: of those that apps shared before each had its own."""
     ending = _JOINT + app if app else ""
-    return tuple(name + ending for name in (COLLECTION, f"{COLLECTION}_keys", f"{COLLECTION}_parts"))
+    return tuple("_".join(filter(None, (COLLECTION, companion))) + ending for companion in _COMPANIONS)
+
+
+def shard_keys_of(app: str) -> dict[str, ShardKey]:
+    """How an app's collections are sharded: shard key by name.
+
+    Args:
+        app: its id.
+    """
+    companions = zip(collections_of(app), _COMPANIONS, strict=True)
+    return {name: SHARD_KEYS[companion] for name, companion in companions if companion in SHARD_KEYS}
 
 
 def has_app(url: str) -> bool:

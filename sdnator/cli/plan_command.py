@@ -28,6 +28,10 @@ _REMEDIES = {
     "dashboard": "do without it (--no-dashboard)",
 }
 _OTHERWISE = "copy fewer packets to the controller, or divide the switches between several pipelines"
+_DIVIDED = (
+    'divide the switches: instances = "sharded" in [{0}], and processes = {{ {0} = 2 }} or more in [up]'
+)
+_DIVISIBLE = ("kitsune", "p4runtime_ctrl")
 _ROOM = 0.7
 
 
@@ -142,18 +146,20 @@ def shown(made: "Plan", demand: "PipelineDemand", costs: "Costs") -> Iterator[st
     if made.partitions:
         yield f"                  on Kafka {made.partitions:,} partitions"
     yield ""
-    yield fitted(bottleneck_sentence(made))
+    yield fitted(bottleneck_sentence(made, demand.switches))
     for note in (*made.notes, basis(costs)):
         yield fitted(f"- {note}")
 
 
-def bottleneck_sentence(made: "Plan") -> str:
+def bottleneck_sentence(made: "Plan", switches: int) -> str:
     """What limits the pipeline, and what to do about it."""
     found = made.bottleneck
     limit = (
         "what SQLite takes" if found.name.startswith("archive") else "one core, which is all a process uses"
     )
     remedy = _REMEDIES.get(found.name, _OTHERWISE)
+    if found.name in _DIVISIBLE and switches > 1:
+        remedy = _DIVIDED.format(found.name)
     if not math.isfinite(found.pps):
         where = "whatever the rate" if found.share >= 1 else "at no rate of packets"
     else:

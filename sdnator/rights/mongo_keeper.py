@@ -11,7 +11,8 @@ from urllib.parse import quote, urlsplit, urlunsplit
 from pymongo import MongoClient
 from pymongo.errors import ConnectionFailure, OperationFailure, PyMongoError
 
-from due.drivers.mongodb_apps import collections_of, of_app
+from due.drivers.mongodb_apps import collections_of, of_app, shard_keys_of
+from due.drivers.mongodb_sharding import shard
 from due.drivers.redis_rights import EVERYTHING, Rights
 from due.keys import Key
 from sdnator.errors import PipelineError
@@ -23,8 +24,8 @@ _CALL_MS = 5000
 _COORDINATOR = "coordinator"
 """Prunes the archives of all."""
 _OPERATORS = (f"network.*.{OPERATOR}.**",)
-_WRITES = ("find", "insert", "update", "createCollection", "createIndex", "listIndexes")
-_DELETES = ("remove", "update", "insert")
+_WRITES = ("find", "insert", "update", "createCollection", "createIndex", "listIndexes", "collStats")
+_DELETES = ("remove", "update", "insert", "collStats")
 Privilege = dict[str, Any]
 
 
@@ -80,7 +81,7 @@ def _database(url: str) -> str:
 
 
 class MongoRightsKeeper(WatchingKeeper):
-    """Makes users and roles in the archive's database.
+    """Makes users and roles in the archive's database, and shards their collections on a cluster.
 
     Args:
         url: of the archive, with the credential of whoever may make users and roles there (`userAdmin`).
@@ -121,6 +122,8 @@ class MongoRightsKeeper(WatchingKeeper):
             database.command("dropUser", gone)
         for gone in sorted(role for role in roles if role.startswith(prefix) and role not in ours):
             database.command("dropRole", gone)
+        # no app may do so
+        shard(database, {table: key for name in rights for table, key in shard_keys_of(name).items()})
 
     def _check(self) -> None:
         """A server that was started without authorization makes users, and lets everybody do everything."""

@@ -3,13 +3,16 @@
 import logging
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pymongo import MongoClient
 
 from due.codec import pack
 from due.drivers import mongodb
 from due.drivers.mongodb import MongoArchive
-from due.drivers.mongodb_sharding import SHARD_KEYS, commands
+from due.drivers.mongodb_apps import shard_keys_of
+from due.drivers.mongodb_sharding import SHARD_KEYS, commands, shard
 from due.messages import Item
 from tests.due.drivers.mongo_router import MongoRouter, mongo_router
 
@@ -53,6 +56,18 @@ def test_collections_are_sharded_by_key_and_time_at_the_first_use(url: str, rout
         {"shardCollection": name, "key": BY_TIME},
         {"shardCollection": f"{name}_parts", "key": {"_id": "hashed"}},
     ], "once"
+
+
+def test_the_collections_of_each_app_are_sharded(
+    router: MongoRouter, cluster: tuple[str, MongoRouter]
+) -> None:
+    with MongoClient[dict[str, Any]](cluster[0]) as client:
+        shard(client["due_test"], shard_keys_of("kitsune"))
+    asked = [one for one in router.commands if next(iter(one)) == "shardCollection"]
+    assert asked == [
+        {"shardCollection": "due_test.items__kitsune", "key": BY_TIME},
+        {"shardCollection": "due_test.items_parts__kitsune", "key": {"_id": "hashed"}},
+    ]
 
 
 def test_documents_are_spread_and_none_is_stored_twice(url: str, router: MongoRouter) -> None:

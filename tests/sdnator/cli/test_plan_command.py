@@ -58,6 +58,8 @@ def test_what_does_not_fit_is_said_with_a_remedy(costs):
     shown = " ".join(run("--pps", 60_000, "--costs", costs).stdout.split())
     assert "Bottleneck: kitsune needs 3 times one core" in shown
     assert "full at about 20,000 packets/s: copy fewer packets" in shown
+    shown = " ".join(run("--switches", 3, "--pps", 60_000, "--costs", costs).stdout.split())
+    assert 'divide the switches: instances = "sharded" in [kitsune], and processes = { kitsune = 2 }' in shown
 
 
 def test_little_room_and_the_error_of_predictions_are_said(tmp_path):

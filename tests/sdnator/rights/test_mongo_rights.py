@@ -93,12 +93,13 @@ def test_a_role_writes_its_own_and_reads_what_the_app_may_read() -> None:
     }
     assert set(mine) == {name for app in ("mine", "door") for name in collections_of(app)}
     assert "remove" not in mine["items__mine"], "what was said stays said"
+    assert "collStats" in mine["items__mine"], "whether it is sharded already"
     assert "items__mine" in _may("kitsune")
     assert "items__kitsune" not in mine
     assert "items__mine" not in _may("door"), "who may observe may not read from the archive"
     coordinator = _may("coordinator")
     assert all(
-        "remove" in actions
+        {"remove", "collStats"} <= actions
         for name, actions in coordinator.items()
         if name not in collections_of("coordinator")
     )
