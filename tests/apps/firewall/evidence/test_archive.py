@@ -4,12 +4,23 @@ import threading
 import time
 import types
 
+import pytest
+
 from apps.firewall.evidence.archive import Archive
 from due import Item
 from tests.apps.firewall.desk import FakeEngine
 
 _HOUR = 3600 * 10**9
 _QUERY = {"dataKey": "a.b.c"}
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The wall clock of the archive's questions: set `now`, ns."""
+    made = types.SimpleNamespace(now=10**18, monotonic=time.monotonic)
+    made.time_ns = lambda: made.now
+    monkeypatch.setattr("apps.firewall.evidence.archive.time", made)
+    return made
 
 
 def test_answers():
@@ -52,11 +63,8 @@ def _looked(archive: Archive) -> list[Item]:
     return archive.look(_QUERY, _HOUR, 0.0)
 
 
-def test_a_look_reads_what_is_new_and_not_all_since_the_start(monkeypatch):
+def test_a_look_reads_what_is_new_and_not_all_since_the_start(clock):
     """An operator's program gives an instruction every few seconds, and all of them were read every two seconds."""
-    clock = types.SimpleNamespace(now=10**18, monotonic=time.monotonic)
-    clock.time_ns = lambda: clock.now
-    monkeypatch.setattr("apps.firewall.evidence.archive.time", clock)
     engine = FakeEngine()
     archive = Archive(engine, 60.0)  # type: ignore[arg-type]
     found = []
@@ -67,10 +75,7 @@ def test_a_look_reads_what_is_new_and_not_all_since_the_start(monkeypatch):
     assert found[-1] == max(found) == 7
 
 
-def test_a_look_finds_what_came_while_the_archive_was_away(monkeypatch):
-    clock = types.SimpleNamespace(now=10**18, monotonic=time.monotonic)
-    clock.time_ns = lambda: clock.now
-    monkeypatch.setattr("apps.firewall.evidence.archive.time", clock)
+def test_a_look_finds_what_came_while_the_archive_was_away(clock):
     engine = FakeEngine()
     archive = Archive(engine, 60.0)  # type: ignore[arg-type]
     engine.archive_away = True
