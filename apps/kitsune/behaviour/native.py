@@ -339,15 +339,14 @@ class NativeBehaviour(Behaviour):
             kinds, subjects = self._counters[statistic].baseline.names()
             _keys(_kind_words(statistic, kind) for kind in kinds)
             _keys(self._subject(statistic, whose) for whose in subjects)
-        _keys(map(self._words, self.senders))
-        _keys(_contact_words(*contact) for contact in self.contacts.trained)
+        self._trained_names()
         if len(self._switches.names) != known:
             raise ValueError("a baseline is about a switch that is not in the checkpoint")
 
-    def _hand_over_names(self) -> None:
-        """Senders, owners of addresses and contacts of a saved training, to C."""
-        parts = (
-            _keys(self._words(sender) for sender in self.senders),
+    def _trained_names(self) -> tuple[npt.NDArray[np.uint64], ...]:
+        """Senders, owners of addresses and contacts of training, as C has them."""
+        return (
+            _keys(map(self._words, self.senders)),
             _keys(
                 (version == 6, mac, hi, lo, 0, 0)
                 for address, macs in self._owners.items()
@@ -356,6 +355,10 @@ class NativeBehaviour(Behaviour):
             ),
             _keys(_contact_words(*contact) for contact in self.contacts.trained),
         )
+
+    def _hand_over_names(self) -> None:
+        """The names of a saved training, to C."""
+        parts = self._trained_names()
         given = [item for part in parts for item in (self._kernel.pointer("uint64_t", part), len(part))]
         check(self._lib.behaviour_know(self._state, *given), _WHAT)
 
