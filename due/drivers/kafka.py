@@ -151,6 +151,9 @@ class KafkaPublisher:
         self._probe_now = 0
         self._denied: set[str] = set()
         """Topics without a right to write them."""
+        self._begun: dict[str, set[int]] = {}
+        """Reliable topics, and those of their partitions that have a record of this producer."""
+        self._beginning = threading.Lock()
         self._counts = {
             "refused": 0,
             "denied": 0,
@@ -337,6 +340,23 @@ class KafkaPublisher:
             return self._windows.setdefault(path, PathWindow(path, topic, self._window))
 
     def _produce(self, window: PathWindow, record: SentRecord, payload: bytes) -> None:
+        """Hand a payload to Kafka's client; a producer's first one in a partition is alone on its way.
+
+        A broker that does not know of a new partition yet refuses a batch, may accept the next one a moment later, and
+        takes the repeated first one for a duplicate: a producer of which it has nothing may begin with any number.
+        """
+        if window.begun or self._begun.get(window.topic, set()).issuperset(self._topics[window.topic]):
+            self._hand_over(window, record, payload)
+            return
+        with self._beginning:
+            self._hand_over(window, record, payload)
+            while record.place is None:
+                self._check()
+                self._reliable.poll(_ASK_SECONDS)
+            self._begun.setdefault(window.topic, set()).add(record.place[0])
+            window.begun = True
+
+    def _hand_over(self, window: PathWindow, record: SentRecord, payload: bytes) -> None:
         def done(error: KafkaError | None, message: Message) -> None:
             self._delivered(window, record, error, message)
 

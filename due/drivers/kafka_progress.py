@@ -104,6 +104,8 @@ class PathWindow:
     kept_bytes: int = 0
     waiting: bool = False
     """Whether a writer waits for room."""
+    begun: bool = False
+    """Whether the brokers have its first record."""
 
     def has_room(self, size: int) -> bool:
         """Whether a payload fits; into an empty window any payload does."""
