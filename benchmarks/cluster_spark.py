@@ -1,7 +1,7 @@
 """`benchmarks.cluster`: queries on a Spark standalone cluster of two workers that reads the packets from Kafka itself.
 
     packets of two switches ─► Kafka ─► two workers, one killed in between ─► results, compared with the host engine's
-    packets of eight ─► Kafka ─► one worker, then two, from the first record to the last ─► spark_speedup_2_workers
+    packets of eight ─► Kafka ─► one worker, then two, from first record to last result ─► spark_speedup_2_workers
 
 `spark_equal_queries`: how many of the catalogue's queries found something, and exactly what the host engine finds, field
 by field; `spark_queries` names them.  The workers share no folder: Spark's checkpoint is on HDFS, and as root each has
@@ -33,6 +33,8 @@ _SECONDS: Final = 18.0
 _WAIT_S: Final = 600.0
 _STATE_S: Final = 0.5
 """Between two states of a switch; the controller writes one a second."""
+_SETTINGS: Final[dict[str, Any]] = {"every_s": 0.2, "idle_s": 3_600.0}
+"""Other than the default: the time of both switches stands still while a worker dies, and neither may go on alone."""
 _SWITCHES: Final = 8
 _MOST_TIMED: Final = 3
 _MEMORY: Final = "1g"
@@ -54,7 +56,8 @@ def figures(rounds: int, scale: float, end: float) -> dict[str, Any]:
         folder = Path(name)
         with SparkStage(folder / "equal") as stage:
             names = _equal(stage)
-        found = {"spark_equal_queries": len(names), "spark_queries": names}
+        found: dict[str, Any] = {"spark_equal_queries": len(names), "spark_queries": names}
+        found["spark_settings"] = _SETTINGS
         if time.monotonic() >= end:
             return found
         with SparkStage(folder / "timed", memory=_MEMORY) as stage:
@@ -74,7 +77,7 @@ def _equal(stage: SparkStage) -> list[str]:
     }
     for switch, half in halves.items():
         controller.write(switch, traffic[switch][:half])
-    app = stage.app(every_s=0.2)
+    app = stage.app(**_SETTINGS)
 
     def arrived(reached_us: int) -> int:
         app.check()
@@ -110,7 +113,11 @@ def _speed(stage: SparkStage, rounds: int, scale: float) -> dict[str, Any]:
         controller.write(f"s{number}", frames)
         packets += len(frames)
     rates = interleaved(
-        {"one": lambda: packets / _seconds(stage, 1), "two": lambda: packets / _seconds(stage, 2)}, rounds
+        {
+            "one": lambda: packets / _seconds(stage, 1, packets),
+            "two": lambda: packets / _seconds(stage, 2, packets),
+        },
+        rounds,
     )
     return {
         "spark_packets": packets,
@@ -131,11 +138,13 @@ def _long(frames: list[TimedFrame], times: int) -> list[TimedFrame]:
     ]
 
 
-def _seconds(stage: SparkStage, cores: int) -> float:
-    """From the first record to the last, by a driver that has done it once before."""
+def _seconds(stage: SparkStage, cores: int, packets: int) -> float:
+    """From the first record to the last result, by a driver that has done it once before."""
     settings = {
         "kafka": stage.kafka.url,
+        "directory": str(stage.folder / "due"),
         "packets": PACKETS,
+        "total": packets,
         "queries": QUERIES,
         "bases": {f"s{number}": BASE_US for number in range(_SWITCHES)},
         "master": stage.cluster.url,

@@ -1,7 +1,7 @@
 """Queries on Spark as a DUE app: the packets go from Kafka to Spark's workers, results come back to DUE.  Does I/O.
 
     packets on Kafka ─► Spark Structured Streaming ─► network.traffic_query.sonata_spark.<query>
-    states of the switches: clock zeros and times ─► network.reached.sonata_spark.<switch>, when their packets were read
+    states of the switches, packets read ─► network.reached.sonata_spark: the time that all switches have passed
 
 Nothing of the packets goes through this process.  Spark's checkpoint says how far Kafka was read: after a restart the
 streams go on where they were; the results of the last batch may then come twice.
@@ -11,7 +11,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import msgspec
@@ -22,6 +22,7 @@ from apps.messages import LATEST_NS, MessageError, read_latest, sender_of
 from apps.sonata_adapter.arrivals import SwitchPrograms, data_in, state_in
 from apps.sonata_adapter.errors import InvalidRequest, SonataError
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT
+from apps.sonata_adapter.host.slowest_switch import SlowestSwitch
 from apps.sonata_adapter.host.spark_clock import ReadClock
 from apps.sonata_adapter.host.spark_jars import kafka_connector_jars
 from apps.sonata_adapter.host.spark_place import MASTER, SparkPlace, cluster_session, way_to
@@ -39,7 +40,7 @@ SWITCHES: Final = "network.switch.p4runtime_ctrl.*"
 PACKETS: Final = "network.packets.p4runtime_ctrl.*.all"
 RESULTS: Final = f"network.traffic_query.{APP}"
 REACHED: Final = f"network.reached.{APP}"
-"""Capture time of a switch up to which Spark has read everything; undeclared, because Spark alone reads it."""
+"""Capture time up to which Spark has read the packets of all switches; undeclared, because Spark alone reads it."""
 _PARAMETERS: Final = sorted({each.name for template in CATALOGUE.values() for each in template.parameters})
 
 INTERESTS = (Interest(SWITCHES), Interest(PACKETS))
@@ -84,6 +85,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Python with SDNator on the workers."""
     every_s: float = 1.0
     """Seconds between the begins of two batches."""
+    idle_s: float = 10.0
+    """Seconds without packets and states after which a switch no longer holds up the windows of the others."""
     records: int = 4096
     """Most records of Kafka in a batch."""
     options: dict[str, str] = {}
@@ -103,6 +106,7 @@ class SonataSparkService:
         self._times: dict[str, int] = {}
         """Switch to the capture time that it has reached, us."""
         self._clock: ReadClock | None = None
+        self._slowest: SlowestSwitch | None = None
         self._clock_at = 0.0
         self._changed = False
         """Whether a clock zero is another than the streams know."""
@@ -125,7 +129,7 @@ class SonataSparkService:
         self._source = KafkaPackets(
             address=kafka_address(self._engine.options.updates),
             pattern=packets_key(self._settings.packets),
-            clocks=f"{REACHED}.*",
+            clocks=REACHED,
             group=APP,
             at_once=self._settings.records,
         )
@@ -162,9 +166,9 @@ class SonataSparkService:
             if not stream.active:
                 self._ended_by_itself(stream, now)
                 return
-        if now >= self._clock_at:
+        if self._slowest is not None and now >= self._clock_at:
             self._clock_at = now + _CLOCK_S
-            self._pass_time()
+            self._pass_time(self._slowest, now)
 
     def stop(self) -> None:
         """End the streams; what is open stays in the checkpoint."""
@@ -184,6 +188,7 @@ class SonataSparkService:
             **told,
             "results": self._written,
             "switches": sorted(self._bases),
+            "idle": [] if self._slowest is None else self._slowest.idle,
             "streams": len(self._streams),
             "failures": self._failures,
             **self._intake.health(),
@@ -198,22 +203,32 @@ class SonataSparkService:
             self._bases[name] = state.base_us
             self._times[name] = max(state.event_time // 1000, self._times.get(name, 0))
 
-    def _pass_time(self) -> None:
-        """Tell Spark how far time has come, once it has read the packets before."""
+    def _pass_time(self, slowest: SlowestSwitch, now: float) -> None:
+        """Tell Spark how far time has come in what it has read."""
         if self._clock is None:
             self._clock = ReadClock(self._source.address, APP, self._source.topic)
-        self._tell(self._clock.due([stream.read() for stream in self._streams]))
+        newest = [stream.newest() for stream in self._streams]
+        everywhere = set.intersection(*map(set, newest))
+        slowest.move({switch: min(each[switch] for each in newest) for switch in everywhere}, now)
+        heard = self._clock.due([stream.read() for stream in self._streams])
+        if heard is not None:
+            noted, times = heard
+            slowest.move(times, now)
+            slowest.all_read(noted)
         with self._lock:
             times = dict(self._times)
-        self._clock.note(times)
+        self._clock.note(times, now)
+        time_us = slowest.next(now)
+        if time_us:
+            self._tell(time_us)
 
-    def _tell(self, times: Mapping[str, int]) -> None:
-        for switch, time_us in times.items():
-            value = {"time": time_us * 1000}
-            self._engine.write(f"{REACHED}.{switch}", value, [NO_WAIT, PUB_ONLY], event_time=time_us * 1000)
+    def _tell(self, time_us: int) -> None:
+        value = {"time": time_us * 1000}
+        self._engine.write(REACHED, value, [NO_WAIT, PUB_ONLY], event_time=time_us * 1000)
 
     def _begin(self, bases: dict[str, int]) -> None:
-        self._tell(dict.fromkeys(bases, 0))  # so that there is a topic
+        self._slowest = SlowestSwitch(bases, time.monotonic(), self._settings.idle_s)
+        self._tell(0)  # so that there is a topic
         self._engine.flush(_FLUSH_S)
         lengths: dict[int, list[QueryRequest]] = {}
         for request in self._requests.values():
@@ -235,7 +250,7 @@ class SonataSparkService:
                     self._source,
                     job,
                     lateness_us=min(self._settings.lateness_us, length // 4),
-                    checkpoint=f"{self._checkpoint}/{length}",
+                    checkpoint=f"{self._checkpoint}/{length}us",
                     take=self._take,
                     every_s=self._settings.every_s,
                 )
@@ -275,7 +290,7 @@ class SonataSparkService:
 
 
 def reached_us(item: Item) -> int:
-    """Capture time up to which a switch's packets were read, us.  Raises `MessageError`."""
+    """Capture time up to which all switches' packets were read, us.  Raises `MessageError`."""
     sender_of(item)
     time_ns = item.value.get("time") if isinstance(item.value, dict) else None
     if type(time_ns) is not int or not 0 <= time_ns <= LATEST_NS:

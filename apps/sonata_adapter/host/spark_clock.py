@@ -1,9 +1,9 @@
-"""How far capture time has come for Spark: told when all packets before that time were read.  Does I/O.
+"""How far the switches say that time has come, told when Spark has read all packets before that.  Does I/O.
 
     states of the switches ─► times, and where the packets' topic ends ─► when Spark has read so far ─► the times
 
-Spark reads packets and clocks from two topics, and closes windows by the newest time of both: a clock that is ahead of
-packets which are still to be read would cost those packets.
+Spark reads packets and clocks from two topics: a clock that is ahead of packets which are still to be read would cost
+those packets.
 """
 
 import logging
@@ -35,46 +35,50 @@ class ReadClock:
         self._consumer = Consumer(
             address.client(**{"group.id": address.group(group), "enable.auto.commit": False})
         )
-        self._waiting: tuple[dict[str, int], Offsets] | None = None
-        self._told: dict[str, int] = {}
+        self._waiting: tuple[float, dict[str, int], Offsets] | None = None
 
-    def note(self, times: Mapping[str, int]) -> None:
+    def note(self, times: Mapping[str, int], now: float) -> None:
         """The switches have come so far; packets of that time were written before.
 
         Args:
             times: switch to capture time, us.
+            now: monotonic time, s.
         """
-        fresh = {name: time for name, time in times.items() if time > self._told.get(name, 0)}
-        if not fresh or self._waiting is not None:
+        if self._waiting is not None:
             return
         try:
-            self._waiting = fresh, self._ends()
+            ends = self._ends()
         except KafkaException as error:
             _LOG.debug("the end of %s: %s", self._topic, error)
+        else:
+            if ends is not None:
+                self._waiting = now, dict(times), ends
 
-    def due(self, read: Sequence[Offsets]) -> dict[str, int]:
-        """Times that can be told now, each once.
+    def due(self, read: Sequence[Offsets]) -> tuple[float, dict[str, int]] | None:
+        """When times were noted, and the times, once everything was read that had been written then.
 
         Args:
             read: how far each stream has read the topic.
         """
         if self._waiting is None or not read:
-            return {}
-        times, ends = self._waiting
+            return None
+        noted, times, ends = self._waiting
         if any(each.get(place, 0) < end for each in read for place, end in ends.items()):
-            return {}
+            return None
         self._waiting = None
-        self._told.update(times)
-        return times
+        return noted, times
 
     def close(self) -> None:
         """Disconnect."""
         self._consumer.close()
 
-    def _ends(self) -> Offsets:
+    def _ends(self) -> Offsets | None:
+        """None where the end of a partition is not known."""
         places = self._consumer.list_topics(self._topic, _ASK_S).topics[self._topic].partitions
         found = {
             place: self._consumer.get_watermark_offsets(TopicPartition(self._topic, place), _ASK_S)
             for place in places
         }
-        return {place: ends[1] for place, ends in found.items() if ends is not None}
+        if None in found.values():
+            return None
+        return {place: end for place, (_, end) in found.items()}

@@ -4,8 +4,8 @@
                                                                     └─ grouped by Spark, window by window
     switch, query, pieces ─► `run_windows`: the numpy operators ─► switch, result
 
-A row without a query carries the capture time that a switch has reached.  A frame that cannot be read, or is in the
-wrong place, makes a row with neither: it is counted.
+A row without a query carries the capture time of a switch's newest packet, or, without a switch, the time that all have
+passed.  A frame that cannot be read, or is in the wrong place, makes a row with neither: it is counted.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -50,15 +50,19 @@ class WindowJob:
     pattern: str
     """Paths of the packets."""
     clocks: str
-    """Topic of the switches' times."""
+    """Topic of the time that all switches have passed."""
     packets_in: Callable[[Item], RecordBatch]
     """Packets of an item; raises `MessageError`."""
     clock_in: Callable[[Item], int]
-    """Capture time that a switch has reached, us, or 0; raises `MessageError`."""
+    """Capture time that all switches have passed, us, or 0; raises `MessageError`."""
 
     def shift_us(self, switch: str) -> int:
         """How much later than multiples of their length this switch's windows begin."""
         return self.bases[switch] % self.length_us
+
+    def latest_shift_us(self) -> int:
+        """The greatest of these, by which a time that all have passed is told."""
+        return max(map(self.shift_us, self.bases))
 
     def parsed(self) -> list[Query]:
         """The queries."""
@@ -91,6 +95,8 @@ def run_windows(batches: Iterable[Any], job: WindowJob) -> Iterator[Any]:
         columns = [batch.column(name) for name in ("switch", "query", "pieces")]
         for row in range(batch.num_rows):
             switch, query, pieces = (column[row].as_py() for column in columns)
+            if query == NO_QUERY:  # its time has moved the watermark
+                continue
             ordered = sorted(pieces, key=lambda piece: int(piece["offset"]))
             found = results_of(
                 queries[query],
@@ -113,7 +119,9 @@ class _Reading:
         self._job, self._queries, self._pattern = job, queries, pattern
         self._packets: dict[str, tuple[int, list[RecordBatch]]] = {}
         """By switch: offset of its first record, and its packets."""
-        self._clocks: dict[str, int] = {}
+        self._newest: dict[str, int] = {}
+        self._passed = 0
+        """Capture time that all switches have passed, us."""
         self._refused = 0
 
     def take(self, topic: str, path: str, value: bytes, offset: int) -> None:
@@ -125,7 +133,7 @@ class _Reading:
             if Key.parse(items[0].key).path != path:
                 raise MessageError("fields", f"{items[0].key} under {path}")
             if topic == self._job.clocks:
-                self._note_clock(path, max(map(self._job.clock_in, items)))
+                self._passed = max(self._passed, *map(self._job.clock_in, items))
                 return
             found = [batch for batch in map(self._job.packets_in, items) if len(batch)]
         except _DAMAGED:
@@ -134,27 +142,24 @@ class _Reading:
         if found:
             self._note_packets(path, offset, found)
 
-    def _note_clock(self, path: str, time_us: int) -> None:
-        switch = path.rpartition(".")[2]
-        if switch in self._job.bases and time_us:
-            self._clocks[switch] = max(time_us, self._clocks.get(switch, 0))
-
     def _note_packets(self, path: str, offset: int, found: list[RecordBatch]) -> None:
         switch = path.split(".")[_SWITCH_SEGMENT]
         if switch not in self._job.bases:
             raise UnknownSwitch(switch)
         self._packets.setdefault(switch, (offset, []))[1].extend(found)
         newest = max(int(batch["time_us"].max()) for batch in found)
-        self._clocks[switch] = max(newest, self._clocks.get(switch, 0))
+        self._newest[switch] = max(newest, self._newest.get(switch, 0))
 
     def rows(self) -> Any:
         """As an Arrow batch."""
         pa: Any = import_module("pyarrow")
 
         rows: list[_Row] = [row for switch in self._packets for row in self._pieces(switch)]
-        for switch, newest in self._clocks.items():
-            read = sum(len(batch) for batch in self._packets.get(switch, (0, []))[1])
+        for switch, newest in self._newest.items():
+            read = sum(len(batch) for batch in self._packets[switch][1])
             rows.append((newest - self._job.shift_us(switch), switch, NO_QUERY, 0, 0, b"", read, 0))
+        if self._passed:
+            rows.append((self._passed - self._job.latest_shift_us(), "", NO_QUERY, 0, 0, b"", 0, 0))
         if self._refused:
             rows.append((None, "", NO_QUERY, 0, 0, b"", 0, self._refused))
         names = [column.split()[0] for column in ROWS.split(", ")]

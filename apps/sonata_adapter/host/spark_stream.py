@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
@@ -30,8 +30,10 @@ from apps.sonata_adapter.host.spark_records import (
 from apps.sonata_adapter.query.dataflow import TupleStream, compile_query
 from apps.sonata_adapter.query.language import Query
 from apps.sonata_adapter.results import QueryResult
+from due.drivers.base import own_group
 from due.drivers.kafka_names import KafkaAddress
 
+_NEWEST: Final = "newest_"
 Take = Callable[[Sequence[tuple[str, QueryResult]]], None]
 """Gets the results of a batch, each with its switch; the batch counts as done when it returns."""
 
@@ -44,7 +46,7 @@ class KafkaPackets:
     pattern: str
     """Key of the packets, without specs."""
     clocks: str
-    """Key under which it is told how far the switches' times have come, without specs."""
+    """Key under which the time that all switches have passed is told, without specs."""
     group: str
     """App in whose name Kafka is read."""
     at_once: int = 4096
@@ -57,15 +59,19 @@ class KafkaPackets:
 
     @property
     def clock_topic(self) -> str:
-        """The topic of the switches' times."""
+        """The topic of that time."""
         return self.address.topic(self.clocks, reliable=False)
 
     def options(self) -> dict[str, str]:
-        """What Spark's source has to know about the brokers; certificates are read here."""
+        """What Spark's source has to know about the brokers; certificates are read here.
+
+        Spark names a group for each start of a stream: workers keep consumers by group, and a task that failed may still
+        read from one which a stream of the same group would take over, so that records would be missing there.
+        """
         address = self.address
         found = {
             "kafka.bootstrap.servers": address.servers,
-            "kafka.group.id": address.group(self.group),
+            "groupIdPrefix": address.group(own_group(self.group, "spark")),
             "kafka.security.protocol": ("SASL_" if address.user else "")
             + ("SSL" if address.tls else "PLAINTEXT"),
         }
@@ -117,7 +123,7 @@ class KafkaWindows:
         lateness_us: how long after its end a window waits for late packets.
         checkpoint: folder of Spark's state, reached by driver and workers alike.
         take: gets the results.
-        every_s: pause between the begins of two batches; 0: only what is there now, then the stream ends.
+        every_s: pause between the begins of two batches.
     """
 
     def __init__(
@@ -134,18 +140,16 @@ class KafkaWindows:
         self.length_us = job.length_us
         self._seen = -1
         self._topic = source.topic
+        self._job = job
         self._read: dict[int, int] = {}
+        self._newest: dict[str, int] = {}
         self._counts = {"packets": 0, "refused": 0, "late": 0, "batches": 0}
-        # the windows of two switches begin at different times, and may wait for each other so long
-        shifts = [job.shift_us(switch) for switch in job.bases]
-        patience_us = lateness_us + max(shifts) - min(shifts)
-        results = _results(session, source, job, patience_us)
-        trigger = {"processingTime": f"{every_s} seconds"} if every_s else {"availableNow": True}
         self._query = (
-            results.writeStream.foreachBatch(partial(_hand_over, take))
+            _results(session, source, job, lateness_us)
+            .writeStream.foreachBatch(partial(_hand_over, take))
             .option("checkpointLocation", checkpoint)
             .outputMode("append")
-            .trigger(**trigger)
+            .trigger(processingTime=f"{every_s} seconds")
             .start()
         )
 
@@ -169,66 +173,95 @@ class KafkaWindows:
             raise UnknownSwitch(text.partition(f"{UnknownSwitch.__name__}: ")[2].partition("\n")[0])
         raise SparkFailed(f"Spark's stream of {self.length_us} us windows ended: {text[:2000]}")
 
-    def wait(self, timeout_s: float) -> bool:
-        """Whether it has ended within this time."""
-        return bool(self._query.awaitTermination(timeout_s))
-
     def counts(self) -> dict[str, int]:
         """Packets and refused frames that were read, rows that were too late, and batches."""
+        self._follow()
+        return dict(self._counts)
+
+    def read(self) -> dict[int, int]:
+        """Partition of the packets' topic to the offset up to which it was read and worked on."""
+        self._follow()
+        return self._read
+
+    def newest(self) -> dict[str, int]:
+        """Switch to the capture time of its newest packet that was read, us."""
+        self._follow()
+        return self._newest
+
+    def _follow(self) -> None:
+        """Take in what Spark says of batches that have ended since the last call."""
         for progress in self._query.recentProgress:
             if progress.batchId <= self._seen:
                 continue
             self._seen = progress.batchId
             self._counts["batches"] += 1
-            intake = progress.observedMetrics.get("intake")
-            for name in ("packets", "refused") if intake is not None else ():
-                self._counts[name] += intake[name] or 0
             self._counts["late"] += sum(each.numRowsDroppedByWatermark for each in progress.stateOperators)
-        return dict(self._counts)
-
-    def read(self) -> dict[int, int]:
-        """Partition of the packets' topic to the offset up to which it was read and worked on."""
-        for progress in self._query.recentProgress:
+            intake = progress.observedMetrics.get("intake")
+            if intake is not None:
+                self._take_in(intake.asDict())
             for source in progress.sources:
                 ends = json.loads(source.endOffset or "null")
                 if isinstance(ends, dict) and self._topic in ends:
                     self._read = {int(place): int(offset) for place, offset in ends[self._topic].items()}
-        return self._read
+
+    def _take_in(self, intake: dict[str, int | None]) -> None:
+        for name in ("packets", "refused"):
+            self._counts[name] += intake[name] or 0
+        for number, switch in enumerate(self._job.bases):
+            shifted = intake[f"{_NEWEST}{number}"]
+            if shifted is not None:
+                newest = shifted + self._job.shift_us(switch)
+                self._newest[switch] = max(newest, self._newest.get(switch, 0))
 
     def stop(self) -> None:
         """End it; what is open stays in the checkpoint."""
         self._query.stop()
 
 
-def _results(session: Any, source: KafkaPackets, job: WindowJob, patience_us: int) -> Any:
-    """The stream's plan."""
+def _results(session: Any, source: KafkaPackets, job: WindowJob, lateness_us: int) -> Any:
+    """The stream's plan; its watermark is that of the clocks alone."""
     from pyspark.sql import functions as f
 
-    packets = _records(session, source, source.topic).option("maxOffsetsPerTrigger", source.at_once)
-    # times are kept for a minute: what was deleted before it was read is no loss
-    clocks = _records(session, source, source.clock_topic).option("failOnDataLoss", "false")
-    columns = ("topic", "key", "value", "offset")
-    records = packets.load().select(*columns).unionByName(clocks.load().select(*columns))
-    rows = (
-        records.mapInArrow(lambda batches: read_records(batches, job), ROWS)
-        .observe("intake", f.sum("read").alias("packets"), f.sum("refused").alias("refused"))
+    packets = _records(session, source, source.topic).options(
+        startingOffsets="earliest", maxOffsetsPerTrigger=source.at_once
+    )
+    # what another driver told is not of these packets; what was deleted before it was read is told again
+    clocks = _records(session, source, source.clock_topic).options(
+        startingOffsets="latest", failOnDataLoss="false"
+    )
+    newest = [
+        f.max(f.when(f.col("switch") == switch, f.col("time"))).alias(f"{_NEWEST}{number}")
+        for number, switch in enumerate(job.bases)
+    ]
+    pieces = (
+        _rows(packets, job)
+        .observe("intake", f.sum("read").alias("packets"), f.sum("refused").alias("refused"), *newest)
+        .where(f.col("query") != NO_QUERY)
+        .withColumn("time", f.timestamp_micros("time"))
+    )
+    times = (
+        _rows(clocks, job)
         .where(f.col("time").isNotNull())
         .withColumn("time", f.timestamp_micros("time"))
-        .withWatermark("time", f"{-(-patience_us // 1000)} milliseconds")
+        .withWatermark("time", f"{-(-lateness_us // 1000)} milliseconds")
     )
     window = f.window("time", f"{job.length_us} microseconds")
     return (
-        rows.groupBy(window, "switch", "query", "shard")
+        times.unionByName(pieces)
+        .groupBy(window, "switch", "query", "shard")
         .agg(f.collect_list(f.struct("offset", "packets")).alias("pieces"))
-        .where(f.col("query") != NO_QUERY)
         .select("switch", "query", "pieces")
         .mapInArrow(lambda batches: run_windows(batches, job), RESULTS)
     )
 
 
+def _rows(records: Any, job: WindowJob) -> Any:
+    columns = ("topic", "key", "value", "offset")
+    return records.load().select(*columns).mapInArrow(lambda batches: read_records(batches, job), ROWS)
+
+
 def _records(session: Any, source: KafkaPackets, topic: str) -> Any:
-    reader = session.readStream.format("kafka").options(**source.options())
-    return reader.option("subscribe", topic).option("startingOffsets", "earliest")
+    return session.readStream.format("kafka").options(**source.options()).option("subscribe", topic)
 
 
 def _hand_over(take: Take, rows: Any, _batch: int) -> None:

@@ -75,7 +75,7 @@ def test_a_day_of_the_archive_on_a_cluster(stage, mounted):
 
 @pytest.mark.timeout(1800)
 def test_a_worker_is_killed_and_the_results_are_those_of_the_host_engine(stage):
-    """The whole catalogue over the packets of two switches, half of them behind the death of a worker."""
+    """The whole catalogue over two switches, half behind the death of a worker, and one switch behind the other."""
     traffic = {"s1": mixed(CATALOGUE, seconds=18), "s2": mixed(["ddos", "syn_flood"], seconds=18, seed=2)}
     found = stage.results()
     controller = stage.controller()
@@ -90,7 +90,9 @@ def test_a_worker_is_killed_and_the_results_are_those_of_the_host_engine(stage):
     }
     for switch, (first, half, _) in parts.items():
         controller.write(switch, traffic[switch][first:half], first)
-    apps = [stage.app(every_s=0.2)]
+    apps = [stage.app(every_s=0.2, idle_s=3_600.0)]
+    health = []
+    stage.engine("onlooker").observe("due.health.sonata_spark").subscribe(health.append)
 
     def tell(seconds):
         """As the controller does once a second."""
@@ -100,13 +102,22 @@ def test_a_worker_is_killed_and_the_results_are_those_of_the_host_engine(stage):
         time.sleep(0.5)
         return len(found)
 
+    def read():
+        """How many packets Spark has read."""
+        return health[-1].value["app"]["packets"] if health else 0
+
     wait_for(lambda: tell(9), 600, lambda: log(stage))
     stage.cluster.kill_worker(0)
+    sent = sum(half for _, half, _ in parts.values())
     for switch, (_, half, end) in parts.items():
         controller.write(switch, traffic[switch][half:end], half)
+        sent += end - half
+        wait_for(lambda sent=sent: tell(9) and read() >= sent, 600, lambda: log(stage))
     wanted = truth(traffic, BASES)
     wait_for(lambda: tell(60) >= len(wanted), 900, lambda: log(stage))
     assert stage.cluster.alive() <= 1
+    wait_for(lambda: health[-1].value["app"]["results"] >= len(wanted))
+    assert health[-1].value["app"]["late"] == 0
     assert len({text.partition(" ")[0] for text in wanted}) >= 8
     assert texts(found) == wanted
     # another driver goes on where the checkpoint says
@@ -116,7 +127,7 @@ def test_a_worker_is_killed_and_the_results_are_those_of_the_host_engine(stage):
         for frame in mixed(["ddos", "port_scan"], seconds=6)
     ]
     controller.write("s1", later, len(traffic["s1"]))
-    apps.append(stage.app(every_s=0.2))
+    apps.append(stage.app(every_s=0.2, idle_s=3_600.0))
     wanted = truth({**traffic, "s1": [*traffic["s1"], *later]}, BASES)
     assert len(found) < len(wanted)
     wait_for(lambda: tell(130) >= len(wanted), 600, lambda: log(stage))
