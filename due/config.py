@@ -115,7 +115,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
                 mode, text = os.fstat(file.fileno()).st_mode, file.read(_CREDENTIAL_BYTES)
             said = msgspec.json.decode(text, type=cls)
         except OSError as error:
-            raise InvalidOption(f"{name}: {error.strerror}") from None
+            raise InvalidOption(f"{name}: {error.strerror}; give a credential file of the app") from None
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise InvalidOption(f"{name}: {error}; enrol the app again") from None
         if mode & 0o077:

@@ -54,6 +54,14 @@ def without_user(url: str) -> str:
     return f"{scheme}://{rest.rpartition('@')[2]}"
 
 
+def is_file(path: Path) -> bool:
+    """Whether a file is there; False for a path that cannot be one, such as a name that is too long."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def open_existing(url: str) -> "ArchiveDriver":
     """An archive to read from.
 
@@ -62,7 +70,7 @@ def open_existing(url: str) -> "ArchiveDriver":
     """
     from due.backends import open_archive
 
-    if url.startswith("sqlite:") and not Path(unquote(urlsplit(url).path)).exists():
+    if url.startswith("sqlite:") and not is_file(Path(unquote(urlsplit(url).path))):
         raise BadInput(
             f"there is no archive at {url} yet: start a pipeline with `sdnator up`, or give --archive"
         )

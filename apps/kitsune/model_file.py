@@ -28,6 +28,8 @@ from apps.kitsune.kitnet import KitNet, Layer
 
 FORMAT: Final = "sdnator-kitsune-model"
 VERSION: Final = 1
+_ZIP: Final = b"PK"
+"""With which a file of numpy's `savez` begins."""
 _ARRAYS: Final = ("weights", "hidden_bias", "visible_bias", "low", "high")
 
 
@@ -87,7 +89,6 @@ def save_model(path: Path, network: KitNet, notes: dict[str, Any]) -> None:
 
 
 _DAMAGE = (
-    OSError,
     ValueError,
     EOFError,
     KeyError,
@@ -107,10 +108,15 @@ _DAMAGE = (
 def load_model(path: Path, *, clip: float = 0.0, kernel: Kernel | None = None) -> Model:
     """Reads a model; raises `ModelFileError` that names the file and what is wrong with it."""
     try:
+        _check_beginning(path)
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise ModelFileError(f"{path}: no such model; write one with --save-model") from None
+    except OSError as error:
+        raise ModelFileError(
+            f"{path}: cannot be read ({error.strerror or error}); use a file from --save-model"
+        ) from None
     except _DAMAGE as error:
         raise NotAModelError(
             f"{path}: an incomplete Kitsune model ({error}); train again and save the result"
@@ -123,6 +129,18 @@ def load_model(path: Path, *, clip: float = 0.0, kernel: Kernel | None = None) -
         raise NotAModelError(
             f"{path}: damaged Kitsune model ({error}); train again and save the result"
         ) from error
+
+
+def _check_beginning(path: Path) -> None:
+    """Numpy would take anything else for a pickle, and advise to trust it."""
+    with path.open("rb") as file:
+        begin = file.read(len(_ZIP))
+    if not _ZIP.startswith(begin):
+        raise NotAModelError(f"{path}: not a Kitsune model; use a file from --save-model")
+    if len(begin) < len(_ZIP):
+        raise NotAModelError(
+            f"{path}: an incomplete Kitsune model ({len(begin)} bytes); train again and save the result"
+        )
 
 
 def _header(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Any]:

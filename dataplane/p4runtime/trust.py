@@ -59,8 +59,9 @@ def read_program(bmv2_json: Path, p4info: Path | None = None) -> Any:
             raise TrustError(
                 f"{error.filename}: no such file; p4c writes a BMv2 JSON and its p4info"
             ) from None
+        cause = error.strerror if isinstance(error, OSError) else error
         raise TrustError(
-            f"{bmv2_json} with {described}: {error}; give the BMv2 JSON that p4c wrote, its p4info beside it"
+            f"{bmv2_json} with {described}: {cause}; give the BMv2 JSON that p4c wrote, its p4info beside it"
         ) from error
     return config
 

@@ -14,6 +14,7 @@ from apps.standing_decisions import in_force
 from due import DueError, Item
 from due.backends import open_archive
 from sdnator.errors import BadInput
+from sdnator.northbound import is_file
 from sdnator.up import running
 
 INSTRUCTION: Final = "network.instruction.operator.firewall"
@@ -28,7 +29,7 @@ def readable(archive: str) -> str:
     """
     url = running.archive_url(archive)
     parts = urlsplit(url)
-    if parts.scheme != "sqlite" or not parts.path or Path(unquote(parts.path)).is_file():
+    if parts.scheme != "sqlite" or not parts.path or is_file(Path(unquote(parts.path))):
         return url
     if url == running.default_archive():
         return ""

@@ -13,6 +13,7 @@ where a file is cut, skip packets silently and carry interfaces from one pcapng 
     └── EmptyCapture        a valid capture without packets
 """
 
+import errno
 import gzip
 import io
 import os
@@ -239,12 +240,14 @@ class CaptureWriter:
         nanoseconds: times in ns instead of µs (the rest is cut off).
 
     Raises:
-        OSError: the folder is missing or not writable.
+        OSError: the folder is missing or not writable, or the path is a folder.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, nanoseconds: bool = False) -> None:
         self.path = Path(path)
         self.packets = 0
+        if self.path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         self._tick = 1 if nanoseconds else 1_000
         raw = self._part.open("wb", buffering=_BUFFER)

@@ -152,7 +152,7 @@ def _parse(path: Path) -> Labels:
     try:
         for number, (flag, sender) in enumerate(_rows(path), start=1):
             if flag not in {"0", "1"}:
-                raise MalformedLabels(f"{path}: label {number:,} is {flag!r}; labels are 0 or 1")
+                raise MalformedLabels(f"{path}: label {number:,} is {flag[:40]!r}; labels are 0 or 1")
             attack.append(flag == "1")
             senders.append(sender)
             if number > MAX_LABELS:

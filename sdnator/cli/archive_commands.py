@@ -116,11 +116,13 @@ def _exported(
 def _progress() -> Iterator[Callable[[str, int, int, int], None]]:
     """A bar on a terminal; elsewhere a line now and then."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+
+    from sdnator.cli.late_progress import LateProgress
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with LateProgress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("export")
         last = time.monotonic()
 

@@ -191,8 +191,12 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
             files = {name: folder / name for name in names if _is_ours(name)}
             for name, path in files.items():
                 _copy_out(tar, name, path)
+    except FileNotFoundError:
+        raise BadInput(f"{file}: no such file; check the path of the backup") from None
     except OSError as error:
-        raise BadInput(f"{file}: {error.strerror or error}") from None
+        raise BadInput(
+            f"{file}: cannot be read ({error.strerror or error}); give a backup written by `sdnator backup`"
+        ) from None
     except (tarfile.TarError, EOFError, KeyError, ValueError, RecursionError) as error:
         raise BadInput(
             f"{file}: this is not a backup of `sdnator backup`, or it is damaged ({error})"

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, DownloadColumn, TaskID, TextColumn, TimeRemainingColumn
 
+from sdnator.cli.late_progress import LateProgress
 from sdnator.errors import BadInput
 from sdnator.plurals import counted
 
@@ -97,9 +98,10 @@ def make_mirai_like(
     )
     with _writing(out), _packets("generating") as progress:
         made = make_capture(options, out, progress)
+    first = "" if made.first_attack is None else f", the first at number {made.first_attack}"
     typer.echo(
         f"{made.capture}: {counted(made.packets, 'packet')}, {made.seconds:,.0f} s; "
-        f"{made.attack_packets:,} of the attack, the first at number {made.first_attack}"
+        f"{made.attack_packets:,} of the attack{first}"
     )
     typer.echo(f"{made.labels}: labels")
 
@@ -339,7 +341,7 @@ def _writing(out: Path) -> Iterator[None]:
 @contextmanager
 def _packets(what: str) -> Iterator[Callable[[int], None]]:
     columns = (TextColumn(what), BarColumn(), TextColumn("{task.completed:,} packets"))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with LateProgress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done: bar.update(task, completed=done)
 
@@ -361,7 +363,7 @@ def _kept_when_stopped() -> Iterator[None]:
 def _steps() -> Iterator[Callable[[str, int, int | None], None]]:
     """One progress bar per file, by its name."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+    with LateProgress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
         tasks: dict[str, TaskID] = {}
 
         def update(what: str, done: int, total: int | None) -> None:

@@ -24,7 +24,7 @@ from apps.sonata_adapter.planner.operators import placed_operators
 from apps.sonata_adapter.planner.plan import plan
 from apps.sonata_adapter.planner.refinement import coarsest
 from apps.sonata_adapter.query.catalogue import Template
-from apps.sonata_adapter.query.templates import QueryFolder, own_queries
+from apps.sonata_adapter.query.templates import QueryFolder, own_queries, read_text
 from apps.sonata_adapter.query.text import parse_queries
 from due import DueError
 from sdnator.capture.captures import CaptureError
@@ -200,14 +200,20 @@ def add_queries(
 
     Example: sdnator queries add my_scan.sonata
     """
+    folder = QueryFolder(own_queries())
     try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeError) as error:
-        raise BadInput(f"{file}: cannot be read ({error}); give a text file with queries") from None
-    try:
+        text = read_text(file, str(file))
         found = parse_queries(text, str(file))
-        folder = QueryFolder(own_queries())
+    except OSError as error:
+        raise BadInput(f"{file}: cannot be read ({error.strerror}); give a text file with queries") from None
+    except SonataError as error:
+        raise BadInput(str(error)) from None
+    try:
         folder.add(found, text)
+    except OSError as error:
+        raise BadInput(
+            f"{folder.path}: cannot be written ({error.strerror}); check its permissions"
+        ) from None
     except SonataError as error:
         raise BadInput(str(error)) from None
     if as_json:

@@ -91,7 +91,7 @@ def tested(file: Path, captures: list[Path], most: int) -> Iterator[Tested]:
         BadInput: the file or a capture cannot be read, or a query is wrong.
     """
     try:
-        found = {one.name: one for one in parse_queries(read_text(file), str(file))}
+        found = {one.name: one for one in parse_queries(read_text(file, str(file)), str(file))}
         for name in found:
             request = request_of(f"network.traffic_query.sonata.{name}", found)
             if request is not None:

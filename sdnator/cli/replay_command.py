@@ -17,6 +17,7 @@ from rich.table import Table
 
 from dataplane.p4runtime.listening import is_address
 from sdnator import training
+from sdnator.cli.late_progress import LateProgress
 from sdnator.config.planned_switches import require_compiler
 from sdnator.datasets.names import named_capture
 from sdnator.errors import BadInput
@@ -165,7 +166,7 @@ def _pace(text: str) -> float | None:
 
 @contextmanager
 def _bars() -> Iterator[Progress]:
-    with Progress(
+    with LateProgress(
         TextColumn("{task.description:<14}"),
         BarColumn(),
         TextColumn("{task.completed:>9,.0f}/{task.total:,.0f}"),

@@ -61,6 +61,7 @@ def detect(
         raise BadInput("no capture and no interface; give a pcap, pcapng or tshark table, or --interface")
     capture = CaptureSource(options.capture) if options.capture is not None else None
     detector = _detector(options)
+    labels = read_labels(options.labels) if options.labels else None
     run = _Run(detector)
     with OutputFolder(options.out, options.features) as output:
         for batch in source if source is not None else capture or ():
@@ -68,7 +69,7 @@ def detect(
             progress(run.packets, len(run.alerts))
         run.end()
         _check_length(options, run)
-        labels = read_labels(options.labels).for_packets(run.packets) if options.labels else None
+        labels = labels.for_packets(run.packets) if labels is not None else None
         summary = _summary(options, run, labels)
         if capture is not None and capture.note:
             summary["warnings"].append(capture.note)

@@ -70,8 +70,8 @@ def prepare(
 ) -> tuple[Survey, Labels | None]:
     """Read capture and labels once; raises BadInput with one clear line."""
     try:
-        surveyed = survey(capture, progress)
         read = read_labels(labels) if labels is not None else None
+        surveyed = survey(capture, progress)
         if read is not None:
             read = read.for_packets(surveyed.packets, cut=surveyed.cut is not None)
     except (CaptureError, LabelsError) as error:

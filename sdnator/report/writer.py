@@ -87,14 +87,20 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
         ReportError: not writable, not a folder, or full of something else.
     """
     folder = Path(folder)
-    if folder.is_dir():
-        foreign = sorted(path.name for path in folder.iterdir() if path.name not in FILES)
-        if foreign:
-            raise ReportError(
-                f"--report {folder}: the folder holds other things ({', '.join(foreign[:3])}); give a new folder"
-            )
-    elif folder.exists():
-        raise ReportError(f"--report {folder}: is a file; give a folder")
+    try:
+        foreign = (
+            sorted(path.name for path in folder.iterdir() if path.name not in FILES)
+            if folder.is_dir()
+            else None
+        )
+        if foreign is None and folder.exists():
+            raise ReportError(f"--report {folder}: is a file; give a folder")
+    except OSError as error:
+        raise ReportError(f"--report {folder}: {error.strerror}; give another folder") from None
+    if foreign:
+        raise ReportError(
+            f"--report {folder}: the folder holds other things ({', '.join(foreign[:3])}); give a new folder"
+        )
     there = folder.absolute().parent
     while not there.exists() and there != there.parent:
         there = there.parent

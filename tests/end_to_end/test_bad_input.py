@@ -27,11 +27,12 @@ def capture(tmp_path_factory):
 
 
 def told(done: subprocess.CompletedProcess[str]) -> str:
-    """The one line of the error; there is no traceback and nothing on standard output."""
+    """The one line of the error; there is no traceback, no progress bar and nothing on standard output."""
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
-    lines = [line for line in done.stderr.splitlines() if line.startswith("sdnator: ")]
+    lines = done.stderr.splitlines()
     assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("sdnator: ")
     return lines[0]
 
 

@@ -43,15 +43,15 @@ class QueryFolder:
         part.replace(target)
 
 
-def read_text(file: Path) -> str:
-    """A file of queries; raises `QueryTextError` for one that is too long or no text, OSError."""
+def read_text(file: Path, name: str = "") -> str:
+    """A file of queries; raises `QueryTextError`, which calls it `name`, for one that is too long or no text, OSError."""
     with file.open("rb") as opened:
         data = opened.read(4 * MOST_TEXT + 1)  # a character has four bytes at most
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise QueryTextError(file.name, line, 1, "not UTF-8 text") from None
+        raise QueryTextError(name or file.name, line, 1, "not UTF-8 text") from None
 
 
 def _refuse_known(names: Iterable[str]) -> None:

@@ -76,7 +76,7 @@ def test_one_of_another_schema_or_a_damaged_one_is_not_used(tmp_path, trained, m
     assert "its schema is 1, this program's is 2" in place.text
     place.path.write_bytes(b"no model")
     assert place.detector(SMALL, None) is None
-    assert "an incomplete Kitsune model" in place.text
+    assert "not a Kitsune model" in place.text
     assert len(models_aside(place.path)) == 2
 
 

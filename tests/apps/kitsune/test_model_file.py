@@ -49,6 +49,21 @@ def test_a_truncated_file_is_refused_wherever_it_ends(path):
             load_model(path)
 
 
+@pytest.mark.parametrize("content", [b"#!/bin/sh\nexit 0\n", b"\x80\x04.", b"\x00" * 100])
+def test_another_file_is_no_model_and_nobody_is_told_to_trust_it(path, content):
+    path.write_bytes(content)
+    with pytest.raises(NotAModelError, match="not a Kitsune model; use a file from --save-model") as raised:
+        load_model(path)
+    assert "pickle" not in str(raised.value)
+
+
+def test_a_folder_is_told_in_words(tmp_path):
+    with pytest.raises(
+        ModelFileError, match=r"cannot be read \(Is a directory\); use a file from --save-model"
+    ):
+        load_model(tmp_path)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_damaged_bytes_never_surprise(tmp_path_factory, network, data):
