@@ -1,6 +1,7 @@
 """The latest items of a large archive without reading all of it.  Pure: the driver reads rows."""
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from operator import attrgetter
 from typing import TypeVar
 
@@ -17,14 +18,18 @@ def latest_items(
 ) -> list[Item]:
     """The latest `limit` items, oldest first.
 
-    `heads`: for each candidate row its greatest timestamp (ns) and its name for `read`.
+    Args:
+        heads: for each candidate row its greatest timestamp (ns) and its name for `read`, the greatest first; no more
+            of them are taken than needed.
+        read: the items of some rows.
+        limit: how many items.
     """
-    rows = sorted(heads, key=lambda head: head[0], reverse=True)
+    rows = iter(heads)
     items: list[Item] = []
-    for start in range(0, len(rows), _ROWS):
-        if len(items) >= limit and items[0].timestamp > rows[start][0]:
+    while some := list(islice(rows, _ROWS)):
+        if len(items) >= limit and items[0].timestamp > some[0][0]:
             break
-        items += read([name for _, name in rows[start : start + _ROWS]])
+        items += read([name for _, name in some])
         items.sort(key=by_age)
         del items[: max(0, len(items) - limit)]
     return items

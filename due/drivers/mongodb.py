@@ -17,8 +17,9 @@ import os
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from operator import itemgetter
 from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
@@ -33,6 +34,7 @@ from pymongo.uri_parser import parse_uri
 
 from due.codec import pack, unpack
 from due.drivers.latest_items import by_age, latest_items
+from due.drivers.mongodb_latest import HEAD, batch_size, latest_to_end, named_keys
 from due.drivers.mongodb_retention import MongoRetention, naming, number
 from due.drivers.mongodb_sharding import SHARD_KEYS, shard
 from due.drivers.query import ArchiveQuery, parse
@@ -106,11 +108,10 @@ class MongoArchive:
         """Items that match, oldest first (timestamp, then sequence); of more than `limit` the latest."""
         parsed = parse(query)
         with self.errors():
-            criteria = self._criteria(parsed)
+            criteria, span = self._criteria(parsed)
             if limit is not None:
-                found = in_time(self._find(criteria, {"dataKey": 1, "timestamp": 1, "lastTimestamp": 1}))
-                heads = [(number(document, "lastTimestamp"), document) for document in found]
-                return latest_items(heads, lambda some: self._read(naming(some), parsed), limit)
+                with closing(self._latest_to_end(criteria, span, limit)) as heads:
+                    return latest_items(heads, lambda some: self._read(naming(some), parsed), limit)
             items = list(self._read(criteria, parsed))
         items.sort(key=by_age)
         return items
@@ -259,7 +260,26 @@ class MongoArchive:
         found = self._table().find(criteria, fields)
         return found if left is None else found.max_time_ms(math.ceil(1000 * left))
 
-    def _criteria(self, query: ArchiveQuery) -> dict[str, Any]:
+    def _latest_to_end(
+        self, criteria: Mapping[str, Any], span: int, limit: int
+    ) -> Generator[tuple[int, Document], None, None]:
+        """Documents that meet the criteria with the time of their last item, the greatest first."""
+        keys = named_keys(criteria)
+        if keys is None:
+            found = [(number(one, "lastTimestamp"), one) for one in in_time(self._find(criteria, HEAD))]
+            yield from sorted(found, key=itemgetter(0), reverse=True)
+            return
+        batch = batch_size(limit, len(keys))
+
+        def read(key: str) -> Generator[Document, None, None]:
+            of_key = {**criteria, "dataKey": {"$eq": key}}
+            with closing(self._find(of_key, HEAD).sort("timestamp", -1).batch_size(batch)) as documents:
+                yield from in_time(documents)
+
+        yield from latest_to_end(keys, read, span)
+
+    def _criteria(self, query: ArchiveQuery) -> tuple[dict[str, Any], int]:
+        """What the server is asked for, and the most nanoseconds between the items of one document."""
         named = list(query.conditions("dataKey"))
         keys = list(self._table("keys").find(_key_range(named)))
 
@@ -275,7 +295,7 @@ class MongoArchive:
         if not named and len(criteria) and len(keys) <= _MAX_NAMED_KEYS and "dataKey" not in criteria:
             # without a key no index would be used
             criteria = {"dataKey": {"$in": [d["_id"] for d in keys]}} | criteria
-        return criteria
+        return criteria, spans["timestamp"]
 
     def _joined(self, document: Document) -> Document:
         count = document.get("parts", 0)

@@ -120,7 +120,8 @@ class SqliteArchive:
                     rows = connection.execute(_SELECT + _AMONG, (f"[{','.join(map(str, numbers))}]",))
                     return (item for row in in_time(rows.fetchall()) for item in self._items(row, parsed))
 
-                return latest_items(map(_head, heads), read, limit)
+                by_end = sorted(map(_head, heads), key=itemgetter(0), reverse=True)
+                return latest_items(by_end, read, limit)
             rows = connection.execute(_SELECT + text, parameters).fetchall()
         items = [item for row in in_time(rows) for item in self._items(row, parsed)]
         items.sort(key=by_age)

@@ -202,8 +202,15 @@ def test_of_more_than_the_limit_the_latest_are_found_oldest_first(archive: Archi
                 )
             ]
         )
+    # another key, with frames that hold some of these
+    for first in range(0, 200, 50):
+        wide = [item("a.wide", n=first + k + 1, timestamp=T0 + (first + 4 * k) * 1000) for k in range(10)]
+        archive.insert_frames([pack(wide)])
     for query in (
         {"dataKey": "a.b.c"},
+        {"dataKey": "a.wide"},
+        {"dataKey": "a.**"},
+        {"dataKey": {"$in": ["a.wide", "a.b.c"]}, "sequence": {"$gt": 7}},
         {"dataKey": "a.**", "instanceId": "late"},
         {"timestamp": {"$lt": T0 + 90_000}},
     ):

@@ -5,6 +5,12 @@ from pathlib import Path
 
 import pytest
 from pymongo import MongoClient
+from pymongo.monitoring import (
+    CommandFailedEvent,
+    CommandListener,
+    CommandStartedEvent,
+    CommandSucceededEvent,
+)
 
 from due.codec import pack
 from due.drivers import mongodb, mongodb_retention
@@ -123,6 +129,48 @@ def test_of_a_large_document_whose_deletion_is_interrupted_nothing_stays(
     assert archive.prune(before=T0 + 1) == 1
     for companion in ("", "parts"):
         assert list(archive._table(companion).find({})) == []
+
+
+class Delivered(CommandListener):
+    """Counts the documents that a server sends in answers to queries."""
+
+    def __init__(self) -> None:
+        self.documents = 0
+
+    def started(self, _event: CommandStartedEvent) -> None:
+        """Nothing to count yet."""
+
+    def failed(self, _event: CommandFailedEvent) -> None:
+        """Nothing was sent."""
+
+    def succeeded(self, event: CommandSucceededEvent) -> None:
+        """An answer."""
+        cursor = event.reply.get("cursor", {})
+        self.documents += len(cursor.get("firstBatch", ())) + len(cursor.get("nextBatch", ()))
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        {"dataKey": "a.b"},
+        {"dataKey": "a.*"},
+        {"dataKey": "a.*", "timestamp": {"$lt": T0 + 2000}, "appId": "app"},
+    ],
+)
+def test_of_a_large_collection_no_more_documents_are_read_than_a_limit_needs(
+    url: str, archive: MongoArchive, query: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for key in ("a.b", "a.c"):
+        archive.insert(items(2000, key=key))
+    delivered = Delivered()
+    monkeypatch.setattr(
+        mongodb, "client_of", lambda url: MongoClient(url, w="majority", event_listeners=[delivered])
+    )
+    counted = MongoArchive(url)
+    found = counted.find(query, limit=10)
+    counted.close()
+    assert found == archive.find(query)[-10:]
+    assert delivered.documents <= 2 * 100 + 3 * 16 + 10
 
 
 def _interrupted(_: object) -> None:
