@@ -21,6 +21,8 @@ HEAD: Final = {"dataKey": 1, "timestamp": 1, "lastTimestamp": 1}
 _MOST_KEYS = 256
 """Keys that are asked for one by one; with more, a question for each costs more than reading every document's times."""
 _LEAST_BATCH, _MOST_BATCH = 100, 1000
+_MORE = 16
+"""Documents beyond the limit, which show that no later item comes."""
 _AHEAD = 20_000
 """Documents that are read ahead, of all keys together."""
 
@@ -46,7 +48,7 @@ def batch_size(limit: int, keys: int) -> int:
         limit: items that are wanted.
         keys: how many keys are read side by side.
     """
-    wanted = min(max(limit, _LEAST_BATCH), _MOST_BATCH)
+    wanted = min(max(limit + _MORE, _LEAST_BATCH), _MOST_BATCH)
     return max(2, min(wanted, _AHEAD // max(1, keys)))
 
 

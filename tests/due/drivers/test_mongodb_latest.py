@@ -104,7 +104,7 @@ def test_keys_are_asked_for_one_by_one_where_a_filter_names_a_few(
 
 def test_batches_grow_with_the_limit_and_shrink_with_the_keys() -> None:
     assert batch_size(1, 1) == 100
-    assert batch_size(500, 1) == 500
+    assert batch_size(500, 1) == 516
     assert batch_size(10**6, 1) == 1000
     assert batch_size(10**6, 200) == 100
     assert batch_size(1, 10**6) == 2
