@@ -73,4 +73,4 @@ def checkpoint_in(value: object) -> Checkpoint:
         return msgspec.convert(value, Checkpoint)
     except (DueError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         # msgspec takes an array or a record batch in place of a map for an object, and fails within it
-        raise DecodeError(f"no checkpoint: {error}") from None
+        raise DecodeError(f"not a checkpoint: {error}") from None

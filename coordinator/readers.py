@@ -91,5 +91,5 @@ def _read(path: Path) -> dict[str, ArchiveReader]:
     with path.open("rb") as file:
         text = file.read(_MOST_BYTES + 1)
     if len(text) > _MOST_BYTES:
-        raise ValueError(f"more than {_MOST_BYTES} bytes")
+        raise ValueError(f"the file has more than {_MOST_BYTES:,} bytes")
     return msgspec.json.decode(text, type=dict[str, ArchiveReader])

@@ -42,7 +42,9 @@ def find(name: str) -> Strategy:
         return STRATEGIES[name]
     module, colon, function = name.partition(":")
     if not colon:
-        raise ValueError(f"selection {name!r}: one of {', '.join(sorted(STRATEGIES))}, or module:function")
+        raise ValueError(
+            f"selection {name!r}: must be one of {', '.join(sorted(STRATEGIES))}, or module:function"
+        )
     try:
         found: Strategy = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:

@@ -91,7 +91,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         find_strategy(self.selection)
         if not 0 <= self.http_port < 65536:
-            raise ValueError(f"http_port {self.http_port}: 0 to 65535")
+            raise ValueError(f"http_port={self.http_port}: must be 0 to 65535")
 
 
 class CoordinatorService:

@@ -92,7 +92,7 @@ def read_batch(data: memoryview) -> RecordBatch:
     for name, text in heads:
         columns[name], at = _read(data, at, _dtype(text), rows)
     if len(columns) != len(heads) or (rows and not heads):
-        raise DecodeError("damaged record batch: a column is there twice, or rows without a column")
+        raise DecodeError("damaged record batch: a column occurs twice, or there are rows without columns")
     return RecordBatch(columns)
 
 

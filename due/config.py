@@ -119,7 +119,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise InvalidOption(f"{name}: {error}; enrol the app again") from None
         if mode & 0o077:
-            raise InvalidOption(f"{name}: others can read it; chmod 600 {path}")
+            raise InvalidOption(f"{name}: others can read it; run `chmod 600 {path}`")
         return said
 
     def checked(self) -> "Options":
@@ -138,7 +138,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         }  # fmt: skip
         for name, bound in least.items():
             if not getattr(self, name) >= bound:  # not a number is refused too
-                raise InvalidOption(f"option {name} is {getattr(self, name)}: at least {bound}")
+                raise InvalidOption(f"option {name}={getattr(self, name)}: must be at least {bound}")
         most = {
             "frame_bytes": _MOST_FRAME_BYTES,
             "heartbeat": MAX_HEARTBEAT,
@@ -148,5 +148,5 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         }
         for name, limit in most.items():
             if not getattr(self, name) <= limit:
-                raise InvalidOption(f"option {name} is {getattr(self, name)}: at most {limit}")
+                raise InvalidOption(f"option {name}={getattr(self, name)}: must be at most {limit}")
         return self

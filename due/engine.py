@@ -169,9 +169,9 @@ class Engine:
         """
         self._before_init("init")
         if not isinstance(app_id, str) or not re.fullmatch(APP_ID, app_id):
-            raise InvalidOption(f"app id {app_id!r}: 1 to {MAX_ID} characters of A-Z a-z 0-9 _ -")
+            raise InvalidOption(f"app id {app_id!r}: must be 1 to {MAX_ID} characters of A-Z a-z 0-9 _ -")
         if instances not in get_args(Instances):
-            raise InvalidOption(f"instances {instances!r}: 'standby', 'shared' or 'sharded'")
+            raise InvalidOption(f"instances={instances!r}: must be 'standby', 'shared' or 'sharded'")
         self._shards = _checked_shards(tuple(shards), instances)
         self._start(
             _checked_registration(
@@ -359,7 +359,9 @@ class Engine:
             NotInitialised: called before `init` or after `close`.
         """
         if not 0 < every <= _LONGEST_EVERY:
-            raise InvalidOption(f"keep_state(every={every}): above 0, at most {_LONGEST_EVERY:g} seconds")
+            raise InvalidOption(
+                f"keep_state(every={every}): must be greater than 0 and at most {_LONGEST_EVERY:g} seconds"
+            )
         self._require().keep_state(state, every)
 
     def shards(self) -> frozenset[str] | None:
@@ -529,9 +531,9 @@ def _checked_shards(shards: tuple[str, ...], instances: Instances) -> tuple[str,
     if shards and instances != "sharded":
         raise InvalidOption('shards are for apps with instances="sharded"')
     if len(set(shards)) != len(shards) or len(shards) > MOST_SHARDS:
-        raise InvalidOption(f"shards: {len(shards)} names; at most {MOST_SHARDS}, each once")
+        raise InvalidOption(f"shards: {len(shards)} names; give at most {MOST_SHARDS}, each once")
     if not all(isinstance(name, str) and 0 < len(name) <= _LONGEST_SHARD for name in shards):
-        raise InvalidOption(f"shards: names of 1 to {_LONGEST_SHARD} characters")
+        raise InvalidOption(f"shards: a name must have 1 to {_LONGEST_SHARD} characters")
     return shards
 
 

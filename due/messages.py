@@ -72,7 +72,9 @@ def _check_rate(what: str, frequency: Frequency) -> None:
     rates = frequency if isinstance(frequency, tuple) else (frequency,)
     for rate in rates:
         if rate and not _LEAST_HZ <= rate <= _MOST_HZ:  # NaN is refused too
-            raise InvalidOption(f"frequency {rate} of {what}: {_LEAST_HZ} to {_MOST_HZ:g} Hz, or None")
+            raise InvalidOption(
+                f"frequency {rate} of {what}: must be {_LEAST_HZ} to {_MOST_HZ:g} Hz, or None"
+            )
 
 
 class Capability(msgspec.Struct, frozen=True):

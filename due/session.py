@@ -211,8 +211,8 @@ class Session:
         lost_place, self._superseded = superseded > self._superseded, superseded
         if lost_place and since:
             raise Superseded(
-                f"another instance took over from this one: of the last {since} items written readers may have "
-                "refused some"
+                f"another instance took over from this one; readers may have refused some of the last {since} items "
+                "written"
             )
 
     @property

@@ -162,7 +162,8 @@ class Tracker:
             return False
         if jump > FAR:
             raise RefusedFrame(
-                "out_of_range", f"{frame.before} items of {frame.key} before it, {expected} were expected"
+                "out_of_range",
+                f"it says that {frame.before} items of {frame.key} came before it, {expected} were expected",
             )
         self._miss(frame, jump)
         if name in self._rested:

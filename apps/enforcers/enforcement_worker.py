@@ -162,7 +162,7 @@ class EnforcementWorker:
         try:
             self._enforcer.end(list(self._desired.standing.values()))
         except EnforcerAway as error:
-            log.warning("the enforcer did not end in order: %s", one_line(str(error)))
+            log.warning("the enforcer did not end cleanly: %s", one_line(str(error)))
 
     def _wait_s(self) -> float:
         """Seconds until there is something to do by time alone."""
@@ -246,7 +246,7 @@ class EnforcementWorker:
 
     def _works(self) -> None:
         if self._outlook.problem:
-            log.info("works again")
+            log.info("the enforcer works again")
             self._outlook.problem = ""
         self._outlook.pause, self._outlook.try_at = _FIRST_PAUSE_S, 0.0
 

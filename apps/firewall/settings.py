@@ -74,4 +74,4 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         if self.syslog:
             syslog_place(self.syslog)
         if not self.enforcers or len(set(self.enforcers)) < len(self.enforcers):
-            raise ValueError(f"enforcers={list(self.enforcers)}: name one or more apps, each once")
+            raise ValueError(f"enforcers={list(self.enforcers)}: must name one or more apps, each once")

@@ -62,7 +62,7 @@ class AfterImage:
         kernel: Kernel | None = None,
     ) -> None:
         if max_streams < 2 or max_links < 1:
-            raise ValueError(f"max_streams={max_streams}, max_links={max_links}: need at least 2 and 1")
+            raise ValueError(f"max_streams={max_streams}, max_links={max_links}: must be at least 2 and 1")
         self._engine = _KernelEngine(
             kernel or load_kernel(), mode == "bounded", max_streams, max_links, horizon
         )

@@ -119,7 +119,7 @@ def _settings(settings: DetectorSettings) -> dict[str, Any]:
 def _check_settings(found: dict[str, Any], settings: DetectorSettings) -> None:
     for name, value in _settings(settings).items():
         if found[name] != value:
-            raise CheckpointError(f"a checkpoint of Kitsune with {name}={found[name]}, not {value}")
+            raise CheckpointError(f"the checkpoint was made with {name}={found[name]}, not {value}")
 
 
 # ---- the kernel
@@ -141,7 +141,7 @@ def _dumped(detector: Detector, name: str) -> npt.NDArray[np.uint8]:
     kernel = detector._kernel
     size = write(state, kernel.ffi.NULL, 0)
     if size < 0:
-        raise MemoryError(f"{name} cannot be dumped: it failed before")
+        raise MemoryError(f"{name} cannot be saved: it failed before")
     found = np.empty(size, np.uint8)
     write(state, kernel.pointer("uint8_t", found), size)
     return found
@@ -153,13 +153,13 @@ def _restore_kernel(
     for name, (lib, state) in _handles(detector).items():
         data = arrays[name]
         if data.dtype != np.uint8 or data.ndim != 1:
-            raise ValueError(f"{name} is no row of bytes")
+            raise ValueError(f"{name} is not a row of bytes")
         more = (switches,) if name in ("senders", "behaviour") else ()
         failed = getattr(lib, f"{name}_load")(state, kernel.pointer("uint8_t", data), len(data), *more)
         if failed == -1:
             raise MemoryError(f"no memory for {name}")
         if failed:
-            raise ValueError(f"{name}: numbers that do not fit each other")
+            raise ValueError(f"{name}: its numbers contradict each other")
 
 
 def _renumber(detector: Detector) -> int:
@@ -236,7 +236,7 @@ def _restore_learnt(detector: Detector, header: dict[str, Any]) -> None:
     if detector._knows_behaviour and not (
         detector.behaviour.seconds > 0 and detector.behaviour.usual_score > 0
     ):
-        raise ValueError("training took no time, or its usual score is none")
+        raise ValueError("training took no time, or has no usual score")
 
 
 def _maxima(pairs: Any, windows: int) -> dict[Any, BlockMaxima]:
@@ -256,7 +256,7 @@ def _benign(state: dict[str, Any]) -> dict[str, Any]:
     kinds = {"packets": int, "log_mean": float, "log_spread": float, "packets_per_hour": float}
     found = {name: built(state[name], kind) for name, kind in kinds.items()}
     if not (found["packets_per_hour"] > 0 and np.isfinite([*found.values()]).all()):
-        raise ValueError("no distribution of benign scores")
+        raise ValueError("benign scores without a distribution")
     return found
 
 
@@ -273,7 +273,7 @@ def _drift(values: Any) -> Drift:
     found = Drift(built(threshold, float), built(limit, float))
     found._blocks.update(built(blocks, dict[int, list[int]]))
     if any(len(counts) != 2 for counts in found._blocks.values()):
-        raise ValueError("half hours without two counts")
+        raise ValueError("a half hour of drift does not have two counts")
     found.reading = None if reading is None else DriftReading(*built(reading, _READING))
     return found
 
@@ -304,7 +304,7 @@ def _restore_kept(detector: Detector, kept: Any) -> None:
     for batch, found in kept:
         explained = [Explanation(*each) for each in built(found, list[kind])]
         if not all(each.features and all(0 <= n < WIDTH for n in each.features) for each in explained):
-            raise ValueError("an explanation by features that there are none of")
+            raise ValueError("an explanation names features that do not exist")
         detector.senders._kept[built(batch, int)] = explained
     lib, state = _handles(detector)["senders"]
     kernel = detector._kernel

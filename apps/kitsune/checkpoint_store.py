@@ -65,7 +65,7 @@ class CheckpointStore:
         parts = [data[at : at + PART_BYTES] for at in range(0, len(data), PART_BYTES)]
         if len(parts) > MOST_PARTS:
             raise CheckpointError(
-                f"a checkpoint of {len(data):,} bytes; lower max_streams and max_links: at most {MOST_PARTS * PART_BYTES:,}"
+                f"a checkpoint of {len(data):,} bytes, at most {MOST_PARTS * PART_BYTES:,} are kept; lower max_streams and max_links"
             )
         self._catch_up()
         now = time.time_ns()
@@ -117,14 +117,14 @@ class CheckpointStore:
         try:
             whole = msgspec.convert(value, _Whole)
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise CheckpointError(f"no checkpoint: {error}") from error
+            raise CheckpointError(f"not a checkpoint: {error}") from error
         if not 0 <= whole.parts <= MOST_PARTS or not 0 <= whole.time < 1 << 63:
-            raise CheckpointError(f"a checkpoint of {whole.parts} parts at {whole.time}")
+            raise CheckpointError(f"a checkpoint cannot have {whole.parts} parts and the time {whole.time}")
         query = {"dataKey": f"{self._parts}.{path}", "eventTime": whole.time, "instanceId": whole.instance}
         data = b"".join(_part(item.value) for item in self._engine.get(query, limit=whole.parts or 1))
         if len(data) != whole.length or zlib.crc32(data) != whole.sum:
             raise CheckpointError(
-                f"the checkpoint has {len(data):,} of {whole.length:,} bytes, or others; were archived parts deleted?"
+                f"the checkpoint is incomplete or changed ({len(data):,} of {whole.length:,} bytes); were archived parts deleted?"
             )
         return data
 

@@ -198,7 +198,7 @@ def network_in(
         KeyError, TypeError, ValueError, IndexError: they describe none.
     """
     if header["lambdas"] != list(LAMBDAS) or header["width"] != WIDTH:
-        raise ValueError(f"features: {header['width']} with scales {header['lambdas']}")
+        raise ValueError(f"it has {header['width']} features with time scales {header['lambdas']}, not ours")
     feature_map = header["feature_map"]
     if sorted(feature for group in feature_map for feature in group) != list(range(WIDTH)):
         raise ValueError("the feature map does not hold every feature once")

@@ -62,16 +62,16 @@ def unpack(data: bytes, mark: bytes, version: int) -> tuple[dict[str, Any], dict
         CheckpointError: it is something else, damaged, too large, or of another version.
     """
     if len(data) < _HEAD.size or not data.startswith(mark):
-        raise CheckpointError("no checkpoint of Kitsune")
+        raise CheckpointError("not a checkpoint of Kitsune")
     found = _HEAD.unpack_from(data)[1]
     if found != version:
-        raise CheckpointError(f"a checkpoint of version {found}, this program reads version {version}")
+        raise CheckpointError(f"checkpoint version {found}, this program reads version {version}")
     content = memoryview(_unzipped(data[_HEAD.size :]))
     try:
         (length,) = _LENGTH.unpack_from(content)
         end = _LENGTH.size + length
         if end > len(content):
-            raise CheckpointError("a checkpoint without its end")
+            raise CheckpointError("a damaged checkpoint: its end is missing")
         header = json.loads(bytes(content[_LENGTH.size : end]))
         return dict(header), _arrays(content[end:], header["arrays"])
     except (struct.error, KeyError, TypeError, ValueError, RecursionError) as error:
@@ -89,7 +89,9 @@ def _unzipped(data: bytes) -> bytes:
     except (zlib.error, MemoryError) as error:
         raise CheckpointError(f"a damaged checkpoint: {error}") from error
     if not unpacker.eof or unpacker.unused_data:
-        raise CheckpointError(f"a checkpoint that does not end, or of more than {MOST_BYTES:,} bytes")
+        raise CheckpointError(
+            f"a damaged checkpoint: its end is not where it should be, or it is larger than {MOST_BYTES:,} bytes"
+        )
     return content
 
 
@@ -106,7 +108,7 @@ def _arrays(content: memoryview, listed: Any) -> dict[str, npt.NDArray[Any]]:
             count *= size
         end = at + count * np.dtype(kind).itemsize
         if end > len(content) or name in found or len(shape) > _MOST_DIMENSIONS:
-            raise CheckpointError("a damaged checkpoint: an array without its end, or one named twice")
+            raise CheckpointError("a damaged checkpoint: an array is cut off, or named twice")
         found[name] = np.frombuffer(content[at:end], dtype=f"<{kind}").reshape(shape).copy()
         at = end
     if at != len(content):

@@ -139,7 +139,7 @@ class Settings(DetectorSettings, frozen=True, kw_only=True, forbid_unknown_field
         super().__post_init__()
         if not 0 < self.checkpoint_seconds <= _MOST_CHECKPOINT_S:
             raise ValueError(
-                f"checkpoint_seconds={self.checkpoint_seconds}: must be greater than 0, and {_MOST_CHECKPOINT_S:g} at most"
+                f"checkpoint_seconds={self.checkpoint_seconds}: must be greater than 0 and at most {_MOST_CHECKPOINT_S:g}"
             )
 
 

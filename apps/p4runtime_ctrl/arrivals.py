@@ -83,7 +83,9 @@ def questions_in(item: Item) -> RecordBatch:
     kinds = QUESTION | {name: kind for name, kind in OPTIONAL.items() if _has(value, name)}
     found = read_columns(value, kinds, "cell_request")
     if len(found) > MOST_QUESTIONS:
-        raise MessageError("size", f"cell_request: {len(found):,} questions; {MOST_QUESTIONS:,} at most")
+        raise MessageError(
+            "size", f"cell_request: {len(found):,} questions; send at most {MOST_QUESTIONS:,} at once"
+        )
     none = {name: np.zeros(len(found), kind) for name, kind in OPTIONAL.items() if name not in kinds}
     return RecordBatch({**found, **none})
 

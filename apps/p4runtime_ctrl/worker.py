@@ -411,7 +411,7 @@ class SwitchWorker:
 
     def _lose(self, cause: str) -> None:
         if self._connected:
-            _LOG.warning("%s: lost: %s", self.name, cause)
+            _LOG.warning("%s: connection lost: %s", self.name, cause)
             self._away_since = time.monotonic()
         self._connected = False
         self._duty.backup = False

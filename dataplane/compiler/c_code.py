@@ -79,7 +79,10 @@ class CGenerator(CStatements):
             width = state.key_widths[n]
             kind = kind_of(width)
             if kind > 128:
-                raise Unsupported(f"a select on {width} bits in parser state {state.name} (at most 128)")
+                raise Unsupported(
+                    f"a select on {width} bits is not supported by the embedded switch (at most 128; "
+                    f"in parser state {state.name})"
+                )
             text, own = self.leaf(key)
             cut = self.e.cut(convert(text, own, kind, signed=False), kind, width)
             self.line(f"{CTYPE[kind]} k{n} = {cut};")
@@ -364,7 +367,9 @@ def _keep_list(g: CGenerator) -> None:
 def generate(program: Program, layout: Layout) -> str:
     """The whole unit."""
     if not all(h.type.width % 8 == 0 for h in program.headers.values() if not h.metadata):
-        raise Unsupported("a header that is not a whole number of bytes")
+        raise Unsupported(
+            "a header that is not a whole number of bytes is not supported by the embedded switch"
+        )
     g = CGenerator(program, layout)
     g.lines += _structures(g)
     with g.block("static int parse(machine *m, phv *p)"):

@@ -144,7 +144,9 @@ class CExpressions:
         text, kind = self.exact(e)
         if kind == 64:
             return text
-        raise Unsupported("a shift by more than 64 bits' worth of distance")
+        raise Unsupported(
+            "a shift by a distance of more than 64 bits is not supported by the embedded switch"
+        )
 
     def _left(self, left: Expression, right: Expression, kind: int) -> str:
         value = self.at(left, kind)
@@ -175,13 +177,17 @@ class CExpressions:
     def _divide(self, op: str, left: Expression, right: Expression, kind: int) -> str:
         own = kind_of(union(bounds(left), bounds(right)).bits)
         if own in _WIDE or bounds(left).signed or bounds(right).signed:
-            raise Unsupported(f"{op} of signed values or of more than 128 bits")
+            raise Unsupported(
+                f"{op} of signed values or of more than 128 bits is not supported by the embedded switch"
+            )
         a, b = self.at(left, own), self.at(right, own)
         return convert(f"({b} ? {a} {op} {b} : 0)", own, kind, signed=False)
 
     def _cast(self, op: str, left: Expression, right: Expression, kind: int) -> str:
         if not isinstance(right, Const):
-            raise Unsupported(f"{op} to a width that is no constant")
+            raise Unsupported(
+                f"{op} to a width that is not a constant is not supported by the embedded switch"
+            )
         width = right.value
         if op == "two_comp_mod":
             own = kind_of(width)
@@ -203,7 +209,9 @@ class CExpressions:
         signed = limit.signed or want.signed
         own = kind_of(max(limit.bits + (not limit.signed and signed), width + 1))
         if own in _WIDE:
-            raise Unsupported("saturating arithmetic on more than 127 bits")
+            raise Unsupported(
+                "saturating arithmetic on more than 127 bits is not supported by the embedded switch"
+            )
         value = self.at(e, own)
         if not signed:
             return convert(f"usat{own}({value}, {literal(want.high, own)})", own, kind, signed=False)

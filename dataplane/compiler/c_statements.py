@@ -44,7 +44,9 @@ def key_places(spec: tree.TableSpec) -> tuple[int, tuple[int, ...]]:
     bit = 0
     for i in wide:
         if spec.keys[i].kind is MatchKind.RANGE:
-            raise Unsupported(f"a range over more than 64 bits in table {spec.name}")
+            raise Unsupported(
+                f"a range over more than 64 bits is not supported by the embedded switch (in table {spec.name})"
+            )
         places[i] = bit
         bit += 64 * words(spec.keys[i].width)
     rooms: list[tuple[int, int]] = []
@@ -211,7 +213,7 @@ class CStatements(Generator):
             return f"((u128){text} >> 64 ? ~0ull : (u64){text})"
         if kind == 64:
             return text
-        raise Unsupported("an index of more than 128 bits")
+        raise Unsupported("an index of more than 128 bits is not supported by the embedded switch")
 
     def store(self, target: FieldRef, value: Expression) -> None:
         text, _ = self.e.stored(value, target.field)

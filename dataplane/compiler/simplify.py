@@ -98,7 +98,7 @@ def _binary(op: str, left: Expression, right: Expression) -> Bounds:
 
 def _cast(op: str, width: Expression) -> Bounds:
     if not isinstance(width, Const):
-        raise Unsupported(f"{op} to a width that is no constant")
+        raise Unsupported(f"{op} to a width that is not a constant is not supported by the embedded switch")
     if op == "usat_cast":
         return Bounds(0, (1 << width.value) - 1)
     half = 1 << (width.value - 1)

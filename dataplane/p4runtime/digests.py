@@ -99,7 +99,7 @@ class DigestLists:
         digest = self._known(message.digest_id)
         old = self._by_name.get(digest.name)
         if kind == INSERT and old is not None:
-            raise Exists(f"digest {digest.name} is configured")
+            raise Exists(f"digest {digest.name} is already configured")
         if kind != INSERT and old is None:
             raise MissingEntity(f"digest {digest.name} is not configured")
         config = message.config

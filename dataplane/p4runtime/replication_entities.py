@@ -54,7 +54,7 @@ class ReplicationEntities:
         old = entries.get(number)
         name = type(entry).DESCRIPTOR.name
         if kind == INSERT and old is not None:
-            raise Exists(f"{name} {number} exists")
+            raise Exists(f"{name} {number} already exists")
         if kind != INSERT and old is None:
             raise MissingEntity(f"{name} {number} does not exist")
         put(number, None if kind == DELETE else entry)

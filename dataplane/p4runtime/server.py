@@ -37,7 +37,7 @@ _MOST_BYTES = 64 << 20
 """Of one message."""
 _SMALL_WRITE = 16
 """Updates; more of them would keep packet-ins waiting for a millisecond and longer."""
-_NO_MESSAGE = "the request is no message of p4.v1"
+_NO_MESSAGE = "the request is not a message of p4.v1"
 _DETAILS = "grpc-status-details-bin"
 _OPTIONS = (
     ("grpc.max_receive_message_length", _MOST_BYTES),

@@ -109,7 +109,7 @@ def read_trusted(file: Path) -> Mapping[str, str]:
 def checked_hash(text: str, where: str) -> str:
     """A SHA-256 in hexadecimal digits.  Raises TrustError."""
     if len(text) != _DIGITS or not all(digit in "0123456789abcdef" for digit in text):
-        raise TrustError(f"{where}: {text[:80]!r} is no SHA-256 of {_DIGITS} hexadecimal digits")
+        raise TrustError(f"{where}: {text[:80]!r} is not a SHA-256 of {_DIGITS} hexadecimal digits")
     return text
 
 

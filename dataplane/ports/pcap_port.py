@@ -36,7 +36,9 @@ class PcapReader:
                 break
         else:
             self._file.close()
-            raise PortError(f"pcap port: {path} is no pcap file (pcapng and gzip are not read here)")
+            raise PortError(
+                f"pcap port: {path} is not a pcap file; pcapng and gzip are not read here: convert it"
+            )
         link = struct.unpack(order + _FILE_HEADER, header)[6] & 0xFFFF
         if link != _ETHERNET:
             self._file.close()

@@ -64,7 +64,7 @@ def document(data: bytes | str) -> Json:
     for name, most in MOST.items():
         part = found.get(name, [])
         if not isinstance(part, list):
-            raise ProgramError(f"malformed BMv2 JSON: {name} is no list; {_HINT}")
+            raise ProgramError(f"malformed BMv2 JSON: {name} is not a list; {_HINT}")
         if len(part) > most:
             raise ProgramError(f"BMv2 JSON with {len(part)} {name}; at most {most} are taken")
     return found
@@ -78,7 +78,7 @@ def _object(pairs: list[tuple[str, Any]]) -> Json:
 
 
 def _no_float(text: str) -> NoReturn:
-    raise ValueError(f"the number {text[:20]} is no integer")
+    raise ValueError(f"the number {text[:20]} is not an integer")
 
 
 def _measure(found: Any) -> None:
@@ -111,7 +111,9 @@ def whole(value: Any, low: int, high: int, what: str) -> int:
 def hexadecimal(text: Any) -> int:
     """A number written like 0x1f.  Raises ProgramError."""
     if not isinstance(text, str) or len(text) > MAX_HEX_DIGITS:
-        raise ProgramError(f"{repr(text)[:40]} is no number of at most {MAX_HEX_DIGITS} hexadecimal digits")
+        raise ProgramError(
+            f"{repr(text)[:40]} is not a number of at most {MAX_HEX_DIGITS} hexadecimal digits"
+        )
     return int(text, 16)
 
 

@@ -183,7 +183,9 @@ def _check_headers(program: Program) -> None:
     kinds = [header.type for header in program.headers.values()]
     octets = sum(kind.max_bytes or kind.width // 8 for kind in kinds)
     if octets > MAX_HEADER_BYTES:
-        raise Unsupported(f"headers of {octets} bytes (at most {MAX_HEADER_BYTES})")
+        raise Unsupported(
+            f"headers of {octets} bytes are not supported by the embedded switch (at most {MAX_HEADER_BYTES})"
+        )
 
 
 def _check_sizes(program: Program) -> None:
@@ -191,18 +193,26 @@ def _check_sizes(program: Program) -> None:
     octets += sum(16 * array.size for array in program.counters.values())
     octets += sum(_METER_BYTES * array.size for array in program.meters.values() if not array.table)
     if octets > MAX_STATE_BYTES:
-        raise Unsupported(f"registers, counters and meters of {octets} bytes (at most {MAX_STATE_BYTES})")
+        raise Unsupported(
+            f"registers, counters and meters of {octets} bytes are not supported by the embedded switch "
+            f"(at most {MAX_STATE_BYTES})"
+        )
     for calculation in program.calculations.values():
         bits = sum(width for _, width in calculation.inputs)
         if bits > MAX_HASHED_BITS:
-            raise Unsupported(f"calculation {calculation.name} over {bits} bits (at most {MAX_HASHED_BITS})")
+            raise Unsupported(
+                f"calculation {calculation.name} over {bits} bits is not supported by the embedded switch "
+                f"(at most {MAX_HASHED_BITS})"
+            )
 
 
 def _check_weights(nodes: Iterable[Any]) -> None:
     weights: dict[int, int] = {}
     operators = (tree.Unary, tree.Binary, tree.Conditional)
     if any(_weight(node, weights) > MAX_WEIGHT for node in nodes if isinstance(node, operators)):
-        raise Unsupported(f"an expression of more than {MAX_WEIGHT} operators")
+        raise Unsupported(
+            f"an expression of more than {MAX_WEIGHT} operators is not supported by the embedded switch"
+        )
 
 
 def _weight(e: Any, known: dict[int, int]) -> int:

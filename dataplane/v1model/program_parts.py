@@ -159,7 +159,7 @@ class PartReader:
         if op in _CASTS:
             width = self.expression(right)
             if not isinstance(width, tree.Const) or not 0 < width.value <= MAX_WIDTH:
-                self.refuse(f"{op} to a width that is no constant within 1..{MAX_WIDTH}")
+                self.refuse(f"{op} to a width that is not a constant within 1..{MAX_WIDTH}")
             return tree.Binary(op, self.expression(left), width)
         if left is None and op in "+-":
             return tree.Binary(op, tree.Const(0), self.expression(right))
@@ -244,7 +244,7 @@ class PartReader:
     def constant(self, data: Json) -> int:
         value = self.expression(data)
         if not isinstance(value, tree.Const):
-            self.refuse("an argument that is no constant")
+            self.refuse("an argument that is not a constant")
         return value.value
 
 

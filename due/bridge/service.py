@@ -128,14 +128,16 @@ class BridgeService:
         """
         settings = self._settings
         if not settings.far:
-            raise InvalidOption("settings: `far` names no credential file of the other site")
+            raise InvalidOption("settings: `far` must name the credential file of the other site")
         to_far, to_near = BridgedKeys(settings.to_far), BridgedKeys(settings.to_near)
         if not (to_far.allowed or to_near.allowed):
-            raise InvalidOption("settings: `to_far` and `to_near` name no keys, so nothing could cross")
+            raise InvalidOption("settings: nothing may cross: name keys in `to_far` or `to_near`")
         to_far.check_apart(to_near)
         options = Options.of_credential(settings.far)
         if not options.updates:
-            raise InvalidOption(f"{settings.far} names no Data Updates; enrol the bridge at the far site")
+            raise InvalidOption(
+                f"{settings.far} names no Data Updates: write it with `sdnator app enrol` at the other site"
+            )
         self._far = Engine(options)
         self._far.when_failed = self._near.when_failed
         self._far.set_db(f"memory://bridge-{uuid4().hex}")  # it reads and writes no archive

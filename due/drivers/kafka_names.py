@@ -172,9 +172,8 @@ def _options(shown: str, query: str, *, tls: bool) -> tuple[dict[str, int], dict
     for name, text in parse_qsl(query, keep_blank_values=True):
         if name in _TEXTS:
             if not text or (name == "mechanism" and text not in _MECHANISMS):
-                raise InvalidOption(
-                    f"URL {shown!r}: mechanism is one of {', '.join(_MECHANISMS)}; {name} a file"
-                )
+                wanted = f"one of {', '.join(_MECHANISMS)}" if name == "mechanism" else "the name of a file"
+                raise InvalidOption(f"URL {shown!r}: {name}={text}: must be {wanted}")
             if name.startswith("ssl_") and not tls:
                 raise InvalidOption(f"URL {shown!r}: {name} belongs to kafkas://, which is over TLS")
             texts[name] = text

@@ -72,10 +72,10 @@ def _parsed(url: str) -> SentinelAddress:
     if not _SERVICE.fullmatch(service):
         raise ValueError("name the service behind the sentinels: …HOST:PORT/SERVICE")
     if database and not _number(database):
-        raise ValueError(f"{database!r} is no number of a database")
+        raise ValueError(f"{database!r} is not the number of a database")
     sentinels = tuple(map(_host, hosts.split(",")))
     if len(sentinels) > _MOST_SENTINELS:
-        raise ValueError(f"{len(sentinels)} sentinels: at most {_MOST_SENTINELS}")
+        raise ValueError(f"{len(sentinels)} sentinels: give at most {_MOST_SENTINELS}")
     options = dict(parse_qsl(query, strict_parsing=True)) if query else {}
     replicas = _replicas(options.pop(_REPLICAS, "1"))
     user, _, password = login.partition(":")
@@ -95,7 +95,7 @@ def _host(text: str) -> tuple[str, int]:
         host, port = text, str(_PORT)
     host = host.removeprefix("[").removesuffix("]")
     if not _HOSTNAME.fullmatch(host) or not _number(port) or not 0 < int(port) < 65536:
-        raise ValueError(f"{text!r} is no HOST:PORT of a sentinel")
+        raise ValueError(f"{text!r} is not HOST:PORT of a sentinel")
     return host, int(port)
 
 
@@ -105,7 +105,7 @@ def _number(text: str) -> bool:
 
 def _replicas(text: str) -> int:
     if not _number(text) or int(text) > _MOST_REPLICAS:
-        raise ValueError(f"{_REPLICAS}={text!r}: 0 to {_MOST_REPLICAS}")
+        raise ValueError(f"{_REPLICAS}={text!r}: must be 0 to {_MOST_REPLICAS}")
     return int(text)
 
 
@@ -113,7 +113,7 @@ def _tls(options: dict[str, str], *, wanted: bool) -> dict[str, Any] | None:
     known = _TLS_OPTIONS if wanted else ()
     strange = sorted(options.keys() - set(known))
     if strange:
-        raise ValueError(f"option {strange[0]!r} is unknown: {', '.join((_REPLICAS, *known))}")
+        raise ValueError(f"option {strange[0]!r} is unknown; known are {', '.join((_REPLICAS, *known))}")
     return options if wanted else None
 
 

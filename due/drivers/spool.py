@@ -115,7 +115,9 @@ class DiskSpool:
         except sqlite3.Error as error:
             if self._failed(error):
                 return self.put(frames)
-            raise BackendError(f"spool {self.path} takes nothing: {error}; make room on its disk") from error
+            raise BackendError(
+                f"spool {self.path} cannot be written: {error}; make room on its disk"
+            ) from error
         return sum(frame.count for frame in frames[len(rows) :])
 
     def take(self, frames: int) -> list[PackedFrame]:

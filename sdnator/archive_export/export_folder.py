@@ -166,9 +166,9 @@ def _os_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except PermissionError as error:
-        raise BadInput(f"{path}: {error.strerror}; give a folder that you may write") from None
+        raise BadInput(f"{path}: {error.strerror}; give a folder that you can write to") from None
     except (FileExistsError, NotADirectoryError):
-        raise BadInput(f"{path}: this is no folder; give another name") from None
+        raise BadInput(f"{path}: is not a folder; give another name") from None
     except OSError as error:
         raise PipelineError(f"{path}: {error.strerror or error}; check free space and permissions") from None
 

@@ -94,11 +94,14 @@ class HourFiles:
         table = self._table(key, rows)
         columns = {column.name: str(column.type) for column in table.schema}
         if self.columns not in ({}, columns):
-            raise MessageError("columns", f"{key}: other columns than those of the other items")
+            raise MessageError("columns", f"{key}: its columns differ from those of the other items")
         hours = rows[TIME] // HOUR_US
         found = np.unique(hours).tolist()
         if len(self._parts.keys() | set(found)) > MOST_HOURS:
-            raise MessageError("size", f"{key}: packets of more than {MOST_HOURS:,} hours in one hour")
+            raise MessageError(
+                "size",
+                f"{key}: one hour of the archive holds packets of more than {MOST_HOURS:,} hours of event time",
+            )
         self.columns, self._schema = columns, table.schema
         for hour in found:
             self._parts.setdefault(hour, 0)

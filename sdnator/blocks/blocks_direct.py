@@ -66,7 +66,9 @@ def _clear(stub: Any, device_id: int, election_id: Any, entries: Callable[[], It
             _delete(stub, device_id, election_id, doomed[start : start + _BATCH])
         doomed = list(entries()) if doomed else []
     if doomed:
-        raise PipelineError(f"the switch keeps {len(doomed)} of {len(found)} entries; see `sdnator tables`")
+        raise PipelineError(
+            f"the switch still has {len(doomed)} of {len(found)} entries; see `sdnator tables`"
+        )
     return len(found)
 
 
@@ -110,7 +112,7 @@ class _Primary:
             try:
                 said = self._answers.get(timeout=_SECONDS)
             except queue.Empty:
-                raise PipelineError("the switch does not answer who its primary controller is") from None
+                raise PipelineError("the switch does not say which controller is primary") from None
             if isinstance(said, Exception):
                 raise said
             if said.WhichOneof("update") == "arbitration":

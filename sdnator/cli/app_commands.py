@@ -66,7 +66,9 @@ def enrol(
             path, credential_file(identities.url(_server(), name), _archive(identities, name), made)
         )
     except OSError as error:
-        raise BadInput(f"{path}: {error.strerror}") from None
+        raise BadInput(
+            f"{path}: cannot be written ({error.strerror}); name another file with --out"
+        ) from None
     granted = (
         f"publish {_shown(rights.publish)}; observe {_shown(rights.observe)}; read {_shown(rights.read)}"
     )

@@ -212,7 +212,7 @@ def _copy_out(tar: tarfile.TarFile, name: str, path: Path) -> None:
     member = tar.getmember(name)
     content = tar.extractfile(member) if member.isreg() else None
     if content is None:
-        raise tarfile.TarError(f"{name} is no regular file")
+        raise tarfile.TarError(f"{name} is not a regular file")
     path.parent.mkdir(mode=0o700, exist_ok=True)
     with content, path.open("xb") as out:
         shutil.copyfileobj(content, out)

@@ -294,7 +294,9 @@ def check_updates(url: str) -> Check:
         wire = Wire(url)
         wire.close()
         if wire.replicas < (least := least_replicas(url)):
-            raise UpdatesUnavailable(f"{wire.primary}: min_replicas={least}, connected are {wire.replicas}")
+            raise UpdatesUnavailable(
+                f"{wire.primary}: min_replicas={least}, but {wire.replicas} are connected"
+            )
 
     return _reached(
         "--updates",

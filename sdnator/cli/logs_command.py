@@ -91,7 +91,9 @@ def _find(part: str) -> list[_Log]:
     if not known:
         raise BadInput(f"{_folder()}: no logs: no pipeline was started here; see `sdnator up`")
     if part and part not in {log.part for log in known}:
-        raise BadInput(f"part {part}: there are logs of {', '.join(log.part for log in known)}")
+        raise BadInput(
+            f"part {part}: it has no logs; there are logs of {', '.join(log.part for log in known)}"
+        )
     return [log for log in known if part in ("", log.part)]
 
 

@@ -78,7 +78,7 @@ def plan_command(
     from sdnator.plan.model import plan
 
     if pps is None and not measure:
-        raise BadInput("--pps: say how many packets a second the pipeline has to carry")
+        raise BadInput("--pps: give the number of packets a second that the pipeline has to carry")
     demand = None if pps is None else PipelineDemand(
         switches=switches, pps=pps, queries=queries, consumers=consumers, archive_days=archive_days,
         blocks=blocks,

@@ -110,4 +110,4 @@ def _write(file: Path, known: Mapping[str, str]) -> None:
             made.writelines(lines)
         Path(made.name).replace(file)
     except OSError as error:
-        raise BadInput(f"{file}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"{file}: cannot be written ({error.strerror}); check its permissions") from None

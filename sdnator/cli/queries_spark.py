@@ -59,7 +59,9 @@ def on_spark_over_archive(request: QueryRequest, period: Past, run: SparkRun) ->
         )
     with _folder(run.parquet) as folder:
         if _PATTERN.search(str(folder)):
-            raise BadInput(f"--parquet {folder}: Spark takes its name for a pattern; give a plain one")
+            raise BadInput(
+                f"--parquet {folder}: Spark would read this name as a pattern; give one without * ? [ ] {{ }} and \\"
+            )
         asked = ExportRequest(
             begin=period.begin, end=period.end, whole_hours=run.parquet is not None, only_missing=True
         )

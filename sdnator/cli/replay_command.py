@@ -130,7 +130,7 @@ def check_switch(switch: str, inject: str | None) -> None:
             raise BadInput("--switch bmv2: veth pairs need root; run as root, or use --switch embedded")
         return
     if not is_address(switch):
-        raise BadInput(f"--switch {switch}: give embedded, bmv2 or HOST:PORT, or unix:/PATH")
+        raise BadInput(f"--switch {switch}: give embedded, bmv2, HOST:PORT or unix:/PATH")
     if inject is None:
         raise BadInput(f"--switch {switch}: add --inject IFACE, the interface through which frames enter it")
 

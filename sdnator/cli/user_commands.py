@@ -96,7 +96,9 @@ def user_link() -> None:
     try:
         link = new_link(running.state_folder(), found.dashboard)
     except OSError as error:
-        raise PipelineError(f"{error.filename}: {error.strerror}") from None
+        raise PipelineError(
+            f"{error.filename}: cannot be written ({error.strerror}); check its permissions"
+        ) from None
     note("created a link that signs in as the owner")
     print(link)
 

@@ -86,7 +86,7 @@ def parse_ports(options: Sequence[str], switch: str, *, look: bool = True) -> di
     """`N=veth:NAME` or `N=null`, by number; raises BadInput naming the wrong one."""
     if switch not in ("embedded", "bmv2"):
         if not is_address(switch):
-            raise BadInput(f"--switch {switch}: give embedded, bmv2 or HOST:PORT, or unix:/PATH")
+            raise BadInput(f"--switch {switch}: give embedded, bmv2, HOST:PORT or unix:/PATH")
         if options:
             raise BadInput(f"--port: the ports of the switch at {switch} are its own; leave --port out")
     ports: dict[int, str] = {}

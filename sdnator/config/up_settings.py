@@ -26,10 +26,10 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def __post_init__(self) -> None:
         if not self.quota >= 0.01:
-            raise ValueError(f"quota={self.quota}: at least 0.01 GiB")
+            raise ValueError(f"quota={self.quota}: must be at least 0.01 GiB")
         for name, count in self.processes.items():
             if not 1 <= count <= _MOST_PROCESSES:
-                raise ValueError(f"processes={{{name}: {count}}}: 1 to {_MOST_PROCESSES} of each app")
+                raise ValueError(f"processes={{{name}: {count}}}: must be 1 to {_MOST_PROCESSES} of each app")
 
 
 class GrantPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -71,11 +71,11 @@ class LearnPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     def __post_init__(self) -> None:
         if len(self.ports) == 1 or len(set(self.ports)) < len(self.ports):
-            raise ValueError(f"learn.ports={list(self.ports)}: give two or more, each once")
+            raise ValueError(f"learn.ports={list(self.ports)}: must name two or more, each once")
         if not self.age_s >= 1:
-            raise ValueError(f"learn.age_s={self.age_s}: at least 1 s")
+            raise ValueError(f"learn.age_s={self.age_s}: must be at least 1 s")
         if self.limit < 1:
-            raise ValueError(f"learn.limit={self.limit}: at least 1")
+            raise ValueError(f"learn.limit={self.limit}: must be at least 1")
 
 
 class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -110,9 +110,9 @@ class SwitchPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("-", "").replace("_", "").isalnum():
-            raise ValueError(f"name {self.name!r}: letters, digits, - and _")
+            raise ValueError(f"name={self.name!r}: must be letters, digits, - and _")
         if self.device_id < 1:
-            raise ValueError(f"device_id={self.device_id}: at least 1")
+            raise ValueError(f"device_id={self.device_id}: must be at least 1")
 
 
 class LogSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -279,7 +279,7 @@ class DashboardService:
             try:
                 self.board.coordinated(apps, instances, flow, time.monotonic())
             except (ValueError, TypeError, LookupError, AttributeError) as error:
-                self.board.uncoordinated(f"{url} answers what no Coordinator says: {error!r}")
+                self.board.uncoordinated(f"{url} does not answer as a Coordinator does: {error!r}")
             self._take_up_switches()
 
     def _serve(self) -> None:

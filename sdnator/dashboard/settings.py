@@ -24,11 +24,11 @@ class DashboardOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     def __post_init__(self) -> None:
         if not 0 <= self.port < 65_536:
-            raise ValueError(f"port={self.port}: 0 to 65535")
+            raise ValueError(f"port={self.port}: must be 0 to 65535")
         if not 0.1 <= self.frames <= 30:
-            raise ValueError(f"frames={self.frames}: 0.1 to 30")
+            raise ValueError(f"frames={self.frames}: must be 0.1 to 30")
         if not 10 <= self.history_s <= 3_600:
-            raise ValueError(f"history_s={self.history_s}: 10 to 3600")
+            raise ValueError(f"history_s={self.history_s}: must be 10 to 3600")
 
 
 class SwitchPlace(msgspec.Struct, frozen=True, kw_only=True):

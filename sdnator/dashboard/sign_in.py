@@ -21,7 +21,7 @@ _REMEMBERED_SECONDS = 60.0
 _FREE_TRIES = 2
 _DELAY_SECONDS, _LONGEST_DELAY_SECONDS = 0.5, 4.0
 _SOURCES = 256
-_WRONG = "name and password, or the token, are wrong"
+_WRONG = "wrong name and password, or wrong token"
 
 
 class WeakToken(ValueError):

@@ -93,7 +93,7 @@ def read_flow_table(
                 f"{path}: an incomplete table ({error}); fetch or copy it again"
             ) from None
         except OSError as error:
-            raise MissingFlowTable(f"{path}: cannot be read ({error.strerror})") from None
+            raise MissingFlowTable(f"{path}: cannot be read ({error.strerror}); copy it again") from None
 
 
 _Lines = Iterator[tuple[int, str]]

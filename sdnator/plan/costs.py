@@ -81,9 +81,9 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         if self.schema != SCHEMA:
             raise ValueError(f"schema {self.schema}: this version reads {SCHEMA}; measure again")
         if not self.rates or self.rates[0] <= 0 or any(one >= after for one, after in pairwise(self.rates)):
-            raise ValueError("rates: at least one, above 0, ascending")
+            raise ValueError("rates: must be one or more numbers above 0, ascending")
         if not self.processes:
-            raise ValueError("processes: there are none")
+            raise ValueError("processes: must name at least one")
         if any(not math.isfinite(each) or each < 0 for each in self._numbers()):
             raise ValueError("a cost is negative or not finite")
         if any(curve and len(curve) != len(self.rates) for curve in self._curves()):
@@ -133,4 +133,4 @@ def write(path: Path, costs: Costs) -> None:
     try:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(costs), indent=1) + b"\n")
     except OSError as error:
-        raise BadInput(f"{path}: {error.strerror}") from None
+        raise BadInput(f"--costs {path}: cannot be written ({error.strerror}); give another file") from None

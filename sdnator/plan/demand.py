@@ -33,10 +33,10 @@ class PipelineDemand:
     def __post_init__(self) -> None:
         _checked("switches", self.switches, 1, _MOST_COUNT)
         if not (math.isfinite(self.pps) and 0 < self.pps <= _MOST_PPS):
-            raise BadInput(f"--pps {self.pps:g}: packets a second, above 0 and at most {_MOST_PPS:g}")
+            raise BadInput(f"--pps {self.pps:g}: give a number above 0 and at most {_MOST_PPS:g}")
         if not (math.isfinite(self.archive_days) and 0 < self.archive_days <= _MOST_DAYS):
             raise BadInput(
-                f"--archive-days {self.archive_days:g}: days, above 0 and at most {_MOST_DAYS:,.0f}"
+                f"--archive-days {self.archive_days:g}: give a number above 0 and at most {_MOST_DAYS:,.0f}"
             )
         for name in ("queries", "consumers", "blocks"):
             _checked(name, getattr(self, name), 0, _MOST_COUNT)
@@ -44,4 +44,4 @@ class PipelineDemand:
 
 def _checked(name: str, value: int, least: int, most: int) -> None:
     if not least <= value <= most:
-        raise BadInput(f"--{name} {value}: a number from {least} to {most:,}")
+        raise BadInput(f"--{name} {value}: give a number from {least} to {most:,}")

@@ -138,8 +138,8 @@ def run(
         if is_last or not blocking.overtaken:
             break
         notes.append(
-            f"the dry run foretold wrongly where nothing is decided, and {counted(blocking.overtaken, 'decision')} would "
-            "have taken effect late: the pass with blocking was made again, and held packets back more often"
+            f"the dry run was wrong about where nothing is decided: {counted(blocking.overtaken, 'decision')} would have "
+            "taken effect late, so the pass with blocking was made again and held packets back more often"
         )
         discarded.append(blocking)
         _set_aside(options)

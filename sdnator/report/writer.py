@@ -96,7 +96,9 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
         if foreign is None and folder.exists():
             raise ReportError(f"--report {folder}: is a file; give a folder")
     except OSError as error:
-        raise ReportError(f"--report {folder}: {error.strerror}; give another folder") from None
+        raise ReportError(
+            f"--report {folder}: cannot be written ({error.strerror}); give another folder"
+        ) from None
     if foreign:
         raise ReportError(
             f"--report {folder}: the folder holds other things ({', '.join(foreign[:3])}); give a new folder"

@@ -78,7 +78,7 @@ class CertificateFolder:
                 f"{name!r}: a certificate's name has 1 to 64 letters, digits, . _ and -, and is not {CA}"
             )
         if not 1 <= days <= _MOST_DAYS:
-            raise BadInput(f"--days {days}: 1 to {_MOST_DAYS}")
+            raise BadInput(f"--days {days}: give 1 to {_MOST_DAYS}")
         ca_key, ca = self._ca()
         key = ec.generate_private_key(ec.SECP256R1())
         purpose = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
@@ -114,7 +114,9 @@ class CertificateFolder:
             write_private(self._file(name, "key"), private)
             write_private(self._file(name, "pem"), certificate.public_bytes(Encoding.PEM).decode())
         except OSError as error:
-            raise BadInput(f"{error.filename or self.folder}: {error.strerror}") from None
+            raise BadInput(
+                f"{error.filename or self.folder}: cannot be written ({error.strerror}); give another folder"
+            ) from None
 
     def _file(self, name: str, kind: str) -> Path:
         return self.folder / f"{name}.{kind}"

@@ -83,7 +83,9 @@ class Identities:
                 write_private(self.path, msgspec.json.format(msgspec.json.encode(self._book)).decode() + "\n")
                 write_private(self.path.with_name(READERS), json.dumps(self._readers()) + "\n")
         except OSError as error:
-            raise BadInput(f"{self.path}: {error.strerror}") from None
+            raise BadInput(
+                f"{self.path}: cannot be written ({error.strerror}); check its permissions"
+            ) from None
 
     def put(self, name: str, rights: Rights, *, enrolled: bool = False) -> AppIdentity:
         """Give an identity these rights; its password stays.  Only while `changing`."""

@@ -124,7 +124,9 @@ class Users:
                 write_private(self.path, text)
                 self._read = (0, 0)
         except OSError as error:
-            raise BadInput(f"{self.path}: {error.strerror}") from None
+            raise BadInput(
+                f"{self.path}: cannot be written ({error.strerror}); check its permissions"
+            ) from None
 
 
 def _hashed(role: UserRole, password: str) -> PageUser:

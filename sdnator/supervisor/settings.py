@@ -23,17 +23,17 @@ class SupervisorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
 
     def __post_init__(self) -> None:
         if self.hung_s and not 3 <= self.hung_s <= 3_600:
-            raise ValueError(f"hung_s={self.hung_s}: 3 to 3600, or 0")
+            raise ValueError(f"hung_s={self.hung_s}: must be 3 to 3600, or 0")
         if not 0.05 <= self.restart_s <= self.restart_longest_s:
             raise ValueError(
-                f"restart_s={self.restart_s}: 0.05 to restart_longest_s={self.restart_longest_s}"
+                f"restart_s={self.restart_s}: must be 0.05 to restart_longest_s={self.restart_longest_s}"
             )
         if self.restart_longest_s > 3_600:
-            raise ValueError(f"restart_longest_s={self.restart_longest_s}: at most 3600")
+            raise ValueError(f"restart_longest_s={self.restart_longest_s}: must be at most 3600")
         if not 0.01 <= self.log_minute_mib <= self.log_mib:
-            raise ValueError(f"log_minute_mib={self.log_minute_mib}: 0.01 to log_mib={self.log_mib}")
+            raise ValueError(f"log_minute_mib={self.log_minute_mib}: must be 0.01 to log_mib={self.log_mib}")
         if not 1 <= self.log_files <= 100:
-            raise ValueError(f"log_files={self.log_files}: 1 to 100")
+            raise ValueError(f"log_files={self.log_files}: must be 1 to 100")
 
     @property
     def file_bytes(self) -> int:

@@ -63,7 +63,7 @@ class StandingPipeline(WholeOrNone):
             self._parts.share_credential()
             self._tell(
                 f"every app may do everything on Data Updates, because the user of --updates may not create users ({error}): "
-                "grant it ACL"
+                "grant it the command ACL"
             )
 
     def _make_archive_users(self) -> None:

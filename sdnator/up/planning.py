@@ -93,7 +93,7 @@ def _processes(
     """Checked; raises BadInput for an app that does not run, or of which all processes but one would only wait."""
     for name, count in wanted.items():
         if name not in settings or name == "coordinator":
-            raise BadInput(f"up.processes: no app {name!r} is run")
+            raise BadInput(f"up.processes: the pipeline runs no app {name!r}")
         if count > 1 and settings[name].get("instances") != "sharded":
             raise BadInput(
                 f"up.processes: {name} = {count}, but only instances that divide the switches all work: "
@@ -101,7 +101,9 @@ def _processes(
             )
         for number in range(2, count + 1):
             if f"{name}-{number}" in settings:
-                raise BadInput(f"up.processes: {name} = {count}: there is an app {name}-{number}")
+                raise BadInput(
+                    f"up.processes: {name} = {count}: there is an app {name}-{number} already; rename it"
+                )
     return wanted
 
 

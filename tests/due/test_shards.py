@@ -64,7 +64,7 @@ def test_state_is_kept_by_sharded_apps_only_and_from_the_beginning(make_engine) 
     with pytest.raises(InvalidOption, match="sharded"):
         make_engine("standby").keep_state(Nothing())
     engine = make_engine("late", init={"instances": "sharded"})
-    with pytest.raises(InvalidOption, match="above 0"):
+    with pytest.raises(InvalidOption, match="greater than 0"):
         engine.keep_state(Nothing(), every=0)
     engine.observe("t.late").subscribe(print)
     with pytest.raises(InvalidOption, match="before the first subscription"):

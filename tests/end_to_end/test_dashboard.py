@@ -174,7 +174,7 @@ def test_who_has_signed_in_undoes_a_block_and_the_rule_is_gone(running):
         assert not page.shows(".decisions"), "who has not signed in sees nothing"
         assert page.driver.execute_script(NAMELESS) == []
         assert unreadable(page) == []
-        page.sign_in("not the token, but as long", lambda: page.seen(".fault", "are wrong"))
+        page.sign_in("not the token, but as long", lambda: page.seen(".fault", "wrong name and password"))
         as_a_viewer(operator, page)
         page.sign_in(token, lambda: page.seen(".sign-out"))
         page.driver.get_log("browser")  # it holds that the wrong password was refused

@@ -54,13 +54,13 @@ class NftProgram:
         try:
             found: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise EnforcerAway(f"nft listed {FAMILY} {name} as something other than JSON: {error}") from None
+            raise EnforcerAway(f"nft's listing of {FAMILY} {name} is not JSON: {error}") from None
         return found
 
     def _run(self, arguments: Sequence[str], text: str) -> str:
         program = shutil.which(self._program) or shutil.which(self._program, path="/usr/sbin:/sbin")
         if program is None:
-            raise EnforcerAway(f"there is no program {self._program}: install nftables")
+            raise EnforcerAway(f"program {self._program} is not installed: install nftables")
         try:
             done = subprocess.run(
                 [program, *arguments],

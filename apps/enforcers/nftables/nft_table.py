@@ -93,7 +93,7 @@ class NftTable:
             try:
                 self._nft.apply(self._plan.delete())
             except TransactionRefused as error:
-                raise EnforcerAway(f"table inet {self._plan.name} stays: {error}") from None
+                raise EnforcerAway(f"table inet {self._plan.name} could not be removed: {error}") from None
         else:
             log.info("table inet %s stays with %d blocks", self._plan.name, len(desired))
 
@@ -111,7 +111,10 @@ class NftTable:
         try:
             self._nft.apply(commands)
         except TransactionRefused as error:
-            log.warning("changed by somebody else? %s; the table is written again", error)
+            log.warning(
+                "nftables refused a change: %s; the table is written again, in case somebody else changed it",
+                error,
+            )
             self._make(new)
 
     def _make(self, elements: Mapping[Element, int]) -> None:

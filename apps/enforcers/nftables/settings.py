@@ -31,8 +31,10 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.table):
-            raise ValueError(f"table {self.table!r}: letters, digits and _, at most 64, not a digit first")
+            raise ValueError(
+                f"table={self.table!r}: must be 1 to 64 letters, digits or _, the first not a digit"
+            )
         if not self.hooks:
-            raise ValueError("hooks: give one or more of input, forward, prerouting")
+            raise ValueError("hooks=[]: must name one or more of input, forward, prerouting")
         if not self.check_s >= _LOWEST:
-            raise ValueError(f"check_s={self.check_s}: at least {_LOWEST} s")
+            raise ValueError(f"check_s={self.check_s}: must be at least {_LOWEST} s")

@@ -30,10 +30,12 @@ def read_secret(path: str) -> bytes:
     file = Path(path)
     try:
         if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-            raise InvalidOption(f"secret_file {path}: others may read it; `chmod 600` it")
+            raise InvalidOption(f"secret_file {path}: others can read it; run `chmod 600 {path}`")
         secret = file.read_bytes()[:4096].strip()
     except OSError as error:
-        raise InvalidOption(f"secret_file {path}: {error.strerror}") from None
+        raise InvalidOption(
+            f"secret_file {path}: cannot be read ({error.strerror}); name a file that this user can read"
+        ) from None
     if len(secret) < _SHORTEST_SECRET:
         raise InvalidOption(
             f"secret_file {path}: {len(secret)} bytes; give {_SHORTEST_SECRET} or more random ones"
@@ -103,7 +105,7 @@ class SignedHttpClient:
         while piece := answer.read1(_PIECE):
             found += piece
             if len(found) > _MOST_BYTES:
-                raise http.client.HTTPException(f"an answer of more than {_MOST_BYTES:,} bytes")
+                raise http.client.HTTPException(f"the answer has more than {_MOST_BYTES:,} bytes")
             if time.monotonic() > deadline:
                 raise TimeoutError(f"no complete answer within {self._timeout_s:g} s")
         answer.close()  # read to its end: the connection may be used again

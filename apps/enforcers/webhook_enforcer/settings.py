@@ -36,9 +36,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 raise ValueError("secret_file: name a file with the secret that signs requests")
         for name in ("timeout_s", "check_s", "patience_s"):
             if not getattr(self, name) >= _LOWEST:
-                raise ValueError(f"{name}={getattr(self, name)}: at least {_LOWEST} s")
+                raise ValueError(f"{name}={getattr(self, name)}: must be at least {_LOWEST} s")
         if self.queue < 1:
-            raise ValueError(f"queue={self.queue}: at least 1")
+            raise ValueError(f"queue={self.queue}: must be at least 1")
 
 
 def check_url(url: str) -> None:

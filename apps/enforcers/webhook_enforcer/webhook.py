@@ -42,7 +42,7 @@ class Webhook:
         """Ask for the listing; what stands there and should not is lifted."""
         status, body = self._client.ask("GET")
         if status != 200:
-            raise EnforcerAway(f"the webhook lists nothing: it answers {status}")
+            raise EnforcerAway(f"the webhook does not list its blocks: it answers {status}")
         try:
             counts = listing_in(body).counts()
         except MessageError as error:

@@ -128,6 +128,6 @@ def theft_evidence(theft: BindingConflict, switch: str, addresses: int, nats: fl
         event_time=theft.at,
         packets=1,
         mac_addresses=addresses,
-        text=f"{thief.text} on port {thief.port} claims {theft.address}, which is {owner.text} on port {owner.port},"
-        " and is there",
+        text=f"{thief.text} on port {thief.port} claims {theft.address}, which belongs to {owner.text} on port {owner.port}, "
+        "and that host is present",
     )

@@ -149,5 +149,5 @@ def _whole_instruction(item: Item) -> tuple[Item, Instruction]:
 def _archived_handshake(item: Item) -> tuple[str, int]:
     source, _, at = handshake_in(item)
     if at > item.timestamp + _DAY_NS:
-        raise MessageError("time", f"{item.key}: {at} is later than the time it was written")
+        raise MessageError("time", f"{item.key}: its time {at} is a day or more after it was written")
     return source, at

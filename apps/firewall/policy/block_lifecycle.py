@@ -280,7 +280,7 @@ class BlockLifecycle:
         old = block.decision
         if block.is_asked_for:
             self._release(old.id)
-            return _changed(old, now, action="unblock", reason="the time that was asked for is over")
+            return _changed(old, now, action="unblock", reason="the requested time is over")
         floor = max(block.training_rate * STILL_GOING_RATIO, STILL_GOING_FLOOR)
         if block.drop_rate > floor and not old.dry_run:
             extended = _changed(

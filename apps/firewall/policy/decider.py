@@ -195,7 +195,10 @@ class Decider:
         if self.test.too_short:
             return None, "training is too short for the budget of false blocks: nobody is blocked"
         if evidence.forged and evidence.routed:
-            return None, f"{sender.ip} is another's, and everybody behind {sender.mac} could have forged it"
+            return (
+                None,
+                f"{sender.ip} belongs to another host, and anybody behind {sender.mac} could have forged it",
+            )
         if target is None:
             behind = f"{evidence.mac_addresses} addresses are behind {sender.mac}"
             return None, f"{behind}, and the frames carry no address"
@@ -216,9 +219,9 @@ class Decider:
         if self._bindings.forged(target.address, host):
             if self._bindings.is_alone(host) and not routed:
                 forger = Target(kind="mac", address=sender.mac, port=sender.port)
-                return forger, f"{target.address} belongs to another, so its forger is blocked"
+                return forger, f"{target.address} belongs to another host, so its forger is blocked"
             where = f"is behind {sender.mac}" if routed else "shares a port"
-            return None, f"{target.address} belongs to another, and its forger {where}"
+            return None, f"{target.address} belongs to another host, and its forger {where}"
         if forgeable and target.address in self._known and not self._rules.block_known_addresses:
             return None, f"{target.address} is known from handshakes and may be forged"
         return target, ""

@@ -186,7 +186,7 @@ class FalseAlarms:
             raise ValueError(f"{decision} has already been called a false alarm")
         if len(self._lessons) >= MOST_LESSONS:
             raise ValueError(
-                f"{MOST_LESSONS} false alarms are remembered; revoke some with `sdnator blocks false-alarm ID "
+                f"{MOST_LESSONS} false alarms are remembered, and no more can be; revoke some with `sdnator blocks false-alarm ID "
                 "--revoke`, or put the senders on the allow-list"
             )
         expires = now + self._days * _DAY_NS

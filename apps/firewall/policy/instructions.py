@@ -74,7 +74,7 @@ class Desk:
         target = target_in(instruction.subject)
         if self.allow.covers_target(target):
             raise ValueError(
-                f"{target.address} is on the allow-list, which always wins; `sdnator allow remove` it first"
+                f"{target.address} is on the allow-list, which always wins; take it off with `sdnator allow remove` first"
             )
         if len(self._lifecycle.blocks) >= self._lifecycle.rules.max_blocks:
             raise ValueError(

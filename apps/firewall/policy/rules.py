@@ -63,7 +63,7 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
                 f"false_blocks_per_day={self.false_blocks_per_day}: must be greater than 0, for instance 0.1"
             )
         if not 1 <= self.false_alarm_days <= 3_650:
-            raise ValueError(f"false_alarm_days={self.false_alarm_days}: 1 to 3,650")
+            raise ValueError(f"false_alarm_days={self.false_alarm_days}: must be 1 to 3,650")
         if not self.limit_s > 0:
             raise ValueError(f"limit_s={self.limit_s}: must be greater than 0, for instance 60")
 

@@ -45,7 +45,7 @@ class CaptureTimes:
             raise CaptureTimesError(f"times of the capture: {path} is not a list of int64")
         if not 0 < len(found) <= MOST_FRAMES:
             raise CaptureTimesError(
-                f"times of the capture: {path} has {len(found):,} of 1 to {MOST_FRAMES:,}"
+                f"times of the capture: {path} holds {len(found):,} times; it must hold 1 to {MOST_FRAMES:,}"
             )
         if int(found.min()) < 0 or int(found.max()) > _LATEST_US:
             raise CaptureTimesError(f"times of the capture: {path} has times before 1970 or after 2116")

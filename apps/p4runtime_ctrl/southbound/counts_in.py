@@ -55,7 +55,9 @@ class CountReader:
         fields = program.digest(DIGEST) if self.digest_id else []
         missing = sorted(_NEEDED - {name for name, _ in fields})
         if self.digest_id and missing:
-            raise P4InfoError(f"digest {DIGEST} of the program lacks {', '.join(missing)}")
+            raise P4InfoError(
+                f"digest {DIGEST} of the program lacks {', '.join(missing)}; load the program of SDNator"
+            )
         self._layout = RowLayout(fields)
         self._base_us = base_us
         self._progress = progress

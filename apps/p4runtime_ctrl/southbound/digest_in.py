@@ -76,7 +76,9 @@ class DigestReader:
         fields = program.digest(FRAME_DIGEST)
         missing = sorted(_NEEDED - {name for name, _ in fields})
         if missing:
-            raise P4InfoError(f"digest {FRAME_DIGEST} of the program lacks {', '.join(missing)}")
+            raise P4InfoError(
+                f"digest {FRAME_DIGEST} of the program lacks {', '.join(missing)}; load the program of SDNator"
+            )
         self.digest_id = program.digest_id(FRAME_DIGEST)
         self._layout = RowLayout(fields)
         self._columns = DigestColumns.of(self._layout)

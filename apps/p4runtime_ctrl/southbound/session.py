@@ -215,7 +215,9 @@ class P4RuntimeSession:
             if outcome.code:
                 outcome = self._write_digest(p4runtime.Update.MODIFY, digest.preamble.id)
             if outcome.code:
-                raise SwitchError(f"{self._address.target}: digest {digest.preamble.name}: {outcome.message}")
+                raise SwitchError(
+                    f"{self._address.target}: digest {digest.preamble.name} refused: {outcome.message}"
+                )
 
     def ensure_group(self, group: int, ports: Sequence[int]) -> None:
         outcome = self._write_group(p4runtime.Update.INSERT, group, ports)

@@ -138,7 +138,7 @@ class EntryUpdates:
         change = self._change(update)
         if table_id(change.entry) in self._reserved:
             raise EntryError(
-                f"{update.table}: the classifier is shared by all requests; ask for packets by a request"
+                f"{update.table}: this table belongs to the classifier, which all requests share; request packets instead"
             )
         if change.kind != DELETE and table_id(change.entry) == self._metered:
             change.entry.meter_config.CopyFrom(self._settings.known.config())

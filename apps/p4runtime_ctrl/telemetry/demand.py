@@ -103,7 +103,10 @@ class Offers(Mapping[str, Offer]):
         Raises `MessageError` if another app has the name or the bit, or the classifier cannot hold it.
         """
         if self._apps.get(offer.name, app) != app:
-            raise MessageError("sender", f"offer {offer.name} of {app}: {self._apps[offer.name]} offers that")
+            raise MessageError(
+                "sender",
+                f"offer {offer.name} of {app}: {self._apps[offer.name]} already has an offer of this name",
+            )
         if not offer.active:
             self._offers.pop(offer.name, None)
             self._apps.pop(offer.name, None)
@@ -112,7 +115,9 @@ class Offers(Mapping[str, Offer]):
             name for name, other in self._offers.items() if other.bit == offer.bit and name != offer.name
         ]
         if taken:
-            raise MessageError("range", f"offer {offer.name} of {app}: bit {offer.bit} is that of {taken[0]}")
+            raise MessageError(
+                "range", f"offer {offer.name} of {app}: bit {offer.bit} is taken by {taken[0]}"
+            )
         try:
             self._fits(offer.request())
         except ControllerError as error:

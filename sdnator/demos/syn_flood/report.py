@@ -113,7 +113,9 @@ def write_report(folder: Path, figures: dict[str, Any], panels: Sequence[Panel])
         path = folder / "syn_flood.png"
         path.write_bytes(picture(panels))
     except OSError as error:
-        raise BadInput(f"--report {folder}: {error.strerror}") from error
+        raise BadInput(
+            f"--report {folder}: cannot be written ({error.strerror}); give another folder"
+        ) from error
     return path
 
 

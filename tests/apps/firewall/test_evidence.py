@@ -151,7 +151,7 @@ def test_a_router_is_not_blocked_for_who_forges_an_inside_address_behind_it():
         on = desk(rules=rules)
         hear(on, routed(forged=True))
         assert on.decisions == []
-        assert any("is another's, and everybody behind" in text for text in on.events)
+        assert any("belongs to another host, and anybody behind" in text for text in on.events)
     on = desk()
     hear(on, routed(forged=True, kind="flood", victims=("10.0.0.1",), service="tcp/80"))
     assert [(each.action, each.target.address) for each in on.decisions] == [("protect", "10.0.0.1")]
@@ -163,7 +163,7 @@ def test_a_router_is_not_blocked_for_an_address_that_arp_has_seen_elsewhere():
     moved = structs.replace(CAMERA, port=3, ip="10.0.0.7")
     hear(on, evidence(20.0, AT, sender=moved, mac_addresses=200, routed=True, forgeable=False))
     assert on.decisions == []
-    assert any("belongs to another, and its forger is behind" in text for text in on.events)
+    assert any("belongs to another host, and its forger is behind" in text for text in on.events)
 
 
 def test_a_handshake_proves_an_address_behind_a_router():

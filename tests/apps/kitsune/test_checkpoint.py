@@ -100,10 +100,10 @@ def test_other_versions_and_other_bytes_are_refused():
     newer = pack(MARK, VERSION + 1, header, arrays)
     for wrong, text in (
         (newer, f"version {VERSION + 1}"),
-        (b"PK" + data, "no checkpoint of Kitsune"),
-        (b"", "no checkpoint of Kitsune"),
-        (data[:-5], "damaged checkpoint|does not end"),
-        (data + b"x", "does not end"),
+        (b"PK" + data, "not a checkpoint of Kitsune"),
+        (b"", "not a checkpoint of Kitsune"),
+        (data[:-5], "damaged checkpoint"),
+        (data + b"x", "its end is not where it should be"),
     ):
         with pytest.raises(CheckpointError, match=text):
             load(wrong, options, load_kernel())

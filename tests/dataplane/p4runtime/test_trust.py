@@ -137,4 +137,4 @@ def test_a_wrong_hash_on_the_command_line_is_one_line():
     done = subprocess.run(
         [sys.executable, "-m", "dataplane", "--trust", "abc"], capture_output=True, text=True, check=False
     )
-    assert (done.returncode, "no SHA-256" in done.stderr) == (2, True)
+    assert (done.returncode, "not a SHA-256" in done.stderr) == (2, True)

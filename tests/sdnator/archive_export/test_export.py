@@ -233,8 +233,8 @@ def test_what_cannot_be_used_is_said(tmp_path, url, monkeypatch):
     (other / "mine.txt").write_text("text")
     exported(tmp_path / "day", url)
     for folder, more, text in (
-        (file, (), "no folder"),
-        (file / "below", (), "no folder"),
+        (file, (), "is not a folder"),
+        (file / "below", (), "is not a folder"),
         (other, (), "holds other files"),
         (tmp_path / "day", ("--key", "a.b"), "holds network.packets"),
         (tmp_path / "new", ("--key", "a..b"), "invalid key"),

@@ -142,7 +142,7 @@ def test_a_link_is_no_file_of_a_backup(home):
         about.size, link.type, link.linkname = len(manifest), tarfile.SYMTYPE, str(home / "secret")
         tar.addfile(about, io.BytesIO(manifest))
         tar.addfile(link)
-    with pytest.raises(BadInput, match="models/a is no regular file"):
+    with pytest.raises(BadInput, match="models/a is not a regular file"):
         run("restore", home / "b.tar.gz")
 
 

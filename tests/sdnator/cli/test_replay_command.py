@@ -53,8 +53,8 @@ def request(**changes):
         ({"reaction": float("nan")}, "--reaction nan: give 0.001 to 60 capture seconds"),
         ({"reproducible": True, "window": 15}, "--window 15: with --reproducible give at least 16"),
         ({"telemetry": "netflow"}, "--telemetry netflow: give packet-in or digest"),
-        ({"switch": "somewhere"}, "--switch somewhere: give embedded, bmv2 or HOST:PORT, or unix:/PATH"),
-        ({"switch": ":9559"}, "--switch :9559: give embedded, bmv2 or HOST:PORT, or unix:/PATH"),
+        ({"switch": "somewhere"}, "--switch somewhere: give embedded, bmv2, HOST:PORT or unix:/PATH"),
+        ({"switch": ":9559"}, "--switch :9559: give embedded, bmv2, HOST:PORT or unix:/PATH"),
         (
             {"switch": "127.0.0.1:9"},
             "--switch 127.0.0.1:9: add --inject IFACE, the interface through which frames enter it",

@@ -150,7 +150,7 @@ def test_a_link_works_once(door, browser):
 def test_a_wrong_password_is_noted_and_the_right_one_still_works(door, browser):
     for _ in range(2):
         answer = sign_in(door, browser, "vera", "not the password")
-        assert (answer.status_code, "are wrong" in answer.text) == (401, True)
+        assert (answer.status_code, "wrong name and password" in answer.text) == (401, True)
     assert not looks(browser)
     assert sign_in(door, browser, "vera", PASSWORD).status_code == 200
     assert [(who, deed) for who, deed, _ in door.noted] == [

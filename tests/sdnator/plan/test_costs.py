@@ -37,7 +37,7 @@ def test_what_is_written_can_be_read(tmp_path):
         ({"rates": []}, "rates"),
         ({"rates": [0, 5]}, "rates"),
         ({"rates": [1000, 100]}, "ascending"),
-        ({"processes": {}}, "there are none"),
+        ({"processes": {}}, "must name at least one"),
         ({"processes": {"switch": {"us_per_packet": [10]}}}, "2 values"),
         ({"processes": {"switch": {"us_per_packet": [10, -5]}}}, "negative"),
         ({"processes": {"switch": {"mib": -1}}}, "negative"),

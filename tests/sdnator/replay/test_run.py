@@ -80,7 +80,7 @@ def test_a_pass_that_ran_past_a_decision_is_made_again_with_less_trust(passes):
     assert passes == [("dry run", False), ("with blocking", True, True), ("again, 2", True)]
     assert [each.overtaken for each in outcome.passes] == [0, 1, 0]
     assert outcome.reported is outcome.passes[-1]
-    assert sum("foretold wrongly" in note for note in outcome.notes) == 1
+    assert sum("the dry run was wrong" in note for note in outcome.notes) == 1
     passes.clear()
     outcome = replayed(HOUR, fm_grace=OVERTAKEN_EARLY)
     assert passes[1:] == [("with blocking", True, True), ("again, 2", True), ("again, 3", False)]

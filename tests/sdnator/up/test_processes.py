@@ -29,8 +29,8 @@ def test_apps_that_divide_the_switches_may_have_several(tmp_path):
     [
         ("p4runtime_ctrl", r'p4runtime_ctrl = 2.* set instances = "sharded" in \[p4runtime_ctrl\]'),
         ("firewall", "only instances that divide the switches all work"),
-        ("coordinator", "no app 'coordinator' is run"),
-        ("kitsun", "no app 'kitsun' is run"),
+        ("coordinator", "the pipeline runs no app 'coordinator'"),
+        ("kitsun", "the pipeline runs no app 'kitsun'"),
     ],
 )
 def test_others_may_not(tmp_path, app, said):

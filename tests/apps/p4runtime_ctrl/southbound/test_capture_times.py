@@ -33,7 +33,7 @@ def test_saved_times_are_read_back(tmp_path):
 @pytest.mark.parametrize(
     ("held", "text"),
     [
-        (np.array([], np.int64), "has 0 of 1"),
+        (np.array([], np.int64), "holds 0 times; it must hold 1"),
         (TIMES_US.astype(float), "not a list of int64"),
         (TIMES_US.reshape(1, 5), "not a list of int64"),
         (np.array([-1]), "before 1970"),

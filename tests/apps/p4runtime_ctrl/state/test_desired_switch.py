@@ -258,7 +258,7 @@ def test_a_command_may_not_touch_the_classifier():
         params={"active": 0, "copies": 0, "digests": 0},
     )
     (answer,) = make().command(TableCommand(id="c1", updates=(update,)), Held())
-    assert "ask for packets by a request" in answer.cause
+    assert "request packets instead" in answer.cause
 
 
 def test_idle_entries_are_deleted_and_confirmed_once():

@@ -60,4 +60,4 @@ def test_commands_are_checked_update_by_update():
     assert [(owner.id, "is_ipv4" in reason) for owner, reason in refused] == [("c", True)]
     reserved = {program().table("block_src").id}
     _, refused = book(reserved).of_command(TableCommand(id="c", updates=(good,)))
-    assert "shared by all requests" in refused[0][1]
+    assert "which all requests share" in refused[0][1]
