@@ -308,10 +308,10 @@ def requests(queries: Sequence[str]) -> dict[str, QueryRequest]:
     for text in queries:
         request = request_of(text if "." in text else f"{QUERY_PREFIX}.{text}", CATALOGUE)
         if request is None or request.kind != "query":
-            raise InvalidRequest(f"queries: {text}: name one query, as syn_flood:window=2s")
+            raise InvalidRequest(f"queries: {text}: name one query, such as syn_flood:window=2s")
         found[streamed(request.query).name] = request
     if not found:
-        raise InvalidRequest("queries: there are none; name some, as syn_flood:window=2s")
+        raise InvalidRequest("queries: there are none; name some, such as syn_flood:window=2s")
     return found
 
 

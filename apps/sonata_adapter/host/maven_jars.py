@@ -62,7 +62,8 @@ def _copy(folder: Path, pom: str, artifact: str) -> None:
     maven = shutil.which("mvn")
     if maven is None:
         raise MavenMissing(
-            f"Maven copies the jars of {artifact}, and it is not installed (on Debian: maven); or give a folder with them"
+            f"Maven, which copies the jars of {artifact}, is not installed (on Debian: maven); install it, or give a "
+            "folder of jars"
         )
     (folder / "pom.xml").write_text(pom, encoding="utf-8")
     copied = subprocess.run(

@@ -322,7 +322,7 @@ def spark_session(master: str) -> Any:
     try:
         session = builder.getOrCreate()
     except (PySparkException, OSError) as error:
-        raise SparkMissing(f"Spark does not start on {master}: {error}") from None
+        raise SparkMissing(f"Spark does not start on {master}: {error}; check its address and Java") from None
     logging.getLogger("py4j").setLevel(logging.WARNING)
     # each partition keeps state of its own: as many as work at a time will do
     session.conf.set("spark.sql.shuffle.partitions", str(session.sparkContext.defaultParallelism))

@@ -119,7 +119,7 @@ def _clock(session: Any, packets: ArchivedPackets, clock: WindowClock) -> Any:
     )
     if least.num_rows > 2 * MOST_WINDOWS:
         raise InvalidRequest(
-            f"more than {MOST_WINDOWS:,} windows of {clock.length_us / 1e6:g} s: give a shorter time, or longer windows"
+            f"more than {MOST_WINDOWS:,} windows of {clock.length_us / 1e6:g} s: give a shorter period, or longer windows"
         )
     return least
 

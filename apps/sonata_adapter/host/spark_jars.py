@@ -33,7 +33,8 @@ def kafka_connector_jars(folder: str = "") -> list[Path]:
     found = sorted(jar for jar in place.glob("*.jar") if _artifact(jar) not in brought)
     if not any(jar.name.startswith("spark-sql-kafka-0-10_") for jar in found):
         raise SparkMissing(
-            f"{place}: no spark-sql-kafka-0-10_2.13-{pyspark.__version__}.jar, which reads Kafka for Spark"
+            f"{place}: no spark-sql-kafka-0-10_2.13-{pyspark.__version__}.jar, which reads Kafka for Spark; "
+            "copy it there, or give another folder of jars"
         )
     return found
 

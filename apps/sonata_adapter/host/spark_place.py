@@ -80,6 +80,8 @@ def cluster_session(place: SparkPlace) -> Any:
     try:
         session = builder.getOrCreate()
     except (PySparkException, OSError) as error:
-        raise SparkMissing(f"Spark does not start on {place.master}: {error}") from None
+        raise SparkMissing(
+            f"Spark does not start on {place.master}: {error}; check the address of the master and Java"
+        ) from None
     logging.getLogger("py4j").setLevel(logging.WARNING)
     return session

@@ -109,7 +109,9 @@ def streamed(query: Query) -> Query:
         InvalidRequest: it reports packets as they come.
     """
     if isinstance(compile_query(query), TupleStream):
-        raise InvalidRequest(f"{query.name} reports packets as they come, which needs no Spark")
+        raise InvalidRequest(
+            f"{query.name} reports packets as they come, which Spark cannot: leave it to the Sonata adapter"
+        )
     return query
 
 
