@@ -55,6 +55,8 @@ _STATES_READ: Final = 2_000
 _FLUSH_S: Final = 60.0
 _AGAIN_S: Final = 2.0
 _CLOCK_S: Final = 0.5
+_SETTLE_S: Final = 2.0
+"""After the first state of a switch: a stream that begins without another one has to begin again for it."""
 _MOST_FAILURES: Final = 5
 """In a row, without a batch between them."""
 _SEGMENTS: Final = 5
@@ -199,6 +201,8 @@ class SonataSparkService:
         if state.base_us is None:
             return
         with self._lock:
+            if name not in self._bases:
+                self._again_at = time.monotonic() + _SETTLE_S
             self._changed |= self._bases.get(name, state.base_us) != state.base_us
             self._bases[name] = state.base_us
             self._times[name] = max(state.event_time // 1000, self._times.get(name, 0))
