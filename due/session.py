@@ -35,6 +35,7 @@ from due.messages import Assignment, AssignmentCallback, Capability, Interest
 from due.observation import Observation
 from due.sender import BatchSender
 from due.shards import ShardState, ShardWork
+from due.struct_types import learn_struct_types
 from due.threads import Failed
 from due.write_admission import WriteAdmission
 
@@ -122,6 +123,7 @@ class Session:
                 f"Data Updates at {without_passwords(self._driver.url)} could not be reached within "
                 f"{self._options.connect_timeout:g} s: start the server, or give another URL"
             ) from None
+        learn_struct_types()
         self.sender.start()
         self.heartbeats.start()
         self.dispatcher.start()
