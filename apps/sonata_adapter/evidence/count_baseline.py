@@ -9,6 +9,7 @@ chapter 3; Efron, 1982).
 """
 
 import math
+from collections.abc import Iterable
 from statistics import median
 from typing import Annotated, Final
 
@@ -30,6 +31,10 @@ _EULER: Final = 0.5772156649
 """Euler's constant: the mean of a Gumbel distribution is this many scales beyond its location."""
 _LEAST_BLOCKS: Final = 8
 """With fewer block maxima their distribution is not estimated."""
+_LEAST_RESULTS: Final = 30
+"""With fewer results it is not estimated how many of them are of new hosts."""
+_SETTLED: Final = 4
+"""After a quarter of training, hosts that are seen for the first time count as new: all are at the beginning."""
 
 Count = Annotated[float, Meta(ge=0, le=1e18)]
 
@@ -53,6 +58,12 @@ class CountBaseline(Message, frozen=True, kw_only=True):
     """The highest count of anybody in each block of training; what did not reach the threshold is one below it."""
     windows: Number = 0
     """Results of training."""
+    host_windows: Number = 0
+    """The same, but a host counts once in a window, whatever the number of switches; 0 if not every host was kept."""
+    fresh: Number = 0
+    """Hosts that reached the threshold for the first time when a quarter of training was over."""
+    met: Annotated[tuple[Name, ...], Meta(max_length=MOST_HOSTS)] = ()
+    """Hosts that reached it after training and were not reported (`KnownHosts`)."""
     seconds: Rate = 0.0
     """Capture time of training."""
     event_time: Time
@@ -80,23 +91,53 @@ class CountBaseline(Message, frozen=True, kw_only=True):
 
         Source: Coles (2001), chapter 3; Hosking, L-moments, Journal of the Royal Statistical Society B 52, 1990.
         """
-        beyond = max(self.low, int(max(self.newcomer, self.low - 1.0)) + 1)
         number = len(self.maxima)
         if number < _LEAST_BLOCKS or not self.seconds:
             nats = -math.log(rate * max(self.seconds, 1.0) / 3600)
-            return max(beyond, self.count_of(nats, max(self.newcomer, self.low - 1.0)))
-        ordered = sorted(self.maxima)
-        mean = sum(ordered) / number
-        spread = sum((2 * place - number + 1) * each for place, each in enumerate(ordered))
-        scale = spread / (number * (number - 1)) / math.log(2)
-        location = mean - _EULER * scale
-        scale = max(_LEAST_SCALE, scale * (1 + 1 / math.sqrt(number)))
-        blocks_an_hour = 3600 * number / self.seconds
-        return max(beyond, math.ceil(location + scale * math.log(blocks_an_hour / rate)))
+            return max(self._beyond, self.count_of(nats, max(self.newcomer, self.low - 1.0)))
+        return max(self._beyond, _exceeded(self.maxima, self._an_hour(number) / rate, _LEAST_SCALE))
+
+    def rare_when_new(self, rate: float) -> int:
+        """The count that hosts which are new here reach this often in all; no more than `rare` says of anybody.
+
+        New hosts do what others do, but there are few of them: how many is estimated from those that were first seen
+        when a quarter of training was over, and one more.  With a share of all results, less is extrapolated, and the
+        scale may be smaller: where all of n block maxima are equal, one count more comes in less than one of n + 1
+        blocks, which is ln(n + 1) scales.  If hosts differ, the highest counts of those of training tell how much.
+        """
+        number = len(self.maxima)
+        if number < _LEAST_BLOCKS or not self.seconds or self.host_windows < _LEAST_RESULTS:
+            return self.rare(rate)
+        fresh = (self.fresh + 1) * _SETTLED / (_SETTLED - 1)
+        share = min(1.0, fresh / (self.host_windows + 1))
+        found = _exceeded(self.maxima, self._an_hour(number) * share / rate, 1 / math.log(number + 1))
+        if len(self.highest) >= _LEAST_BLOCKS:
+            found = max(found, _exceeded(self.highest.values(), self._an_hour(fresh) / rate, _LEAST_SCALE))
+        return min(max(self._beyond, found), self.rare(rate))
+
+    def _an_hour(self, number: float) -> float:
+        return 3600 * number / max(self.seconds, 1.0)
+
+    @property
+    def _beyond(self) -> int:
+        """One more than was ever seen."""
+        return max(self.low, int(max(self.newcomer, self.low - 1.0)) + 1)
 
     def count_of(self, nats: float, usual: float) -> int:
         """The count that weighs this many nats for a host with this usual count."""
         return max(self.low, int(usual + nats * self.scale(usual)) + 1)
+
+
+def _exceeded(maxima: Iterable[float], times: float, least_scale: float) -> int:
+    """The count that one in so many such maxima reaches, by Gumbel's distribution with at least this scale."""
+    ordered = sorted(maxima)
+    number = len(ordered)
+    mean = sum(ordered) / number
+    spread = sum((2 * place - number + 1) * each for place, each in enumerate(ordered))
+    scale = spread / (number * (number - 1)) / math.log(2)
+    location = mean - _EULER * scale
+    scale = max(least_scale, scale * (1 + 1 / math.sqrt(number)))
+    return math.ceil(location + scale * math.log(times))
 
 
 class CountTraining:
@@ -107,6 +148,9 @@ class CountTraining:
         self._origin_us: int | None = None
         self._block_us = 0
         self._results = 0
+        self._windows: dict[str, tuple[int, int, int]] = {}
+        """For each host the first and the latest window with a result, us, and how many there were."""
+        self._all_kept = True
 
     def learn(self, host: str, window_us: int, length_us: int, count: float) -> None:
         """Note the count of a window, which began at `window_us` (capture time)."""
@@ -120,6 +164,12 @@ class CountTraining:
             if name in self._blocks or len(self._blocks) <= MOST_HOSTS:
                 seen = self._blocks.setdefault(name, {})
                 seen[block] = max(count, seen.get(block, 0.0))
+            else:
+                self._all_kept = False
+        if host in self._blocks:
+            first_us, latest_us, number = self._windows.get(host, (window_us, window_us - 1, 0))
+            if window_us > latest_us:
+                self._windows[host] = (first_us, window_us, number + 1)
 
     def close(self, text: str, low: int, *, begin_us: int, end_us: int) -> CountBaseline:
         """What was learnt; `begin_us` and `end_us`: capture time of training."""
@@ -131,6 +181,8 @@ class CountTraining:
                 ratios.append((ranked[0] - rest) / (rest + 1))
         highest = {name: max(blocks.values()) for name, blocks in self._blocks.items()}
         newcomer = highest.pop(_EVERYBODY, 0.0)
+        settled_us = begin_us + (end_us - begin_us) // _SETTLED
+        windows = self._windows.values() if self._all_kept else ()
         return CountBaseline(
             text=text,
             low=low,
@@ -140,6 +192,8 @@ class CountTraining:
             maxima=self._maxima(low, end_us),
             relative=sum(ratios) / len(ratios) if ratios else 0.0,
             windows=self._results,
+            host_windows=sum(number for _, _, number in windows),
+            fresh=sum(first_us >= settled_us for first_us, _, _ in windows),
             seconds=max(0, end_us - begin_us) / 1e6,
             event_time=end_us * 1000,
         )

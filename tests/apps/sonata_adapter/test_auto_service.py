@@ -61,7 +61,8 @@ def test_it_learns_and_then_reports_attacks_only(tmp_path):
         assert "threshold=auto" in results.items[0].key
         found = results.items[0].value["count"]  # told once a second: the newest plan may be of the training
         wait_for(
-            lambda: plans.items[-1].value["auto"]["threshold"] == found, why=lambda: plans.items[-1].value
+            lambda: plans.items[-1].value["auto"]["new_hosts_threshold"] == found,
+            why=lambda: plans.items[-1].value,
         )
         plan = plans.items[-1].value
         assert plan["state"] == "running"

@@ -37,6 +37,19 @@ def test_training_is_bounded():
     assert baseline.seconds > 2 * BLOCKS
 
 
+def test_hosts_that_are_new_are_counted_when_a_quarter_of_training_is_over():
+    """A host counts once in a window, from however many switches; with a host that was not kept nothing is said."""
+    found = trained([("10.0.0.1", 12.0)] * 60 + [("10.0.0.2", 12.0)] * 20)
+    assert (found.host_windows, found.fresh) == (80, 1)
+    training = CountTraining()
+    for window in (0, 0, 1, 1):
+        training.learn("10.0.0.1", window * SECOND, SECOND, 12.0)
+    assert training.close("query", 10, begin_us=0, end_us=2 * SECOND).host_windows == 2
+    many = trained([(f"host{n}", float(n)) for n in range(MOST_HOSTS + 10)])
+    assert (many.host_windows, many.fresh) == (0, 0)
+    assert many.rare_when_new(1.0) == many.rare(1.0)
+
+
 def test_an_outlier_of_a_block_widens_the_scale():
     """Left out, it lies far above the others: such a count is nothing new here."""
     steady = trained([("10.0.0.1", 40.0)] * 100)
