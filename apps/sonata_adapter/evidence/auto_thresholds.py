@@ -80,8 +80,8 @@ class AutoQuery(LearntQuery[QueryResult]):
         """When the thresholds were chosen."""
         self._low: dict[tuple[tuple[str, ...], int], tuple[int, int]] = {}
         """Hosts to be learnt, by window: when the window is over, us, and the highest count."""
-        self._high: dict[tuple[tuple[str, ...], int], tuple[int, set[str]]] = {}
-        """Hosts reported in each window, until it is over, and from which switches."""
+        self._high: dict[tuple[tuple[str, ...], int], set[str]] = {}
+        """The last hosts that were reported, by window, and from which switches; other reports of them may be late."""
 
     def hear(self, now_us: int) -> list[QueryResult]:
         """Capture time has come to `now_us`: follow what was benign."""
@@ -91,8 +91,6 @@ class AutoQuery(LearntQuery[QueryResult]):
             _, count = self._low.pop(place)
             if place not in self._high:
                 self._follow(place[0][0], count, place[1])
-        for place in [place for place, (end_us, _) in self._high.items() if end_us <= now_us]:
-            del self._high[place]
         baseline, known = self.baseline, self._known
         if baseline is None or known is None or self.learning or now_us - self._judged_us < FOLLOW_US:
             return found
@@ -126,11 +124,11 @@ class AutoQuery(LearntQuery[QueryResult]):
             return []
         end_us = result.window_us + result.length_us + result.length_us // 4 + SLACK_US
         subject = subject_of(result)
-        place, seen_before = (subject, result.window_us), known.knows(subject[0])
+        place, seen_before = (subject, result.window_us), known.knows(subject[0], result.window_us)
         if count >= (chosen.known if seen_before else chosen.new):
             if not seen_before:
                 known.suspect(subject[0], result.window_us, result.length_us)
-            return self._reported(switch, place, end_us, result)
+            return self._reported(switch, place, result)
         # what began before the thresholds were chosen may be counted in part: of an attack, too
         if result.window_us < self._judged_us or (seen_before and count <= baseline.newcomer):
             return []
@@ -140,10 +138,10 @@ class AutoQuery(LearntQuery[QueryResult]):
         return []
 
     def _reported(
-        self, switch: str, place: tuple[tuple[str, ...], int], end_us: int, result: QueryResult
+        self, switch: str, place: tuple[tuple[str, ...], int], result: QueryResult
     ) -> list[QueryResult]:
         """The result, unless this switch has already said so of this host in this window."""
-        _, switches = self._high.setdefault(place, (end_us, set()))
+        switches = self._high.setdefault(place, set())
         if switch in switches:
             return []
         switches.add(switch)
@@ -212,7 +210,8 @@ def auto_told(query: AutoQuery) -> dict[str, Any]:
     """What `explain` says about the threshold."""
     baseline, chosen = query.baseline, query.thresholds
     if chosen is None or baseline is None:
-        return {"threshold": None, "learning": True, "text": auto_text(query)}
+        nothing = {"threshold": None, "new_hosts_threshold": None}
+        return {**nothing, "learning": True, "text": auto_text(query)}
     return {
         "text": auto_text(query),
         "threshold": chosen.known,

@@ -28,24 +28,25 @@ class KnownHosts:
 
     def __init__(self, baseline: CountBaseline) -> None:
         self._trained = baseline.highest
-        self._met = dict.fromkeys(baseline.met)
+        self._met = dict.fromkeys(baseline.met, 0)
+        """Hosts that came later, and the window in which they were met, us."""
         self._lately = 0
         """Hosts that were met since the last call of `noted`."""
         self._suspects: OrderedDict[str, tuple[int, int]] = OrderedDict()
         """New hosts that were reported: the last window, us, and in how many in a row; the last reported is the last."""
 
-    def knows(self, host: str) -> bool:
-        """Whether it has been seen before; where no more hosts can be kept, everybody counts as known."""
-        full = len(self._trained) + len(self._met) >= MOST_HOSTS
-        return full or host in self._trained or host in self._met
+    def knows(self, host: str, window_us: int) -> bool:
+        """Whether it was seen before this window; where no more hosts can be kept, everybody counts as known."""
+        return self._kept_for_good(host) or self._met.get(host, window_us) < window_us
 
     def suspect(self, host: str, window_us: int, length_us: int) -> None:
         """A new host was reported in a window, which began at `window_us`."""
+        self._met.pop(host, None)  # met in this window, whose report came late
         last_us, row = self._suspects.get(host, (window_us, 1))
         if window_us > last_us:
             row = row + 1 if window_us - last_us <= length_us else 1
         if row >= MOST_IN_A_ROW:
-            self._learn(host)
+            self._learn(host, window_us)
             return
         self._suspects[host] = (max(window_us, last_us), row)
         self._suspects.move_to_end(host)
@@ -55,8 +56,8 @@ class KnownHosts:
     def meet(self, host: str, window_us: int, length_us: int) -> None:
         """It was seen in a window at a count that is not reported: it is known, if that is not the rest of an attack."""
         last_us, _ = self._suspects.get(host, (window_us - length_us - 1, 0))
-        if not self.knows(host) and window_us - last_us > length_us:
-            self._learn(host)
+        if not self._kept_for_good(host) and host not in self._met and window_us - last_us > length_us:
+            self._learn(host, window_us)
 
     def noted(self, baseline: CountBaseline, seconds: float) -> CountBaseline:
         """The baseline with the hosts that were met in the last `seconds`.
@@ -69,7 +70,10 @@ class KnownHosts:
         self._lately = 0
         return msgspec.structs.replace(baseline, met=tuple(self._met), fresh=max(baseline.fresh, expected))
 
-    def _learn(self, host: str) -> None:
+    def _learn(self, host: str, window_us: int) -> None:
         self._suspects.pop(host, None)
-        self._met[host] = None
+        self._met[host] = window_us
         self._lately += 1
+
+    def _kept_for_good(self, host: str) -> bool:
+        return host in self._trained or len(self._trained) + len(self._met) >= MOST_HOSTS

@@ -58,13 +58,14 @@ class AutoNetwork:
         if more:
             self.goes_on(60)  # ... and this is the first window that begins after it
 
-    def counts(self, count, *, request=-1, host="192.0.2.1", switch="s1"):
-        """What is written for a result of the window that has just begun."""
+    def counts(self, count, *, request=-1, host="192.0.2.1", switch="s1", ago=0):
+        """What is written for a result of the window that has just begun, or of one that began some seconds ago."""
         asked = self.query.requests[request]
         length = asked.query.window_us
         measure = self.query.recipe.measure
+        at_us = self.now - ago * SECOND
         result = QueryResult(
-            query=asked.identity, window_us=self.now - self.now % length, length_us=length, at_us=self.now,
+            query=asked.identity, window_us=at_us - at_us % length, length_us=length, at_us=at_us,
             fields={"dst": host, measure: count},
         )  # fmt: skip
         return self.queries.take([(asked.identity, switch, result)])
@@ -106,7 +107,7 @@ def test_nothing_is_reported_while_it_learns():
         f"{PREFIX}.new_tcp:dst=any,refine=none,threshold=auto,window=3s": "learning"
     }
     told = auto_told(network.query)
-    assert (told["threshold"], told["learning"]) == (None, True)
+    assert (told["threshold"], told["new_hosts_threshold"], told["learning"]) == (None, None, True)
     assert "reports nothing before it knows" in told["text"]
 
 
@@ -216,6 +217,20 @@ def test_a_new_host_that_reaches_both_thresholds_is_reported_once():
     assert network.counts(known, request=2, host=NEW) == []
     assert network.counts(new, request=1, host=NEW, switch="s2")
     network.goes_on(3)
+    assert network.counts(new, request=1, host=NEW)
+
+
+def test_reports_that_come_late_are_of_their_window():
+    """A capture is replayed so fast that all windows have ended when the second threshold of the first is reported."""
+    network = after_training()
+    _, new, known = (request.query.steps[-1].condition.right.value for request in network.query.requests)
+    for _ in range(2):
+        assert network.counts(10, request=0, host=NEW) == []
+        network.goes_on(30)
+    assert network.counts(new, request=1, host=NEW, ago=60)
+    assert network.counts(new, request=1, host=NEW, ago=30)
+    network.goes_on(30)
+    assert network.counts(known, request=2, host=NEW, ago=90) == []
     assert network.counts(new, request=1, host=NEW)
 
 
@@ -357,7 +372,7 @@ def test_the_budget_holds_while_servers_come_and_go():
         chosen, known = Thresholds.of(baseline, 1), KnownHosts(baseline)
         for window, host in np.argwhere(counts >= 1).tolist()[len(seen) :]:
             name, begin_us = f"host{host}", window * window_us
-            if counts[window, host] < (chosen.known if known.knows(name) else chosen.new):
+            if counts[window, host] < (chosen.known if known.knows(name, begin_us) else chosen.new):
                 known.meet(name, begin_us, window_us)
             else:
                 known.suspect(name, begin_us, window_us)
