@@ -162,7 +162,7 @@ static void prefetch_packet(const AfterImage *self, const Names *names)
 /* Grows with every change of the interface, so that a library left over from before is noticed. */
 int32_t kitsune_kernel_version(void)
 {
-    return 10;
+    return 11;
 }
 
 AfterImage *afterimage_new(int bounded, int32_t max_streams, int32_t max_links, double horizon)

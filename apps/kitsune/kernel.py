@@ -15,7 +15,7 @@ LAMBDAS: Final = (5.0, 3.0, 1.0, 0.1, 0.01)
 Columns = Mapping[str, npt.NDArray[Any]]
 """A record batch, or the columns of one."""
 
-VERSION: Final = 10
+VERSION: Final = 11
 """Version of the C interface, compared with that of the library."""
 
 _LIBRARY: Final = Path(__file__).with_name("_kernel.so")
@@ -69,6 +69,9 @@ _TRACKERS: Final = (
                      long m, double *out);
     long rows_marked(const PacketRows *, const uint32_t *sequence, long n, long trained, long most, int32_t *rows,
                      int32_t *by, int32_t *senders, int64_t *out);
+    typedef struct { uint64_t mac, source; double newest; int32_t port, first, count; } MarkedSender;
+    void marked_senders(const PacketRows *, const int64_t *time_us, long found, const int32_t *rows, const int32_t *by,
+                        long count, const int32_t *senders, MarkedSender *out, double *times);
     typedef struct {
         int32_t most_subjects, kept, most_contacts, calibration;
         double grace_s, least_nats, most_nats, least_step, least_share, deciding_nats, half_life_s,

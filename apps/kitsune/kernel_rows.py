@@ -26,6 +26,7 @@ _VICTIM_SIX: Final = 1 << 17
 _NAMES: Final = tuple(name for name, _, _ in ROW_FIELDS)
 _KINDS: Final = tuple(kind for _, _, kind in ROW_FIELDS)
 _TYPES: Final = tuple(map(np.dtype, _KINDS))
+_NO_ROWS: Final = np.empty(0, np.int32)
 _NANOSECONDS: Final = np.dtype("i8")
 _POINTERS: Final = tuple(array_type(f"const {c_type}") for _, c_type, _ in ROW_FIELDS)
 Address = tuple[int, int, int]
@@ -44,6 +45,33 @@ class RowRoom:
         return self._bytes
 
 
+class MarkedRoom:
+    """Memory for SYNs that have their destination's address as sequence number; serves one batch after the other.
+
+    Args:
+        kernel: the C kernel.
+        most: how many of a batch are looked at.
+    """
+
+    def __init__(self, kernel: Kernel, most: int) -> None:
+        ffi = kernel.ffi
+        self.most = most
+        self.rows, self.by, self.senders = (ffi.new("int32_t[]", most) for _ in range(3))
+        self.counts, self.times = ffi.new("int64_t[3]"), ffi.new("double[]", most)
+        self.found = ffi.new("MarkedSender[]", most)
+
+
+class MarkedSender(NamedTuple):
+    """Who sent marked SYNs."""
+
+    port: int
+    mac: int
+    address: int
+    times: list[float]
+    """Capture times, seconds; one that goes back is the one before it."""
+    newest: float
+
+
 class MarkedSyns(NamedTuple):
     """SYNs that have their destination's address as sequence number."""
 
@@ -53,10 +81,8 @@ class MarkedSyns(NamedTuple):
     """Those of them that are marked."""
     rows: npt.NDArray[np.int32]
     """Of the marked ones after training the first, as many as are looked at."""
-    by: npt.NDArray[np.int32]
-    """Number of the sender of each, from 0 in the order in which they come."""
-    senders: npt.NDArray[np.int32]
-    """A row of each sender."""
+    senders: list[MarkedSender]
+    """In the order in which they come."""
 
 
 class KernelRows(CheckedColumns):
@@ -111,12 +137,12 @@ class KernelRows(CheckedColumns):
         count = kernel.lib.rows_benign(self.decoded, first, self.count, *given, found)
         return count, int(found[0]), found[1], found[2]
 
-    def marked(self, trained: int, most: int) -> "MarkedSyns":
+    def marked(self, trained: int, room: MarkedRoom) -> MarkedSyns:
         """SYNs of IPv4 whose sequence number (`tcp_seq`) is the address of their destination.
 
         Args:
             trained: packets at the beginning that belong to training; of those such SYNs are only counted.
-            most: how many of the others are looked at.
+            room: for as many of the others as are looked at.
 
         Raises:
             ColumnError: the sequence numbers are no column of this batch.
@@ -124,11 +150,28 @@ class KernelRows(CheckedColumns):
         kernel, sequence = self._kernel, contiguous(self._batch["tcp_seq"], "u4")
         if sequence.shape != self.seconds.shape:
             raise ColumnError(f"tcp_seq has the shape {sequence.shape}, other columns {self.seconds.shape}")
-        found, counts = np.empty((3, most), np.int32), kernel.ffi.new("int64_t[3]")
-        given = (self.pointer, kernel.pointer("uint32_t", sequence), self.count, trained, most)
-        count = kernel.lib.rows_marked(*given, *(kernel.pointer("int32_t", each) for each in found), counts)
-        opening, marked, senders = counts
-        return MarkedSyns(opening, marked, found[0, :count], found[1, :count], found[2, :senders])
+        found = room.rows, room.by, room.senders, room.counts
+        count = kernel.lib.rows_marked(
+            self.pointer, kernel.pointer("uint32_t", sequence), self.count, trained, room.most, *found
+        )
+        opening, learnt, senders = room.counts
+        if not count:
+            return MarkedSyns(opening, learnt, _NO_ROWS, [])
+        rows = np.frombuffer(kernel.ffi.buffer(room.rows, count * _NO_ROWS.itemsize), _NO_ROWS.dtype)
+        return MarkedSyns(opening, learnt, rows, self._marked_senders(count, senders, room))
+
+    def _marked_senders(self, count: int, senders: int, room: MarkedRoom) -> list[MarkedSender]:
+        (ffi, lib), times = self._kernel, contiguous(self._batch["time_us"], "i8")
+        if times.shape != self.seconds.shape:
+            raise ColumnError(f"time_us has the shape {times.shape}, other columns {self.seconds.shape}")
+        given = self._kernel.pointer("int64_t", times), count, room.rows, room.by, senders, room.senders
+        lib.marked_senders(self.pointer, *given, room.found, room.times)
+        return [
+            MarkedSender(
+                who.port, who.mac, who.source, ffi.unpack(room.times + who.first, who.count), who.newest
+            )
+            for who in room.found[0:senders]
+        ]
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         # every reader asks for seconds first

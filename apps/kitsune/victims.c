@@ -132,6 +132,39 @@ long rows_marked(const PacketRows *columns, const uint32_t *sequence, long n, lo
     return found;
 }
 
+/* Marked SYNs of one sender. */
+typedef struct {
+    uint64_t mac, source;
+    double newest;
+    int32_t port, first, count;
+} MarkedSender;
+
+/* Who sent the `found` rows that `rows_marked` returned: `count` senders, and the times of each, seconds, beginning with
+ * number `first` in `times`; a time that goes back is the one before it. */
+void marked_senders(const PacketRows *c, const int64_t *time_us, long found, const int32_t *rows, const int32_t *by, long count, const int32_t *senders, MarkedSender *out, double *times)
+{
+    for (long i = 0; i < count; i++) {
+        long row = senders[i];
+        MarkedSender whose = {c->eth_src[row], c->ip_src_lo[row], -INFINITY, c->port[row], 0, 0};
+        out[i] = whose;
+    }
+    for (long i = 0; i < found; i++)
+        out[by[i]].count++;
+    for (long i = 1; i < count; i++) {
+        out[i].first = out[i - 1].first + out[i - 1].count;
+        out[i - 1].count = 0;
+    }
+    if (count)
+        out[count - 1].count = 0;
+    for (long i = 0; i < found; i++) {
+        MarkedSender *whose = &out[by[i]];
+        double time = (double)time_us[rows[i]] / 1e6;
+        if (time > whose->newest)
+            whose->newest = time;
+        times[whose->first + whose->count++] = whose->newest;
+    }
+}
+
 static int is_among(const uint64_t *sorted, long n, uint64_t mac)
 {
     long low = 0;

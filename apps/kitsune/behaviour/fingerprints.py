@@ -17,22 +17,18 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
 from apps.kitsune.behaviour.baseline import FORGOTTEN_AT_A_TIME, MOST_EVENTS, MOST_SUBJECTS
 from apps.kitsune.behaviour.contacts import TCP
 from apps.kitsune.behaviour.findings import HALF_LIFE_S, MOST_NATS, Finding, FoundSoFar
 from apps.kitsune.behaviour.rows import SenderId
 from apps.kitsune.kernel import Columns, Kernel, load_kernel
-from apps.kitsune.kernel_rows import MarkedSyns, rows_of
+from apps.kitsune.kernel_rows import MarkedRoom, MarkedSyns, rows_of
 
 NUMBERS: Final = 1 << 32
 """Sequence numbers that a stack chooses from."""
 MOST_AT_A_TIME: Final = 256
 """Such SYNs of a batch that are looked at: a few decide."""
-_WHOSE: Final = ("port", "eth_src", "ip_src_lo")
-_NAMES: Final = (*_WHOSE, "ip_dst_lo", "tcp_dport", "arrival")
+_NAMES: Final = ("port", "eth_src", "ip_src_lo", "ip_dst_lo", "tcp_dport", "arrival")
 
 
 class SynFingerprints:
@@ -44,6 +40,7 @@ class SynFingerprints:
 
     def __init__(self, kernel: Kernel | None = None) -> None:
         self._kernel = kernel or load_kernel()
+        self._room = MarkedRoom(self._kernel, MOST_AT_A_TIME)
         self.syns = 0
         """Of training."""
         self.marked = 0
@@ -72,28 +69,21 @@ class SynFingerprints:
         """
         if "tcp_seq" not in batch:
             return []
-        syns = rows_of(self._kernel, batch).marked(trained, MOST_AT_A_TIME)
+        syns = rows_of(self._kernel, batch).marked(trained, self._room)
         self.syns += syns.opening
         self.marked += syns.learnt
-        if not len(syns.rows):
-            return []
-        times = batch["time_us"][syns.rows] / 1e6
-        if self._are_settled(batch, switch, syns, times):
+        if not syns.senders or self._are_settled(switch, syns):
             return []
         return self._findings(batch, syns.rows, switch, self._nats(senders))
 
-    def _are_settled(
-        self, batch: Columns, switch: str, syns: MarkedSyns, times: npt.NDArray[np.float64]
-    ) -> bool:
+    def _are_settled(self, switch: str, syns: MarkedSyns) -> bool:
         """Whether nothing can be worth a message, as in most batches of a scan; then the SYNs are counted."""
-        columns = (batch[name][syns.senders].tolist() for name in _WHOSE)
         heard = []
-        for number, whose in enumerate(zip(*columns, strict=True)):
-            sender: SenderId = (switch, *whose)
-            own = times if len(syns.senders) == 1 else times[syns.by == number]
-            if not own.max() < self._settled.get(sender, 0.0):
+        for port, mac, address, times, newest in syns.senders:
+            sender: SenderId = (switch, port, mac, address)
+            if not newest < self._settled.get(sender, 0.0):
                 return False
-            heard.append((self._times[sender], own))
+            heard.append((self._times[sender], times))
         for former, own in heard:
             _extend(former, own)
         return True
@@ -167,9 +157,10 @@ def _append(times: list[float], time: float) -> None:
         del times[: MOST_EVENTS // 4]
 
 
-def _extend(times: list[float], more: npt.NDArray[np.float64]) -> None:
-    """As `_append` of each, where there are times."""
-    times += np.maximum(np.maximum.accumulate(more), times[-1]).tolist()
+def _extend(times: list[float], more: list[float]) -> None:
+    """As `_append` of each, where there are times; `more` never goes back."""
+    last = times[-1]
+    times += more if more[0] >= last else [max(time, last) for time in more]
     over = len(times) - MOST_EVENTS
     if over > 0:
         quarter = MOST_EVENTS // 4
