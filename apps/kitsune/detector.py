@@ -201,9 +201,7 @@ class Detector:
             self._trained_at_us = int(rows["time_us"][trained - 1])
             self._keep_tail(features[:trained])
             self._keep_sample(features[:trained], before)
-        state = np.empty(len(scores), np.uint8)
-        state.fill(SCORED)
-        state[:trained] = TRAIN
+        states = bytearray((TRAIN,)) * trained + bytearray((SCORED,)) * (len(scores) - trained)
         threshold = self.threshold
 
         anomalous = self.senders.add(
@@ -233,11 +231,12 @@ class Detector:
         self._evidence += self._as_evidence(findings)
         self._follow_drift(rows, scores, trained, findings)
         scored = scores[trained:]
-        over = int(np.count_nonzero(~(scored < threshold)))
+        over = rows.over(trained, scores, threshold)
         if trained and self.model.is_trained:
             self.training_warnings = self._check.warnings(self.senders.known())
         if self.calibration.add(scored, rows.seconds[trained:]):
             self.threshold = self._threshold()
+        state = np.frombuffer(states, np.uint8)
         return Scored(scores, state, features, over, threshold), [self._alert(second) for second in anomalous]
 
     def take_evidence(self) -> list[Evidence]:

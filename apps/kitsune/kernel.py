@@ -65,6 +65,7 @@ _TRACKERS: Final = (
     void seconds_of(const int64_t *nanoseconds, long n, double *out);
     long row_bytes(void);
     void rows_read(const PacketRows *, long n, Row *);
+    long scores_over(const double *scores, long first, long last, double threshold);
     long rows_benign(const Row *, long first, long last, const double *scores, double threshold, const uint64_t *macs,
                      long m, double *out);
     long rows_marked(const PacketRows *, const uint32_t *sequence, long n, long trained, long most, int32_t *rows,

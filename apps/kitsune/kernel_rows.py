@@ -36,13 +36,16 @@ class RowRoom:
     """Memory for decoded packets that serves one batch after the other."""
 
     def __init__(self) -> None:
-        self._bytes = np.empty(0, np.uint8)
+        self._count = -1
+        self._held: tuple[Any, Any] = (None, None)
 
-    def of(self, size: int) -> npt.NDArray[np.uint8]:
-        """As many bytes, or more."""
-        if len(self._bytes) < size:
-            self._bytes = np.empty(size, np.uint8)
-        return self._bytes
+    def of(self, kernel: Kernel, count: int) -> tuple[Any, Any]:
+        """Memory for so many packets, or more, and where they go in it."""
+        if count > self._count:
+            memory = np.empty(count * kernel.lib.row_bytes(), np.uint8)
+            self._count = count
+            self._held = memory, kernel.ffi.cast("Row *", kernel.ffi.from_buffer(memory))
+        return self._held
 
 
 class MarkedRoom:
@@ -114,10 +117,21 @@ class KernelRows(CheckedColumns):
         self.count = len(self.seconds)
         ffi, lib = kernel
         self.pointer = ffi.new("PacketRows *", list(map(ffi.from_buffer, _POINTERS, kept)))
-        self._room = (room or RowRoom()).of(self.count * lib.row_bytes())
-        self.decoded = ffi.cast("Row *", ffi.from_buffer(self._room))
+        self._memory, self.decoded = (room or RowRoom()).of(kernel, self.count)
         """The packets as the trackers read them."""
         lib.rows_read(self.pointer, self.count, self.decoded)
+
+    def over(self, first: int, scores: npt.NDArray[np.float64], threshold: float) -> int:
+        """How many packets from `first` on score at or above a threshold, or no number.
+
+        Args:
+            first: row.
+            scores: of all rows, float64.
+            threshold: a score.
+        """
+        kernel = self._kernel
+        found: int = kernel.lib.scores_over(kernel.pointer("double", scores), first, self.count, threshold)
+        return found
 
     def benign(
         self, first: int, scores: npt.NDArray[np.float64], threshold: float, macs: npt.NDArray[np.uint64]

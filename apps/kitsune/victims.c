@@ -180,6 +180,15 @@ static int is_among(const uint64_t *sorted, long n, uint64_t mac)
     return 0;
 }
 
+/* How many scores from number `first` on are at or above the threshold, or no number. */
+long scores_over(const double *scores, long first, long last, double threshold)
+{
+    long count = 0;
+    for (long i = first; i < last; i++)
+        count += !(scores[i] < threshold);
+    return count;
+}
+
 /* Rows from `first` on that neither come from one of m MACs (ascending) nor go to one: how many score above the
  * threshold, and the first and last time among them; returns how many there are. */
 long rows_benign(const Row *rows, long first, long last, const double *scores, double threshold, const uint64_t *macs, long m, double *out)

@@ -218,7 +218,9 @@ class NativeBehaviour(Behaviour):
         )
 
     def _log_scores(self, scores: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.log(np.maximum(scores, twin.TINY) / self.usual_score)
+        logs = np.maximum(scores, twin.TINY)
+        logs /= self.usual_score
+        return np.log(logs, logs)
 
     def _apply_blocks(self, blocked: Blocked) -> None:
         rows = self._switches.changed_blocks(blocked)

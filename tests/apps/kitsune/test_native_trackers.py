@@ -152,6 +152,15 @@ def test_benign_packets_are_counted_as_the_accused_are_left_out(accused):
     assert KernelRows(kernel, batch, room).benign(40, scores, 0.5, known.macs(0.0))[0] == 0
 
 
+def test_scores_at_or_above_the_threshold_are_counted_as_by_numpy():
+    """What is no number is above it, too."""
+    random, kernel = np.random.default_rng(6), load_kernel()
+    rows, scores = KernelRows(kernel, traffic(random, 300, 0.0)), scores_of(random, 300)
+    scores[[8, 9, 10]] = 0.5, np.nan, np.inf
+    for first in (0, 7, 300):
+        assert rows.over(first, scores, 0.5) == np.count_nonzero(~(scores[first:] < 0.5))
+
+
 def test_nanoseconds_become_seconds_as_in_numpy():
     """Before 1970, too, and whatever the layout."""
     random = np.random.default_rng(4)
