@@ -14,7 +14,7 @@ from apps.kitsune.behaviour.native import NativeBehaviour
 from apps.kitsune.checkpoint import MARK, VERSION, dump, load
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import PACKET_FIELDS, ROW_FIELDS, ColumnError, Kernel, load_kernel
-from apps.kitsune.kernel_rows import KernelRows
+from apps.kitsune.kernel_rows import KernelRows, MarkedRoom
 from apps.kitsune.kitnet import KitNet, Layer
 from apps.kitsune.packed_arrays import CheckpointError, pack, unpack
 from apps.kitsune.senders import Senders
@@ -107,7 +107,9 @@ def trackers(kernel: Kernel, random: np.random.Generator, rounds: int) -> None:
             behaviour.add(found, f"s{step % 2}", scores, trained, lambda: np.full(50, 0.5))
             found["tcp_seq"] = np.where(random.random(rows) < 0.5, found["ip_dst_lo"], 0).astype("u4")
             found["tcp_flags"] = random.choice(np.array([2, 18], "u1"), rows)
-            KernelRows(kernel, found).marked(trained, int(random.choice([1, 7, 256])))
+            KernelRows(
+                kernel, found | {"time_us": random.integers(-(2**63), 2**63 - 1, len(found["length"]))}
+            ).marked(trained, MarkedRoom(kernel, int(random.choice([1, 7, 256]))))
         senders.finish()
         rates.to_state(), senders.to_state(), behaviour.to_state()
 
