@@ -232,7 +232,7 @@ def check(failed: int, what: str) -> None:
     if failed == -1:
         raise MemoryError(f"{what}: no memory for another entry")
     if failed:
-        raise ColumnError(f"{what}: the numbers handed over do not fit each other")
+        raise ColumnError(f"{what}: the numbers handed over contradict each other")
 
 
 def seed() -> int:
