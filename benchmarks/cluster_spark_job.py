@@ -80,7 +80,8 @@ class _Runs:
 
         def take(found: Any) -> None:
             nonlocal taken, last
-            taken, last = taken + len(found), time.monotonic()
+            if found:
+                taken, last = taken + len(found), time.monotonic()
 
         self._tell(0)
         self._engine.flush()
