@@ -117,7 +117,7 @@ class _Runs:
             time.sleep(_EVERY_S)
             stream.check()
             now = time.monotonic()
-            slowest.move(stream.newest(), now)
+            slowest.move(stream.read()[1], now)
             time_us = slowest.next(now)
             if time_us:
                 self._tell(time_us)

@@ -359,9 +359,7 @@ class Engine:
             NotInitialised: called before `init` or after `close`.
         """
         if not 0 < every <= _LONGEST_EVERY:
-            raise InvalidOption(
-                f"keep_state(every={every}): must be greater than 0 and at most {_LONGEST_EVERY:g} seconds"
-            )
+            raise InvalidOption(f"every={every}: must be greater than 0 and at most {_LONGEST_EVERY:g} s")
         self._require().keep_state(state, every)
 
     def shards(self) -> frozenset[str] | None:

@@ -211,10 +211,10 @@ class SonataSparkService:
         """Tell Spark how far time has come in what it has read."""
         if self._clock is None:
             self._clock = ReadClock(self._source.address, APP, self._source.topic)
-        newest = [stream.newest() for stream in self._streams]
+        read, newest = zip(*(stream.read() for stream in self._streams), strict=True)
         everywhere = set.intersection(*map(set, newest))
         slowest.move({switch: min(each[switch] for each in newest) for switch in everywhere}, now)
-        heard = self._clock.due([stream.read() for stream in self._streams])
+        heard = self._clock.due(read)
         if heard is not None:
             noted, times = heard
             slowest.move(times, now)

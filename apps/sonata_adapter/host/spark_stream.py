@@ -180,15 +180,15 @@ class KafkaWindows:
         self._follow()
         return dict(self._counts)
 
-    def read(self) -> dict[int, int]:
-        """Partition of the packets' topic to the offset up to which it was read and worked on."""
-        self._follow()
-        return self._read
+    def read(self) -> tuple[dict[int, int], dict[str, int]]:
+        """What was read and worked on.
 
-    def newest(self) -> dict[str, int]:
-        """Switch to the capture time of its newest packet that was read, us."""
+        Returns:
+            Partition of the packets' topic to the offset up to which it was; switch to the capture time of its newest
+            packet, us.
+        """
         self._follow()
-        return self._newest
+        return self._read, self._newest
 
     def _follow(self) -> None:
         """Take in what Spark says of batches that have ended since the last call."""
