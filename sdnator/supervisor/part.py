@@ -88,6 +88,7 @@ class Part:
         self._cause = ""
         self._start_at = 0.0
         self._since = 0.0
+        self._ran_s = 0.0
         self._prepare_at = 0.0
         self._silence = Silence(spec.silence_s)
         self._suspension = Silence(spec.suspended_s)
@@ -122,6 +123,7 @@ class Part:
 
     def start(self, now: float) -> None:
         """Start its process; raises PipelineError if that fails at the first start."""
+        self._ran_s = 0.0
         try:
             with self.spec.inside(), deferred_signals():
                 self.process = self.spec.start()
@@ -228,7 +230,12 @@ class Part:
             self.spec.reserve.discard()
 
     def _end(self, reason: str, now: float) -> None:
+        self._note_run(now)
         self.state, self._reason, self._since = "ending", reason, now
+
+    def _note_run(self, now: float) -> None:
+        if self.state == "running":
+            self._ran_s = now - self._since
 
     def _close(self) -> None:
         if self.process is not None:
@@ -238,7 +245,7 @@ class Part:
     def _died(self, how: str, now: float) -> None:
         self._close()
         policy, first = self.spec.restart, not self.was_ready and not self.restarts
-        ran = self.state == "running"
+        self._note_run(now)
         self._cause, self._reason = first_line(how), ""
         if policy is None or (first and self.spec.vital):
             self.state, self._start_at, self._fatal = "waiting", float("inf"), how
@@ -247,7 +254,7 @@ class Part:
             self.failed = how
         self.deaths += 1
         self.restarts += 1
-        pause = policy.pause_s(self.deaths, now - self._since if ran else 0.0)
+        pause = policy.pause_s(self.deaths, self._ran_s)
         self.state, self._start_at = "waiting", now + pause
         self._say(f"{self._cause}: restarting it {f'in {pause:g} s' if pause else 'at once'}", now)
 

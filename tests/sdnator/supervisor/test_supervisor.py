@@ -95,6 +95,21 @@ def test_a_suspended_part_that_must_not_stand_still_is_killed_long_before_it_cou
     assert "was suspended for 0.2 s" in report(supervisor, "switch").cause
 
 
+def test_a_part_that_ran_well_until_it_was_suspended_comes_back_at_once_each_time(stage):
+    policy = RestartPolicy(at_once=True, first_s=30.0, quick_s=0.1)
+    supervisor = stage.supervisor(stage.part("switch", silence_s=3_600, suspended_s=0.2, restart=policy))
+    supervisor.start()
+    for restarts in (1, 2):
+        os.kill(supervisor.pids()["switch"], signal.SIGSTOP)
+        watch_until(
+            supervisor,
+            lambda restarts=restarts: (
+                report(supervisor, "switch").restarts == restarts and state(supervisor, "switch") == "running"
+            ),
+        )
+    assert sum(line.endswith("restarting it at once") for line in stage.told) == 2
+
+
 def test_a_part_that_lives_but_makes_no_progress_is_started_again(stage):
     """Such as one whose dispatching thread has died."""
     supervisor = stage.supervisor(stage.part("silent", "silent", silence_s=0.5))
