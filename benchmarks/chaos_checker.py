@@ -6,7 +6,7 @@ The model.  The probes live through every fault, on a disk and with a clock of t
                                        └─► in the archive at the end      archived key
     instruction taken and flushed ─► answered ─► done: a decision in the archive ─► an entry in the switch
                                               └─► refused with its cause: no promise
-    words of the standby pair, by the time of writing: turns of one instance, never both at once
+    words of the standby pair, and of the controllers, by the time of writing: turns of one instance, never both at once
 
 Delivery is at least once to an app and once to an instance that lives; the reading probe is never killed, so
 that a number that it gets twice was delivered again after it was done with it.
@@ -103,7 +103,7 @@ class RunRecord:
     passed: list[Passed] = field(default_factory=list)
     words: list[Word] = field(default_factory=list)
     reports: list[Word] = field(default_factory=list)
-    """The same of the controllers: when what they say of the switch came, and from which instance."""
+    """The same of the controllers, by what they say of the switch."""
     switch_faults: list[float] = field(default_factory=list)
     """When the switch, its controller, or what both hear the firewall by was broken."""
     away: list[str] = field(default_factory=list)

@@ -10,6 +10,8 @@ APPS = ("coordinator", *CONTROLLERS, "kitsune", "sonata_adapter", "firewall", "d
 PAIR = ("standby-a", "standby-b")
 EVERY = ("switch", "updates", *APPS, *PAIR)
 FIRST_S = 3.0
+JUMP_S = 3600
+"""How far a clock jumps, back or forth."""
 _PAUSE_S = (4.0, 18.0)
 
 
@@ -70,6 +72,8 @@ def schedule(seed: int, seconds: float, kinds: Sequence[str]) -> list[PlannedFau
         kind = KINDS[name]
         lasts = min(draw.uniform(*kind.seconds), end - at)
         targets = tuple(draw.sample(list(kind.targets), kind.at_once))
-        faults.append(PlannedFault(round(at, 2), name, targets, round(lasts, 2), draw.choice((-3600, 3600))))
+        faults.append(
+            PlannedFault(round(at, 2), name, targets, round(lasts, 2), draw.choice((-JUMP_S, JUMP_S)))
+        )
         at += draw.uniform(*_PAUSE_S)
     return faults

@@ -1,7 +1,10 @@
 """The faults of a run follow from its seed, and leave it time to settle."""
 
+import pytest
+
 from benchmarks.chaos_faults import ACTIONS
-from benchmarks.chaos_schedule import KINDS, schedule
+from benchmarks.chaos_probes import by_the_right_clock
+from benchmarks.chaos_schedule import JUMP_S, KINDS, schedule
 
 
 def test_a_seed_gives_the_same_faults_again():
@@ -34,3 +37,10 @@ def test_the_last_tenth_is_quiet():
 def test_whatever_can_be_drawn_can_be_done():
     """Each kind has its action, and none is left without a row in the table."""
     assert set(ACTIONS) == set(KINDS)
+
+
+@pytest.mark.parametrize("jump", [-JUMP_S, 0, JUMP_S])
+@pytest.mark.parametrize("came", [100.0, 130.0])
+def test_a_jump_does_not_change_when_an_item_was_written(jump, came):
+    """Also where it came late: order is that of writing, whoever has the wrong clock."""
+    assert by_the_right_clock(99.5 + jump, came) == 99.5
