@@ -8,7 +8,8 @@ alone; `reproducible_pps` with blocking and `--reproducible`; `packet_in_pps` wi
 `in_flight` is how many packets were when each block took effect, `passed_in_flight` those of blocked senders;
 `blocking_passes` says how often the capture was replayed for `blocking_pps`, the dry run included.
 `kept_pps` is the default with `--keep`, which archives packets and scores, too: `archived_bytes_per_packet`.
-`detector_vs_kernel` is in batches of 1,024 packets; `detector_vs_kernel_handed_over` in the largest of the loop, of 8,192.
+`detector_vs_kernel` is in batches of 1,024 packets, `detector_vs_kernel_by_batch` in those of several sizes up to the
+largest of the loop; `batch_packets` is how many packets the batches of `kept` had on average.
 `best_pps` is the best round.  Rounds take turns; figures are medians of `rounds`, which are fewer than asked for
 (five) if all parts together would take more than ten minutes (`kept`, reproducible and packet-ins: of the first alone).
 `rss_mb` is the most memory of each process.  `--long` adds one replay of a capture of 764,137 packets with the same
@@ -37,6 +38,7 @@ from benchmarks.measure import arguments, machine, table, write_json
 from benchmarks.replay_live import live
 from benchmarks.replay_processes import ProcessMeter
 from benchmarks.switch_pipeline import figures_of
+from due.backends import open_archive
 from sdnator.capture.packet_sources import Batch, CaptureSource
 from sdnator.datasets.mirai_like import MiraiLikeOptions, make
 from sdnator.replay import run
@@ -48,13 +50,14 @@ LONG_PACKETS = 764_137
 """Of the published Mirai capture."""
 BENIGN_SHARE = 0.45
 PACKETS_A_SECOND = 28
-HANDED_OVER = 8_192
-"""Packets of the largest batch that the controller hands over in a replay: four full lists of digests."""
+LARGER = (2_048, 4_096, 8_192)
+"""Packets of larger batches; the last is four full lists of digests, the most that the controller hands over at once."""
 ROUNDS = 5
 LONGEST_S = 600.0
 """All parts: no round of the loop, which comes last, begins that is likely to end later than that."""
 ONCE = ("kept", "reproducible", "packet_in")
 """Ways that are measured in the first round alone."""
+_SCORES = "network.anomaly.kitsune.score"
 PARTS = ("loop", "detector", "pipeline", "live")
 PIPELINE_S = 1.0
 """Traffic of each round."""
@@ -86,6 +89,7 @@ def one_round(
             progress=lambda _: meter.look,
         )
         archived = sum(each.stat().st_size for each in Path(folder).glob("*/archive.db*"))
+        scored = batch_sizes(Path(folder)) if kept else []
     figures, packets = run.figures(outcome), surveyed.packets
     # a dry run that goes first is part of what blocking costs, and so is a pass that was made again
     seconds = sum(each.seconds for each in outcome.passes)
@@ -100,7 +104,20 @@ def one_round(
         "start_cpu_s": round(sum(meter.start_cpu_s().values()), 2),
         "rss_mb": meter.peak_mb(),
         "archived_bytes_per_packet": round(archived / packets, 1),
+        "batch_packets": round(statistics.mean(scored), 1) if scored else 0.0,
     }, outcome.reported
+
+
+def batch_sizes(folder: Path) -> list[int]:
+    """Packets of each batch that was scored, from the archives that `--keep` has left."""
+    found = []
+    for path in folder.glob("*/archive.db"):
+        driver = open_archive(f"sqlite://{path}")
+        try:
+            found += [len(item.value["score"]) for item in driver.find({"dataKey": _SCORES})]
+        finally:
+            driver.close()
+    return found
 
 
 def batches_of(capture: Path) -> list[Batch]:
@@ -203,15 +220,19 @@ def measured(capture: Path, rounds: int, deadline: float) -> dict[str, Any]:
         "start_cpu_s": statistics.median(each["start_cpu_s"] for each in default),
         "rss_mb": _medians([each["rss_mb"] for each in default]),
         "archived_bytes_per_packet": found["kept"][0]["archived_bytes_per_packet"],
+        "batch_packets": found["kept"][0]["batch_packets"],
         "scores_equal": scores_equal(batches_of(capture), result, options),
     }
 
 
-def detector_figures(capture: Path, rounds: int) -> dict[str, float]:
-    """`detector_vs_kernel` in both sizes of batches."""
+def detector_figures(capture: Path, rounds: int) -> dict[str, Any]:
+    """`detector_vs_kernel` in batches of several sizes."""
     batches, options = batches_of(capture), ReplayOptions()
-    handed_over = detector_vs_kernel(joined(batches, HANDED_OVER), options, rounds)["detector_vs_kernel"]
-    return detector_vs_kernel(batches, options, rounds) | {"detector_vs_kernel_handed_over": handed_over}
+    found = detector_vs_kernel(batches, options, rounds)
+    ratios = {len(batches[0]["length"]): found["detector_vs_kernel"]}
+    for packets in LARGER:
+        ratios[packets] = detector_vs_kernel(joined(batches, packets), options, rounds)["detector_vs_kernel"]
+    return found | {"detector_vs_kernel_by_batch": {f"{size}": ratio for size, ratio in ratios.items()}}
 
 
 def _medians(rows: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from apps.evidence import Evidence
 from apps.kitsune.accused import LEAST_NATS, Accused
-from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, Mode
+from apps.kitsune.afterimage import HORIZON_S, MAX_LINKS, MAX_STREAMS, AfterImage, FeatureRoom, Mode
 from apps.kitsune.behaviour.behaviour import CALIBRATION_PACKETS
 from apps.kitsune.behaviour.findings import Finding
 from apps.kitsune.behaviour.fingerprints import SynFingerprints
@@ -141,7 +141,7 @@ class Detector:
         self._check = TrainingCheck()
         self._trained_at_us = 0
         self._kernel = kernel
-        self._room = RowRoom()
+        self._room, self._feature_room = RowRoom(), FeatureRoom()
         self.senders = Senders(kernel)
         self.behaviour = NativeBehaviour(settings.fm_grace + settings.ad_grace + 1, kernel)
         self.fingerprints = SynFingerprints(kernel)
@@ -192,7 +192,7 @@ class Detector:
         """
         rows = KernelRows(self._kernel, batch, self._room)
         if features is None:
-            features = self.afterimage.update(rows)
+            features = self.afterimage.update(rows, self._feature_room)
         before = self.model.trained
         scores, errors = self.model.process(features)
         trained = self.model.trained - before

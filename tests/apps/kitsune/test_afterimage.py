@@ -1,6 +1,7 @@
 """Features equal the published ones bit for bit, in the kernel, its twin and the naive version, whatever the traffic."""
 
 import platform
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apps.kitsune.afterimage import WIDTH, AfterImage, seconds
+from apps.kitsune.afterimage import WIDTH, AfterImage, FeatureRoom, seconds
 from due import RecordBatch
 from sdnator.testing.oracles.afterimage import NaiveAfterImage as Naive
 from sdnator.testing.packet_rows import batch_of, blank, part, tshark_fields
@@ -247,3 +248,25 @@ def test_time_in_seconds_is_the_captures_own():
 def test_ceilings_that_hold_no_packet_are_refused():
     with pytest.raises(ValueError, match="max_streams=1"):
         AfterImage("bounded", max_streams=1)
+
+
+def test_features_that_somebody_holds_are_not_overwritten():
+    """Nor where only some rows of them are held."""
+    batch, room, afterimage, other = real(2_000), FeatureRoom(), AfterImage(), AfterImage()
+    parts = [part(batch, at, at + 100) for at in range(0, 2_000, 100)]
+    held = [afterimage.update(each, room)[10:] for each in parts]
+    assert all(np.array_equal(rows, other.update(each)[10:]) for rows, each in zip(held, parts, strict=True))
+
+
+def test_memory_for_features_is_used_again():
+    """Also for somebody who holds the last ones until the next have come."""
+    room = FeatureRoom()
+    last = [room.of(5_000) for _ in range(2)].pop()
+    tracemalloc.start()
+    try:
+        for rows in (5_000, 100, 5_000, 5_000):
+            last = room.of(rows)
+            assert last.shape == (rows, WIDTH)
+        assert tracemalloc.get_traced_memory()[1] < last.nbytes / 10
+    finally:
+        tracemalloc.stop()
