@@ -6,6 +6,7 @@
 #include "state_dump.h"
 
 #define MOST_LOGGED (1u << 26)
+#define LARGEST 1e60 /* more than traffic can sum up to, and its fourth power is a number */
 
 /* ---- numbered cells */
 
@@ -106,7 +107,26 @@ static void dump_pool(Dump *dump, Loading *loading, Pool *pool, DumpCell cell)
     free(seen);
 }
 
+/* Those of a structure that lie in a row. */
+#define NUMBERS(cell, first, after) (const double *)((const char *)(cell) + (first)), ((after) - (first)) / sizeof(double)
+
+/* Statistics that are read are numbers from which features can be computed. */
+static void check_numbers(Dump *dump, const double *numbers, size_t count, double least)
+{
+    for (size_t i = 0; dump->in && i < count; i++)
+        dump_check(dump, numbers[i] >= least && numbers[i] <= LARGEST);
+}
+
 /* ---- streams */
+
+static void check_event(Dump *dump, const Event *event)
+{
+    check_numbers(dump, &event->time, 1, -LARGEST);
+    check_numbers(dump, &event->since, 1, -LARGEST);
+    check_numbers(dump, event->residual, SCALES, -LARGEST);
+    for (int k = 0; dump->in && event->since > 0 && k < SCALES; k++)
+        dump_check(dump, event->factor[k] >= 0 && event->factor[k] <= 1);
+}
 
 static void dump_log(Dump *dump, Loading *loading, int32_t at)
 {
@@ -137,8 +157,10 @@ static void dump_log(Dump *dump, Loading *loading, int32_t at)
         if (self->bounded)
             table->logging[table->logs++] = at;
     }
-    for (uint64_t number = logged_so_far - kept; number < logged_so_far; number++)
+    for (uint64_t number = logged_so_far - kept; number < logged_so_far && !dump->failed; number++) {
         dump_bytes(dump, logged(s, number), offsetof(Event, zero));
+        check_event(dump, logged(s, number));
+    }
 }
 
 static uint32_t dump_stream(Dump *dump, Loading *loading, int32_t at)
@@ -150,6 +172,9 @@ static uint32_t dump_stream(Dump *dump, Loading *loading, int32_t at)
     if (dump->in) {
         s->first_link = s->last_link = s->first_hub_link = s->self_link = NONE;
         dump_check(dump, s->key.length < KEY_BYTES && (s->hub == 0 || s->hub == 1));
+        check_numbers(dump, NUMBERS(s, offsetof(Stream, last), offsetof(Stream, packets)), -LARGEST);
+        check_numbers(dump, s->w, SCALES, 0);
+        check_numbers(dump, s->count, SCALES, 0);
     }
     dump_log(dump, loading, at);
     dump_check(dump, s->hub || !s->logged);
@@ -173,6 +198,10 @@ static uint32_t dump_link(Dump *dump, Loading *loading, int32_t at)
     if (dump->failed)
         return 0;
     if (dump->in) {
+        check_numbers(dump, NUMBERS(link, offsetof(Link, last), offsetof(Link, next)), -LARGEST);
+        check_numbers(dump, NUMBERS(link, offsetof(Link, then), sizeof *link), -LARGEST);
+        check_numbers(dump, link->w3, SCALES, 0);
+        check_numbers(dump, NUMBERS(link, offsetof(Link, count_then), offsetof(Link, residuals_then)), 0);
         for (int side = 0; side < 2; side++) {
             int32_t end = link->end[side];
             dump_check(dump, end >= 0 && end < table->streams.used);
@@ -353,6 +382,8 @@ static int dump_afterimage(Dump *dump, AfterImage *self)
     DUMP(dump, self->clock);
     DUMP(dump, self->offset);
     dump_check(dump, self->order < UINT64_MAX / 2);
+    check_numbers(dump, &self->clock, 1, -HUGE_VAL); /* before the first packet */
+    check_numbers(dump, &self->offset, 1, -LARGEST);
     dump_tables(dump, self);
     return dump_end(dump);
 }

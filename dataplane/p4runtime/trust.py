@@ -54,7 +54,8 @@ def read_program(bmv2_json: Path, p4info: Path | None = None) -> Any:
                 raise TrustError(f"{path} is too large for a program")
         config.p4_device_config = bmv2_json.read_bytes()
         text_format.Parse(described.read_text(encoding="utf-8"), config.p4info)
-    except (OSError, UnicodeError, text_format.ParseError) as error:
+    except (OSError, ValueError, text_format.ParseError) as error:
+        # ValueError: it is not UTF-8, or a number is one that its field cannot hold
         if isinstance(error, FileNotFoundError):
             raise TrustError(
                 f"{error.filename}: no such file; p4c writes a BMv2 JSON and its p4info"

@@ -20,6 +20,8 @@ NAME = "sdnator.toml"
 PREFIX = "SDNATOR_"
 MAX_BYTES = 1 << 18
 """The largest file that is read."""
+_SHOWN = 80
+"""Characters of a wrong value that are shown."""
 _WANTED = {
     "int_type": "a whole number",
     "int_from_float": "a whole number",
@@ -150,10 +152,11 @@ def _parsed(text: str, path: Path | None) -> tuple[dict[str, Any], dict[config_l
         raise WrongConfiguration(
             [Fault(f"{path}:{line if line.isdigit() else 1}", "", f"this is not TOML: {what}")]
         ) from None
-    except RecursionError:
-        raise WrongConfiguration(
-            [Fault(f"{path}:1", "", "this is not TOML: it is nested too deeply")]
-        ) from None
+    except (RecursionError, ValueError) as error:
+        what = (
+            "it is nested too deeply" if isinstance(error, RecursionError) else "a number has too many digits"
+        )
+        raise WrongConfiguration([Fault(f"{path}:1", "", f"this is not TOML: {what}")]) from None
     return given, lines_of(text)
 
 
@@ -188,6 +191,8 @@ def _fault(error: Any, place: Callable[[config_lines.Path], str]) -> Fault:
         kind = "section" if len(at) == 1 else "option"
         return Fault(place(at), option, f"there is no such {kind}{_meant(at)}")
     got = json.dumps(error["input"], default=str)
+    if len(got) > _SHOWN:
+        got = f"{got[:_SHOWN]}…"
     if error["type"] == "literal_error":
         return Fault(place(at), option, f"{got} is none of {error['ctx']['expected']}")
     wanted = _WANTED.get(error["type"])
@@ -288,7 +293,7 @@ def _typed(text: str, kind: Any) -> Any:
         return text
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         if get_origin(kind) is tuple:
             return [one.strip() for one in text.split(",") if one.strip()]
         return text

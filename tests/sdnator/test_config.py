@@ -98,6 +98,12 @@ def test_wrong_variables_are_named(tmp_path):
     assert fault == '$SDNATOR_KITSUNE_THRESHOLD: kitsune.threshold: "high": give a number'
 
 
+def test_a_variable_with_too_many_digits_is_named(tmp_path):
+    (fault,) = faults(tmp_path, "", {"SDNATOR_KITSUNE_THRESHOLD": "9" * 5_000})
+    assert fault.startswith("$SDNATOR_KITSUNE_THRESHOLD: kitsune.threshold: ")
+    assert len(fault) < 300
+
+
 def test_nothing_given_costs_nothing_and_means_the_defaults():
     given = load(None, {})
     assert given.given == {}

@@ -141,6 +141,7 @@ def test_mutated_settings(tmp_path, mutations):
     ("content", "words"),
     [
         (b"a = " + b"[" * 50_000, "nested too deeply"),
+        (b"a = " + b"9" * 5_000, "a number has too many digits"),
         (b"# " + b"x" * 300_000, "larger than 262,144 bytes"),
         (b"\xff\xfe", "not UTF-8 text"),
     ],

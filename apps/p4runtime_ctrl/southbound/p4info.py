@@ -94,7 +94,8 @@ class ProgramInfo:
         """Read a p4info in protobuf text format; raises `P4InfoError` for any other text."""
         try:
             return cls(text_format.Parse(text, p4info.P4Info()))
-        except text_format.ParseError as error:
+        except (text_format.ParseError, ValueError) as error:
+            # ValueError: a number that its field cannot hold
             raise P4InfoError(f"not a p4info in text format: {error}") from error
         except KeyError as error:
             raise P4InfoError(

@@ -14,6 +14,7 @@ from apps.kitsune.packed_arrays import CheckpointError, pack, unpack
 from due import RecordBatch
 from tests.apps.kitsune.random_traffic import traffic
 
+NUMBERS = (np.nan, np.inf, -np.inf, -1.0, -1e300, 1e75, 1e300)
 TRAINING = {"fm_grace": 60, "ad_grace": 240, "calibration_packets": 200, "threshold": 0.05}
 SMALL = {"max_streams": 12, "max_links": 9, "horizon": 20.0}
 
@@ -135,6 +136,23 @@ def test_a_damaged_checkpoint_is_refused_or_works(data, stage):
         for batch in batches(5, 3):
             results(detector, batch)
         load(dump(detector), options, load_kernel())
+
+
+@settings(max_examples=150, deadline=None)
+@given(stage=st.sampled_from([1, 3]), place=st.integers(0), number=st.sampled_from(NUMBERS))
+def test_damaged_statistics_are_refused_or_yield_numbers(stage, place, number):
+    """Training ended with an error in the middle of the traffic, and again after each restart."""
+    header, arrays = unpack(checkpoints()[stage], MARK, VERSION)
+    at = place * 4 % (len(arrays["afterimage"]) - 8)
+    arrays["afterimage"][at : at + 8] = np.frombuffer(np.float64(number).tobytes(), np.uint8)
+    options = DetectorSettings(mode="bounded", **TRAINING, **SMALL)
+    try:
+        detector, _ = load(pack(MARK, VERSION, header, arrays), options, load_kernel())
+    except CheckpointError:
+        return
+    for batch in batches(5, 2):
+        features = detector.afterimage.update(batch)
+        assert np.isfinite(np.square(features)).all()
 
 
 @pytest.mark.parametrize("name", [None, -1, [1, None], "s1", ["s9", 1, 2, 3]])

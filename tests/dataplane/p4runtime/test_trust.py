@@ -17,6 +17,7 @@ from dataplane.p4runtime.trust import (
     TrustError,
     own_program,
     program_hash,
+    read_program,
     read_trusted,
 )
 from sdnator.cli.main import app
@@ -131,6 +132,14 @@ def test_a_list_that_is_none_is_an_error(listed, text):
     listed.write_text(text)
     with pytest.raises(TrustError):
         read_trusted(listed)
+
+
+def test_a_p4info_with_a_number_that_its_field_cannot_hold_is_an_error(tmp_path):
+    program = tmp_path / "x.json"
+    program.write_text("{}")
+    program.with_suffix(".p4info.txtpb").write_text("tables { match_fields { match_type: 4294967295 } }")
+    with pytest.raises(TrustError, match="give the BMv2 JSON that p4c wrote"):
+        read_program(program)
 
 
 def test_a_wrong_hash_on_the_command_line_is_one_line():

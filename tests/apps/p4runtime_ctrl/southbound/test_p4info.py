@@ -87,8 +87,9 @@ def test_a_foreign_program_is_read_and_its_lacks_are_named():
     assert small.describe(entry) == "I.acl[h.ip.src=167772161]@1"
     with pytest.raises(P4InfoError, match="lacks timestamp"):
         small.header("packet_in", ["ingress_port", "timestamp"])
-    with pytest.raises(P4InfoError, match="not a p4info"):
-        ProgramInfo.from_text("{ not a p4info")
+    for text in ("{ not a p4info", "tables { match_fields { match_type: 4294967295 } }"):
+        with pytest.raises(P4InfoError, match="not a p4info"):
+            ProgramInfo.from_text(text)
 
 
 def test_a_table_with_an_action_that_is_not_there_is_refused():
