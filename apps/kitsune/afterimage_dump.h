@@ -7,6 +7,7 @@
 
 #define MOST_LOGGED (1u << 26)
 #define LARGEST 1e60 /* more than traffic can sum up to, and its fourth power is a number */
+#define LEAST_SPREAD 1e-12 /* of lengths, if they differ: rounding alone makes it larger */
 
 /* ---- numbered cells */
 
@@ -175,6 +176,9 @@ static uint32_t dump_stream(Dump *dump, Loading *loading, int32_t at)
         check_numbers(dump, NUMBERS(s, offsetof(Stream, last), offsetof(Stream, packets)), -LARGEST);
         check_numbers(dump, s->w, SCALES, 0);
         check_numbers(dump, s->count, SCALES, 0);
+        int64_t which = loading->table - loading->self->table;
+        for (int k = 0; (which == HOSTS || which == SOCKETS) && k < SCALES; k++) /* correlations are divided by it */
+            dump_check(dump, !s->std[k] || s->std[k] >= LEAST_SPREAD);
     }
     dump_log(dump, loading, at);
     dump_check(dump, s->hub || !s->logged);

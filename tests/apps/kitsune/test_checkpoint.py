@@ -14,7 +14,7 @@ from apps.kitsune.packed_arrays import CheckpointError, pack, unpack
 from due import RecordBatch
 from tests.apps.kitsune.random_traffic import traffic
 
-NUMBERS = (np.nan, np.inf, -np.inf, -1.0, -1e300, 1e75, 1e300)
+NUMBERS = (np.nan, np.inf, -np.inf, -1.0, -1e300, 1e75, 1e300, 1e-310, 1e-200)
 TRAINING = {"fm_grace": 60, "ad_grace": 240, "calibration_packets": 200, "threshold": 0.05}
 SMALL = {"max_streams": 12, "max_links": 9, "horizon": 20.0}
 
