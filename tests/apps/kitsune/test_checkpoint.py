@@ -138,7 +138,7 @@ def test_a_damaged_checkpoint_is_refused_or_works(data, stage):
         load(dump(detector), options, load_kernel())
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(stage=st.sampled_from([1, 3]), place=st.integers(0), number=st.sampled_from(NUMBERS))
 def test_damaged_statistics_are_refused_or_yield_numbers(stage, place, number):
     """Training ended with an error in the middle of the traffic, and again after each restart."""
