@@ -26,6 +26,8 @@ _HEAD = 42
 _FREE_SOURCES = 40
 _TIMESTAMP = 35
 """SO_TIMESTAMPNS of Linux, which Python does not name."""
+_EVERY = 3
+"""ETH_P_ALL: a socket that asks for it before it is bound gets frames of all interfaces."""
 _STAMP = struct.Struct("@qq")
 
 
@@ -142,10 +144,10 @@ def copy(entry: str, leave: str) -> None:
 
 
 def _open(interface: str) -> socket.socket:
-    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     opened.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
-    opened.bind((interface, 0))
+    opened.bind((interface, _EVERY))
     return opened
 
 

@@ -79,7 +79,8 @@ class DelayingRelay:
 
 
 def _opened(name: str) -> socket.socket:
-    made = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_ALL))
+    # protocol 0 until it is bound, or frames of all interfaces would come in
+    made = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     made.setsockopt(_SOL_PACKET, _IGNORE_OUTGOING, 1)
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
     made.bind((name, _ALL))

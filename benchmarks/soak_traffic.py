@@ -23,6 +23,8 @@ _SLICE_S = 0.02
 _AHEAD = 20_000
 _HOURS = 24 * 365
 _OUTGOING = 4
+_EVERY = 3
+"""ETH_P_ALL: a socket that asks for it before it is bound gets frames of all interfaces."""
 _HEAD = 34
 
 
@@ -150,7 +152,7 @@ def _sources(head: bytes) -> set[str]:
 
 
 def _open(interface: str) -> socket.socket:
-    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
-    opened.bind((interface, 0))
+    opened.bind((interface, _EVERY))
     return opened

@@ -56,7 +56,7 @@ class WireFeed:
     def __init__(self, interface: str) -> None:
         self.interface = interface
         try:
-            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL))
+            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # it receives nothing
             self._socket.bind((interface, 0))
         except PermissionError:
             raise BadInput(f"--inject {interface}: sending frames needs root; run as root") from None

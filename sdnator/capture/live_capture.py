@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
+from sdnator.capture.interfaces import ETH_P_ALL
 from sdnator.capture.packet_sources import BATCH, Batch, frame_batch
 from sdnator.errors import BadInput
 
-_ETH_P_ALL: Final = 3
-_SOL_PACKET, _PACKET_AUXDATA = 263, 8
+_SOL_PACKET, _PACKET_ADD_MEMBERSHIP, _PACKET_AUXDATA, _PACKET_MR_PROMISC = 263, 1, 8, 1
 _AUXDATA: Final = struct.Struct("=IIIHHHH")
 _VLAN_VALID, _VLAN_TPID_VALID = 0x10, 0x40
 _MOST: Final = 65_536
@@ -23,21 +23,24 @@ _PERIOD_S: Final = 0.1
 class LiveSource:
     """Frames that arrive at an interface, in batches about every tenth of a second, until `stop()` is true.
 
-    VLAN tags that the network card took off are put back.  Raises `BadInput` when there is no such
+    Also those for others: the interface is promiscuous meanwhile, as one at a mirror port has to be.  VLAN tags that the network card took off are put back.  Raises `BadInput` when there is no such
     interface or the rights are missing.
     """
 
     def __init__(self, interface: str, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
         try:
-            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_ETH_P_ALL))
+            # protocol 0 until it is bound, or frames of all interfaces would come in
+            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
         except PermissionError:
             raise BadInput(
                 f"{interface}: listening needs root or CAP_NET_RAW; use sudo, or give a capture"
             ) from None
         try:
             self._socket.setsockopt(_SOL_PACKET, _PACKET_AUXDATA, 1)
-            self._socket.bind((interface, 0))
+            every = struct.pack("=iHH8s", socket.if_nametoindex(interface), _PACKET_MR_PROMISC, 0, b"")
+            self._socket.setsockopt(_SOL_PACKET, _PACKET_ADD_MEMBERSHIP, every)
+            self._socket.bind((interface, ETH_P_ALL))
         except OSError as error:
             self._socket.close()
             raise BadInput(

@@ -526,6 +526,6 @@ def test_two_interfaces_are_a_wire_and_their_packets_are_seen(operator, switch):
 
 
 def raw(interface):
-    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
-    opened.bind((interface, 0))
+    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+    opened.bind((interface, 3))  # all frames, but of this interface only
     return opened

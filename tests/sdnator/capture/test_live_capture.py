@@ -33,16 +33,51 @@ print(vlans, lengths)
 """
 
 
-def test_frames_of_a_veth_pair():
+def said_inside(script):
+    """What a script prints in a network namespace with a pair of interfaces."""
     require_netns()
     setup = (
         "ip link add left type veth peer name right && "
-        "sysctl -q -w net.ipv6.conf.all.disable_ipv6=1 2>/dev/null; ip link set left up && ip link set right up && "
-        f"exec {sys.executable} -c '{SCRIPT}'"
+        "sysctl -q -w net.ipv6.conf.all.disable_ipv6=1 2>/dev/null; "
+        "ip link set lo up && ip link set left up && ip link set right up && "
+        f'exec {sys.executable} -c "$SCRIPT"'
     )
     command = ["unshare", "--net", "sh", "-c", setup]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ, timeout=60)
-    assert done.stdout.strip() == "[-1, 100, -1] [74, 78, 74]", done.stderr
+    given = {**os.environ, "SCRIPT": script}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=given, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_frames_of_a_veth_pair():
+    assert said_inside(SCRIPT) == "[-1, 100, -1] [74, 78, 74]"
+
+
+FLOOD = """
+import socket
+with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as flood:
+    flood.bind(("lo", 0))
+    while True:
+        flood.send(bytes(60))
+"""
+LISTENERS = f"""
+import subprocess, sys
+from sdnator.capture.live_capture import LiveSource
+flood = subprocess.Popen([sys.executable, "-c", {FLOOD!r}])
+came = 0
+for _ in range(20):
+    answers = iter((False, True))
+    source = LiveSource("left", lambda: next(answers))
+    shown = subprocess.run(["ip", "-d", "link", "show", "left"], capture_output=True, text=True).stdout
+    came += sum(len(batch["length"]) for batch in source)
+flood.kill()
+print(came, shown.partition("promiscuity ")[2].split()[0])
+"""
+
+
+def test_frames_of_others_are_taken_but_none_of_other_interfaces():
+    """Nor in the moment in which it is opened."""
+    assert said_inside(LISTENERS) == "0 1"
 
 
 def test_an_interface_that_is_not_there_is_named():
