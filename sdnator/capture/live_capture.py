@@ -23,8 +23,9 @@ _PERIOD_S: Final = 0.1
 class LiveSource:
     """Frames that arrive at an interface, in batches about every tenth of a second, until `stop()` is true.
 
-    Also those for others: the interface is promiscuous meanwhile, as one at a mirror port has to be.  VLAN tags that the network card took off are put back.  Raises `BadInput` when there is no such
-    interface or the rights are missing.
+    Also those for others: the interface is promiscuous meanwhile, as one at a mirror port has to be.  VLAN tags that
+    the network card took off are put back.  Raises `BadInput` when there is no such interface or the rights are
+    missing.
     """
 
     def __init__(self, interface: str, stop: Callable[[], bool] = lambda: False) -> None:
