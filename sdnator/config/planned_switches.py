@@ -143,6 +143,7 @@ def parse_wires(options: Sequence[str] | None, ports: Mapping[int, str], switch:
 
 
 def _port_number(text: str, option: str) -> int:
-    if not text.isascii() or not text.isdecimal() or int(text) not in _PORTS[1:-1]:
+    # int() takes no more than some thousand digits
+    if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) not in _PORTS[1:-1]:
         raise BadInput(f"{option}: ports are numbered from 1 to 509")
     return int(text)
