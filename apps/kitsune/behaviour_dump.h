@@ -9,6 +9,38 @@
 #include "table_dump.h"
 
 #define MOST_DUMPED_EVENTS (2 * MOST_EVENTS)
+#define LARGEST_COUNT 1e15 /* more than seconds, nats and counts of packets ever are */
+
+/* Seconds, nats and counts that are read are numbers, of which messages can tell. */
+static void check_count(Dump *dump, double number)
+{
+    if (dump->in)
+        dump_check(dump, number >= -LARGEST_COUNT && number <= LARGEST_COUNT);
+}
+
+/* As `check_count`; what has not happened yet was endlessly long ago. */
+static void check_past(Dump *dump, double number)
+{
+    if (number != -INFINITY)
+        check_count(dump, number);
+}
+
+/* A payload of doubles; `context` is its table. */
+static void dump_counts(Dump *dump, void *context, void *of)
+{
+    size_t bytes = ((const Table *)context)->stride - sizeof(Head);
+    const double *numbers = of;
+    dump_bytes(dump, of, bytes);
+    for (size_t i = 0; i < bytes / sizeof *numbers; i++)
+        check_past(dump, numbers[i]);
+}
+
+static void dump_visit(Dump *dump, void *context, void *of)
+{
+    (void)context;
+    dump_bytes(dump, of, sizeof(Visit));
+    check_count(dump, ((const Visit *)of)->time);
+}
 
 /* ---- events of a subject */
 
@@ -42,6 +74,10 @@ static void dump_events(Dump *dump, void *context, void *of)
         dump_check(dump, events->first[i] >= 0 && events->first[i] <= count);
     dump_bytes(dump, times_of(events), (size_t)count * sizeof(double));
     dump_bytes(dump, times_of(events) + events->room, ((size_t)count + 1) * sizeof(double));
+    for (int32_t i = 0; i < count; i++)
+        check_count(dump, times_of(events)[i]);
+    for (int32_t i = 0; i <= count; i++)
+        check_count(dump, times_of(events)[events->room + i]);
 }
 
 static void dump_counter(Dump *dump, Counter *counter)
@@ -52,10 +88,15 @@ static void dump_counter(Dump *dump, Counter *counter)
     DUMP(dump, counter->shared_scale);
     DUMP(dump, counter->rarity);
     DUMP(dump, counter->begun);
+    const double numbers[] = {counter->own_scale, counter->shared_scale, counter->rarity};
+    for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++)
+        check_count(dump, numbers[i]);
+    for (int i = 0; i < MOST_WINDOWS; i++)
+        check_count(dump, counter->begun[i]);
     dump_table(dump, &counter->events, dump_events, counter);
-    dump_table(dump, &counter->shared, NULL, NULL);
-    dump_table(dump, &counter->highest, NULL, NULL);
-    dump_table(dump, &counter->reported, NULL, NULL);
+    Table *counts[] = {&counter->shared, &counter->highest, &counter->reported};
+    for (size_t i = 0; i < sizeof counts / sizeof *counts; i++)
+        dump_table(dump, counts[i], dump_counts, counts[i]);
     if (dump->in) {
         counter->quiet = NONE;
         counter->is_shared_known = 0;
@@ -68,6 +109,7 @@ static void dump_pending(Dump *dump, void *context, void *of)
 {
     (void)context;
     dump_bytes(dump, of, offsetof(Pending, known) + sizeof(int32_t)); /* without what pads it */
+    check_count(dump, ((const Pending *)of)->time);
 }
 
 static void dump_dues(Dump *dump, const Behaviour *b, Dues *dues)
@@ -88,6 +130,7 @@ static void dump_dues(Dump *dump, const Behaviour *b, Dues *dues)
     for (int32_t i = 0; i < count && !dump->failed; i++) {
         Due *due = &dues->due[(dues->from + i) & (dues->room - 1)];
         DUMP(dump, due->deadline);
+        check_count(dump, due->deadline);
         DUMP(dump, due->contact.subject);
         if (dump->in)
             due->contact = keyed_by(b, due->contact.subject);
@@ -97,8 +140,11 @@ static void dump_dues(Dump *dump, const Behaviour *b, Dues *dues)
 static void dump_tail(Dump *dump, Behaviour *b)
 {
     int32_t count = dump_number(dump, (int32_t)b->tail_count, b->limits.calibration);
-    for (int32_t i = 0; i < count && !dump->failed; i++)
-        DUMP(dump, b->tail[(b->tail_from + i) % b->limits.calibration]);
+    for (int32_t i = 0; i < count && !dump->failed; i++) {
+        Trained *each = &b->tail[(b->tail_from + i) % b->limits.calibration];
+        DUMP(dump, *each);
+        check_count(dump, each->time);
+    }
     if (dump->in)
         b->tail_count = count;
 }
@@ -122,6 +168,13 @@ static void dump_numbers(Dump *dump, Behaviour *b)
     DUMP(dump, b->outside_gap);
     DUMP(dump, b->silence);
     DUMP(dump, b->in_vain_since);
+    const double numbers[] = {b->callback_nats, b->callback_usual, b->arp_grace, b->slowest_arp, b->begun, b->seconds, b->outside_last,
+                              b->outside_gap, b->silence, b->in_vain_since};
+    for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++)
+        check_past(dump, numbers[i]);
+    for (size_t i = 0; i < sizeof b->one_way_most / sizeof *b->one_way_most; i++)
+        for (int block = 0; block < MOST_BLOCKS; block++)
+            check_past(dump, b->one_way_most[i][block]);
     b->outside_heard = dump_number(dump, b->outside_heard, 1);
     b->outside_reached = dump_number(dump, b->outside_reached, 1);
     b->learning = dump_number(dump, b->learning, 1);
@@ -177,16 +230,21 @@ static void check_senders(Dump *dump, const Behaviour *b, int32_t switches)
 
 static int dump_behaviour(Dump *dump, Behaviour *b, int32_t switches)
 {
-    Table *plain[] = {&b->failures, &b->called, &b->visits, &b->vain, &b->proven, &b->senders, &b->owners, &b->owner_macs, &b->exchanges,
-                      &b->asked, &b->logins, &b->strangers, &b->told, &b->in_vain, &b->known};
+    Table *const plain[] = {&b->failures, &b->called, &b->visits, &b->vain, &b->proven, &b->senders, &b->owners, &b->owner_macs,
+                            &b->exchanges, &b->asked, &b->logins, &b->strangers, &b->told, &b->in_vain, &b->known};
+    Table *const counts[] = {&b->failures, &b->called, &b->owners, &b->asked, &b->told};
     dump_same(dump, b->limits.calibration);
     dump_same(dump, b->limits.blocks);
     for (int what = 0; what < STATISTICS && !dump->failed; what++) {
         dump_same(dump, b->counter[what].set.windows);
         dump_counter(dump, &b->counter[what]);
     }
-    for (size_t i = 0; i < sizeof plain / sizeof *plain; i++)
-        dump_table(dump, plain[i], NULL, NULL);
+    for (size_t i = 0; i < sizeof plain / sizeof *plain; i++) {
+        DumpPayload each = plain[i] == &b->visits ? dump_visit : NULL;
+        for (size_t j = 0; j < sizeof counts / sizeof *counts; j++)
+            each = plain[i] == counts[j] ? dump_counts : each;
+        dump_table(dump, plain[i], each, plain[i]);
+    }
     dump_table(dump, &b->pending, dump_pending, NULL);
     for (int which = 0; which < 2; which++)
         dump_dues(dump, b, &b->dues[which]);

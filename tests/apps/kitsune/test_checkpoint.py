@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from apps.evidence import Evidence
 from apps.kitsune.checkpoint import MARK, VERSION, dump, load
 from apps.kitsune.detector import Detector, DetectorSettings
 from apps.kitsune.kernel import load_kernel
@@ -138,21 +139,37 @@ def test_a_damaged_checkpoint_is_refused_or_works(data, stage):
         load(dump(detector), options, load_kernel())
 
 
+@pytest.mark.parametrize("name", ["afterimage", "behaviour"])
 @settings(max_examples=60, deadline=None)
-@given(stage=st.sampled_from([1, 3]), place=st.integers(0), number=st.sampled_from(NUMBERS))
-def test_damaged_statistics_are_refused_or_yield_numbers(stage, place, number):
-    """Training ended with an error in the middle of the traffic, and again after each restart."""
+@given(stage=st.sampled_from([1, 3, 9]), place=st.integers(0), number=st.sampled_from(NUMBERS))
+def test_damaged_statistics_are_refused_or_yield_numbers(name, stage, place, number):
+    """Training or evidence ended with an error in the middle of the traffic, and again after each restart."""
     header, arrays = unpack(checkpoints()[stage], MARK, VERSION)
-    at = place * 4 % (len(arrays["afterimage"]) - 8)
-    arrays["afterimage"][at : at + 8] = np.frombuffer(np.float64(number).tobytes(), np.uint8)
+    at = place * 4 % (len(arrays[name]) - 8)
+    arrays[name][at : at + 8] = np.frombuffer(np.float64(number).tobytes(), np.uint8)
     options = DetectorSettings(mode="bounded", **TRAINING, **SMALL)
     try:
         detector, _ = load(pack(MARK, VERSION, header, arrays), options, load_kernel())
     except CheckpointError:
         return
-    for batch in batches(5, 2):
-        features = detector.afterimage.update(batch)
-        assert np.isfinite(np.square(features)).all()
+    for batch in batches(5, 3):
+        scored, _ = detector.process(batch, "s1")
+        assert np.isfinite(np.square(scored.features)).all()
+        for evidence in detector.take_evidence():
+            assert Evidence.from_value(evidence.to_value()) == evidence
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, 1e300])
+def test_times_that_are_none_are_refused(number):
+    """Evidence that begins at no time ended Kitsune."""
+    header, arrays = unpack(checkpoints()[9], MARK, VERSION)
+    data = arrays["behaviour"].tobytes()
+    for time in {time for batch in batches(1, 9) for time in (batch["time_us"] / 1e6).tolist()}:
+        data = data.replace(np.float64(time).tobytes(), np.float64(number).tobytes())
+    damaged = {**arrays, "behaviour": np.frombuffer(data, np.uint8)}
+    options = DetectorSettings(mode="bounded", **TRAINING, **SMALL)
+    with pytest.raises(CheckpointError):
+        load(pack(MARK, VERSION, header, damaged), options, load_kernel())
 
 
 @pytest.mark.parametrize("name", [None, -1, [1, None], "s1", ["s9", 1, 2, 3]])
