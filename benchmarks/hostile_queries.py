@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 from urllib.parse import quote
 
+import msgspec
 import numpy as np
 
 from apps.packets import PACKET_COLUMNS, read_columns, read_frames
@@ -52,7 +53,7 @@ def _archive() -> MemoryArchive:
 
 
 def _query(data: bytes) -> object:
-    query = parse(json.loads(data))
+    query = parse(msgspec.json.decode(data))
     query.to_mongo(lambda _: [], {"timestamp": 5, "eventTime": 5})
     query.to_sql(lambda _: [], {"timestamp": 5, "eventTime": 5})
     return [query.matches(item) for item in _ITEMS]
@@ -214,7 +215,7 @@ TARGETS = (
     DecoderTarget(
         "archive query",
         _query,
-        (InvalidQuery, InvalidKey, json.JSONDecodeError, UnicodeDecodeError, RecursionError),
+        (InvalidQuery, InvalidKey, msgspec.DecodeError, RecursionError),
         tuple(json.dumps(query).encode() for query in _QUERIES),
         mutate_json,
     ),

@@ -9,13 +9,14 @@ import sqlite3
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from due.drivers.query import ArchiveQuery
 from due.drivers.query_tree import Condition
-from due.errors import ArchiveUnavailable, BackendError
+from due.errors import ArchiveUnavailable, BackendError, InvalidKey
+from due.keys import Key
 from due.messages import Item
 
 _VERSION = 1
@@ -58,9 +59,18 @@ _inherited: list[sqlite3.Connection] = []
 
 
 class Dictionary:
-    """The ids of one small table of texts, and which of them meet a condition; read as it grows."""
+    """The ids of one small table of texts, and which of them meet a condition; read as it grows.
 
-    def __init__(self, table: str, used_as: str, *columns: str) -> None:
+    Args:
+        table: its name.
+        used_as: the column of `frames` that refers to it.
+        columns: those with the texts.
+        check: raises `InvalidKey` for a first text that is damaged.
+    """
+
+    def __init__(
+        self, table: str, used_as: str, *columns: str, check: Callable[[str], object] | None = None
+    ) -> None:
         self._select = f"SELECT id, {', '.join(columns)} FROM {table} WHERE id > ? ORDER BY id"  # noqa: S608 our own names
         self._insert = (
             f"INSERT INTO {table}({', '.join(columns)}) VALUES({', '.join('?' * len(columns))}) RETURNING id"
@@ -72,6 +82,7 @@ class Dictionary:
             f"DELETE FROM {table} WHERE id < (SELECT max(id) FROM {table}) "  # noqa: S608 our own names
             f"AND NOT EXISTS (SELECT 1 FROM frames WHERE {used_as} = {table}.id)"
         )
+        self._check = check
         self._lock = threading.Lock()
         self._last = 0
         self._compare_at = 0.0
@@ -86,9 +97,13 @@ class Dictionary:
             for number, *texts in connection.execute(self._select, (self._last,)):
                 self._last = whole_number(number)
                 try:
-                    self.entries[number] = tuple(map(_decoded, texts))
-                except DamagedCell:
+                    decoded = tuple(map(_decoded, texts))
+                    if self._check is not None:
+                        self._check(decoded[0])
+                except (DamagedCell, InvalidKey):
                     self.unreadable.add(number)
+                else:
+                    self.entries[number] = decoded
             if time.monotonic() >= self._compare_at:
                 self._compare_at = time.monotonic() + _COMPARE_S
                 self._drop_pruned({whole_number(each[0]) for each in connection.execute(self._select, (0,))})
@@ -169,7 +184,7 @@ class SqliteFile:
         self._file: tuple[int, int] | None = None
         self._writer: sqlite3.Connection | None = None
         self._idle: deque[sqlite3.Connection] = deque()
-        self.keys = Dictionary("keys", "key_id", "key")
+        self.keys = Dictionary("keys", "key_id", "key", check=Key.parse)
         self.sources = Dictionary("sources", "source_id", "app", "instance")
         self.spans: dict[int, tuple[int, int]] = {}
 
