@@ -215,7 +215,7 @@ TARGETS = (
     DecoderTarget(
         "archive query",
         _query,
-        (InvalidQuery, InvalidKey, msgspec.DecodeError, RecursionError),
+        (InvalidQuery, InvalidKey, msgspec.DecodeError, UnicodeDecodeError, RecursionError),
         tuple(json.dumps(query).encode() for query in _QUERIES),
         mutate_json,
     ),
