@@ -230,21 +230,20 @@ static void check_senders(Dump *dump, const Behaviour *b, int32_t switches)
 
 static int dump_behaviour(Dump *dump, Behaviour *b, int32_t switches)
 {
-    Table *const plain[] = {&b->failures, &b->called, &b->visits, &b->vain, &b->proven, &b->senders, &b->owners, &b->owner_macs,
-                            &b->exchanges, &b->asked, &b->logins, &b->strangers, &b->told, &b->in_vain, &b->known};
-    Table *const counts[] = {&b->failures, &b->called, &b->owners, &b->asked, &b->told};
+    const struct {
+        Table *table;
+        DumpPayload each;
+    } parts[] = {{&b->failures, dump_counts}, {&b->called, dump_counts}, {&b->visits, dump_visit}, {&b->vain, NULL}, {&b->proven, NULL},
+                 {&b->senders, NULL}, {&b->owners, dump_counts}, {&b->owner_macs, NULL}, {&b->exchanges, NULL}, {&b->asked, dump_counts},
+                 {&b->logins, NULL}, {&b->strangers, NULL}, {&b->told, dump_counts}, {&b->in_vain, NULL}, {&b->known, NULL}};
     dump_same(dump, b->limits.calibration);
     dump_same(dump, b->limits.blocks);
     for (int what = 0; what < STATISTICS && !dump->failed; what++) {
         dump_same(dump, b->counter[what].set.windows);
         dump_counter(dump, &b->counter[what]);
     }
-    for (size_t i = 0; i < sizeof plain / sizeof *plain; i++) {
-        DumpPayload each = plain[i] == &b->visits ? dump_visit : NULL;
-        for (size_t j = 0; j < sizeof counts / sizeof *counts; j++)
-            each = plain[i] == counts[j] ? dump_counts : each;
-        dump_table(dump, plain[i], each, plain[i]);
-    }
+    for (size_t i = 0; i < sizeof parts / sizeof *parts; i++)
+        dump_table(dump, parts[i].table, parts[i].each, parts[i].table);
     dump_table(dump, &b->pending, dump_pending, NULL);
     for (int which = 0; which < 2; which++)
         dump_dues(dump, b, &b->dues[which]);
