@@ -50,15 +50,18 @@ class Page:
         driver.get(url)
 
     def seen(self, selector, text=""):
-        """The first visible element, None where there is none now; a page may change under one's eyes."""
-        from selenium.common.exceptions import StaleElementReferenceException
+        """The first visible element, None where there is none now; a page may change under one's eyes.
+
+        The driver says so in several ways: mostly that an element is stale, now and then in the browser's words.
+        """
+        from selenium.common.exceptions import WebDriverException
         from selenium.webdriver.common.by import By
 
         try:
             for found in self.driver.find_elements(By.CSS_SELECTOR, selector):
                 if found.is_displayed() and text in found.text:
                     return found
-        except StaleElementReferenceException:
+        except WebDriverException:
             pass
         return None
 
