@@ -3,9 +3,10 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from due.drivers.base import ArchiveDriver
+from due.drivers.lasting import Lasting
 from due.errors import DueError
 
 log = logging.getLogger("coordinator.retention")
@@ -22,12 +23,16 @@ class Retention:
         age_s: float,
         max_bytes: int,
         every_s: float,
+        lasting_keys: Sequence[str] = (),
+        lasting_age_s: float = 0.0,
     ) -> None:
         self._open_archive = open_archive
         self._allowed = allowed
         self._age_s = age_s
         self._max_bytes = max_bytes
         self._every_s = every_s
+        self._lasting_keys = tuple(lasting_keys)
+        self._lasting_age_s = lasting_age_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator-retention", daemon=True)
         self.deleted = 0
@@ -35,7 +40,7 @@ class Retention:
 
     def start(self) -> None:
         """Start the thread if there is a limit."""
-        if self._age_s > 0 or self._max_bytes > 0:
+        if self._age_s > 0 or self._max_bytes > 0 or self._lasting_age_s > 0:
             self._thread.start()
 
     def stop(self) -> None:
@@ -52,12 +57,19 @@ class Retention:
         archive.close()
 
     def _prune(self, archive: ArchiveDriver) -> None:
-        before = time.time_ns() - int(self._age_s * 1e9) if self._age_s > 0 else None
+        lasting = Lasting(self._lasting_keys, _ago(self._lasting_age_s))
         try:
-            deleted = archive.prune(before=before, max_bytes=self._max_bytes or None)
+            deleted = archive.prune(
+                before=_ago(self._age_s), max_bytes=self._max_bytes or None, lasting=lasting
+            )
         except DueError as error:
             log.warning("the archive could not be pruned: %s; retrying in %g s", error, self._every_s)
             return
         self.deleted += deleted
         if deleted:
             log.info("deleted %d items that exceeded the archive's limit of age or size", deleted)
+
+
+def _ago(seconds: float) -> int | None:
+    """That moment, ns since the epoch; None for 0."""
+    return time.time_ns() - int(seconds * 1e9) if seconds > 0 else None

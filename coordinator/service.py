@@ -22,6 +22,7 @@ import msgspec
 from coordinator.active_standby import ActiveStandby, Claim
 from coordinator.admission import Admission
 from coordinator.api import Api, Northbound
+from coordinator.checkpoint import KEY as CHECKPOINT
 from coordinator.checkpoint import Checkpoints
 from coordinator.readers import ArchiveReaders
 from coordinator.registry import Checkpoint, Registry
@@ -32,7 +33,8 @@ from due import service as due_service
 from due.backends import default_archive, open_archive
 from due.backoff import LONGEST_S
 from due.codec import encode_value
-from due.errors import InvalidOption
+from due.errors import InvalidKey, InvalidOption
+from due.keys import Key
 from due.membership import ASSIGNMENT, HEARTBEAT, REGISTRATION, Heartbeat, Registration
 from due.private_files import write_private
 
@@ -85,11 +87,21 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Age in seconds from which items are deleted from the archive; 0: never."""
     retain_bytes: int = 0
     """Size of the archive in bytes beyond which the oldest items are deleted; 0: no limit."""
+    lasting_keys: tuple[str, ...] = ()
+    """Keys, with wildcards, of what holds until further notice: by age it is deleted after `retain_lasting_s` only, and by
+    size only what exceeds half of `retain_bytes`."""
+    retain_lasting_s: float = 0.0
+    """Age in seconds from which items of `lasting_keys` are deleted; 0: never."""
     retain_every_s: float = 60.0
     """Seconds between two checks of age and size."""
 
     def __post_init__(self) -> None:
         find_strategy(self.selection)
+        for key in self.lasting_keys:
+            try:
+                Key.parse(key)
+            except InvalidKey as error:
+                raise ValueError(f"lasting_keys={key}: {error}") from error
         if not 0 <= self.http_port < 65536:
             raise ValueError(f"http_port={self.http_port}: must be 0 to 65535")
 
@@ -127,6 +139,8 @@ class CoordinatorService:
             age_s=settings.retain_s,
             max_bytes=settings.retain_bytes,
             every_s=settings.retain_every_s,
+            lasting_keys=(CHECKPOINT, *settings.lasting_keys),
+            lasting_age_s=settings.retain_lasting_s,
         )
 
     def start(self) -> None:

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
+from due.drivers.lasting import NOTHING, Lasting
 from due.messages import Item, PackedFrame
 
 NO_RIGHT = (
@@ -63,8 +64,13 @@ class ArchiveDriver(Protocol):
         """
         ...
 
-    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+    def prune(
+        self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
+    ) -> int:
         """Retention: delete items older than `before` (ns), then oldest first down to `max_bytes`.
+
+        Items of `lasting` keys have an age of their own, and by size they go only as far as they exceed half
+        of `max_bytes`: see `due.drivers.lasting`.
 
         Returns how many items were deleted.
         """

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from due.codec import pack, unpack
+from due.drivers.lasting import NOTHING, SHARE, Lasting
 from due.drivers.latest_items import by_age
 from due.drivers.query import parse
 from due.errors import BackendError, InvalidOption
@@ -108,16 +109,22 @@ class MemoryArchive:
         found.sort(key=by_age)
         return found if limit is None else found[max(0, len(found) - limit) :]
 
-    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+    def prune(
+        self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
+    ) -> int:
         """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
         with self._open().lock:
+            lasts = frozenset(lasting.among({row.frame.key for row in self._store.rows}))
             deleted = 0
-            if before is not None:
-                deleted += self._store.drop(
-                    [row for row in self._store.rows if row.frame.last_timestamp < before]
-                )
+            for kept, moment in ((False, before), (True, lasting.before)):
+                if moment is not None:
+                    deleted += self._store.drop(
+                        row
+                        for row in self._store.rows
+                        if (row.frame.key in lasts) is kept and row.frame.last_timestamp < moment
+                    )
             if max_bytes is not None:
-                deleted += self._store.drop(_oldest(self._store.rows, max_bytes))
+                deleted += self._store.drop(_oldest(self._store.rows, max_bytes, lasts))
             return deleted
 
     def close(self) -> None:
@@ -134,12 +141,23 @@ def _plain(condition: Any) -> bool:
     return condition.operator == "eq" and not condition.negated
 
 
-def _oldest(rows: Sequence[_Row], max_bytes: int) -> list[_Row]:
-    excess = sum(len(row.frame.payload) + _OVERHEAD for row in rows) - max_bytes
+def _oldest(rows: Sequence[_Row], max_bytes: int, lasts: frozenset[str]) -> list[_Row]:
+    lasting = [row for row in rows if row.frame.key in lasts]
+    excess = _size(rows) - max_bytes
+    gone = _up_to(min(excess, _size(lasting) - max_bytes // SHARE), lasting)
+    return gone + _up_to(excess - _size(gone), [row for row in rows if row.frame.key not in lasts])
+
+
+def _size(rows: Sequence[_Row]) -> int:
+    return sum(len(row.frame.payload) + _OVERHEAD for row in rows)
+
+
+def _up_to(size: int, rows: Sequence[_Row]) -> list[_Row]:
+    """The oldest rows that hold so many bytes together."""
     gone: list[_Row] = []
     for row in sorted(rows, key=lambda one: one.frame.first_timestamp):
-        if excess <= 0:
+        if size <= 0:
             break
         gone.append(row)
-        excess -= len(row.frame.payload) + _OVERHEAD
+        size -= len(row.frame.payload) + _OVERHEAD
     return gone

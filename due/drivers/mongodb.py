@@ -33,6 +33,7 @@ from pymongo.errors import BulkWriteError, ConnectionFailure, ExecutionTimeout, 
 from pymongo.uri_parser import parse_uri
 
 from due.codec import pack, unpack
+from due.drivers.lasting import NOTHING, SHARE, Lasting
 from due.drivers.latest_items import by_age, latest_items
 from due.drivers.mongodb_latest import HEAD, batch_size, latest_to_end, named_keys
 from due.drivers.mongodb_retention import MongoRetention, naming, number
@@ -116,12 +117,14 @@ class MongoArchive:
         items.sort(key=by_age)
         return items
 
-    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+    def prune(
+        self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
+    ) -> int:
         """Delete documents that are wholly older than `before`, then the oldest down to `max_bytes`."""
         with self.errors():
-            deleted = 0 if before is None else self._retention.older(before)
+            deleted = self._retention.older(before, lasting)
             if max_bytes is not None:
-                deleted += self._retention.larger(max_bytes)
+                deleted += self._retention.larger(max_bytes, lasting, max_bytes // SHARE)
             self._retention.forget_keys()
             return deleted
 

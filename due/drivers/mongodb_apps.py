@@ -9,12 +9,13 @@ URL: `mongodb://USER:PASSWORD@host/database?app=NAME&collection=items`.
 import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 from pymongo.collection import Collection
 from pymongo.errors import OperationFailure
 
+from due.drivers.lasting import NOTHING, SHARE, Lasting
 from due.drivers.latest_items import by_age
 from due.drivers.mongodb import Document, MongoArchive
 from due.drivers.mongodb_sharding import SHARD_KEYS, ShardKey
@@ -93,14 +94,13 @@ class MongoAppsArchive:
         found.sort(key=by_age)
         return found if limit is None else found[max(0, len(found) - limit) :]
 
-    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+    def prune(
+        self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
+    ) -> int:
         """See `ArchiveDriver.prune`; of all collections in which this user may delete."""
-        parts, shares = self._parts(), {}
-        if max_bytes is not None:
-            sizes = {part: part.size() for part in parts}
-            whole = max(1, sum(sizes.values()))
-            shares = {part: max_bytes * size // whole for part, size in sizes.items() if whole > max_bytes}
-        return sum(_pruned(part, before, shares.get(part)) for part in parts)
+        parts = self._parts()
+        limits = {} if max_bytes is None else _limits(parts, max_bytes, lasting)
+        return sum(_pruned(part, before, lasting, limits.get(part)) for part in parts)
 
     def close(self) -> None:
         """See `ArchiveDriver.close`."""
@@ -124,6 +124,13 @@ class MongoAppsArchive:
                 yield name, joint + app
 
 
+class _Limit(NamedTuple):
+    """What one collection may hold, bytes."""
+
+    all_items: int
+    lasting: int
+
+
 class _Sized(MongoArchive):
     """Knows its size."""
 
@@ -131,6 +138,16 @@ class _Sized(MongoArchive):
         """Bytes of all documents."""
         with self.errors():
             return self._retention.size()
+
+    def lasting_size(self, lasting: Lasting) -> int:
+        """Bytes of the documents that last."""
+        with self.errors():
+            return self._retention.lasting_size(lasting)
+
+    def prune_to(self, limit: _Limit, lasting: Lasting) -> int:
+        """Delete the oldest documents until the limit is kept; the number of items."""
+        with self.errors():
+            return self._retention.larger(limit.all_items, lasting, limit.lasting)
 
 
 class _OwnCollection(_Sized):
@@ -164,9 +181,26 @@ class _OtherCollection(_Sized):
         return self._own.shared(name)
 
 
-def _pruned(part: _Sized, before: int | None, max_bytes: int | None) -> int:
+def _limits(parts: "list[_Sized]", max_bytes: int, lasting: Lasting) -> "dict[_Sized, _Limit]":
+    """The limit in parts as the sizes now are: one for what lasts, one for the rest; none while all of it fits."""
+    sizes = {part: part.size() for part in parts}
+    if sum(sizes.values()) <= max_bytes:
+        return {}
+    lasts = {part: part.lasting_size(lasting) for part in parts}
+    others = {part: max(0, sizes[part] - lasts[part]) for part in parts}
+    room = min(sum(lasts.values()), max_bytes // SHARE)
+    found = {}
+    for part in parts:
+        own = room * lasts[part] // max(1, sum(lasts.values()))
+        rest = (max_bytes - room) * others[part] // max(1, sum(others.values()))
+        found[part] = _Limit(own + rest, own)
+    return found
+
+
+def _pruned(part: _Sized, before: int | None, lasting: Lasting, limit: _Limit | None) -> int:
     try:
-        return part.prune(before=before, max_bytes=max_bytes)
+        deleted = part.prune(before=before, lasting=lasting)
+        return deleted if limit is None else deleted + part.prune_to(limit, lasting)
     except ArchiveUnavailable:
         raise
     except BackendError as error:

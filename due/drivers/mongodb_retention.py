@@ -19,6 +19,8 @@ from typing import Any, TypeAlias
 from pymongo.collection import Collection
 from pymongo.errors import OperationFailure
 
+from due.drivers.lasting import Lasting
+
 Document: TypeAlias = dict[str, Any]
 
 _EMPTY_SECONDS = 600.0
@@ -45,28 +47,59 @@ class MongoRetention:
         self._empty: dict[str, float] = {}
         """Keys without a document, and since when that is known (s, monotonic)."""
 
-    def older(self, before: int) -> int:
+    def older(self, before: int | None, lasting: Lasting) -> int:
         """Delete documents that are wholly older; the number of items.
 
         Args:
-            before: ns since the epoch.
+            before: ns since the epoch; None: all are young enough.
+            lasting: for these its own moment counts.
         """
-        return sum(self._older_of(key, before) for key in self._keys())
+        lasts, others = self._divided(lasting)
+        of_each = ((others, before), (lasts, lasting.before))
+        return sum(
+            self._older_of(key, moment) for keys, moment in of_each if moment is not None for key in keys
+        )
 
-    def larger(self, max_bytes: int) -> int:
+    def larger(self, max_bytes: int, lasting: Lasting, room: int) -> int:
         """Delete the oldest documents until the rest is small enough; the number of items.
 
         Args:
             max_bytes: of all documents.
+            lasting: these go only as far as they exceed their room.
+            room: bytes.
         """
         deleted = 0
         for _ in range(_PASSES):
             excess = self.size() - max_bytes
-            step = self._oldest_of(max(excess // 2, min(excess, _LEAST_BYTES))) if excess > 0 else 0
+            if excess <= 0:
+                break
+            lasts, others = self._divided(lasting)
+            step = self._oldest_of(lasts, _part(min(excess, self.size_of(lasts) - room)))
+            step = step or self._oldest_of(others, _part(excess))
             if not step:
                 break
             deleted += step
         return deleted
+
+    def size_of(self, keys: Sequence[str]) -> int:
+        """Bytes of these keys' documents, as each says of itself.
+
+        Args:
+            keys: concrete ones.
+        """
+        return sum(
+            number(one, "bytes")
+            for key in keys
+            for one in self._table("").find({"dataKey": {"$eq": key}}, {"bytes": 1})
+        )
+
+    def lasting_size(self, lasting: Lasting) -> int:
+        """Bytes of the documents that last.
+
+        Args:
+            lasting: which do.
+        """
+        return self.size_of(self._divided(lasting)[0])
 
     def size(self) -> int:
         """Bytes of all documents: as the server counts them, without reading them, where it may be asked."""
@@ -90,8 +123,11 @@ class MongoRetention:
                 keys.replace_one({"_id": {"$eq": entry["_id"]}}, entry, upsert=True)
         self._empty = empty
 
-    def _keys(self) -> list[str]:
-        return [entry["_id"] for entry in self._table("keys").find({}, {"_id": 1})]
+    def _divided(self, lasting: Lasting) -> tuple[list[str], list[str]]:
+        """Keys whose documents last, and the others."""
+        keys = [entry["_id"] for entry in self._table("keys").find({}, {"_id": 1})]
+        lasts = lasting.among(keys)
+        return lasts, sorted({*keys} - {*lasts})
 
     def _stored_bytes(self, companion: str) -> int:
         table = self._table(companion)
@@ -111,9 +147,8 @@ class MongoRetention:
                 break
         return deleted
 
-    def _oldest_of(self, size: int) -> int:
+    def _oldest_of(self, keys: Sequence[str], size: int) -> int:
         """Delete the oldest documents that hold so many bytes together; the number of items."""
-        keys = self._keys()
         ahead = max(2, min(_STEP, _AHEAD // max(1, len(keys))))
         each = [self._by_time(key, ahead) for key in keys]
         deleted = 0
@@ -166,6 +201,11 @@ def number(document: Mapping[str, Any], name: str) -> int:
     """
     found = document.get(name)
     return int(found) if isinstance(found, int) else 0
+
+
+def _part(excess: int) -> int:
+    """How much of what is too much a pass deletes; see `_LEAST_BYTES`."""
+    return max(excess // 2, min(excess, _LEAST_BYTES))
 
 
 def _up_to(total: int, documents: Iterable[Document]) -> Iterator[Document]:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from due.codec import decode_value, encode_value, unpack
+from due.drivers.lasting import NOTHING, SHARE, Lasting
 from due.drivers.latest_items import by_age, latest_items
 from due.drivers.query import ArchiveQuery, parse
 from due.drivers.query_time import in_time, time_left
@@ -47,6 +48,7 @@ _DELETE = "DELETE FROM frames WHERE id = ?"
 _OLDEST = """SELECT coalesce(CAST(first_time AS INTEGER), 0), id, coalesce(CAST(count AS INTEGER), 0),
     coalesce(length(payload), 0)
 FROM frames WHERE key_id = ? ORDER BY first_time"""
+_BYTES = "SELECT count(*), coalesce(sum(length(payload)), 0) FROM frames WHERE key_id = ?"
 
 _by_identity = attrgetter("instance_id", "key", "sequence")
 _by_stream = attrgetter("instance_id", "key")
@@ -127,19 +129,42 @@ class SqliteArchive:
         items.sort(key=by_age)
         return items
 
-    def prune(self, *, before: int | None = None, max_bytes: int | None = None) -> int:
+    def prune(
+        self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
+    ) -> int:
         """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
-        deleted = 0
-        if before is not None:
-            deleted += self._in_steps(lambda connection: _prune_older(connection, before))
+
+        def older(connection: sqlite3.Connection) -> int:
+            lasts, others = self._divided(connection, lasting)
+            return _prune_older(connection, others, before) or _prune_older(connection, lasts, lasting.before)
+
+        def larger(connection: sqlite3.Connection) -> int:
+            excess = _used(connection) - (max_bytes or 0)
+            if excess <= 0:
+                return 0
+            lasts, others = self._divided(connection, lasting)
+            too_much = _size(connection, lasts) - (max_bytes or 0) // SHARE
+            return _prune_oldest(connection, lasts, min(excess, too_much)) or _prune_oldest(
+                connection, others, excess
+            )
+
+        deleted = self._in_steps(older)
         if max_bytes is not None:
-            deleted += self._in_steps(lambda connection: _prune_larger(connection, max_bytes))
+            deleted += self._in_steps(larger)
         if deleted:
             with self._file.writing() as connection:
                 self._file.keys.prune(connection)
                 self._file.sources.prune(connection)
             self._file.shrink()
         return deleted
+
+    def _divided(self, connection: sqlite3.Connection, lasting: Lasting) -> tuple[list[int], list[int]]:
+        """Ids of keys whose items last, and of the others; damaged ones do not last."""
+        self._file.keys.refresh(connection)
+        ids = {text: number for number, (text,) in self._file.keys.entries.items()}
+        lasts = {ids[key] for key in lasting.among(ids)}
+        every = [whole_number(number) for (number,) in connection.execute("SELECT id FROM keys")]
+        return sorted(lasts), [number for number in every if number not in lasts]
 
     def _in_steps(self, step: Callable[[sqlite3.Connection], int]) -> int:
         """Use many short transactions, so that writers in other processes are not blocked for long."""
@@ -304,8 +329,8 @@ def _overlap(connection: sqlite3.Connection, row: _Row) -> tuple[int, int] | Non
     return found if whole and found[0] <= row.last_sequence else None
 
 
-def _prune_older(connection: sqlite3.Connection, before: int) -> int:
-    for (key,) in connection.execute("SELECT id FROM keys").fetchall():
+def _prune_older(connection: sqlite3.Connection, keys: Sequence[int], before: int | None) -> int:
+    for key in keys if before is not None else ():
         old = connection.execute(_OLDER, (key, before, before, _PRUNE_ROWS)).fetchall()
         if old:
             connection.executemany(_DELETE, [(number,) for number, _ in old])
@@ -313,21 +338,24 @@ def _prune_older(connection: sqlite3.Connection, before: int) -> int:
     return 0
 
 
-def _prune_larger(connection: sqlite3.Connection, max_bytes: int) -> int:
-    excess = _used(connection) - max_bytes
-    if excess <= 0:
-        return 0
-    keys = connection.execute("SELECT id FROM keys").fetchall()
-    deleted, ids = 0, []
-    by_time = merge(*(connection.execute(_OLDEST, key) for key in keys), key=itemgetter(0))
+def _prune_oldest(connection: sqlite3.Connection, keys: Sequence[int], excess: int) -> int:
+    """Delete the oldest rows that hold so many bytes together, or the most of a step."""
+    deleted, ids = 0, list[tuple[int]]()
+    by_time = merge(*(connection.execute(_OLDEST, (key,)) for key in keys), key=itemgetter(0))
     for _, number, count, size in by_time:
+        if excess <= 0 or len(ids) >= _PRUNE_ROWS:
+            break
         ids.append((number,))
         deleted += count
         excess -= size + _ROW_OVERHEAD
-        if excess <= 0 or len(ids) >= _PRUNE_ROWS:
-            break
     connection.executemany(_DELETE, ids)
     return deleted
+
+
+def _size(connection: sqlite3.Connection, keys: Sequence[int]) -> int:
+    """Bytes of these keys' rows."""
+    each = (connection.execute(_BYTES, (key,)).fetchone() for key in keys)
+    return sum(int(rows * _ROW_OVERHEAD + payloads) for rows, payloads in each)
 
 
 def _used(connection: sqlite3.Connection) -> int:

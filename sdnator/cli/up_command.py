@@ -94,7 +94,7 @@ def up(
     quota: Annotated[
         float | None,
         typer.Option(
-            help="Size limit of the embedded archive, GiB; the oldest items are deleted first; default: 10.",
+            help="Size limit of the embedded archive, GiB; the oldest items are deleted first, what is in force last; default: 10.",
             min=0.01,
         ),
     ] = None,

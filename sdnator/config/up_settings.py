@@ -15,7 +15,7 @@ class UpSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     archive: str = ""
     """Data Archives, mongodb:// or sqlite:///; empty: a file in the data folder."""
     quota: float = 10.0
-    """Size limit of the embedded archive, GiB; the oldest items are deleted first."""
+    """Size limit of the embedded archive, GiB; the oldest items are deleted first, what is in force last."""
     keep_model: bool = True
     """Keep Kitsune's model in the state folder, and use it again at the next start if switches, ports and settings
     are the same; off: train at every start, unless `kitsune.load_model` or `--model` names a model."""

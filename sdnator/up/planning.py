@@ -108,8 +108,10 @@ def _processes(
 
 
 def _coordinator(config: "Config", quota: float, *, embedded: bool) -> dict[str, Any]:
+    from sdnator.up.lasting_keys import LASTING_KEYS
+
     limit = {"retain_bytes": int(quota * _GIB)} if embedded else {}
-    return limit | config.section("coordinator")
+    return {"lasting_keys": list(LASTING_KEYS)} | limit | config.section("coordinator")
 
 
 def _adapter(config: "Config", given: Given) -> dict[str, Any]:

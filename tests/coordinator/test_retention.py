@@ -3,6 +3,7 @@
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 from coordinator.retention import Retention
 from due.drivers.sqlite import SqliteArchive
@@ -18,7 +19,7 @@ def filled(folder: Path) -> SqliteArchive:
     return archive
 
 
-def run(archive: SqliteArchive, folder: Path, turns: int, allowed: bool = True, **limits: float) -> Retention:
+def run(archive: SqliteArchive, folder: Path, turns: int, allowed: bool = True, **limits: Any) -> Retention:
     """Let it have some turns."""
     asked = threading.Semaphore(0)
 
@@ -32,6 +33,8 @@ def run(archive: SqliteArchive, folder: Path, turns: int, allowed: bool = True, 
         age_s=limits.get("age_s", 0),
         max_bytes=int(limits.get("max_bytes", 0)),
         every_s=0.01,
+        lasting_keys=limits.get("lasting_keys", ()),
+        lasting_age_s=limits.get("lasting_age_s", 0),
     )
     retention.start()
     for _ in range(turns):
@@ -54,6 +57,14 @@ def test_what_is_too_much_goes_oldest_first(tmp_path: Path) -> None:
     assert left
     assert left == [1, 2, 3, 4][-len(left) :]
     assert len(left) < 4
+    archive.close()
+
+
+def test_what_lasts_stays_until_an_age_of_its_own(tmp_path: Path) -> None:
+    archive = filled(tmp_path)
+    assert run(archive, tmp_path, 2, age_s=60, lasting_keys=("*",)).deleted == 0
+    assert run(archive, tmp_path, 2, lasting_age_s=3599.5, lasting_keys=("*",)).deleted == 1
+    assert [item.sequence for item in archive.find({})] == [2, 3, 4]
     archive.close()
 
 

@@ -40,6 +40,7 @@ def faults(tmp_path, text, environment=None):
         ("[up]\nquota = 0", "FILE:2: up.quota: quota=0.0: must be at least 0.01 GiB"),
         ("[up]\nprocesses = { kitsune = 0 }", "FILE:2: up.processes: processes={kitsune: 0}: must be 1 to 64 of each app"),
         ("[up]\nretain_every_s = 5", "FILE:2: up.retain_every_s: there is no such option; it belongs to coordinator.retain_every_s"),
+        ('[coordinator]\nlasting_keys = ["a..b"]', "FILE:2: coordinator.lasting_keys: lasting_keys=a..b: invalid key 'a..b' at position 2: a segment is '*', '**' or one or more of A-Z a-z 0-9 _ -"),
         ("schema = 2", "FILE:1: schema: 2 is not supported; this version reads 1: see CHANGELOG for what changed"),
         ('[[switches]]\n[[switches]]\nname = "s1"', "FILE:3: switches[1].name: there are two switches named s1"),
         ('[[switches]]\nkind = "there"', "FILE:1: switches[0]: --switch there: give embedded, bmv2, HOST:PORT or unix:/PATH"),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from due.backends import open_archive as archive_of
 from due.codec import pack
 from due.drivers.base import ArchiveDriver
+from due.drivers.lasting import Lasting
 from due.errors import BackendError, InvalidKey, InvalidQuery
 from due.messages import Item, RecordBatch
 from tests.due.drivers.mongo_router import mongo_router
@@ -22,6 +23,7 @@ from tests.due.drivers.mongo_server import PATIENT, mongo_server
 from tests.naive.archive_query import naive_find
 
 T0 = 1_700_000_000_123_456_789
+LASTING = Lasting(("network.block.*", "network.meter.*"))
 DRIVERS = ("sqlite", "mongodb", "mongodb_cluster", "memory")
 Open = Callable[[], ArchiveDriver]
 
@@ -261,6 +263,36 @@ def test_retention_by_size_takes_the_oldest_first(archive: ArchiveDriver) -> Non
     assert 40 <= len(left) <= 110
     assert min(i.sequence for i in left) >= 100 - len(left) // 2
     assert archive.prune(max_bytes=0) == len(left)
+
+
+def test_what_lasts_makes_way_for_nothing_else(archive: ArchiveDriver) -> None:
+    archive.insert([item("network.block.x", value=bytes(1000), n=n) for n in range(1, 11)])
+    archive.insert([item("a", value=bytes(20_000), n=n) for n in range(11, 101)])
+    archive.prune(max_bytes=600_000, lasting=LASTING)
+    assert [i.sequence for i in archive.find({"dataKey": "network.block.x"})] == list(range(1, 11))
+    left = [i.sequence for i in archive.find({"dataKey": "a"})]
+    assert 5 <= len(left) <= 40
+    assert left == list(range(101 - len(left), 101))
+
+
+def test_what_lasts_has_room_for_half(archive: ArchiveDriver) -> None:
+    archive.insert([item("network.block.x", value=bytes(20_000), n=n) for n in range(1, 101)])
+    archive.insert([item("a", value=bytes(20_000), n=n) for n in range(1, 21)])
+    archive.prune(max_bytes=1_200_000, lasting=LASTING)
+    left = [i.sequence for i in archive.find({"dataKey": "network.block.x"})]
+    assert 20 <= len(left) <= 40
+    assert left == list(range(101 - len(left), 101))
+    assert archive.find({"dataKey": "a"})
+
+
+def test_what_lasts_has_an_age_of_its_own(archive: ArchiveDriver) -> None:
+    for key in ("network.block.x", "network.block:a=b", "a"):
+        archive.insert([item(key, n=n) for n in range(1, 11)])
+    assert archive.prune(before=T0 + 8001, lasting=LASTING) == 16
+    assert [i.sequence for i in archive.find({"dataKey": "network.block.x"})] == list(range(1, 11))
+    assert archive.prune(lasting=LASTING._replace(before=T0 + 3001)) == 3
+    assert [i.sequence for i in archive.find({"dataKey": "network.block.x"})] == list(range(4, 11))
+    assert len(archive.find({})) == 11
 
 
 def test_wrong_queries_name_the_fault(archive: ArchiveDriver) -> None:

@@ -10,6 +10,7 @@ from pymongo import MongoClient
 from pymongo.errors import OperationFailure
 
 from due.backends import open_archive
+from due.drivers.lasting import Lasting
 from due.drivers.mongodb_apps import MongoAppsArchive, collections_of, of_app
 from due.drivers.redis_rights import Rights
 from due.errors import InvalidOption
@@ -61,6 +62,29 @@ def test_apps_write_collections_of_their_own_and_read_all_that_they_may(server: 
     assert reader.prune(before=T0 + 2) == 3
     assert reader.prune(max_bytes=0) == 6
     assert reader.find({"dataKey": "network.x.*"}) == []
+    for archive in archives.values():
+        archive.close()
+
+
+def test_one_limit_holds_for_the_collections_of_all_apps(server: str) -> None:
+    """What lasts stays in each collection, whatever share of the limit that collection would have had."""
+    archives = {name: open_archive(of_app(f"{server}&collection=limit", name)) for name in ("fw", "ctrl")}
+    big = bytes(20_000)
+    for app, key, numbers in (
+        ("fw", "network.block.fw", range(1, 21)),
+        ("fw", "network.x.fw", range(21, 41)),
+        ("ctrl", "network.x.ctrl", range(1, 101)),
+    ):
+        archives[app].insert([Item(key, big, T0 + n, T0 + n, app, f"{app}1", n) for n in numbers])
+    reader = archives["ctrl"]
+    reader.prune(max_bytes=1_200_000, lasting=Lasting(("network.block.*",)))
+    assert len(reader.find({"dataKey": "network.block.fw"})) == 20
+    assert 20 <= len(reader.find({"dataKey": "network.x.*"})) <= 45
+    assert reader.find({"dataKey": "network.x.fw"}), "each collection keeps its newest"
+    reader.prune(max_bytes=400_000, lasting=Lasting(("network.block.*",)))
+    left = [item.sequence for item in reader.find({"dataKey": "network.block.fw"})]
+    assert 5 <= len(left) <= 11
+    assert left == list(range(21 - len(left), 21))
     for archive in archives.values():
         archive.close()
 
