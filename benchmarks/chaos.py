@@ -8,7 +8,8 @@ holds one against the other.  Exit code 1 where a promise was broken.
 
 `forwarding_gap_ms` is the longest run of frames by fault that the switch lost or forwarded later than half a second,
 `machine_gap_ms` that of the same frames at the same time through a program that only copies them: on a busy machine
-both have gaps.  `none` is what came before the first fault.  Ctrl-C and SIGTERM end the faults early, and judge
+both have gaps.  `none` is what came before the first fault.  The archive reaches its limit within half an hour: `pruned`
+counts what that has taken, of which nothing may be in force.  Ctrl-C and SIGTERM end the faults early, and judge
 what was; after each fault the file has the figures so far (`"unfinished": true`).
 """
 
@@ -269,6 +270,7 @@ class ChaosRun:
             "entries": len(record.entries or ()),
             "words": len(record.words),
             "scores": self._probes.scores,
+            "pruned": sum(self._probes.pruned.values()),
             "frames_sent": len(self._wire.sent) if self._wire else 0,
             "frames_forwarded": len(self._wire.came) if self._wire else 0,
             "frames_of_blocked_sources_passed": len(self._wire.passed) if self._wire else 0,

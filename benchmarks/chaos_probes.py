@@ -29,6 +29,7 @@ _ANSWER = "network.answer.firewall.operator"
 _CONFIRMATIONS = "network.confirmation.p4runtime_ctrl.*"
 _REPORTS = "network.switch.p4runtime_ctrl.*"
 _SCORES = "network.anomaly.kitsune.score"
+_COORDINATORS = "due.health.coordinator"
 _BLOCK_S = 86_400
 _FLUSH_S = 120.0
 _BATCH = 50
@@ -52,6 +53,8 @@ class Probes:
         self.record = RunRecord()
         self.errors: list[str] = []
         self.scores = 0
+        self.pruned: dict[str, int] = {}
+        """Items that the quota has taken, by instance of the Coordinator that deleted them."""
         self.unwanted_instructions = 0
         self._began = time.time()
         self._draw = random.Random(seed)
@@ -72,6 +75,7 @@ class Probes:
         self._reader.observe(RELIABLE).subscribe(lambda item: self.record.delivered.append(item.value))
         self._reader.observe(SPEECH).subscribe(self._heard)
         self._reader.observe(_SCORES).subscribe(self._scored)
+        self._reader.observe(_COORDINATORS).subscribe(self._deleted)
         self._operator.observe(_ANSWER).subscribe(self._answered)
         self._operator.observe(_CONFIRMATIONS).subscribe(self._confirmed)
         self._reader.observe(_REPORTS).subscribe(self._reported)
@@ -205,6 +209,9 @@ class Probes:
 
     def _scored(self, item: Item) -> None:
         self.scores += len(item.value["score"]) if "score" in item.value else 1
+
+    def _deleted(self, item: Item) -> None:
+        self.pruned[item.instance_id] = item.value["app"]["retention_deleted"]
 
 
 class _Noted(suppress):

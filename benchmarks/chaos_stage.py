@@ -14,16 +14,20 @@ from types import TracebackType
 from typing import Any, Self
 
 from benchmarks.chaos_links import UnixLink
+from benchmarks.chaos_probes import ARCHIVED
 from benchmarks.chaos_schedule import APPS, CONTROLLERS
 from sdnator.capture.interfaces import VethPair
 from sdnator.config.planned_switches import PlannedSwitch
 from sdnator.supervisor import Child, Supervisor
 from sdnator.supervisor.app_command import app_command
 from sdnator.supervisor.spec import PartProcess, PartSpec
+from sdnator.up.lasting_keys import LASTING_KEYS
 from sdnator.up.parts import UpParts
 from sdnator.up.plan import StandingPlan
 
 DISK_MIB = 1024
+ARCHIVE_MIB = 300
+"""Limit of the archive: an idle machine writes twice as much in half an hour."""
 PREFIX = "chaos-"
 """Of the folder of a run; the process id follows."""
 _LIBRARY = "*/faketime/libfaketimeMT.so.1"
@@ -190,8 +194,13 @@ class ChaosStage:
             state=state,
             archive=f"sqlite://{self.archive_file}",
             switches=(PlannedSwitch(ports=ports, forward={1: 2, 2: 1}),),
-            # bounded as an operator would have it, but beyond what half an hour of this load writes
-            settings={"coordinator": {"retain_bytes": 600 << 20}},
+            # reached within a run: what is in force has to outlive it, as do the numbers that probes archive
+            settings={
+                "coordinator": {
+                    "retain_bytes": ARCHIVE_MIB << 20,
+                    "lasting_keys": [*LASTING_KEYS, ARCHIVED],
+                }
+            },
             dashboard={"port": 0, "token_file": str(token)},
         )
 
