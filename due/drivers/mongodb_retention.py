@@ -68,14 +68,17 @@ class MongoRetention:
             lasting: these go only as far as they exceed their room.
             room: bytes.
         """
+        if self.size() <= max_bytes:
+            return 0
+        lasts, others = self._divided(lasting)
+        deleted = self._passes(lasts, lambda: min(self.size() - max_bytes, self.size_of(lasts) - room))
+        return deleted + self._passes(others, lambda: self.size() - max_bytes)
+
+    def _passes(self, keys: Sequence[str], excess: Callable[[], int]) -> int:
         deleted = 0
         for _ in range(_PASSES):
-            excess = self.size() - max_bytes
-            if excess <= 0:
-                break
-            lasts, others = self._divided(lasting)
-            step = self._oldest_of(lasts, _part(min(excess, self.size_of(lasts) - room)))
-            step = step or self._oldest_of(others, _part(excess))
+            too_much = excess()
+            step = self._oldest_of(keys, _part(too_much)) if too_much > 0 else 0
             if not step:
                 break
             deleted += step

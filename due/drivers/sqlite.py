@@ -134,29 +134,35 @@ class SqliteArchive:
     ) -> int:
         """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
 
-        def older(connection: sqlite3.Connection) -> int:
-            lasts, others = self._divided(connection, lasting)
-            return _prune_older(connection, others, before) or _prune_older(connection, lasts, lasting.before)
-
-        def larger(connection: sqlite3.Connection) -> int:
-            excess = _used(connection) - (max_bytes or 0)
-            if excess <= 0:
-                return 0
-            lasts, others = self._divided(connection, lasting)
-            too_much = _size(connection, lasts) - (max_bytes or 0) // SHARE
-            return _prune_oldest(connection, lasts, min(excess, too_much)) or _prune_oldest(
-                connection, others, excess
-            )
-
-        deleted = self._in_steps(older)
+        deleted = self._in_steps(lambda connection: self._prune_older(connection, before, lasting))
         if max_bytes is not None:
-            deleted += self._in_steps(larger)
+            deleted += self._in_steps(lambda connection: self._prune_lasting(connection, max_bytes, lasting))
+            deleted += self._in_steps(lambda connection: self._prune_others(connection, max_bytes, lasting))
         if deleted:
             with self._file.writing() as connection:
                 self._file.keys.prune(connection)
                 self._file.sources.prune(connection)
             self._file.shrink()
         return deleted
+
+    def _prune_older(self, connection: sqlite3.Connection, before: int | None, lasting: Lasting) -> int:
+        lasts, others = self._divided(connection, lasting)
+        return _delete_older(connection, others, before) or _delete_older(connection, lasts, lasting.before)
+
+    def _prune_lasting(self, connection: sqlite3.Connection, max_bytes: int, lasting: Lasting) -> int:
+        excess = _used(connection) - max_bytes
+        if excess <= 0:
+            return 0
+        lasts, _ = self._divided(connection, lasting)
+        too_much = _size(connection, lasts) - max_bytes // SHARE
+        return _delete_oldest(connection, lasts, min(excess, too_much))
+
+    def _prune_others(self, connection: sqlite3.Connection, max_bytes: int, lasting: Lasting) -> int:
+        excess = _used(connection) - max_bytes
+        if excess <= 0:
+            return 0
+        _, others = self._divided(connection, lasting)
+        return _delete_oldest(connection, others, excess)
 
     def _divided(self, connection: sqlite3.Connection, lasting: Lasting) -> tuple[list[int], list[int]]:
         """Ids of keys whose items last, and of the others; damaged ones do not last."""
@@ -329,7 +335,7 @@ def _overlap(connection: sqlite3.Connection, row: _Row) -> tuple[int, int] | Non
     return found if whole and found[0] <= row.last_sequence else None
 
 
-def _prune_older(connection: sqlite3.Connection, keys: Sequence[int], before: int | None) -> int:
+def _delete_older(connection: sqlite3.Connection, keys: Sequence[int], before: int | None) -> int:
     for key in keys if before is not None else ():
         old = connection.execute(_OLDER, (key, before, before, _PRUNE_ROWS)).fetchall()
         if old:
@@ -338,7 +344,7 @@ def _prune_older(connection: sqlite3.Connection, keys: Sequence[int], before: in
     return 0
 
 
-def _prune_oldest(connection: sqlite3.Connection, keys: Sequence[int], excess: int) -> int:
+def _delete_oldest(connection: sqlite3.Connection, keys: Sequence[int], excess: int) -> int:
     """Delete the oldest rows that hold so many bytes together, or the most of a step."""
     deleted, ids = 0, list[tuple[int]]()
     by_time = merge(*(connection.execute(_OLDEST, (key,)) for key in keys), key=itemgetter(0))
