@@ -69,7 +69,8 @@ def address_in(text: object, what: str) -> str:
 Role = Literal["host", "gateway", "dns", "dhcp", "multicast"]
 Action = Literal["block", "unblock", "protect", "unprotect", "meter", "unmeter"]
 TargetKind = Literal["ip", "mac"]
-State = Literal["installed", "exists", "removed", "expired", "failed"]
+State = Literal["installed", "exists", "removed", "expired", "failed", "pending"]
+"""Of a decision at an enforcer; `pending`: it keeps the decision, and carries it out as soon as it can."""
 
 
 def writer_of(key: str) -> str:

@@ -5,7 +5,7 @@ The model.  The probes live through every fault, on a disk and with a clock of t
     taken by `write` ─► covered by `flush` ─► delivered once, in order      reliable key
                                        └─► in the archive at the end      archived key
     instruction taken and flushed ─► answered ─► done: a decision in the archive ─► an entry in the switch
-                                              └─► refused with its cause: no promise
+                                              └─► refused with its cause: no promise, but what is in force can be lifted
     words of the standby pair, and of the controllers, by the time of writing: turns of one instance, never both at once
 
 Delivery is at least once to an app and once to an instance that lives; the reading probe is never killed, so
@@ -151,6 +151,7 @@ def _missing(kind: str, acknowledged: int, seen: set[int]) -> Iterator[Violation
 
 def _instructions(record: RunRecord) -> Iterator[Violation]:
     decided = {(each.action, each.address) for each in record.decisions}
+    stands = in_force(record.decisions)
     for asked in record.asked:
         if asked.id not in record.answers:
             yield Violation(
@@ -160,6 +161,10 @@ def _instructions(record: RunRecord) -> Iterator[Violation]:
             continue
         if record.answers.get(asked.id) and (asked.verb, asked.address) not in decided:
             yield Violation("acknowledged_not_decided", f"{asked.verb} {asked.address} was answered as done")
+        if record.answers.get(asked.id) is False and asked.verb == "unblock" and asked.address in stands:
+            yield Violation(
+                "not_lifted", f"unblock {asked.address} at {asked.at:.1f} s was refused, and it is in force"
+            )
 
 
 def in_force(decisions: Sequence[Decided]) -> frozenset[str]:

@@ -451,9 +451,11 @@ class FirewallService:
                 self._limits.confirm(confirmation)
             self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
             self._floods.confirmed(confirmation)
+        where = f"{item.app_id} {confirmation.switch}"
         if confirmation.state == "failed":
-            words = f"{item.app_id} {confirmation.switch} refused {confirmation.id}: {confirmation.cause}"
-            log.error("%s", one_line(words))
+            log.error("%s", one_line(f"{where} refused {confirmation.id}: {confirmation.cause}"))
+        elif confirmation.state == "pending":
+            log.warning("%s", one_line(f"{where} has {confirmation.id} pending: {confirmation.cause}"))
 
     def _on_enforced(self, _: Item, report: EnforcementReport) -> None:
         with self._lock:

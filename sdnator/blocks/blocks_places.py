@@ -75,7 +75,7 @@ def action_word(decision: Decision, answers: Collection[PlaceAnswer]) -> str:
 
 
 def places_words(decision: Decision, answers: Collection[PlaceAnswer]) -> str:
-    """Where it is in force, and who has refused it and why."""
+    """Where it is in force, who keeps it for later, and who has refused it and why."""
     if decision.dry_run:
         return "in force nowhere: a dry run"
     stands = [answer.where() for answer in answers if answer.stands]
@@ -84,7 +84,12 @@ def places_words(decision: Decision, answers: Collection[PlaceAnswer]) -> str:
         for answer in answers
         if answer.state == "failed"
     ]
+    waits = [
+        f"{answer.where()} has it pending: {one_line(answer.cause)[:_CAUSE]}"
+        for answer in answers
+        if answer.state == "pending"
+    ]
     words = f"in force: {', '.join(stands)}" if stands else "in force nowhere"
     if not answers:
         words += ", no enforcer has answered"
-    return "; ".join([words, *refused])
+    return "; ".join([words, *waits, *refused])

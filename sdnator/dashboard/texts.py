@@ -53,13 +53,15 @@ def decision_row(one: Decision, answers: dict[str, str]) -> dict[str, Any]:
 
 
 def _places_said(answers: dict[str, str]) -> str:
-    """Where a decision is in force; who has refused it and why, or has ended it."""
+    """Where a decision is in force; who keeps it for later, has refused it and why, or has ended it."""
     stands = sorted(place for place, text in answers.items() if text.startswith(_STANDING))
     found = [f"in force: {', '.join(stands)}"] if stands else []
     for place, text in sorted(answers.items()):
         state, _, cause = text.partition(": ")
         if state == "failed":
             found.append(f"{place} refused it: {cause}" if cause else f"{place} refused it")
+        elif state == "pending":
+            found.append(f"{place} has it pending: {cause}")
         elif place not in stands:
             found.append(f"{place}: {state}")
     return "; ".join(found)

@@ -61,6 +61,13 @@ def test_a_run_that_kept_every_promise_has_no_violation():
         ({"entries": frozenset()}, "decision_without_entry"),
         ({"decisions": [BLOCK, LIFT]}, "entry_without_decision"),
         ({"entries": None}, "switch_unreadable"),
+        (
+            {
+                "asked": [Asked("i1", "block", "20.0.7.9"), Asked("i2", "unblock", "20.0.7.9")],
+                "answers": {"i1": True, "i2": False},
+            },
+            "not_lifted",
+        ),
         ({"passed": [Passed(11.0, "20.0.7.9")]}, "passed_while_blocked"),
         ({"words": [Word(1.0, "a"), Word(1.1, "b"), Word(1.2, "a")]}, "two_actives"),
         ({"reports": [Word(1.0, "a"), Word(1.6, "b"), Word(2.0, "a")]}, "two_actives"),

@@ -74,7 +74,7 @@ class DeclaredEnforcers:
             said: the answer.
 
         Returns:
-            Whether it holds for the decision as a whole.  One of several that refuses or removes it does not end it
+            Whether it holds for the decision as a whole; what is pending is neither in force nor at its end.  One of several that refuses or removes it does not end it
             while others carry it out or have not answered; neither does one that ends it by its own clock, because
             the firewall extends or lifts it then.
         """
@@ -83,7 +83,7 @@ class DeclaredEnforcers:
         name = place_text(enforcer, said.switch)
         if name in places.states or len(places.states) < MOST_PLACES:
             places.states[name] = said.state
-        if said.state in _STANDING:
+        if said.state in _STANDING or said.state == "pending":
             return True
         if enforcer != SWITCHES and said.state == "expired":
             return False

@@ -254,6 +254,8 @@ class IncidentBook:
         elif confirmation.state == "failed":
             # one switch of several may refuse what others carry out
             after = action if action.state == "in_force" else structs.replace(action, state="failed")
+        elif confirmation.state == "pending":
+            after = action
         else:
             after = action if places else structs.replace(action, state="over")
         after = structs.replace(after, places=tuple(places[:MOST_PLACES]))

@@ -151,7 +151,7 @@ class SynAckBuffer:
             return
         if state in ("installed", "exists"):
             job.confirmed = job.confirmed or now
-        else:
+        elif state != "pending":
             del self._jobs[decision]
 
     def due(

@@ -380,6 +380,8 @@ class DesiredSwitch:
             done: State = "removed" if update.main.kind == DELETE else "installed"
             cause = report.failed.get(key)
             state: State = "failed" if cause else done
+            if state == "failed" and done == "installed":
+                self._give_up(update)
             text = cause or "done when the switch was connected again"
             answers.append(self._confirmation(update.owner, state, update.main.entry, cause=text))
         return answers
@@ -428,7 +430,7 @@ class DesiredSwitch:
         self._remember(update)
         self._unconfirmed[entry_key(update.main.entry)] = update
         text = f"{cause}; it is kept, and written when the switch is connected again"
-        return self._confirmation(update.owner, "failed", update.main.entry, cause=text)
+        return self._confirmation(update.owner, "pending", update.main.entry, cause=text)
 
     def _conclude(self, update: EntryUpdate, outcomes: list[UpdateOutcome]) -> Confirmation:
         main = update.main
@@ -448,6 +450,12 @@ class DesiredSwitch:
         self._remember(update)
         return self._confirmation(update.owner, "installed", main.entry)
 
+    def _give_up(self, update: EntryUpdate) -> None:
+        """What the switch has refused is not tried at each connection: nobody holds it to be in force."""
+        self._entry_updates.give_up(update)
+        for change in update.changes:
+            self._forget(change.entry)
+
     def _kept(self, update: EntryUpdate, said: str) -> str:
         """The existing entry stays; returns the text for the confirmation."""
         held = self._desired.get(update.main.entry)
@@ -462,7 +470,7 @@ class DesiredSwitch:
     ) -> Confirmation:
         event_time, arrival = self._clock()
         handle = self.program.describe(entry) if entry is not None else ""
-        if state == "failed" and handle and handle not in cause:
+        if state in ("failed", "pending") and handle and handle not in cause:
             cause = f"{handle}: {cause}"
         return Confirmation(
             id=owner.id,

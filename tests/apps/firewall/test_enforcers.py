@@ -57,6 +57,17 @@ def test_one_that_refuses_does_not_end_what_another_carries_out():
     assert in_force(desk) == 0
 
 
+def test_what_a_controller_keeps_for_later_is_lifted_as_any_other():
+    """Its switch is away: the entry comes when the switch is back, and somebody has to know of it."""
+    desk = Desk()
+    made = block(desk)
+    desk.confirm(made, "pending")
+    assert in_force(desk) == 1
+    instruct(desk, "unblock", "192.0.2.1", 2)
+    assert (desk.decisions[-1].action, desk.decisions[-1].id) == ("unblock", made.id)
+    assert in_force(desk) == 0
+
+
 def test_an_enforcer_s_own_clock_does_not_end_a_block():
     """The firewall extends or lifts it: only it knows whether the attack goes on."""
     desk = Desk(enforcers=("nftables",))

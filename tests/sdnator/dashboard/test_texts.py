@@ -43,6 +43,11 @@ def test_a_row_says_where_it_is_in_force_and_who_has_refused_it():
         == "in force: nftables gateway, switch s1; webhook_enforcer edge refused it: it is our printer"
     )
     assert row["word"] == "block"
+    waits = decision_row(one, {"switch s1": "pending: the switch is not connected"})
+    assert (waits["said"], waits["word"]) == (
+        "switch s1 has it pending: the switch is not connected",
+        "would block",
+    )
     assert decision_row(one, {"switch s1": "removed"})["said"] == "switch s1: removed"
 
 

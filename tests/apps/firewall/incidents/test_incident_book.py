@@ -203,6 +203,7 @@ def test_nothing_enforced_is_nothing_mitigated():
     book.decided(decision(dry_run=True))
     assert not book.confirmed(confirmation(state="exists"))[0].mitigated
     book.decided(decision(id="d2"))
+    assert book.confirmed(confirmation(name="d2", state="pending")) == []
     (refused,) = book.confirmed(confirmation(name="d2", state="failed"))
     assert refused.actions[1].state == "failed"
     (spared,) = book.spared(evidence(103.0), 12.0, BOUND, "it is the gateway")

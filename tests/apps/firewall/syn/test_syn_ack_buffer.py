@@ -41,6 +41,7 @@ def test_nothing_before_the_switch_confirms_nor_before_their_time():
     """A reset backlog would be filled again; a client may still answer."""
     made = resets(answers("10.2.0.5"))
     assert due(made, 5.0) == []
+    made.confirm("d1", "pending", 0.5)
     made.confirm("d1", "installed", 0.6)
     assert due(made, 0.9) == []
     assert due(made, 1.1) == [5]

@@ -167,13 +167,26 @@ def test_decisions_made_while_the_switch_is_away_are_carried_out_later():
     held.broken = True
     away = switch.decide([decision(2, address="10.0.0.2"), decision(3, "unblock")], held)
     away += switch.decide([decision(4, address="10.0.0.4")], None)
-    assert {state for _, state in said(away)} == {"failed"}
+    assert {state for _, state in said(away)} == {"pending"}
     assert "is kept" in away[0].cause
     held.broken = False
     report = switch.bring_up(held)
     assert held.names() == {block_name("10.0.0.2"), block_name("10.0.0.4")}
     assert sorted(said(report.confirmations)) == [("d2", "installed"), ("d3", "removed"), ("d4", "installed")]
     assert str(report) == "2 inserted, 1 removed"
+
+
+def test_what_the_switch_refuses_when_it_is_back_is_given_up():
+    """The firewall does not hold it to be in force any more, so nobody would ever lift it."""
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([decision(1)], None)
+    held.refuse[block_name("10.0.0.1")] = (8, "table is full")
+    assert said(switch.bring_up(held).confirmations) == [("d1", "failed")]
+    assert not switch.blocks
+    held.refuse.clear()
+    assert str(switch.bring_up(held)) == "nothing to change"
+    assert not held.names()
 
 
 def test_what_another_controller_will_have_confirmed_is_carried_out_and_not_confirmed():
