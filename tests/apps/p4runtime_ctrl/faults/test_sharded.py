@@ -240,7 +240,7 @@ def test_after_a_kill_the_other_controller_goes_on_with_the_switch(site, updates
         traffic.more()
         wait_for(lambda: site.owner("s1") == other and site.sends("s1"), why=site.why)
         traffic.more()
-        sent = traffic.sent
+    sent = traffic.sent  # its thread has ended
     wait_for(lambda: sum(map(len, site.arrivals("s2").values())) >= sent, why=site.why)
     assert complete(site, "s2") == list(range(sent)), "packets of the other switch are not disturbed"
     taken_over = complete(site, "s1")
