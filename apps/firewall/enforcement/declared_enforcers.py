@@ -17,6 +17,8 @@ _ENDED: Final = 1_024
 """Decisions whose drop counters may still come, though they have ended."""
 _MOST_WATCHED: Final = 1_000
 _STANDING: Final = ("installed", "exists")
+_HELD: Final = (*_STANDING, "pending")
+"""In force, or soon."""
 _COMMANDED: Final = ("insert", "modify", "delete")
 
 
@@ -83,11 +85,11 @@ class DeclaredEnforcers:
         name = place_text(enforcer, said.switch)
         if name in places.states or len(places.states) < MOST_PLACES:
             places.states[name] = said.state
-        if said.state in _STANDING or said.state == "pending":
+        if said.state in _HELD:
             return True
         if enforcer != SWITCHES and said.state == "expired":
             return False
-        stands = any(state in _STANDING for state in places.states.values())
+        stands = any(state in _HELD for state in places.states.values())
         over = not stands and (not self.elsewhere or places.answered >= self._enforcers)
         if over:
             self._end(said.id)

@@ -68,6 +68,16 @@ def test_what_a_controller_keeps_for_later_is_lifted_as_any_other():
     assert in_force(desk) == 0
 
 
+def test_a_refusal_elsewhere_does_not_end_what_a_controller_keeps_for_later():
+    desk = Desk(enforcers=("nftables",))
+    made = block(desk)
+    desk.confirm(made, "pending")
+    answer(desk, made, "failed")
+    assert in_force(desk) == 1
+    desk.confirm(made, "failed")
+    assert in_force(desk) == 0
+
+
 def test_an_enforcer_s_own_clock_does_not_end_a_block():
     """The firewall extends or lifts it: only it knows whether the attack goes on."""
     desk = Desk(enforcers=("nftables",))
