@@ -4,7 +4,8 @@
 
 Half of them ask twice, and nothing answers the second request: contacts in vain are kept, too.  Some of them connect
 to the next one by TCP in the end: the firewall, its controller and the switch keep sources with a finished handshake, and
-their services.  Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest to take the
+their services.  At the end some hosts speak with ten others each: what such a hub says is logged for the peers that have
+not heard it yet, and without them the number of these logs would grow for hours.  Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest to take the
 newest: memory that grows from then on is a leak.
 """
 
@@ -14,7 +15,7 @@ from typing import Any, Final
 
 from apps.firewall.settings import Settings
 from apps.firewall.syn.syn_defence import SERVICES_LEARNT
-from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS
+from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS, STREAMS_PER_LOG
 from apps.kitsune.behaviour.contacts import MOST_CONTACTS
 
 PAIRS: Final = round(2.1 * MOST_CONTACTS)
@@ -25,10 +26,19 @@ UNANSWERED: Final = round(1.05 * MOST_CONTACTS)
 """Of their requests."""
 HANDSHAKES: Final = round(1.05 * max(Settings().known_limit, SERVICES_LEARNT))
 """Connections: each brings a known source and a service.  To a host goes one, so that nothing looks like a flood."""
-FRAMES: Final = 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES
+HUBS: Final = round(1.2 * MAX_STREAMS / STREAMS_PER_LOG)
+"""Each has a log in two tables."""
+PEERS: Final = 10
+ROUNDS: Final = 26
+"""A log keeps 256 packets."""
+FRAMES: Final = 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES + HUBS * PEERS * (ROUNDS + 1)
 TRAINED: Final = 70_000
 """Frames of the office before: 55,000 of training, the rest is scored."""
-CAPS: Final = {"streams": 4 * MAX_STREAMS, "links": 2 * MAX_LINKS}
+CAPS: Final = {
+    "streams": 4 * MAX_STREAMS,
+    "links": 2 * MAX_LINKS,
+    "hub_logs": 2 * MAX_STREAMS // STREAMS_PER_LOG,
+}
 """Of those tables of which Kitsune's health says how full they are."""
 
 _TOGETHER: Final = 64
@@ -49,7 +59,7 @@ _PSEUDO = struct.Struct("!IIHH")
 
 
 def fill_frames(
-    pairs: int = PAIRS, unanswered: int = UNANSWERED, handshakes: int = HANDSHAKES
+    pairs: int = PAIRS, unanswered: int = UNANSWERED, handshakes: int = HANDSHAKES, hubs: int = HUBS
 ) -> Iterator[tuple[int, bytes]]:
     """Frames, and the end that each is sent into: 0 that of the office, 1 that of the Internet.
 
@@ -57,6 +67,7 @@ def fill_frames(
         pairs: of neighbours in the chain.
         unanswered: requests without an answer, by the first hosts.
         handshakes: connections, by the first hosts, after all requests.
+        hubs: hosts behind the chain that speak with ten others each, all at the same time.
     """
     for first in range(0, pairs, _TOGETHER):
         askers = range(first, min(first + _TOGETHER, pairs))
@@ -74,6 +85,19 @@ def fill_frames(
             yield (number + 1) % 2, _segment(number + 1, number, _SYN | _ACK, _SERVERS, _CLIENTS + 1)
         for number in clients:
             yield number % 2, _segment(number, number + 1, _ACK, _CLIENTS + 1, _SERVERS + 1)
+    yield from _hub_frames(max(pairs, handshakes) + 1, hubs)
+
+
+def _hub_frames(first: int, hubs: int) -> Iterator[tuple[int, bytes]]:
+    """Each hub speaks to its peers in turn; once they answer.  Every second number is on its side."""
+    numbers = range(first + first % 2, first + first % 2 + hubs * 2 * PEERS, 2 * PEERS)
+    for turn in range(ROUNDS):
+        for hub in numbers:
+            peers = range(hub + 1, hub + 2 * PEERS, 2)
+            for peer in peers:
+                yield 0, _frame(hub, peer)
+            for peer in peers if turn == 0 else ():
+                yield 1, _frame(peer, hub)
 
 
 def fullness(health: Mapping[str, Any]) -> dict[str, dict[str, int]]:

@@ -28,6 +28,8 @@ Mode = Literal["reference", "bounded"]
 
 MAX_STREAMS: Final = 65_536
 MAX_LINKS: Final = 65_536
+STREAMS_PER_LOG: Final = 128
+"""A table has at most one log of a hub for so many streams, of 32 KiB each; as in `afterimage_hubs.h`."""
 HORIZON_S: Final = 3_000.0
 """After this idle time a stream's weight at the slowest scale is below 1e-9."""
 
