@@ -30,6 +30,8 @@ _CONFIRMATIONS = "network.confirmation.p4runtime_ctrl.*"
 _REPORTS = "network.switch.p4runtime_ctrl.*"
 _SCORES = "network.anomaly.kitsune.score"
 _COORDINATORS = "due.health.coordinator"
+_TABLES = ("ingress.block_src", "ingress.block_mac")
+"""The firewall decides by itself, too, and blocks a MAC that has one address only."""
 _BLOCK_S = 86_400
 _FLUSH_S = 120.0
 _BATCH = 50
@@ -250,7 +252,7 @@ def held(address: str) -> frozenset[str] | None:
     with where.channel() as channel:
         session = P4RuntimeSession(P4RuntimeStub(channel), where, CompiledProgram(b"", info.message), None)
         try:
-            entries = list(session.read_counters(info.table("ingress.block_src").id))
+            entries = [entry for name in _TABLES for entry in session.read_counters(info.table(name).id)]
         except SwitchError:
             return None
     return frozenset(_sources(map(info.describe, entries)))

@@ -188,12 +188,14 @@ def _limits(parts: "list[_Sized]", max_bytes: int, lasting: Lasting) -> "dict[_S
         return {}
     lasts = {part: part.lasting_size(lasting) for part in parts}
     others = {part: max(0, sizes[part] - lasts[part]) for part in parts}
-    room = min(sum(lasts.values()), max_bytes // SHARE)
+    half = max_bytes // SHARE
+    room = min(sum(lasts.values()), half)
     found = {}
     for part in parts:
         own = room * lasts[part] // max(1, sum(lasts.values()))
         rest = (max_bytes - room) * others[part] // max(1, sum(others.values()))
-        found[part] = _Limit(own + rest, own)
+        # while what lasts fits, nothing of it goes: not even what is written before the limit is applied
+        found[part] = _Limit(own + rest, half if room < half else own)
     return found
 
 
