@@ -4,9 +4,10 @@ other keys      older than `before`, then the oldest until the archive is small 
 lasting keys    older than `Lasting.before`; by size only what exceeds half of the whole archive's limit
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
+from due.errors import InvalidKey
 from due.keys import Key
 
 SHARE: Final = 2
@@ -28,13 +29,20 @@ class Lasting(NamedTuple):
         """Those of the keys whose items last.
 
         Args:
-            keys: concrete ones, as an archive has them.
+            keys: concrete ones, as an archive has them; damaged ones do not last.
 
         Raises:
-            InvalidKey: a pattern, or a key, breaks the grammar.
+            InvalidKey: a pattern breaks the grammar.
         """
         patterns = [Key.parse(pattern) for pattern in self.keys]
-        return [key for key in keys if any(pattern.matches(Key.parse(key)) for pattern in patterns)]
+        return [key for key in keys if _meets(key, patterns)]
+
+
+def _meets(key: str, patterns: Sequence[Key]) -> bool:
+    try:
+        return any(pattern.matches(Key.parse(key)) for pattern in patterns)
+    except InvalidKey:
+        return False
 
 
 NOTHING: Final = Lasting()

@@ -129,8 +129,8 @@ class MongoRetention:
     def _divided(self, lasting: Lasting) -> tuple[list[str], list[str]]:
         """Keys whose documents last, and the others."""
         keys = [entry["_id"] for entry in self._table("keys").find({}, {"_id": 1})]
-        lasts = lasting.among(keys)
-        return lasts, sorted({*keys} - {*lasts})
+        lasts = dict.fromkeys(lasting.among(keys))
+        return list(lasts), [key for key in keys if key not in lasts]
 
     def _stored_bytes(self, companion: str) -> int:
         table = self._table(companion)

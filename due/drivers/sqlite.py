@@ -133,8 +133,9 @@ class SqliteArchive:
         self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
     ) -> int:
         """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
-
-        deleted = self._in_steps(lambda connection: self._prune_older(connection, before, lasting))
+        deleted = 0
+        if before is not None or lasting.before is not None:
+            deleted += self._in_steps(lambda connection: self._prune_older(connection, before, lasting))
         if max_bytes is not None:
             deleted += self._in_steps(lambda connection: self._prune_lasting(connection, max_bytes, lasting))
             deleted += self._in_steps(lambda connection: self._prune_others(connection, max_bytes, lasting))

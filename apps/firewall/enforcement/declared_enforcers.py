@@ -76,9 +76,9 @@ class DeclaredEnforcers:
             said: the answer.
 
         Returns:
-            Whether it holds for the decision as a whole; what is pending is neither in force nor at its end.  One of several that refuses or removes it does not end it
-            while others carry it out or have not answered; neither does one that ends it by its own clock, because
-            the firewall extends or lifts it then.
+            Whether it holds for the decision as a whole; what is pending is neither in force nor at its end.  One of
+            several that refuses or removes it does not end it while others carry it out or have not answered; neither
+            does one that ends it by its own clock, because the firewall extends or lifts it then.
         """
         places = self._of(said.id)
         places.answered.add(enforcer)

@@ -380,7 +380,7 @@ class DesiredSwitch:
             done: State = "removed" if update.main.kind == DELETE else "installed"
             cause = report.failed.get(key)
             state: State = "failed" if cause else done
-            if state == "failed" and done == "installed":
+            if cause and update.main.kind != DELETE:
                 self._give_up(update)
             text = cause or "done when the switch was connected again"
             answers.append(self._confirmation(update.owner, state, update.main.entry, cause=text))

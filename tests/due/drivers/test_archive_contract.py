@@ -295,6 +295,10 @@ def test_what_lasts_has_an_age_of_its_own(archive: ArchiveDriver) -> None:
     assert len(archive.find({})) == 11
 
 
+def test_a_damaged_key_lasts_no_longer_than_others() -> None:
+    assert LASTING.among(["network.block.x", "network..block", "a"]) == ["network.block.x"]
+
+
 def test_wrong_queries_name_the_fault(archive: ArchiveDriver) -> None:
     with pytest.raises(InvalidQuery, match="colour"):
         archive.find({"colour": 1})
