@@ -47,6 +47,7 @@ class Page:
 
     def __init__(self, driver, url):
         self.driver = driver
+        self.obstacle = "nothing like it is shown"
         driver.get(url)
 
     def seen(self, selector, text=""):
@@ -76,13 +77,16 @@ class Page:
         found = self.seen(selector, text)
         try:
             if found is not None:
+                # the driver takes what lies under the fixed header for visible, and does not scroll by itself
+                self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", found)
                 found.click()
-        except WebDriverException:  # something lies before it, or it is gone
+        except WebDriverException as fault:  # something lies before it, or it is gone
+            self.obstacle = str(fault)
             return False
         return found is not None
 
     def click(self, selector, text=""):
-        until(lambda: self.click_now(selector, text))
+        until(lambda: self.click_now(selector, text), why=lambda: (selector, text, self.obstacle))
 
     def type_now(self, selector, text):
         """Over what is there; whether the field says so: the page may bring it up to date meanwhile."""

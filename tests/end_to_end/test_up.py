@@ -115,14 +115,14 @@ class Operator:
             assert (process.returncode, "Traceback" in error) == (0, False), error
 
 
-def until(condition):
-    """The first true answer."""
+def until(condition, why=lambda: ""):
+    """The first true answer; `why` says what is known where there is none."""
     deadline = time.monotonic() + SECONDS
     while time.monotonic() < deadline:
         if answer := condition():
             return answer
         time.sleep(0.1)
-    raise AssertionError(f"did not come about in {SECONDS} s")
+    raise AssertionError(f"did not come about in {SECONDS} s {why()}")
 
 
 @pytest.fixture
