@@ -27,9 +27,10 @@ def test_decisions_that_follow_each_other_are_counted_together(monkeypatch):
     engine, switch = Written(), Read()
     settings = Settings(switches=(MINE,), program="", p4info="", restore=False)
     one = worker.SwitchWorker(engine, settings, MINE, program(), Connected)
-    one._counted_at = float("-inf")  # as long after boot
+    one._counters._counted_at = float("-inf")  # as long after boot
     one.start(active=True)
     one.became_primary(switch)
+    wait_for(one.settled.is_set)
     one.decide(decision(1))
     wait_for(lambda: set(engine.counted()) == {"d1"}, 60)
     for number in range(2, 6):
