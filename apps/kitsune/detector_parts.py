@@ -19,7 +19,7 @@ _DETECTOR: Final[Kinds] = {
     "_knows_behaviour": bool,
 }
 _CHECK: Final[Kinds] = {"_second": int, "_syn": int, "_tcp": int, "_worst": int}
-_SENDERS: Final[Kinds] = {"clock_jumps": int, "_history": dict[_Identity, deque[int]]}
+_SENDERS: Final[Kinds] = {"clock_jumps": int, "_history": OrderedDict[_Identity, deque[int]]}
 _SWITCHES: Final[Kinds] = {"names": list[str]}
 _ROLES: Final[Kinds] = {
     "_behind": dict[int, set[_Address]],

@@ -7,7 +7,7 @@ TCP SYN-ACK or RST, an ICMP error, or a UDP packet back, soon after the initiato
 """
 
 import math
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
@@ -111,8 +111,8 @@ class Senders:
             raise MemoryError("senders: no memory for their tables")
         self._state = kernel.ffi.gc(state, self._lib.senders_free)
         self._switches = SwitchNumbers()
-        self._history: dict[Identity, deque[int]] = {}
-        """Anomalous seconds of senders that had some."""
+        self._history: OrderedDict[Identity, deque[int]] = OrderedDict()
+        """Anomalous seconds of senders that had some within `HISTORY_S`; who had the last one is at the end."""
         self._kept: dict[int, Sequence[Any]] = {}
         """Evidence of the open second, by number of the batch."""
         self._full: npt.NDArray[np.uint64] = np.zeros(0, np.uint64)
@@ -283,9 +283,18 @@ class Senders:
     def _anomalous(self, identity: Identity, numbers: Sequence[Any], proof: Any) -> AnomalousSecond:
         second, packets, over, destinations, first_over, rate, hosts, peak = numbers
         history = self._history.setdefault(identity, deque())
+        self._history.move_to_end(identity)
         history.append(second)
         while history[0] <= second - HISTORY_S:
             history.popleft()
+        self._forget_until(second - HISTORY_S)
         record = SenderRecord(identity, rate, hosts, second, history)
         tally = Tally(packets, over, peak, first_over, destinations, proof)
         return AnomalousSecond(second, record, tally, len(history))
+
+    def _forget_until(self, second: int) -> None:
+        """Senders whose last anomalous second is no later: in a network that meets ever new ones they would pile up."""
+        while (former := next(iter(self._history.values()), None)) is not None:
+            if former and former[-1] > second:
+                return
+            self._history.popitem(last=False)

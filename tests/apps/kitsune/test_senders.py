@@ -65,6 +65,13 @@ def test_anomalous_seconds_of_the_last_ten_add_up():
     assert counts == [1, 2, 3, 3, 3]
 
 
+def test_who_was_anomalous_long_ago_is_not_remembered():
+    senders = trained_senders()
+    feed(senders, [(5 + number // 4, HOST + number, 5) for number in range(100) for _ in range(3)])
+    senders.finish()
+    assert [identity[3][2] - HOST for identity in senders._history] == list(range(60, 100))
+
+
 def test_the_open_second_is_closed_at_the_end():
     senders = trained_senders()
     feed(senders, [(5, HOST, 2)] * 3)
