@@ -16,7 +16,7 @@ _ROUTED: Final = 3
 """A MAC with traffic from or to this many addresses outside the local network is a gateway."""
 _DNS, _DHCP = 53, 67
 _FEW: Final = 4
-_KEPT: Final = 65_536
+_KEPT: Final = 4_096
 """Addresses of which it is known whether they are inside."""
 _BORROWED: Final = 4
 """Most addresses of a host that lends itself others' names; a MAC with more may be a new router."""
