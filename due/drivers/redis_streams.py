@@ -107,6 +107,8 @@ class SendWindow:
         """The stream is announced, and its expiry was renewed within the last `CARE_SECONDS`."""
         self.written = False
         """Written to since its expiry was renewed."""
+        self.made = False
+        """The stream is on the server, in its present life."""
         self._heard_at: float | None = None
         """When its first announcement reached somebody, s, monotonic; negative infinity: nobody."""
         self.groups: tuple[bytes, ...] = ()
@@ -203,7 +205,7 @@ class SendWindow:
         return sum(entry.id is not None and entry.id > self._read_to for entry in self.retained)
 
     def forget_ids(self, now: float) -> None:
-        """The server was restarted or replaced: earlier ids mean nothing, and its clock may be behind them.
+        """The server was restarted, replaced or emptied: earlier ids mean nothing, and its clock may be behind them.
 
         Readers that this producer has not met yet have to find their way again, too.  `now`: s, monotonic.
         """
@@ -214,6 +216,7 @@ class SendWindow:
             self.kept_bytes += entry.size
         self._read_to = NOTHING
         self._heard_at = now
+        self.made = False
         for entry in (*self.retained, *self.kept):
             entry.id = None
 

@@ -10,7 +10,7 @@ from due import PUB_ONLY, Capability
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis import RedisUpdates
 from due.drivers.redis_streams import work_name
-from due.drivers.redis_wire import Wire
+from due.drivers.redis_wire import Wire, client
 from due.errors import Timeout
 from tests.due.conftest import wait_for
 
@@ -58,6 +58,50 @@ def test_gaps_of_a_best_effort_key_are_counted(make_engine, tmp_path):
         assert consumer.health()["receiving"]["gaps"] == got[1] - 1
         producer.close()
         consumer.close()
+
+
+def _expire_all(commands: Any) -> None:
+    """As a clock does that jumps by more than a day."""
+    for name in commands.scan_iter():
+        if commands.ttl(name) >= 0:
+            commands.expire(name, 0)
+
+
+@pytest.mark.parametrize("later", [2100, 2000], ids=["written-on", "idle"])
+@pytest.mark.parametrize(
+    "lose", [_expire_all, lambda commands: commands.flushall()], ids=["expired", "flushed"]
+)
+def test_what_a_server_loses_without_a_restart_is_sent_again(tmp_path, monkeypatch, lose, later):
+    monkeypatch.setattr("due.drivers.redis_publisher.CARE_SECONDS", 0.2)
+    with EmbeddedServer(tmp_path / "u") as server:
+        updates, commands = RedisUpdates(server.url), client(server.url)
+        publisher, receiver = updates.publisher("producer"), updates.receiver("group", "one")
+        found: set[int] = set()
+
+        def read_to(count: int) -> bool:
+            publisher.poll()
+            receiver.renew()
+            for delivery in receiver.receive(0.05):
+                found.add(int(delivery.payload))
+                receiver.acknowledge(delivery)
+            return len(found) >= count
+
+        receiver.follow("r.lost")
+        receiver.subscribe("r.lost")
+        publisher.append("r.lost", b"0")
+        wait_for(lambda: read_to(1))
+        for number in range(1, 2000):
+            publisher.append("r.lost", b"%d" % number)
+        publisher.settle(10)
+        wait_for(lambda: read_to(100))
+        lose(commands)
+        for number in range(2000, later):
+            publisher.append("r.lost", b"%d" % number)
+        wait_for(lambda: read_to(later))
+        assert found == set(range(later))
+        publisher.close()
+        receiver.close()
+        commands.close()
 
 
 def test_foreign_and_newer_payloads_are_counted_and_skipped(make_engine, server, caplog):

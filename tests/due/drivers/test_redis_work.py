@@ -83,7 +83,7 @@ def test_whoever_claims_work_whose_payload_is_gone_is_told_so(commands):
 
 
 def test_a_crowd_of_made_up_readers_hides_no_real_one(make_engine, commands, monkeypatch):
-    monkeypatch.setattr("due.drivers.redis.CARE_SECONDS", 0.2)
+    monkeypatch.setattr("due.drivers.redis_publisher.CARE_SECONDS", 0.2)
     init = {"capabilities": [Capability("w.crowd", delivery="reliable")]}
     names = [f"nobody{number}" for number in range(3000)]
     commands.sadd(readers_name("w.crowd"), *names)
