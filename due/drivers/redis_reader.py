@@ -37,6 +37,7 @@ from due.drivers.redis_work import (
     ReadAhead,
     ReadRound,
     last_id,
+    list_gone,
     packed_ids,
     packed_payload,
     put_before,
@@ -527,20 +528,18 @@ class StreamReader:
         self._acks.add(path, token)
 
     def _refused(self, error: Exception, expected: _Expected) -> None:
-        text = str(error)
         if expected[0] == "put" and put_before(error):
             return
-        if "NOGROUP" in text or "no such key" in text:
+        if list_gone(error):
             self._listless = True
-        elif text.startswith("NOPERM"):
+        elif str(error).startswith("NOPERM"):
             self._drop_denied()
         else:
             raise UpdatesUnavailable(f"reading streams was refused: {error}")
 
     def _begin_again(self) -> None:
         """A work list is gone because the server restarted empty: begin at the stream's beginning."""
-        with self._lock:
-            paths = list(self._paths)
+        paths = self.offered()
         for path in paths:
             self._make_list(path, "0")
         with self._lock:
@@ -562,10 +561,9 @@ class StreamReader:
                 continue  # it is found with the next request
 
     def _look_after_the_dead(self) -> None:
-        with self._lock:
-            paths = list(self._paths)
+        paths = self.offered()
         self._ask_lists = True  # with the next request: what is on its way may have taken long
-        self._alone = True
+        self._alone, gone = True, False
         for path in paths:
             unmade = self._places.unmade.get(path)
             if unmade is not None:
@@ -577,11 +575,14 @@ class StreamReader:
             except (redis.RedisError, OSError) as error:
                 log.debug("members of %s could not be checked: %s", path, error)
                 self._alone = False
+                gone = gone or (list_gone(error) and path not in self._places.unmade)
                 continue
             if not waits or self._shared:
                 with self._lock:
                     self._held.discard(path)
         self._take_over = False
+        if gone:  # while this member rested, so that no answer to a request told it
+            self._begin_again()
 
     def _claim(self, path: str) -> bool:
         """Take the pending entries of dead members; returns whether a live one has some."""

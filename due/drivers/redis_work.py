@@ -81,6 +81,11 @@ def put_before(error: Exception) -> bool:
     return _REPEATED in str(error)
 
 
+def list_gone(error: Exception) -> bool:
+    """Whether a command about a list failed because the server does not have it."""
+    return "NOGROUP" in str(error) or "no such key" in str(error)
+
+
 def last_id(reply: Any) -> str:
     """The last id of a list, from `XINFO STREAM`."""
     last: bytes = dict(zip(reply[::2], reply[1::2], strict=True))[b"last-generated-id"]

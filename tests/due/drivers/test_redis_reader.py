@@ -63,6 +63,15 @@ def _read(reader: StreamReader) -> list[Delivery]:
     return found
 
 
+def _what_came(reader: StreamReader) -> list[Delivery]:
+    """Deliveries of one wait, where the connection may be away."""
+    reader.care()
+    if reader.fileno() < 0:
+        return []
+    ready, _, _ = select.select([reader.fileno()], [], [], 0.05)
+    return reader.read(set(ready))
+
+
 class _NoLists:
     """A client whose connection is cut whenever it makes a list."""
 
@@ -194,18 +203,31 @@ def test_an_acknowledgement_is_for_the_life_of_the_server_that_it_is_of(tmp_path
         again = client(server.url)
         again.xadd(stream_name("r.lives"), {"f": "late"}, id=entry)
         found: list[Delivery] = []
-
-        def comes() -> list[Delivery]:
-            reader.care()
-            if reader.fileno() >= 0:
-                ready, _, _ = select.select([reader.fileno()], [], [], 0.05)
-                found.extend(reader.read(set(ready)))
-            return found
-
-        wait_for(comes)
+        wait_for(lambda: found.extend(_what_came(reader)) or found)
         assert [delivery.payload for delivery in found] == [b"late"]
         reader.acknowledge(early)
         reader.close()
         assert again.xpending(work_name("group", "r.lives"), "group")["pending"] == 1
+        for each in (commands, again):
+            each.close()
+
+
+def test_one_that_rested_while_the_server_lost_everything_reads_from_the_beginning(tmp_path):
+    """It has never had a connection for reading, on which an answer would have told it."""
+    with EmbeddedServer(tmp_path / "u") as server:
+        commands = client(server.url)
+        reader = StreamReader(server.url, commands, "group", "one", shared=False)
+        reader.activate(False, take_over=False)
+        commands.xadd(stream_name("r.rested"), {"f": "lost"})
+        reader.add("r.rested", "$")
+        server.kill()
+        server.start()
+        again = client(server.url)
+        again.xadd(stream_name("r.rested"), {"f": "new"})
+        reader.activate(True, take_over=False)
+        found: list[Delivery] = []
+        wait_for(lambda: found.extend(_what_came(reader)) or found)
+        assert [delivery.payload for delivery in found] == [b"new"]
+        reader.close()
         for each in (commands, again):
             each.close()
