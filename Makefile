@@ -27,7 +27,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 venv: $(STAMP)
 
 # The stamps hold what the environment was made from: a second run does nothing.
-$(BASE): pyproject.toml $(wildcard setup.py apps/*/*.c)
+$(BASE): pyproject.toml $(wildcard setup.py apps/*/*.[ch] apps/*/*/*.[ch])
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "SDNator needs Python 3.11 or later; $(PYTHON) is `$(PYTHON) -V 2>&1`. Try: make PYTHON=python3.11" >&2; exit 2; }
 	@echo "==> setting up $(VENV) (once; takes a minute or two)"
