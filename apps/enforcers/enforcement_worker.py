@@ -23,6 +23,8 @@ _REPORT_EVERY_S: Final = 10.0
 _TOGETHER: Final = 1_000
 """Decisions that are carried out at once, at most."""
 _CLOSE_S: Final = 10.0
+_MOST_LIFTED: Final = 100_000
+_NO_HISTORY: Final = "Data Archives have not answered since the start: what was in force before is left alone, and not read back"
 
 log = logging.getLogger(__name__)
 
@@ -97,37 +99,51 @@ class EnforcementWorker:
         self._held: Mapping[str, HeldCount] = {}
         self._outlook = _Outlook()
         self._closing = threading.Event()
-        self._allow_again = True
+        self._allow_again = False
+        self._archived: tuple[tuple[str, ...], tuple[Spoken, ...]] | None = None
+        """History that has come and is not taken up yet."""
+        self._history_known = False
+        self._allow_heard = False
+        self._lifted: dict[str, None] = {}
+        """Ids lifted before history came; the archive may not have these lifts yet."""
         self._counts = dict.fromkeys(
             ("installed", "removed", "expired", "failed", "restored", "refused_full", "tries_failed"), 0
         )
         self._thread = threading.Thread(target=self._work, name=f"enforcer {self._app}", daemon=True)
 
-    def restore_allowed(self, entries: tuple[str, ...]) -> None:
-        """The allow-list from the archive; before `start`."""
-        self._allowed.replace(entries)
+    def restore(self, allowed: tuple[str, ...], spoken: Iterable[Spoken]) -> None:
+        """Take up the archive's allow-list and its last decision of each id, however many.
 
-    def restore(self, spoken: Iterable[Spoken]) -> None:
-        """Blocks from the archive, however many; before `start`."""
-        for each in spoken:
-            self._decide(each)
+        Until then what already stands is left alone, except for what is lifted.
+        """
+        self._archived = allowed, tuple(spoken)
+        self.put(None)
 
     def start(self) -> None:
         """Begin to work."""
         self._thread.start()
 
-    def put(self, job: Job) -> None:
-        """Queue a decision or an allow-list; never waits.  What does not fit is counted and answered as failed."""
+    def put(self, job: Job) -> bool:
+        """Queue a decision or an allow-list; never waits.  What does not fit is counted and answered as failed.
+
+        Returns:
+            Whether it fitted.
+        """
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
             if isinstance(job, Spoken):
                 self._counts["refused_full"] += 1
                 self._answer(job.decision, "failed", f"{self._jobs.maxsize:,} decisions are already waiting")
+            return False
+        return True
 
     def knows(self, decision_id: str) -> bool:
-        """Whether a block of this id stands or waits to be carried out; may be a moment old."""
-        return decision_id in self._desired.standing or decision_id in self._desired.adding
+        """Whether a block of this id stands or shall stand, and is not being removed; may be a moment old."""
+        desired = self._desired
+        return decision_id not in desired.removing and (
+            decision_id in desired.standing or decision_id in desired.adding
+        )
 
     def check(self) -> None:
         """Raises `RuntimeError` if the worker thread has ended with an error."""
@@ -146,8 +162,8 @@ class EnforcementWorker:
         return {
             "blocks": len(self._held),
             "waiting": self._jobs.qsize() + len(self._desired.adding) + len(self._desired.removing),
-            "working": not self._outlook.problem,
-            "problem": self._outlook.problem,
+            "working": not self._problem,
+            "problem": self._problem,
             **self._counts,
         }
 
@@ -155,6 +171,7 @@ class EnforcementWorker:
 
     def _work(self) -> None:
         while not self._closing.is_set():
+            self._take_up_history()
             self._take(self._wait_s())
             self._step()
         self._take(0.0)
@@ -167,7 +184,9 @@ class EnforcementWorker:
     def _wait_s(self) -> float:
         """Seconds until there is something to do by time alone."""
         now, outlook = time.monotonic(), self._outlook
-        moments = [outlook.check_at, outlook.report_at]
+        moments = [outlook.report_at]
+        if self._history_known:
+            moments.append(outlook.check_at)
         if self._waits():
             moments.append(outlook.try_at)
         if (end := self._desired.next_end()) and not self._desired.removing:
@@ -188,21 +207,39 @@ class EnforcementWorker:
         except queue.Empty:
             pass
 
+    def _take_up_history(self) -> None:
+        archived, self._archived = self._archived, None
+        if archived is None:
+            return
+        self._history_known = True
+        allowed, decisions = archived
+        self._allow(self._allowed.entries if self._allow_heard else allowed)
+        for each in decisions:
+            name = each.decision.id
+            if each.decision.action != "block":
+                self._desired.remove(name)
+            elif name not in self._lifted and not self.knows(name):  # what was heard is newer
+                self._decide(each)
+        self._lifted.clear()
+
     def _hear(self, job: Job) -> None:
         if isinstance(job, tuple):
-            self._allowed.replace(job)
-            self._allow_again = True
-            for desired_block in [*self._desired.standing.values(), *self._desired.adding.values()]:
-                if self._allowed.cover(desired_block.target):
-                    self._desired.remove(desired_block.id)
+            self._allow_heard = True
+            self._allow(job)
         elif job is not None and not job.decision.dry_run:
             self._decide(job)
+
+    def _allow(self, entries: tuple[str, ...]) -> None:
+        self._allowed.replace(entries)
+        self._allow_again = self._history_known
+        for desired_block in [*self._desired.standing.values(), *self._desired.adding.values()]:
+            if self._allowed.cover(desired_block.target):
+                self._desired.remove(desired_block.id)
 
     def _decide(self, spoken: Spoken) -> None:
         decision = spoken.decision
         if decision.action == "unblock":
-            if not self._desired.remove(decision.id):
-                self._answer(decision, "removed", "it was not in force here")
+            self._lift(decision)
             return
         if decision.action != "block":
             return
@@ -219,6 +256,19 @@ class EnforcementWorker:
         else:
             self._answer(decision, "exists")
 
+    def _lift(self, decision: Decision) -> None:
+        found = self._desired.remove(decision.id)
+        if self._history_known:
+            if not found:
+                self._answer(decision, "removed", "it was not in force here")
+            return
+        if len(self._lifted) >= _MOST_LIFTED:
+            self._lifted.pop(next(iter(self._lifted)))
+        self._lifted[decision.id] = None
+        if not found and len(self._desired.removing) < self._limit:
+            # it may stand since before the start
+            self._desired.removing[decision.id] = DesiredBlock(decision, 0)
+
     def _step(self, *, last: bool = False) -> None:
         now, outlook = time.monotonic(), self._outlook
         for name in self._desired.ended(time.time_ns()):
@@ -226,7 +276,7 @@ class EnforcementWorker:
         try:
             if self._waits() and (last or now >= outlook.try_at):
                 self._carry_out()
-            if not last and now >= outlook.check_at:
+            if self._history_known and not last and now >= outlook.check_at:
                 self._read_back()
         except EnforcerAway as error:
             self._away(str(error))
@@ -324,12 +374,16 @@ class EnforcementWorker:
             )
         )
 
+    @property
+    def _problem(self) -> str:
+        return self._outlook.problem or ("" if self._history_known else _NO_HISTORY)
+
     def _report(self) -> None:
         now, outlook = time.monotonic(), self._outlook
         standing = self._desired.standing
         held = [(standing[name], count) for name, count in self._held.items() if name in standing]
         waiting = len(self._desired.adding) + len(self._desired.removing)
-        problem = outlook.problem or outlook.found
+        problem = self._problem or outlook.found
         what = (problem, tuple((desired_block.id, count) for desired_block, count in held), waiting)
         if what == outlook.told and now < outlook.report_at:
             return
@@ -339,7 +393,7 @@ class EnforcementWorker:
             EnforcementReport(
                 enforcer=self._app,
                 place=self._place,
-                working=not outlook.problem,
+                working=not self._problem,
                 problem=problem,
                 blocks=blocks,
                 waiting=waiting,

@@ -20,7 +20,10 @@ class HeldCount:
 
 
 class Enforcer(Protocol):
-    """Adds, removes, lists back; called from one thread.  Every method raises `EnforcerAway` only."""
+    """Adds, removes, lists back; called from one thread.  Every method raises `EnforcerAway` only.
+
+    Until the first `allow`, history is unknown: `change` leaves alone what it is not told of, and `held` is not called.
+    """
 
     def change(self, add: Sequence[DesiredBlock], remove: Sequence[DesiredBlock]) -> Mapping[str, str]:
         """Add and remove blocks; adding what stands changes its end.

@@ -38,7 +38,8 @@ class NftTable:
         self._nft = program
         self._at_end: AtEnd = at_end
         self._desired: dict[str, DesiredBlock] = {}
-        self._allowed: tuple[str, ...] = ()
+        self._allowed: tuple[str, ...] | None = None
+        """None: history is unknown, and what stands is not to be made anew."""
         self._shape: str | None = None
         """As it was right after it was made; None: it is to be made."""
         self._before: dict[Element, HeldCount] = {}
@@ -50,7 +51,9 @@ class NftTable:
         for desired_block in remove:
             wanted.pop(desired_block.id, None)
         old, new = elements_of(self._desired.values()), elements_of(wanted.values())
-        if self._shape is None:
+        if self._allowed is None:
+            self._amend(old, new, {element_of(desired_block.target) for desired_block in remove})
+        elif self._shape is None:
             self._make(new)
         else:
             self._differ(old, new)
@@ -117,12 +120,39 @@ class NftTable:
             )
             self._make(new)
 
+    def _amend(
+        self, old: Mapping[Element, int], new: Mapping[Element, int], lifted: Iterable[Element]
+    ) -> None:
+        """Add and remove in a table of which nobody knows yet what shall stand in it."""
+        listing = self._read()
+        if listing is None:
+            self._make(new)
+            return
+        gone = [each for each in lifted if each in listing.elements and each not in new]
+        left = dict.fromkeys(listing.elements.keys() - set(gone), 0)
+        every = {**left, **new}
+        gone += [each for each in left if outermost(each, every) != each]
+        changed = {
+            each: end
+            for each, end in new.items()
+            if outermost(each, every) == each and (each not in left or old.get(each, -1) != end)
+        }
+        self._keep_counts(listing, [each for each in changed if each in left])
+        try:
+            # in one transaction, nft would refuse a prefix around another one that goes
+            self._nft.apply(self._plan.change({}, gone, {}, time.time_ns()))
+            self._nft.apply(self._plan.change(changed, (), left, time.time_ns()))
+        except TransactionRefused as error:
+            raise EnforcerAway(
+                f"nftables refuses a change of table inet {self._plan.name}: {error}"
+            ) from None
+
     def _make(self, elements: Mapping[Element, int]) -> None:
         listing = self._read()
         self._keep_counts(listing, listing.elements if listing is not None else ())
         self._shape = None
         try:
-            self._nft.apply(self._plan.create(self._allowed, elements, time.time_ns()))
+            self._nft.apply(self._plan.create(self._allowed or (), elements, time.time_ns()))
         except TransactionRefused as error:
             raise EnforcerAway(f"nftables refuses table inet {self._plan.name}: {error}") from None
         made = self._read()

@@ -5,6 +5,7 @@ import time
 from itertools import count
 
 import pytest
+from msgspec import structs
 
 from apps.enforcement import AllowedEntries, EnforcementReport
 from apps.enforcers.arrivals import allowed_in, decision_in
@@ -32,6 +33,7 @@ class Obedient:
 
     def __init__(self):
         self.standing = {}
+        self.changed = []
         self.away = ""
         self.gate = threading.Event()
         self.gate.set()
@@ -40,6 +42,7 @@ class Obedient:
         self.gate.wait(60)
         if self.away:
             raise EnforcerAway(self.away)
+        self.changed += [f"+{each.id}" for each in add] + [f"-{each.id}" for each in remove]
         self.standing |= {
             desired_block.id: desired_block
             for desired_block in add
@@ -70,13 +73,15 @@ class Obedient:
 class Told:
     """An enforcement worker, its enforcer, and what it says."""
 
-    def __init__(self, **options):
+    def __init__(self, *, archive=True, **options):
         self.enforcer = Obedient()
         self.said: list[Confirmation] = []
         self.reports: list[EnforcementReport] = []
         chosen = {"check_s": 0.05, "patience_s": 0.2, **options}
         names = ("app", "place")
         self.worker = EnforcementWorker(self.enforcer, names, self.said.append, self.reports.append, **chosen)
+        if archive:
+            self.worker.restore((), ())
 
     def tell(self, decision):
         self.worker.put(Spoken(decision, time.time_ns()))
@@ -151,6 +156,50 @@ def test_a_limit_of_blocks_holds():
     made = [told.tell(block(f"192.0.2.{n}")) for n in range(1, 4)]
     told.wait_for(made[2], "failed")
     assert len(told.enforcer.standing) == 2
+    told.worker.close()
+
+
+def test_without_history_only_what_is_told_is_changed():
+    """What an earlier run has left stays until it is lifted; the report says that history is missing."""
+    told = Told(archive=False)
+    stays, lifted = block(), block("192.0.2.2")
+    told.enforcer.standing = {each.id: each for each in (stays, lifted)}
+    told.enforcer.held = told.enforcer.allow = None
+    told.worker.start()
+    new = told.tell(block("192.0.2.3"))
+    told.wait_for(new, "installed")
+    told.tell(structs.replace(lifted, action="unblock"))
+    told.wait_for(lifted, "removed")
+    assert told.enforcer.standing.keys() == {stays.id, new.id}
+    assert told.enforcer.changed == [f"+{new.id}", f"-{lifted.id}"]
+    assert not told.reports[-1].working
+    assert "Data Archives" in told.worker.health()["problem"]
+    told.worker.close()
+
+
+def test_what_was_heard_is_newer_than_history():
+    """A late answer of the archive brings back neither a lifted block nor an old end, and lifts what it knows."""
+    told = Told(archive=False)
+    told.worker.start()
+    lifted, extended, ended = block(), block("192.0.2.2"), block("192.0.2.3")
+    longer = structs.replace(extended, expires=extended.expires + 10**9)
+    told.worker.put(("192.0.2.5",))
+    for each in (structs.replace(lifted, action="unblock"), longer, ended):
+        told.tell(each)
+    for each, state in ((lifted, "removed"), (longer, "installed"), (ended, "installed")):
+        told.wait_for(each, state)
+    allowed, old = block("192.0.2.5"), block("192.0.2.6")
+    history = (lifted, extended, structs.replace(ended, action="unblock"), allowed, old)
+    told.worker.restore((), [Spoken(each, each.event_time, restored=True) for each in history])
+    told.wait_for(old, "installed")
+    told.wait_for(ended, "removed")
+    told.wait_for(allowed, "failed")
+    assert {each.id: each.decision for each in told.enforcer.standing.values()} == {
+        longer.id: longer,
+        old.id: old,
+    }
+    assert told.enforcer.allowed == ("192.0.2.5",)
+    assert told.worker.health()["working"]
     told.worker.close()
 
 

@@ -1,9 +1,14 @@
 """nftables for real: packets of a blocked host stop in a network namespace, and come again."""
 
+import time
 from functools import partial
 
 import pytest
 
+from apps.enforcers.desired_blocks import desired_block_of
+from apps.enforcers.nftables.nft_program import NftProgram
+from apps.enforcers.nftables.nft_table import NftTable
+from apps.enforcers.nftables.ruleset import TablePlan
 from sdnator.testing.enforcer_run import EnforcerRun
 from sdnator.testing.routed_lab import FORWARD, INPUT, OTHERS, SENDER_MAC, SENDERS, RoutedLab
 from sdnator.testing.waiting import wait_for
@@ -114,6 +119,26 @@ def test_a_killed_enforcer_leaves_its_blocks_and_takes_them_up_again(lab, run):
         wait_for(six.passes, why=run.words)
         assert not four.passes()
         wait_for(lambda: run.held() == {stays.id}, why=run.words)
+
+
+def test_without_an_allow_list_what_stands_stays(lab, run):
+    """A new process that knows no history adds, extends and lifts by transactions, also prefixes in each other."""
+    addresses = (SENDERS[4], OTHERS[4], "10.78.1.0/24", "10.79.0.0/16", SENDERS[6])
+    _, lifted, _, _, extended = blocks = [run.decide(run.block(address)) for address in addresses]
+    for each in blocks:
+        run.wait_for(each, "installed")
+    run.kill()
+    new = [run.block(address) for address in ("10.78.0.0/16", "10.79.1.0/24", "02:00:00:00:00:07")]
+    longer = run.block(SENDERS[6], seconds=1800, id=extended.id)
+    with lab.inside("gateway"):
+        table = NftTable(TablePlan(), NftProgram())
+        table.change([desired_block_of(each, time.time_ns()) for each in new], [])
+        table.change([desired_block_of(longer, time.time_ns())], [desired_block_of(lifted, 0)])
+    listed = lab.nft("list", "table", "inet", "sdnator")
+    for stands in (SENDERS[4], "10.78.0.0/16", "10.79.0.0/16", "02:00:00:00:00:07", "timeout 30m"):
+        assert stands in listed
+    for gone in (f"{OTHERS[4]} ", "10.78.1.0/24", "10.79.1.0/24"):
+        assert gone not in listed
 
 
 def restored(run, number):
