@@ -100,25 +100,26 @@ class Device:
     # -- streams --------------------------------------------------------------------------------------
 
     def open_stream(self) -> ControllerStream:
-        """A controller has opened a StreamChannel.  Raises Exhausted."""
-        with self.control:
-            if len(self._streams) >= MAX_STREAMS:
-                raise Exhausted(f"{MAX_STREAMS} streams are open; close one first")
-            self._next_stream += 1
-            stream = ControllerStream(self._next_stream)
-            self._streams[stream.number] = stream
-            return stream
+        """A controller has opened a StreamChannel; to be called by one thread only.  Raises Exhausted."""
+        # without `control`, which is held while a program compiles: nobody would close the stream of a client
+        # that gave up meanwhile
+        if len(self._streams) >= MAX_STREAMS:
+            raise Exhausted(f"{MAX_STREAMS} streams are open; close one first")
+        self._next_stream += 1
+        stream = ControllerStream(self._next_stream)
+        self._streams[stream.number] = stream
+        return stream
 
     def close_stream(self, stream: ControllerStream) -> None:
         """The stream is over; its role may be without a primary now."""
+        self._streams.pop(stream.number, None)
         with self.control:
-            self._streams.pop(stream.number, None)
             stream.queue = None
             self._notify(self._arbitration.leave(stream.number))
             self._assign_queues()
 
     def arbitrate(self, stream: ControllerStream, update: Any) -> None:
-        """A MasterArbitrationUpdate.  Raises what ends the stream."""
+        """A MasterArbitrationUpdate; one of a stream that is closed is ignored.  Raises what ends the stream."""
         self.check_device(stream, update.device_id)
         if update.role.HasField("config"):
             raise InvalidArgument(
@@ -131,6 +132,8 @@ class Device:
             )
         election_id = messages.number(update.election_id) if update.HasField("election_id") else None
         with self.control:
+            if stream.number not in self._streams:
+                return
             before = self._arbitration.primary(update.role.name)
             notices = self._arbitration.update(stream.number, update.role.name, election_id)
             self._assign_queues()
@@ -152,7 +155,7 @@ class Device:
 
     def _assign_queues(self) -> None:
         primaries = set(self._arbitration.primaries())
-        for stream in self._streams.values():
+        for stream in list(self._streams.values()):
             role = self._arbitration.role_of(stream.number)
             if role is None or stream.number not in primaries:
                 stream.queue = None

@@ -129,7 +129,7 @@ class Servicer:
         try:
             if self._rights is not None:
                 self._rights.require_stream(context.auth_context())
-            stream = await self._at_once(self._device.open_stream)
+            stream = self._device.open_stream()
         except Refused as error:
             await context.abort(status.grpc_code(error), str(error))
         peer = None if self._rights is None else context.auth_context()

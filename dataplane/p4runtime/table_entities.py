@@ -9,7 +9,13 @@ from typing import Any
 from dataplane.p4runtime.meters import meter_config, write_meter_config
 from dataplane.p4runtime.schema import Schema
 from dataplane.p4runtime.status import Denied, InvalidArgument, MissingEntity, Unimplemented
-from dataplane.p4runtime.table_codec import PackedReader, TableCodec, packed_reader, unpack_metadata
+from dataplane.p4runtime.table_codec import (
+    PackedReader,
+    TableCodec,
+    pack_metadata,
+    packed_reader,
+    unpack_metadata,
+)
 from dataplane.p4runtime.update_forms import UpdateForms
 from dataplane.v1model.externs import CounterValue, MeterConfig
 from dataplane.v1model.switch import Switch
@@ -20,6 +26,7 @@ INSERT, MODIFY, DELETE = p4runtime.Update.INSERT, p4runtime.Update.MODIFY, p4run
 Undo = Callable[[], None]
 PAGE = 512
 """Entities that are read at a time."""
+_MOST = 2**63 - 1
 _Direct = tuple[MeterConfig | None, CounterValue | None]
 
 
@@ -41,6 +48,8 @@ class TableEntities:
             table_id: packed_reader(codec.table, table.key)
             for table_id, (codec, table) in self._parts.items()
         }
+        self._default_metadata: dict[int, bytes] = {}
+        """Of default actions that were set with some, by table id."""
         self._id_of = {codec.name: table_id for table_id, (codec, _) in self._parts.items()}
         self._forms = UpdateForms()
 
@@ -76,12 +85,9 @@ class TableEntities:
         if self._forms.is_full:
             return
         codec, table = self._find(message.table_id)
-        if not table.key.all_exact:
+        if update.type == MODIFY or not table.key.all_exact or not _is_plain(message):
             return
-        is_plain = not (
-            message.is_default_action or message.idle_timeout_ns or _check_written(codec, message)
-        )
-        if is_plain and update.type != MODIFY and self._packed[codec.table.id](message.match) is not None:
+        if self._packed[codec.table.id](message.match) is not None:
             self._forms.learn(update, table, codec.content(message) if update.type == INSERT else None)
 
     def write_entry(self, kind: int, message: Any) -> Undo:
@@ -90,9 +96,12 @@ class TableEntities:
         Raises InvalidArgument, Denied, Unimplemented and the table's own errors.
         """
         codec, table = self._find(message.table_id)
+        if message.is_const:
+            raise InvalidArgument(f"table {codec.name}: is_const must be false in a Write")
         if message.is_default_action:
             return self._write_default(kind, message, codec, table)
-        has_direct = _check_written(codec, message)
+        # of a deletion only the key counts, so that an entry can be deleted as it was read
+        has_direct = kind != DELETE and _check_written(codec, message)
         if table.spec.is_const and (kind != MODIFY or message.HasField("action")):
             raise Denied(
                 f"table {codec.name} is constant; only its entries' counters and meters can be modified"
@@ -138,6 +147,7 @@ class TableEntities:
         values = self._direct_values(message, codec)
         with self._switch.lock:
             entry = old[0]
+            # without an action only counter and meter are modified, as the specification has it
             if message.HasField("action"):
                 entry = codec.entry(message)
                 if entry.idle_timeout_ns:
@@ -187,18 +197,29 @@ class TableEntities:
             )
         if codec.table.const_default:
             raise Denied(f"table {codec.name}: its default action is constant")
-        old = table.default
+        old, old_metadata = table.default, self._default_metadata.get(codec.table.id, b"")
+        metadata = pack_metadata(message.controller_metadata, message.metadata)
         if message.HasField("action"):
             table.set_default(*codec.action(message.action, default=True))
+            self._default_metadata[codec.table.id] = metadata
         else:
             table.reset_default()
-        return lambda: table.reset_default() if old is None else table.set_default(*old)
+            self._default_metadata[codec.table.id] = b""
+
+        def undo() -> None:
+            if old is None:
+                table.reset_default()
+            else:
+                table.set_default(*old)
+            self._default_metadata[codec.table.id] = old_metadata
+
+        return undo
 
     def read_entries(self, message: Any) -> Iterator[Any]:
         """Entities for a TableEntry filter; table id 0 = all tables."""
         for codec, table in self._selected(message):
             if message.is_default_action:
-                yield from _read_default(codec, table)
+                yield from self._read_default(message, codec, table)
                 continue
             for entry in self._filtered(message, codec, table):
                 if entry is None:
@@ -209,6 +230,17 @@ class TableEntities:
                 entity.table_entry.is_const = table.spec.is_const
                 self._read_direct(message, entity.table_entry, table, entry)
                 yield entity
+
+    def _read_default(self, asked: Any, codec: TableCodec, table: Table) -> Iterator[Any]:
+        default, metadata = table.default, self._default_metadata.get(codec.table.id, b"")
+        if default is not None and _metadata_fits(asked, metadata):
+            entity = p4runtime.Entity()
+            entry = entity.table_entry
+            entry.table_id = codec.table.id
+            entry.is_default_action = True
+            codec.write_action(*default, entry)
+            entry.controller_metadata, entry.metadata = unpack_metadata(metadata)
+            yield entity
 
     def entries_looked_at(self, entity: Any) -> int:
         """How many entries a Read of this filter goes through, at most."""
@@ -248,7 +280,7 @@ class TableEntities:
                     (match is None or entry.match == match)
                     and message.priority in (0, entry.priority)
                     and (not action or codec.action_id(entry.action) == action)
-                    and _metadata_fits(message, entry)
+                    and _metadata_fits(message, entry.metadata)
                 )
                 if fits:
                     yield entry
@@ -373,21 +405,23 @@ def _check_written(codec: TableCodec, message: Any) -> bool:
     return bool(has_meter or has_counter)
 
 
-def _metadata_fits(asked: Any, entry: TableEntry) -> bool:
+def _is_plain(message: Any) -> bool:
+    """Whether an entry has nothing but its key, action and metadata."""
+    return not (
+        message.is_default_action
+        or message.idle_timeout_ns
+        or message.HasField("meter_config")
+        or message.HasField("counter_data")
+        or message.HasField("meter_counter_data")
+        or message.HasField("time_since_last_hit")
+    )
+
+
+def _metadata_fits(asked: Any, kept: bytes) -> bool:
     if not asked.controller_metadata and not asked.metadata:
         return True
-    cookie, metadata = unpack_metadata(entry.metadata)
+    cookie, metadata = unpack_metadata(kept)
     return asked.controller_metadata in (0, cookie) and asked.metadata in (b"", metadata)
-
-
-def _read_default(codec: TableCodec, table: Table) -> Iterator[Any]:
-    default = table.default
-    if default is not None:
-        entity = p4runtime.Entity()
-        entity.table_entry.table_id = codec.table.id
-        entity.table_entry.is_default_action = True
-        codec.write_action(*default, entity.table_entry)
-        yield entity
 
 
 def counter_value(message: Any, what: str) -> CounterValue:
@@ -398,6 +432,9 @@ def counter_value(message: Any, what: str) -> CounterValue:
 
 
 def write_counter(value: CounterValue, message: Any) -> None:
-    """A counter's value into a CounterData message (which is then set even when zero)."""
+    """A counter's value into a CounterData message (which is then set even when zero).
+
+    The switch counts in 64 bits without sign, CounterData has one: what it has no room for reads as its largest.
+    """
     message.SetInParent()
-    message.packet_count, message.byte_count = value.packets, value.bytes
+    message.packet_count, message.byte_count = min(value.packets, _MOST), min(value.bytes, _MOST)

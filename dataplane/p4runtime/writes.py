@@ -19,6 +19,7 @@ from p4rt import p4runtime
 
 Handler = Callable[[int, Any], Undo]
 _CONTINUE = p4runtime.WriteRequest.CONTINUE_ON_ERROR
+_ROLLBACK = p4runtime.WriteRequest.ROLLBACK_ON_ERROR
 _ATOMIC = p4runtime.WriteRequest.DATAPLANE_ATOMIC
 _KINDS = (p4runtime.Update.INSERT, p4runtime.Update.MODIFY, p4runtime.Update.DELETE)
 
@@ -43,7 +44,14 @@ class Writer:
         }
 
     def apply(self, updates: Iterable[Any], atomicity: int) -> list[Refused | None]:
-        """One result per update, None = done.  The list is empty where all succeeded."""
+        """One result per update, None = done.  The list is empty where all succeeded.
+
+        Raises InvalidArgument for another atomicity than the three.
+        """
+        if atomicity not in (_CONTINUE, _ROLLBACK, _ATOMIC):
+            raise InvalidArgument(
+                f"atomicity {atomicity} is none of CONTINUE_ON_ERROR, ROLLBACK_ON_ERROR, DATAPLANE_ATOMIC"
+            )
         self._arrays.cells_left = self._cells
         if atomicity == _CONTINUE:
             return self._each(updates)

@@ -33,6 +33,8 @@ FORWARDED = 2
 
 MAX_WIRE = 1 << 18
 """Bytes that a frame had on the wire: what was cut is padded to so many, whatever the feeder says."""
+MAX_TIME_US = (2**63 - 1) // 1000
+"""P4Runtime has 64 bits for ns."""
 _MAGIC = b"SDNF"
 _HEADER = struct.Struct("<4sII")
 _PER_FRAME = 16
@@ -97,6 +99,11 @@ class BlockReader:
         times = np.frombuffer(block, "<i8", count)
         wire = np.frombuffer(block, "<u4", count, 8 * count)
         captured = np.frombuffer(block, "<u4", count, 12 * count)
+        if count and (times.min() < 0 or times.max() > MAX_TIME_US):
+            raise CapturePortError(
+                f"frames at {times.min()} to {times.max()} µs of the capture; the clock of the switch goes from 0 to"
+                f" {MAX_TIME_US}"
+            )
         if int(captured.sum(dtype=np.int64)) != size:
             raise CapturePortError("the frames' lengths do not add up to the block's")
         longest, total = int(wire.max(initial=0)), int(wire.sum(dtype=np.int64))

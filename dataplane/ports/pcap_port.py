@@ -5,7 +5,9 @@ padded with zeros to their length on the wire.
 """
 
 import struct
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,6 +18,8 @@ _ETHERNET = 1
 _SNAPLEN = 1 << 18
 _FILE_HEADER = "IHHiIII"
 _RECORD = "IIII"
+_SECONDS = 0xFFFFFFFF
+"""What a stamp has room for."""
 
 
 class PcapReader:
@@ -48,7 +52,10 @@ class PcapReader:
         self._base_s: int | None = None
 
     def read(self) -> tuple[int, bytes] | None:
-        """(µs since the first packet's whole second, frame), or None at the end of what is whole."""
+        """(µs since the first packet's whole second, frame), or None at the end of what is whole.
+
+        The switch's clock has nothing before 0: a frame that is older than the first one's second gets that.
+        """
         header = self._file.read(16)
         if len(header) < 16:
             return None
@@ -60,29 +67,53 @@ class PcapReader:
             return None
         if self._base_s is None:
             self._base_s = seconds
-        return (seconds - self._base_s) * 1_000_000 + fraction // self._divisor, data.ljust(wire, b"\0")
+        time_us = (seconds - self._base_s) * 1_000_000 + fraction // self._divisor
+        return max(0, time_us), data.ljust(wire, b"\0")
 
     def close(self) -> None:
         self._file.close()
 
 
 class PcapWriter:
-    """A capture file with µs stamps.  Raises PortError where it cannot be written."""
+    """A capture file with µs stamps; where writing fails it ends, and that is said once.
+
+    Raises PortError where it cannot be created.
+    """
 
     def __init__(self, path: Path) -> None:
         try:
             self._file: BinaryIO = path.open("wb")
         except OSError as error:
             raise PortError(f"pcap port: cannot write {path}: {error.strerror}") from error
+        self._path = path
+        self._ended = False
         self._file.write(struct.pack("<" + _FILE_HEADER, _MICRO, 2, 4, 0, 0, _SNAPLEN, _ETHERNET))
 
-    def write(self, time_us: int, frame: bytes) -> None:
-        """One frame."""
+    def write(self, time_us: int, frame: bytes) -> bool:
+        """One frame; False where the file has ended."""
         seconds, micro = divmod(time_us, 1_000_000)
-        self._file.write(struct.pack("<" + _RECORD, seconds, micro, len(frame), len(frame)) + frame)
+        record = struct.pack("<" + _RECORD, seconds & _SECONDS, micro, len(frame), len(frame)) + frame
+        if not self._ended:
+            try:
+                self._file.write(record)
+            except OSError as error:
+                self._end(error)
+        return not self._ended
 
     def close(self) -> None:
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:
+            self._end(error)
+
+    def _end(self, error: OSError) -> None:
+        if not self._ended:
+            self._ended = True
+            told = (
+                f"dataplane: pcap port: cannot write {self._path}: {error.strerror}; the capture ends there"
+            )
+            with suppress(OSError):  # a log on the same disk is full, too
+                print(told, file=sys.stderr, flush=True)
 
 
 class PcapPort(Unanswering):
@@ -118,9 +149,10 @@ class PcapPort(Unanswering):
         return Arrived(frames, times)
 
     def send(self, frame: bytes) -> None:
-        self.counters.sent += 1
-        if self._writer is not None:
-            self._writer.write(self._clock(), frame)
+        if self._writer is None or self._writer.write(self._clock(), frame):
+            self.counters.sent += 1
+        else:
+            self.counters.failed += 1
 
     def close(self) -> None:
         if self._reader is not None:

@@ -6,8 +6,11 @@ from pathlib import Path
 import pytest
 
 from dataplane.compiler.machine import BatchResult
+from dataplane.p4runtime.device import Device
+from dataplane.p4runtime.status import Precondition
 from dataplane.p4runtime.trust import AnyProgram
 from dataplane.ports.port import MemoryPort
+from p4rt import p4runtime
 from sdnator.testing.p4runtime_client import TIMEOUT_S, EntryBuilder, P4RuntimeClient, insert, program_config
 from sdnator.testing.switch_double import SwitchDouble
 from tests.dataplane.loading import MAKERS
@@ -164,6 +167,19 @@ def test_streams_are_limited():
         assert late.error.code().name == "RESOURCE_EXHAUSTED"
         for controller in (*controllers, late):
             controller.close()
+
+
+def test_a_claim_that_is_carried_out_after_its_stream_was_closed_makes_no_primary():
+    device = Device(1, clock=lambda: 0)
+    gone, here = device.open_stream(), device.open_stream()
+    claim = p4runtime.MasterArbitrationUpdate(device_id=1)
+    claim.election_id.low = 5
+    device.close_stream(gone)
+    device.arbitrate(gone, claim)
+    claim.election_id.low = 1
+    device.arbitrate(here, claim)
+    with pytest.raises(Precondition, match="no pipeline"):  # and not that it may not write
+        device.write(p4runtime.WriteRequest(device_id=1, election_id=claim.election_id))
 
 
 def test_time_comes_with_the_frames(lossless):

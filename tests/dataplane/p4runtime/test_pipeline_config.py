@@ -7,6 +7,7 @@ import pytest
 from dataplane.p4runtime.pipeline import ForwardingPipeline, verify
 from dataplane.p4runtime.pipeline_config import plan
 from dataplane.p4runtime.status import InvalidArgument
+from dataplane.v1model.externs import CounterValue
 from p4rt import p4runtime
 from sdnator.testing.p4runtime_client import program_config
 from tests.dataplane.loading import MAKERS
@@ -49,6 +50,14 @@ def test_registers_are_carried_over(make, config):
     assert {n: a.written() for n, a in new.switch.registers.items() if a.written()} == {
         name: [(array.size - 1, 5)]
     }
+
+
+def test_counters_that_are_beyond_what_a_read_can_say_are_carried_over_as_its_largest(make, config):
+    """A Write may set one to 2^63 - 1, and the next frame is counted."""
+    old, most = make(config), 2**63 - 1
+    old.switch.counters["I.seen"].write(3, CounterValue(most + 1, 2**64 - 1))
+    new = plan(reconcile(config), old, None, make).active
+    assert new.switch.counters["I.seen"].read(3) == CounterValue(most, most)
 
 
 def test_a_register_that_the_new_program_lacks_is_refused(make, config):

@@ -1,10 +1,14 @@
 """The server's one thread waits for nobody: neither for a busy device nor for packet-outs that are crowded."""
 
+import asyncio
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
 
+from dataplane.p4runtime.device import MAX_STREAMS, Device
+from dataplane.p4runtime.server import Servicer
 from dataplane.p4runtime.trust import AnyProgram
 from p4rt import p4runtime
 from sdnator.testing.p4runtime_client import TIMEOUT_S, P4RuntimeClient, program_config
@@ -55,6 +59,37 @@ def test_packet_ins_go_on_while_another_controller_waits_for_the_device(switch, 
             assert other.arbitrations.empty()
         assert came == list(range(50))
         assert other.arbitrations.get(timeout=TIMEOUT_S).status.code == 0
+
+
+class Silent:
+    """The context of a call whose client takes nothing."""
+
+    async def write(self, message):
+        raise AssertionError(message)
+
+
+def test_clients_that_give_up_while_a_program_compiles_leave_no_stream_behind():
+    device, pool = Device(1, clock=lambda: 0), ThreadPoolExecutor(2 * MAX_STREAMS)
+
+    async def claims():
+        yield p4runtime.StreamMessageRequest(arbitration=p4runtime.MasterArbitrationUpdate(device_id=1))
+
+    async def come_and_go():
+        servicer = Servicer(device, pool)
+        with held(device.control):
+            calls = [
+                asyncio.create_task(servicer.StreamChannel(claims(), Silent())) for _ in range(MAX_STREAMS)
+            ]
+            for _ in range(10):
+                await asyncio.sleep(0)
+            for call in calls:
+                call.cancel()
+        await asyncio.gather(*calls, return_exceptions=True)
+
+    asyncio.run(come_and_go())
+    pool.shutdown()
+    for _ in range(MAX_STREAMS):
+        device.open_stream()
 
 
 def test_other_calls_go_on_while_packet_outs_are_crowded_and_none_of_those_is_lost(switch, controller):

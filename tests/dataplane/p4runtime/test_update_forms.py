@@ -62,6 +62,8 @@ SPOILERS = {
     "metadata": spoil_with(metadata=b"m"),
     "idle time-out": spoil_with(idle_timeout_ns=5),
     "default action": spoil_with(is_default_action=True),
+    "age": lambda update: setattr(update.entity.table_entry.time_since_last_hit, "elapsed_ns", 5),
+    "constant": spoil_with(is_const=True),
     "counter": lambda update: setattr(update.entity.table_entry.counter_data, "packet_count", 5),
     "no kind": lambda update: setattr(update, "type", 0),
 }

@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataplane.ports.capture_port import BlockReader, CaptureFeed, CapturePort, CapturePortError, pack_block
+from dataplane.ports.capture_port import (
+    MAX_TIME_US,
+    BlockReader,
+    CaptureFeed,
+    CapturePort,
+    CapturePortError,
+    pack_block,
+)
 from dataplane.ports.port import PortError
 
 FRAMES = st.lists(st.tuples(st.integers(0, 1 << 48), st.binary(max_size=80), st.integers(0, 20)), max_size=30)
@@ -41,6 +48,15 @@ def test_lengths_that_do_not_add_up_are_refused():
     block[12 + 12] = 2
     with pytest.raises(CapturePortError, match="add up"):
         BlockReader().feed(bytes(block))
+
+
+@pytest.mark.parametrize("time_us", [-1, MAX_TIME_US + 1])
+def test_times_that_the_switch_s_clock_does_not_have_are_refused(time_us):
+    """The clock goes into every entry that is written afterwards."""
+    reader = BlockReader()
+    reader.feed(pack_block([0, MAX_TIME_US], [1, 1], [b"a", b"b"]))
+    with pytest.raises(CapturePortError, match="clock"):
+        reader.feed(pack_block([5, time_us], [1, 1], [b"a", b"b"]))
 
 
 @pytest.mark.parametrize("wire", [[1 << 32 - 1], [1 << 18] * 2000])

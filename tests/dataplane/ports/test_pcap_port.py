@@ -1,6 +1,7 @@
-"""Capture files as ports: both byte orders, µs and ns, cut frames and cut files."""
+"""Capture files as ports: both byte orders, µs and ns, cut frames and cut files, full disks."""
 
 import struct
+from pathlib import Path
 
 import pytest
 
@@ -52,6 +53,35 @@ def test_what_is_sent_can_be_read_again(tmp_path):
     arrived = again.receive(10)
     assert (list(arrived.frames), list(arrived.times_us)) == ([b"one", b"two"], [1, 1_500_000])
     again.close()
+
+
+def test_a_frame_from_before_the_first_one_s_second_comes_at_0(tmp_path):
+    path = tmp_path / "in.pcap"
+    path.write_bytes(capture(records=[(100, 5, b"a", 1), (98, 0, b"b", 1), (101, 0, b"c", 1)]))
+    port = PcapPort(path, None, lambda: 0)
+    assert list(port.receive(10).times_us) == [5, 0, 1_000_000]
+    port.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+@pytest.mark.parametrize("frames", [1, 1000])
+def test_a_full_disk_ends_the_capture_and_not_the_switch(capsys, frames):
+    """It is said once, and frames that could not be written are counted."""
+    port = PcapPort(None, Path("/dev/full"), lambda: 0)
+    for _ in range(frames):
+        port.send(bytes(1000))
+    port.close()
+    assert port.counters.sent + port.counters.failed == frames
+    assert port.counters.failed or frames == 1  # a single one is still in the buffer
+    assert capsys.readouterr().err.count("/dev/full") == 1
+
+
+def test_a_time_beyond_a_stamp_is_written_modulo_2_to_the_32_s(tmp_path):
+    path = tmp_path / "out.pcap"
+    port = PcapPort(None, path, lambda: (2**32 + 7) * 1_000_000)
+    port.send(b"frame")
+    port.close()
+    assert struct.unpack_from("<II", path.read_bytes(), 24) == (7, 0)
 
 
 @pytest.mark.parametrize("data", [b"", b"not a capture at all, really", capture(link=113)])
