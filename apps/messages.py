@@ -389,6 +389,10 @@ class Decision(Message, frozen=True, kw_only=True):
     """The evidence that added up to it, the strongest first; empty where something else decided."""
     limit: RateLimit | None = None
     """What `meter` and `unmeter` are about: a kind of packets towards the target; None for other actions."""
+    training_rate: Rate | None = None
+    """Packets per second of the blocked sender in training, 0 where a block does not depend on it; None: not known."""
+    host: Name = ""
+    """The address behind a blocked MAC, if it is known."""
 
     def check(self) -> None:
         """Check target, grounds and rate limit.

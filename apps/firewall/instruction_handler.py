@@ -3,6 +3,7 @@
 I/O: writes answers and lessons; reads the archive.
 """
 
+import logging
 import threading
 import time
 from collections import deque
@@ -19,13 +20,15 @@ from apps.firewall.evidence.archived_state import ArchivedState
 from apps.firewall.evidence_handler import EvidenceHandler
 from apps.firewall.policy.false_alarms import FalseAlarms
 from apps.firewall.policy.instructions import Desk, refused_as_foreign, refused_as_late
-from apps.messages import Answer, Decision, Instruction, Intake
+from apps.messages import Answer, Decision, Exhibit, Instruction, Intake, one_line
 from due import DueError, Engine, Item
 
 ARCHIVED_WORD_S = 2.0
 CLOCKS_DIFFER_NS: Final = 2 * 3600 * 1_000_000_000
 PANICS: Final = {"dataKey": history.INSTRUCTIONS, "value.verb": "panic"}
 PANICS_KEPT: Final = 1_000
+
+log = logging.getLogger(__name__)
 
 
 class InstructionHandler:
@@ -102,7 +105,10 @@ class InstructionHandler:
             for key, answer in self._past.recent_answers():
                 self._engine.write(key, answer.to_value(), [due.PUB_ONLY, due.NO_WAIT])
             for item, instruction in self._past.unanswered(self._stored):
-                self._answer(item, instruction)
+                try:
+                    self._answer(item, instruction)
+                except DueError as error:  # it must not end this start, nor each one after it
+                    log.error("%s", one_line(f"instruction {instruction.id} cannot be answered: {error}"))  # noqa: TRY400
 
     def read_archived_words(self) -> None:
         """A `blocks panic` while Data Updates were unreachable is in the archive only."""
@@ -138,9 +144,19 @@ class InstructionHandler:
         )
         if early is not None:
             return early
+        try:
+            return self._decide(instruction, evidence)
+        except DueError as error:
+            return Answer(id=instruction.id, done=False, text=f"failed: {error}")
+
+    def _decide(self, instruction: Instruction, evidence: Exhibit) -> Answer:
         decisions, answer = self._desk.carry_out(instruction, evidence, self._now() or evidence.timestamp)
-        for decision in decisions:
-            self._publish(decision)
+        for place, decision in enumerate(decisions):
+            try:
+                self._publish(decision)
+            except DueError:
+                self._desk.take_back(decisions[place:])
+                raise
         for lesson in self._lessons.told():
             self._evidence.learnt(lesson)
             self._engine.write(history.lesson_key(lesson), lesson.to_value(), [due.NO_WAIT])

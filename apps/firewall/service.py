@@ -28,7 +28,7 @@ from apps.firewall.enforcement.mirrors import Mirrors
 from apps.firewall.enforcement.switch_entries import KEPT, AllowEntries, is_prefix, prefix_update
 from apps.firewall.evidence import history
 from apps.firewall.evidence.archive import Archive
-from apps.firewall.evidence.archived_state import ArchivedState
+from apps.firewall.evidence.archived_state import UNREAD, ArchivedState
 from apps.firewall.evidence.history import FAMILIES
 from apps.firewall.evidence.known_sources import HANDSHAKES, KnownSources, in_batches
 from apps.firewall.evidence.own_evidence import EVIDENCE_CAPABILITY, OWN_APP, OwnEvidence
@@ -40,7 +40,7 @@ from apps.firewall.policy.auto_allowlist import surroundings
 from apps.firewall.policy.block_lifecycle import BlockLifecycle, OperatorNotice
 from apps.firewall.policy.decider import Decider
 from apps.firewall.policy.false_alarms import FalseAlarms
-from apps.firewall.policy.instructions import Desk
+from apps.firewall.policy.instructions import Desk, refused_as_late
 from apps.firewall.policy.rate_limits import RateLimits
 from apps.firewall.settings import Settings
 from apps.firewall.syn.flood_handler import TELEMETRY, FloodHandler
@@ -157,7 +157,10 @@ class FirewallService:
             contest_s=settings.arp_contest_s,
         )
         self._archive = Archive(engine, settings.archive_patience_s)
-        self._past = ArchivedState(self._archive, self._intake, settings)
+        # with questions of its own: neither they nor those about earlier offences wait for the others
+        self._past = ArchivedState(Archive(engine, settings.archive_patience_s), self._intake, settings)
+        self._panicked = False
+        """An operator has lifted everything before the archive said what that is."""
         self._enforcers = DeclaredEnforcers(engine, settings.enforcers)
         self._mirrors = Mirrors(elsewhere=self._enforcers.elsewhere)
         self._lessons = FalseAlarms(settings.rules.false_alarm_days)
@@ -214,12 +217,14 @@ class FirewallService:
         return self._time.now or 0
 
     def start(self) -> None:
-        """Restore history, then subscribe."""
-        self._take_up_history()
-        self._take_up_entries()
-        if self._settings.learn:
-            self._past.teach(self._known)
+        """Restore history, or wait for it, then subscribe."""
+        if self._past.read():
+            self._take_up_history()
             self._known.changes()
+        else:
+            self._lifecycle.waits_for = self._lifecycle.stopped = UNREAD
+            log.error("nobody is blocked unless operators ask for it: %s", UNREAD)
+        if self._settings.learn:
             self._hear(HANDSHAKES, arrivals.handshake_in, self._on_handshake)
         self._hear("network.anomaly.kitsune.alert", Alert.from_item, self._on_alert)
         self._hear(f"{TRAINING}.*", arrivals.training_in, self._on_training)
@@ -234,7 +239,7 @@ class FirewallService:
                 self._hear(f"{ENFORCED}.{enforcer}.*", arrivals.report_in, self._on_enforced)
         self._hear("network.switch.p4runtime_ctrl.*", arrivals.state_in, self._on_switch)
         self._instructions.answer_earlier()
-        self._hear(history.INSTRUCTIONS, Instruction.from_item, self._instructions.instruct)
+        self._hear(history.INSTRUCTIONS, Instruction.from_item, self._on_instruction)
         if self._settings.detect:
             self._hear_tcp()
         if self._settings.detect and self._settings.arp != "off":
@@ -261,24 +266,62 @@ class FirewallService:
 
     def _take_up_history(self) -> None:
         """Restore what was in force before a restart, as it still is in the switch."""
+        past = self._past.past
+        if past is None:
+            return
         self._instructions.restore()
         standing = self._past.standing()
         self._lifecycle.restore(standing)
         self._syn.restore(standing)
         self._limits.restore(standing)
-        self._incidents.restore(self._past.incidents())
-        self._lessons.restore(self._past.false_alarms())
-        self._handler.trained(self._past.training())
+        self._incidents.restore(past.incidents)
+        self._lessons.restore(past.false_alarms)
+        if self._handler.decider.test.training is None:
+            self._handler.trained(past.training)
+        self._take_up_entries()
+        if self._settings.learn:
+            self._past.teach(self._known)
+        self._past.taken_up()
         if standing:
             log.info("decisions in force from the archive: %d", len(standing))
 
     def _take_up_entries(self) -> None:
         """Restore allowed entries; stale ones of an earlier run are deleted when their switch connects."""
-        self._allow_entries.change(self._desk.entries)
+        updates = self._allow_entries.change(self._desk.entries)
         targets = [block.decision.target for block in self._lifecycle.blocks.values()]
         wanted = self._allow_entries.everything()
         wanted += [prefix_update("insert", target.address) for target in targets if is_prefix(target)]
         self._leftovers = self._past.leftovers(wanted)
+        for switch in self._switches:
+            self._keep(switch, self._leftovers.pop(switch, []))
+            self._keep(switch, updates)
+
+    def _take_up_later(self) -> None:
+        """The archive did not answer at the start.  What operators have done meanwhile holds."""
+        if self._past.is_taken_up or not self._past.read_later():
+            return
+        with self._lock:
+            earlier = {*self._lifecycle.blocks}
+            self._take_up_history()
+            self._lifecycle.waits_for = self._lifecycle.stopped = ""
+            log.warning("Data Archives have answered: history is known from now on")
+            blocks = [each.decision for each in self._lifecycle.blocks.values()]
+            restored = [each for each in blocks if each.id not in earlier]
+            for decision in restored:
+                if is_prefix(decision.target):
+                    self._carry_out_prefix(decision, self._switches)
+            over = {each.id for each in restored if self._panicked}
+            over |= {each.id for each in blocks if self._desk.allow.covers_target(each.target)}
+            self._lift(over, "lifted by an operator, or allowed, while history was not known")
+
+    def _lift(self, blocks: Iterable[str], reason: str) -> None:
+        now = self._now or time.time_ns()
+        over = [self._lifecycle.lift(each, now, reason) for each in sorted(blocks)]
+        if self._panicked:
+            over += [*self._syn.release_all(now, reason), *self._limits.release_all(now, reason)]
+        for decision in over:
+            if decision is not None:
+                self._publish(decision)
 
     def tick(self) -> None:
         """Examine suspected floods that are due, and write known sources in batches."""
@@ -292,6 +335,7 @@ class FirewallService:
             for switch in self._switches if updates else ():
                 self._command(switch, updates)
             self._say_notices()
+        self._take_up_later()
         self._instructions.answer_earlier()
         self._instructions.read_archived_words()
         self._announcer.check()
@@ -323,7 +367,7 @@ class FirewallService:
             "stopped_by": self._lifecycle.stopped,
             "evidence_missed": self._order.missed,
             "evidence_sums": len(self._handler.decider.test),
-            **self._archive.health(),
+            **{name: n + self._past.archive.health()[name] for name, n in self._archive.health().items()},
             "times_doubted": self._time.doubted + self._row_time.doubted,
             **self._incidents.health(),
             **self._intake.health(),
@@ -408,7 +452,13 @@ class FirewallService:
         updates = self._allow_entries.change(self._desk.entries)
         for switch in self._switches if updates else ():
             self._keep(switch, updates)
-        self._enforcers.tell_allowed(self._desk.entries)
+        if self._past.is_taken_up:  # what they have is what an earlier run has told them, and complete
+            self._enforcers.tell_allowed(self._desk.entries)
+
+    def _on_instruction(self, item: Item, instruction: Instruction) -> None:
+        self._instructions.instruct(item, instruction)
+        if instruction.verb == "panic" and refused_as_late(instruction, time.time_ns()) is None:
+            self._panicked = self._panicked or not self._past.is_taken_up
 
     def _keep(self, switch: str, updates: Iterable[TableUpdate], name: str = "") -> None:
         """Write entries that outlive the controller."""
@@ -449,7 +499,9 @@ class FirewallService:
             if followed and self._enforcers.confirmed(item.app_id, confirmation):
                 self._lifecycle.confirm(confirmation)
                 self._limits.confirm(confirmation)
-            self._incidents.confirmed(confirmation, self._enforcers.in_force(confirmation.id))
+            places = self._enforcers.in_force(confirmation.id)
+            self._syn.confirm(confirmation, self._now, stands=bool(places))
+            self._incidents.confirmed(confirmation, places)
             self._floods.confirmed(confirmation)
         where = f"{item.app_id} {confirmation.switch}"
         if confirmation.state == "failed":
@@ -515,6 +567,7 @@ class FirewallService:
             event_time=decision.event_time,
         )
         self._decisions += 1
+        self._past.decided(decision)
         return decision
 
     def _carry_out_prefix(self, decision: Decision, switches: Iterable[str]) -> None:

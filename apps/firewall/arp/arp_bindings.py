@@ -4,8 +4,14 @@ A claim of an address that belongs to another host proves nothing by itself: hos
 a standby takes over from a dead router.  It is an attack if the owner, from its own port and MAC, uses
 the address after the claim.  Then the claimant's port + MAC is blocked, never the address.
 
-Two cases are only reported and lead to no block: the owner was not present in training, so it may be the
-attacker itself; and the claimant shares its port with other hosts, one of which may have forged its MAC.
+Four cases are only reported and lead to no block: the owner was not present in training, so it may be the
+attacker itself; it speaks from a port to which it has moved since, as an attacker under its MAC would; the
+claimant has the owner's MAC on another port, as an owner that moves to and fro has; and the claimant shares its
+port with other hosts, one of which may have forged its MAC.
+
+An owner that was present in training stays the owner on its port of training: its MAC on another port is a claim,
+and becomes a move, which holds until the port of training speaks again, if that port is silent for as long as a
+claim waits.
 """
 
 import ipaddress
@@ -44,6 +50,8 @@ class BoundHost(NamedTuple):
 @dataclass
 class _Binding:
     host: BoundHost
+    home: BoundHost
+    """The host where it was bound; `host` has the same MAC, and another port after a move."""
     since: int
     seen: int
     trained: bool
@@ -62,14 +70,14 @@ class BindingConflict:
     at: int
     """When the owner spoke."""
     owner_trained: bool
-    """Whether the owner was present in training; otherwise it may be the attacker."""
+    """Whether the owner was present in training, on this port; otherwise it may be the attacker."""
     thief_alone: bool
     """Whether no other host behind its port could have forged its MAC."""
 
     @property
     def certain(self) -> bool:
         """Whether a block of the claimant harms nobody else."""
-        return self.owner_trained and self.thief_alone
+        return self.owner_trained and self.thief_alone and self.thief.mac != self.owner.mac
 
 
 class ArpBindings:
@@ -119,19 +127,42 @@ class ArpBindings:
         if bound is None:
             if honest:
                 self._bind(address, host, now)
-        elif bound.host == host and honest:
-            bound.seen = now
-            self._bound.move_to_end(address)
-            yield from self._contested(address, bound, now)
-        elif not self._settled(bound, now) or bound.host.mac == host.mac:
+        elif host in (bound.host, bound.home):
+            if honest:
+                yield from self._spoke(address, bound, host, now)
+        elif not self._settled(bound, now) or (bound.host.mac == host.mac and not bound.trained):
             # too new to have an owner, or the owner moved to another port
             self._bind(address, host, now)
+        elif bound.host.mac == host.mac:
+            self._elsewhere(address, bound, host, now, honest=honest)
         else:
-            self._claims[address, host] = now
-            if len(self._claims) > CLAIMS:
-                self._claims.popitem(last=False)
+            self._claim(address, host, now)
             if now - bound.seen > self._settle:  # the owner is gone
                 self._bind(address, host, now)
+
+    def _spoke(self, address: int, bound: _Binding, host: BoundHost, now: int) -> Iterator[BindingConflict]:
+        """The owner, on its own port or on that to which it has moved."""
+        if host != bound.host:  # it is back, and who was taken for it may have been another
+            self._claim(address, bound.host, bound.seen)
+        self._seen(address, bound, host, now)
+        yield from self._contested(address, bound, now)
+
+    def _elsewhere(self, address: int, bound: _Binding, host: BoundHost, now: int, *, honest: bool) -> None:
+        """The MAC of a trained owner on another port: a move, once the owner's port has been silent for long enough."""
+        since = min(now, self._claims.get((address, host), now))  # no later than now: a clock may be set back
+        self._claim(address, host, since)
+        if honest and now - since > self._contest:
+            del self._claims[address, host]
+            self._seen(address, bound, host, now)
+
+    def _claim(self, address: int, host: BoundHost, at: int) -> None:
+        self._claims[address, host] = at
+        if len(self._claims) > CLAIMS:
+            self._claims.popitem(last=False)
+
+    def _seen(self, address: int, bound: _Binding, host: BoundHost, now: int) -> None:
+        bound.host, bound.seen = host, now
+        self._bound.move_to_end(address)
 
     def _settled(self, bound: _Binding, now: int) -> bool:
         return (bound.trained and now >= self._trained_at) or now - bound.since >= self._settle
@@ -141,7 +172,7 @@ class ArpBindings:
         if ":" in address or not address:
             return False
         bound = self._bound.get(int(ipaddress.IPv4Address(address)))
-        return bound is not None and bound.trained and bound.host != host
+        return bound is not None and bound.trained and host not in (bound.host, bound.home)
 
     def addresses_of(self, host: BoundHost) -> list[str]:
         """Addresses that belong to a host."""
@@ -150,7 +181,7 @@ class ArpBindings:
 
     def _bind(self, address: int, host: BoundHost, now: int) -> None:
         trained = now < self._trained_at and address not in self._bound
-        self._bound[address] = _Binding(host, now, now, trained)
+        self._bound[address] = _Binding(host, host, now, now, trained)
         self._bound.move_to_end(address)
         self._claims.pop((address, host), None)
         if len(self._bound) > ADDRESSES:
@@ -161,11 +192,13 @@ class ArpBindings:
             claimed, thief = self._claims.pop(key), key[1]
             if now - claimed <= self._contest:
                 text = str(ipaddress.IPv4Address(address))
-                alone = self.is_alone(thief)
-                yield BindingConflict(text, bound.host, thief, claimed, now, bound.trained, alone)
+                trained = bound.trained and bound.host == bound.home
+                # the owner is behind its own port, whoever uses its MAC behind that of the claimant
+                alone = self.is_alone(thief, elsewhere=bound.host.mac)
+                yield BindingConflict(text, bound.host, thief, claimed, now, trained, alone)
 
-    def is_alone(self, host: BoundHost) -> bool:
-        """Whether it is the only host behind its port."""
-        others = self._behind.get(host.port, {host.mac, 0}) - {host.mac}
+    def is_alone(self, host: BoundHost, *, elsewhere: int = -1) -> bool:
+        """Whether it is the only host behind its port, but for a MAC whose host is elsewhere."""
+        others = self._behind.get(host.port, {host.mac, 0}) - {host.mac, elsewhere}
         lives_here = any(each.host == host for each in self._bound.values())
         return not (others and lives_here)

@@ -90,7 +90,10 @@ class TheftHandler:
         if self._mode == "tell":
             return 'the setting `arp` is "tell"'
         if evidence.supporting:
-            return "the owner was not present in training, or other hosts share the claimant's port"
+            return (
+                "the owner was not on its port in training, the claimant has the owner's MAC, "
+                "or other hosts share its port"
+            )
         if len(self._switches) != 1:
             return f"{len(self._switches)} switches are connected, and records do not say which"
         allow = self._allowed()

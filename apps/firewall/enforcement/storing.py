@@ -1,5 +1,6 @@
 """What operators' programs were answered: `done` of nothing that a restart would forget, and again if they ask again."""
 
+import time
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -7,6 +8,7 @@ from typing import Final
 
 from msgspec import structs
 
+from apps.firewall.evidence import archive
 from apps.messages import Answer
 from due import DueError, Engine
 
@@ -31,18 +33,23 @@ class StoredAnswers:
         self._patience_s = _PATIENCE_S
         self._catching_up = lock
         self._behind = True
+        self._ask_after = float("-inf")
 
     @contextmanager
     def catching_up(self) -> Iterator[bool]:
         """Whether to answer now what earlier runs did not; once, and newer instructions wait until it is done.
 
         Not before this instance works: after a kill the Coordinator still names the dead one for a while, and the
-        decisions of another are refused.
+        decisions of another are refused.  If the archive does not answer meanwhile it is done another time, a little later.
         """
         with self._catching_up:
-            now = self._behind and self._engine.active
+            now = self._behind and self._engine.active and time.monotonic() >= self._ask_after
             self._behind = self._behind and not now
-            yield now
+            try:
+                yield now
+            except archive.NoAnswer:
+                self._behind = True
+                self._ask_after = time.monotonic() + archive.ASK_AGAIN_S
 
     def __contains__(self, instruction: object) -> bool:
         return instruction in self._given

@@ -28,17 +28,18 @@ class AllowEntries:
     """The allow-list as it is in the switches."""
 
     def __init__(self) -> None:
-        self._written: dict[str, TableUpdate] = {}
+        self._written: dict[tuple[str, bytes], TableUpdate] = {}
+        """By place in the table: `10.0.0.1` and `10.0.0.1/32` are one entry there."""
         self.left_out = 0
         """Entries of the list that do not fit into the table; decisions respect them nevertheless."""
 
     def change(self, entries: Iterable[str]) -> list[TableUpdate]:
         """Updates after which exactly these entries are allowed."""
-        wanted = {entry: allow_update(entry) for entry in entries}
+        wanted = {_place(update): update for update in map(allow_update, entries)}
         self.left_out = max(0, len(wanted) - LIMIT)
         wanted = dict(list(wanted.items())[:LIMIT])
-        updates = [_deletion(old) for entry, old in self._written.items() if entry not in wanted]
-        updates += [new for entry, new in wanted.items() if entry not in self._written]
+        updates = [_deletion(old) for place, old in self._written.items() if place not in wanted]
+        updates += [new for place, new in wanted.items() if place not in self._written]
         self._written = wanted
         return updates
 

@@ -16,6 +16,10 @@ ASK_AGAIN_S: Final = 10.0
 log = logging.getLogger(__name__)
 
 
+class NoAnswer(Exception):
+    """Data Archives did not answer, so that it is not known what they hold."""
+
+
 MOST: Final = 100_000
 """Most items of one query, the newest."""
 OFFENCES_READ: Final = 1_000
@@ -51,13 +55,15 @@ class Archive:
         self._looked_to = time.time_ns()
         """Wall time of the last look that was answered; before the first, of the start."""
         self._quiet_until = float("-inf")
+        self._answers = True
         self.unanswered = 0
         self.items_read = 0
 
     @property
     def away(self) -> bool:
-        """Whether the last query got no answer."""
-        return self._quiet_until > time.monotonic()
+        """Whether the last query has no answer so far, or got none a moment ago: another one is not asked."""
+        asks = self._asked is not None and self._asked.is_alive()
+        return asks or self._quiet_until > time.monotonic()
 
     def health(self) -> dict[str, int]:
         """Counters for the operator and for Prometheus."""
@@ -73,7 +79,7 @@ class Archive:
     ) -> list[Item] | None:
         """The newest `most` items written after `since` (ns), oldest first; None if no answer comes in time."""
         asked = {"dataKey": query} if isinstance(query, str) else query
-        if self.away or (self._asked is not None and self._asked.is_alive()):
+        if self.away:
             self.unanswered += 1
             return None
         question = self._asked = _Question(self._engine, asked, since, most)
@@ -82,7 +88,9 @@ class Archive:
         if found is None:
             self.unanswered += 1
             self._quiet_until = time.monotonic() + ASK_AGAIN_S
-            log.warning("Data Archives do not answer, deciding without history: %s", question.problem)
+            if self._answers:
+                log.warning("Data Archives do not answer: %s", question.problem)
+        self._answers = found is not None
         self.items_read += len(found or ())
         return found
 

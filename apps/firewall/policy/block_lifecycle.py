@@ -1,9 +1,9 @@
 """Life cycle of decisions: in force, extended while the attack continues, probation, lifted.
 
 Pure: every call carries its capture time.  A block that ends while its drop counter still grows at more
-than three times the sender's training rate is extended.  Otherwise it is lifted and the sender is on
-probation: one anomalous second blocks it again, for the next longer time.  A block that an instruction asked for
-ends when it says, and without probation: it rests on no evidence.
+than three times the sender's training rate is extended.  Otherwise, or if that rate is not known, it is lifted and
+the sender is on probation: one anomalous second blocks it again, for the next longer time.  A block that an
+instruction asked for ends when it says, and without probation: it rests on no evidence.
 """
 
 import hashlib
@@ -58,12 +58,14 @@ class Block:
     """One block in force."""
 
     decision: Decision
-    training_rate: float
     readings: deque[tuple[int, int]] = field(default_factory=deque)
     """Capture time and drop counter of the last minute, oldest first."""
     state: str = "decided"
-    host: str = ""
-    """The address behind a blocked MAC, or the blocked address."""
+
+    @property
+    def host(self) -> str:
+        """The address behind a blocked MAC, or the blocked address."""
+        return self.decision.host or self.decision.target.address
 
     @property
     def is_asked_for(self) -> bool:
@@ -103,6 +105,8 @@ class BlockLifecycle:
     """Notices that are not yet published."""
     stopped: str = ""
     """The cap that stops blocking; empty: none."""
+    waits_for: str = ""
+    """Why nobody may be blocked yet unless an instruction asks for it; empty: anybody may be."""
     _recent: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_RECENT))
     _said: dict[str, int] = field(default_factory=dict)
     _ids: deque[str] = field(default_factory=lambda: deque(maxlen=_NEW_IDS))
@@ -155,6 +159,8 @@ class BlockLifecycle:
     def cap_reached(self, now: int, host: str = "") -> str | None:
         """Why no further block, or none of this host, may be made now; None if it may."""
         self._forget_old(now)
+        if self.waits_for:
+            return self.waits_for
         if len(self.blocks) >= self.rules.max_blocks:
             return f"{len(self.blocks)} blocks are in force (max_blocks)"
         if len(self._recent) >= self.rules.max_decisions_per_minute:
@@ -172,7 +178,8 @@ class BlockLifecycle:
         self.refused += 1
         self.stopped = cap
         name = cap[cap.rfind("(") :]
-        if now - self._said.get(name, now - MINUTE) >= MINUTE:
+        # a clock that was ahead may have been set right since
+        if abs(now - self._said.get(name, now - MINUTE)) >= MINUTE:
             self._said[name] = now
             text = f"BLOCKING STOPPED, {cap}: {who} stays unblocked, and others after it"
             self.notices.append(OperatorNotice("cap", text, now))
@@ -208,15 +215,22 @@ class BlockLifecycle:
             level=level,
             dry_run=self.rules.dry_run,
             first_packet=first_packet,
+            training_rate=training_rate,
+            host=host,
         )
-        block = Block(decision, training_rate, deque([(now, 0)]), host=host or target.address)
-        self._hold(block)
+        self._hold(Block(decision, deque([(now, 0)])))
         self._forget_old(now)
         self._recent.append(now)
         return decision
 
     def _forget_old(self, now: int) -> None:
-        """Only decisions of the last minute count towards a cap."""
+        """Only decisions of the last minute count towards a cap.
+
+        Those of a clock that was ahead would keep all later ones.  Capture times of several senders differ by a
+        little, so that what is less than a minute ahead counts.
+        """
+        while self._recent and self._recent[-1] >= now + MINUTE:
+            self._recent.pop()
         while self._recent and self._recent[0] <= now - MINUTE:
             self._recent.popleft()
 
@@ -236,9 +250,7 @@ class BlockLifecycle:
         """Restore blocks from before a restart."""
         for decision in decisions:
             if decision.action == "block":
-                readings = deque([(decision.event_time, 0)])
-                block = Block(decision, 0.0, readings, "restored", decision.target.address)
-                self._hold(block)
+                self._hold(Block(decision, deque([(decision.event_time, 0)]), "restored"))
 
     def matching(self, subject: str) -> list[Decision]:
         """Blocks in force with this id or address."""
@@ -281,8 +293,7 @@ class BlockLifecycle:
         if block.is_asked_for:
             self._release(old.id)
             return _changed(old, now, action="unblock", reason="the requested time is over")
-        floor = max(block.training_rate * STILL_GOING_RATIO, STILL_GOING_FLOOR)
-        if block.drop_rate > floor and not old.dry_run:
+        if _goes_on(block) and not old.dry_run:
             extended = _changed(
                 old,
                 now,
@@ -298,6 +309,12 @@ class BlockLifecycle:
         if len(self.probation) > _MOST_PROBATION:
             del self.probation[next(iter(self.probation))]
         return _changed(old, now, action="unblock", reason="the block ran out; on probation for ten minutes")
+
+
+def _goes_on(block: Block) -> bool:
+    """Whether it drops more than its sender's usual traffic; where that is not known only new evidence can tell."""
+    usual = block.decision.training_rate
+    return usual is not None and block.drop_rate > max(usual * STILL_GOING_RATIO, STILL_GOING_FLOOR)
 
 
 def _stops(target: Target, sender: Sender) -> bool:

@@ -309,11 +309,14 @@ class Decider:
     def _news(self, subject: object, now: int) -> bool:
         """Whether no refusal about this subject was reported recently."""
         last = self._told.get(subject)
-        if last is not None and now - last < TELL_AGAIN_S * SECOND:
+        # a clock that was ahead may have been set back since
+        if last is not None and abs(now - last) < TELL_AGAIN_S * SECOND:
             return False
         self._told[subject] = now
         self._told.move_to_end(subject)
-        while len(self._told) > MOST_TOLD or next(iter(self._told.values())) < now - TELL_AGAIN_S * SECOND:
+        while (
+            len(self._told) > MOST_TOLD or abs(now - next(iter(self._told.values()))) > TELL_AGAIN_S * SECOND
+        ):
             self._told.popitem(last=False)
         return True
 

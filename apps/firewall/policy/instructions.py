@@ -13,6 +13,7 @@ from apps.firewall.syn.syn_defence import EVERY_SWITCH, SynDefence
 from apps.messages import Answer, Decision, Exhibit, Instruction, Target
 
 _MOST_ENTRIES = 10_000
+_MOST_PORT = 65_535
 OPERATORS: Final = ("operator", "dashboard")
 """Apps that speak for people: the command line and the page."""
 _TEACHING: Final = ("false_alarm", "revoke")
@@ -60,6 +61,12 @@ class Desk:
         except ValueError as error:
             return [], Answer(id=instruction.id, done=False, text=str(error))
         return decisions, Answer(id=instruction.id, done=True, text=text)
+
+    def take_back(self, decisions: Iterable[Decision]) -> None:
+        """Forget blocks that could not be published: nobody carries them out."""
+        for each in decisions:
+            if each.action == "block":
+                self._lifecycle.lift(each.id, each.event_time, "")
 
     def decided_before(self, instruction: Instruction, evidence: Exhibit) -> Answer | None:
         """The answer to an instruction whose block stands: the firewall was killed before it could answer."""
@@ -141,7 +148,7 @@ class Desk:
             raise ValueError(f"the allow-list has {_MOST_ENTRIES} entries; remove some, or name prefixes")
         self._set_entries((*self.entries, instruction.subject))
         blocks = [block.decision for block in self._lifecycle.blocks.values()]
-        touched = [each for each in blocks if self.allow.covers_target(each.target)]
+        touched = [each for each in blocks if self._spares(each)]
         lifted = self._lift(touched, now, f"{instruction.subject} is on the allow-list now")
         blocks_lifted = "1 block" if len(lifted) == 1 else f"{len(lifted)} blocks"
         return lifted, f"{instruction.subject} is allowed; {blocks_lifted} lifted"
@@ -153,6 +160,11 @@ class Desk:
             )
         self._set_entries(tuple(each for each in self.entries if each != instruction.subject))
         return [], f"{instruction.subject} is no longer allowed"
+
+    def _spares(self, decision: Decision) -> bool:
+        """Whether the allow-list covers what a block matches, or the address of the host whose MAC it matches."""
+        host = decision.host if decision.target.kind == "mac" else ""
+        return self.allow.covers_target(decision.target) or (bool(host) and self.allow.covers_address(host))
 
     def _lift(self, decisions: Iterable[Decision], now: int, reason: str) -> list[Decision]:
         lifted = (self._lifecycle.lift(each.id, now, reason) for each in decisions)
@@ -192,6 +204,8 @@ def target_in(text: str) -> Target:
     """An address, prefix, MAC or MAC@PORT as a target; raises ValueError that names the valid forms."""
     mac, _, port = text.partition("@")
     if is_mac(mac) and (port.isdecimal() or text == mac):
+        if port and int(port) > _MOST_PORT:
+            raise ValueError(f"{text!r}: a port of a switch is a number up to {_MOST_PORT:,}")
         return Target(kind="mac", address=mac.lower(), port=int(port) if port else None)
     try:
         if "/" not in text:

@@ -183,7 +183,7 @@ class RateLimits:
 
     def _refuse(self, victim: str, now: int) -> None:
         self.refused += 1
-        if self._said is None or now - self._said >= MINUTE:
+        if self._said is None or abs(now - self._said) >= MINUTE:
             self._said = now
             text = f"{MOST_LIMITS} rate limits are in force: none is set towards {victim} or any later victim"
             self.notices.append(OperatorNotice("cap", text, now))

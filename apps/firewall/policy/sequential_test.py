@@ -8,7 +8,8 @@ budget of b false blocks a day
     A = ln(m · day / (T · b))
 
 Sources that saw the same packets say the same thing twice, so the largest counts in full and the others by a
-quarter.  Evidence that only supports other evidence makes up a part of the bound at most.
+quarter.  Evidence that only supports other evidence makes up a part of the bound at most; so does forgeable evidence
+that names an address only, in the sum of the sender last seen with it: another may have sent that under its address.
 
 Source: Wald, Sequential Analysis, 1947; the fading sum is that of a CUSUM (Page, 1954) with a half-life in place
 of a drift.
@@ -46,6 +47,9 @@ PLACE_HELD_S: Final = 3_600
 """Seconds of capture time for which it is known where an address was last seen."""
 _SWEEP_S: Final = 60
 _SECOND: Final = 1_000_000_000
+
+_BY_ADDRESS: Final = " by address"
+"""Suffix of a source where it names no sender: its weight is not that of what it says about a sender."""
 
 UNPLACED: Final = "unplaced"
 """In place of a service: the address of a sender whose port and MAC are unknown."""
@@ -141,6 +145,8 @@ class SequentialTest:
         if evidence.sender is not None and evidence.sender.ip:
             self._place(evidence.sender, evidence.event_time)
         subject, source = self._subject_of(evidence), shared_text(f"{app}.{evidence.source}")
+        if evidence.sender is None and evidence.forgeable and isinstance(subject, Sender):
+            evidence, source = structs.replace(evidence, supporting=True), shared_text(source + _BY_ADDRESS)
         now = evidence.event_time
         tally = self._tallies.get(subject)
         if tally is None:
@@ -180,13 +186,14 @@ class SequentialTest:
 
     def _sweep(self, now: int) -> None:
         """Once a minute, forget what can have no part in a decision: a network meets ever new addresses."""
-        if now < self._swept + _SWEEP_S * _SECOND:
+        # a clock that was ahead may have been set back since; evidence that is merely late is no sign of that
+        if -PLACE_HELD_S * _SECOND < now - self._swept < _SWEEP_S * _SECOND:
             return
         self._swept = now
         bound = self.bound
         for subject in [each for each, tally in self._tallies.items() if tally.faded(now, bound)]:
             del self._tallies[subject]
-        while self._placed and next(iter(self._placed.values()))[1] < now - PLACE_HELD_S * _SECOND:
+        while self._placed and abs(now - next(iter(self._placed.values()))[1]) > PLACE_HELD_S * _SECOND:
             self._placed.popitem(last=False)
 
     def _subject_of(self, evidence: Evidence) -> Subject:

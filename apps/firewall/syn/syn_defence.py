@@ -23,13 +23,16 @@ from apps.firewall.syn.flood_evidence import Suspicion, SynFinding, flood_eviden
 from apps.firewall.syn.recent_syns import RecentSyns
 from apps.firewall.syn.services import TcpService
 from apps.firewall.syn.syn_policy import Sample, SynRules, SynVerdict, judge_syns
-from apps.messages import Decision, Exhibit
+from apps.messages import Confirmation, Decision, Exhibit
 
 EVERY_SWITCH = "*"
 UNKNOWN_HISTORY = "history unknown: Data Archives do not answer"
 COLD_HISTORY = "nobody is known from handshakes yet, so everybody is challenged once"
 SERVICES_LEARNT = 4096
 SOURCES_SAMPLED = 4096
+REFUSED_S = 30
+"""Seconds for which a guard that a switch has refused is not tried again."""
+MOST_REFUSED = 1024
 
 
 class Watch:
@@ -83,6 +86,8 @@ class SynDefence:
         self._lifecycle = lifecycle
         self.allow = allow
         self._guarded: dict[TcpService, Decision] = {}
+        self._refused: dict[TcpService, tuple[Decision, int]] = {}
+        """Guards that no switch has, and when the last one refused."""
         self.services: dict[TcpService, TcpService] = {}
         """Known from handshakes; the most recent last."""
         self.recent = RecentSyns(rules.sample)
@@ -232,7 +237,33 @@ class SynDefence:
         for decision in decisions:
             port = decision.target.port
             if decision.action == "protect" and decision.expires and port is not None:
-                self._guarded[TcpService(decision.target.address, port)] = decision
+                service = TcpService(decision.target.address, port)
+                held = self._guarded.get(service)
+                if held is None or held.expires < decision.expires:
+                    # it was told to each switch that connected, and ends on all of them
+                    self._guarded[service] = _on(EVERY_SWITCH, decision)
+
+    def confirm(self, confirmation: Confirmation, now: int, *, stands: bool) -> None:
+        """Record what a switch says of a guard; one that was refused is not in force, and a flood may set it again.
+
+        Args:
+            confirmation: of this or another decision.
+            now: capture time, ns.
+            stands: whether the decision is in force on any switch.
+        """
+        if confirmation.state == "failed" and not stands:
+            for service, decision in self._guarded.items():
+                if decision.id == confirmation.id:
+                    self._refused[service] = self._guarded.pop(service), now
+                    break
+            if len(self._refused) > MOST_REFUSED:
+                del self._refused[next(iter(self._refused))]
+        elif stands:
+            for service, (decision, _) in self._refused.items():
+                if decision.id == confirmation.id:  # another switch had refused it before
+                    del self._refused[service]
+                    self._guarded.setdefault(service, decision)
+                    break
 
     def holds(self, which: str) -> bool:
         """Whether a guard set because of a flood has this id or address."""
@@ -271,12 +302,18 @@ class SynDefence:
         expires = now + self.rules.protect_s * SECOND
         if service in self._guarded:
             self._guarded[service] = _changed(self._guarded[service], expires=expires)
-        if service in self._always or service in self._guarded:
+        if service in self._always or service in self._guarded or self._was_refused(service, now):
             return []
         reason = reason if len(self.known) else f"{reason} ({COLD_HISTORY})"
         made = self._protect(service, EVERY_SWITCH, reason, evidence, now, expires=expires)
         self._guarded[service] = made
+        self._refused.pop(service, None)
         return [made]
+
+    def _was_refused(self, service: TcpService, now: int) -> bool:
+        """Whether a switch has just refused a guard of it; tried at each suspicion it would come and go."""
+        _, at = self._refused.get(service, (None, now - REFUSED_S * SECOND))
+        return abs(now - at) < REFUSED_S * SECOND
 
     def _protect(
         self,

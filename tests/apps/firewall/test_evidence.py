@@ -93,7 +93,7 @@ def test_a_foreign_app_can_speak_and_nobody_in_its_name():
 
 
 def test_a_query_that_knows_only_an_address_counts_against_its_sender():
-    """Alone it blocks nobody: the address may be forged, and its port is unknown."""
+    """Alone, or with hardly anything else, it blocks nobody: the address may be forged, and its port is unknown."""
     query = structs.replace(evidence(20.0, AT, "port_scan"), sender=None, address=CAMERA.ip)
     alone = desk(evidence_queries=("port_scan",))
     hear(alone, query, app="sonata_adapter")
@@ -101,6 +101,9 @@ def test_a_query_that_knows_only_an_address_counts_against_its_sender():
     on = desk(evidence_queries=("port_scan",))
     hear(on, evidence(1.0, AT))
     hear(on, query, app="sonata_adapter")
+    assert not on.blocked
+    bound = on.service._handler.decider.test.bound
+    hear(on, evidence(0.8 * bound - 1.0, AT))
     assert on.blocked == [CAMERA.mac]
 
 
@@ -116,6 +119,14 @@ def test_who_is_not_blocked_is_named(changes, why):
     hear(on, evidence(20.0, AT, **changes))
     assert not on.blocked
     assert any(why in value["text"] for key, value in on.engine.written if key.startswith("network.event."))
+
+
+def test_who_is_not_blocked_is_named_again_after_the_clock_was_set_back():
+    """That the same was told half an hour later is no reason to tell nothing for as long."""
+    on = desk()
+    for at in (AT + 1_800, AT, AT + 1):
+        hear(on, evidence(20.0, at, role="gateway"))
+    assert len(on.events) == 2
 
 
 def test_training_that_is_too_short_blocks_nobody():

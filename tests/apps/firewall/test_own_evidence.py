@@ -236,9 +236,8 @@ def test_on_probation_the_earlier_block_is_told_though_it_adds_nothing():
 
 
 def test_an_archive_that_does_not_answer_knows_no_offence():
-    engine = FakeEngine()
-    engine.archive_away = True
-    on = blocked_before(desk(engine=engine))
+    on = blocked_before(desk())
+    on.engine.archive_away = True
     hear(on, evidence(20.0, AT))
     assert "history unknown" in on.decisions[0].reason
     assert on.decisions[0].level == 0

@@ -145,6 +145,13 @@ def test_archive_that_is_away_from_the_start():
     assert "nobody is known" in desk.decisions[0].reason
 
 
+def test_guard_that_the_switch_refused_is_not_shown_as_in_force():
+    desk = Desk(syn=QUICK)
+    flood(desk, *spoofed())
+    desk.confirm(desk.decisions[0], "failed")
+    assert desk.service.health()["guarded"] == []
+
+
 def test_switch_gets_everything_again_after_controller_or_switch_began_anew():
     """Allowed entries, guards, prefix blocks, known sources; not at every word of the same controller."""
     desk = Desk(guard=("10.0.0.1:80",), rules=Rules(allow=("10.0.0.9",)))

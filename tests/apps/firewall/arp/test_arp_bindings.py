@@ -36,10 +36,47 @@ def test_takeover_from_a_dead_owner_is_none():
     assert made.add(records([arp(5800, 1, OWNER, HOST)])) == []
 
 
-def test_moved_host_keeps_its_address():
-    """The same MAC behind another port."""
+def test_the_owners_mac_on_another_port_does_not_hide_a_theft():
+    """One frame under the owner's MAC and address, before or during the theft, takes the address from nobody."""
     made = trained()
-    assert made.add(records([arp(700, 2, OWNER, HOST), arp(701, 1, OWNER, HOST)])) == []
+    (told,) = made.add(records([arp(700, 3, OWNER, HOST), arp(701, 1, OWNER, HOST)]))
+    assert (told.thief, told.certain) == (BoundHost(3, OWNER), False)
+    for at in (710, 720):
+        (theft,) = made.add(records([arp(at, 3, THIEF, HOST), arp(at + 1, 1, OWNER, HOST)]))
+        assert (theft.thief, theft.certain) == (BoundHost(3, THIEF), True)
+    assert made.forged(HOST, BoundHost(3, THIEF))
+
+
+def test_moved_host_keeps_its_address():
+    """The same MAC behind another port, and back: nobody is blocked, and both ports are the owner's."""
+    made, there = trained(), BoundHost(2, OWNER)
+    assert made.add(records([arp(at, 2, OWNER, HOST) for at in (700, 730, 761)])) == []
+    assert made.addresses_of(there) == [HOST]
+    assert not made.forged(HOST, there)
+    assert made.forged(HOST, BoundHost(3, THIEF))
+    (theft,) = made.add(records([arp(800, 3, THIEF, HOST), arp(801, 2, OWNER, HOST)]))
+    assert not theft.certain
+    assert made.add(records([arp(900, 1, OWNER, HOST)])) == []
+    assert made.addresses_of(there) == []
+    (theft,) = made.add(records([arp(910, 3, THIEF, HOST), arp(911, 1, OWNER, HOST)]))
+    assert theft.certain
+
+
+def test_who_forges_the_mac_of_a_dead_owner_gets_its_successor_blocked_by_nobody():
+    """Only the port of training proves that the owner is there."""
+    made = trained()
+    assert made.add(records([arp(at, 3, OWNER, HOST) for at in (700, 800)])) == []
+    (told,) = made.add(records([arp(810, 4, OTHER, HOST), arp(811, 3, OWNER, HOST)]))
+    assert (told.thief, told.certain) == (BoundHost(4, OTHER), False)
+    (told,) = made.add(records([arp(820, 1, OWNER, HOST)]))
+    assert (told.thief, told.certain) == (BoundHost(3, OWNER), False)
+
+
+def test_a_frame_of_the_owner_that_says_two_things_does_not_unbind_it():
+    """Its own port and MAC in Ethernet, another MAC in ARP, as a virtual router sends."""
+    made = trained()
+    made.add(records([arp(700, 1, OWNER, HOST, arp_src_mac=OTHER)]))
+    assert made.forged(HOST, BoundHost(3, THIEF))
 
 
 def test_squatter_gets_nobody_blocked():

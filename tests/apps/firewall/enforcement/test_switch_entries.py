@@ -52,6 +52,16 @@ def test_changes_of_the_allow_list():
     assert len(entries.everything()) == 2
 
 
+def test_entries_that_mean_the_same_are_one_in_the_table():
+    """It stays until the last of them is gone."""
+    entries = AllowEntries()
+    both = ["10.0.0.1", "10.0.0.1/32", "02:00:00:00:00:AA", "02:00:00:00:00:aa"]
+    assert [each.kind for each in entries.change(both)] == ["insert", "insert"]
+    assert entries.change(both[1:]) == []
+    assert entries.change(both[1::2]) == []
+    assert [each.kind for each in entries.change([])] == ["delete", "delete"]
+
+
 def test_table_has_room_for_so_many():
     """The others are heeded by decisions only, and counted."""
     entries = AllowEntries()

@@ -160,6 +160,30 @@ def test_drops_at_the_training_rate_do_not_extend():
     assert lifecycle.due(decision.expires)[0].action == "unblock"
 
 
+def test_a_restart_does_not_make_a_block_of_a_busy_host_endless():
+    """What is usual for it, and which host it is, comes with the decision; where it does not nothing is extended."""
+    for seconds, packets, then in ((600, 20, "unblock"), (600, 61, "block")):
+        decision = opened(BlockLifecycle(Rules()))
+        restarted = BlockLifecycle(Rules())
+        restarted.restore([Decision.from_value(decision.to_value())])
+        restarted.count_drops(decision.id, packets * seconds, decision.expires)
+        assert restarted.due(decision.expires)[0].action == then
+    old = {
+        name: value for name, value in decision.to_value().items() if name not in ("training_rate", "host")
+    }
+    restarted.restore([Decision.from_value(old)])
+    restarted.count_drops(decision.id, 1_000_000, decision.expires)
+    assert restarted.due(decision.expires)[0].action == "unblock"
+    assert restarted.on_probation(CAMERA, decision.expires)
+
+
+def test_a_known_host_that_is_blocked_by_its_mac_is_known_after_a_restart():
+    decision = opened(BlockLifecycle(Rules()))
+    restarted = BlockLifecycle(Rules(), known={CAMERA.ip, "10.0.0.77"})
+    restarted.restore([Decision.from_value(decision.to_value())])
+    assert "max_known_share" in (restarted.cap_reached(decision.event_time, "10.0.0.77") or "")
+
+
 def test_a_block_that_was_asked_for_ends_when_it_says():
     """However much it drops, also after a restart, and it puts nobody on probation: it rests on no evidence."""
     said = Exhibit(key="network.instruction.operator.firewall", timestamp=1, summary="block")
@@ -195,6 +219,19 @@ def test_caps_stop_blocking():
     assert "max_decisions_per_minute" in (lifecycle.cap_reached(102 * SECOND) or "")
     assert lifecycle.cap_reached(161 * SECOND) is None
     assert "max_blocks" in (BlockLifecycle(Rules(max_blocks=0)).cap_reached(0) or "")
+
+
+def test_a_clock_that_was_ahead_does_not_stop_blocking():
+    """One decision a day ahead; when the clock is right again, one block in ten minutes is no cap, and a cap is told."""
+    lifecycle = BlockLifecycle(Rules(max_decisions_per_minute=3))
+    opened(lifecycle, 86_400)
+    lifecycle.refuse("too many (test)", "10.0.0.1", 86_400 * SECOND)
+    lifecycle.notices.clear()
+    for number in range(5):
+        assert lifecycle.cap_reached(number * 600 * SECOND) is None
+        opened(lifecycle, number * 600)
+    lifecycle.refuse("too many (test)", "10.0.0.1", 3_000 * SECOND)
+    assert len(lifecycle.notices) == 1
 
 
 def test_dry_run_is_marked():

@@ -101,6 +101,17 @@ def test_allowing_lifts_blocks_that_touch_it():
     assert not tell(again, "disallow", "192.0.2.0/24")[1].done
 
 
+def test_allowing_an_address_lifts_the_block_of_its_hosts_mac():
+    """A host with one address is blocked by MAC; that of another host stays blocked."""
+    made = desk()
+    for last, host in ((5, "10.0.0.5"), (6, "10.0.0.6"), (7, "")):
+        target = Target(kind="mac", address=f"02:00:00:00:00:0{last}", port=3)
+        made._lifecycle.open("s1", target, "scan", (), NOW, host=host)
+    (lifted,), answer = tell(made, "allow", "10.0.0.5")
+    assert (lifted.action, lifted.target.address) == ("unblock", "02:00:00:00:00:05")
+    assert "1 block lifted" in answer.text
+
+
 def test_wrong_allow_entry_changes_nothing():
     """It is named, and the list stays."""
     made = desk("10.0.0.1")
@@ -133,4 +144,8 @@ def test_targets():
     assert target_in("192.0.2.7/32") == Target(kind="ip", address="192.0.2.7")
     for wrong in ("02:00:00:00:00:AA@x", "192.0.2.7@3", "192.0.2.0/33"):
         with pytest.raises(ValueError, match="not an IP address"):
+            target_in(wrong)
+    assert target_in("02:00:00:00:00:AA@65535").port == 65_535
+    for wrong in ("02:00:00:00:00:AA@65536", "02:00:00:00:00:AA@99999999999999999999"):
+        with pytest.raises(ValueError, match="65,535"):
             target_in(wrong)

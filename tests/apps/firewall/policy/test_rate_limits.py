@@ -135,6 +135,8 @@ def test_the_table_of_the_switch_has_an_end_and_people_are_told():
     assert not opened(limits, AT + 1)
     assert limits.refused == 2
     assert [VICTIM in each.text for each in limits.notices] == [True]
+    assert not opened(limits, AT - 86_400)
+    assert len(limits.notices) == 2, "also after a clock that was a day ahead was set right"
 
 
 def test_what_a_switch_refuses_is_not_in_force():

@@ -96,6 +96,30 @@ def test_what_only_supports_never_decides():
     assert total(test, evidence(6.0)) == pytest.approx(6.0 + 0.3 * test.bound)
 
 
+def test_forgeable_evidence_of_an_address_supports_what_there_is_against_its_sender():
+    """Anybody behind a router may scan under the address of a host; what a handshake proves counts in full."""
+    named = {"sender": None, "address": CAMERA.ip, "source": "port_scan"}
+    test = trained()
+    assert total(test, evidence(0.01), evidence(40.0, **named)) == pytest.approx(0.01 + 0.3 * test.bound)
+    # what names the sender itself keeps its weight, whatever its source is called
+    assert total(test, evidence(6.0, source="port_scan")) == pytest.approx(
+        6.0 + 0.25 * 0.01 + 0.3 * test.bound
+    )
+    assert total(trained(), evidence(0.0), evidence(40.0, forgeable=False, **named)) == pytest.approx(40.0)
+
+
+def test_after_a_clock_was_set_back_sums_and_places_are_forgotten_as_before():
+    """What was noted while it was ahead by a day holds for no day."""
+    test, ahead = trained(), 100 + 86_400
+    place = structs.replace(CAMERA, ip="198.51.100.9")
+    test.hear(evidence(1.0, ahead, sender=place), "kitsune")
+    test.hear(evidence(1.0, 100), "kitsune")
+    assert test.placed(evidence(sender=None, address=place.ip)).sender is None
+    other = structs.replace(CAMERA, ip="198.51.100.10")
+    test.hear(evidence(1.0, 100 + 12 * int(HALF_LIFE_S), sender=other), "kitsune")
+    assert CAMERA not in test._tallies
+
+
 def test_victims_of_forged_senders_have_a_sum_of_their_own():
     test = trained()
     flood = structs.replace(evidence(8.0), sender=None, victims=("10.0.0.1",), service="tcp/80")

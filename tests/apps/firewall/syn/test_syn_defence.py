@@ -6,9 +6,15 @@ from apps.firewall.policy.rules import AllowList, Rules
 from apps.firewall.syn.flood_evidence import Suspicion
 from apps.firewall.syn.recent_syns import RecentSyns
 from apps.firewall.syn.services import TcpService
-from apps.firewall.syn.syn_defence import SERVICES_LEARNT, SOURCES_SAMPLED, SynDefence, Watch
+from apps.firewall.syn.syn_defence import (
+    REFUSED_S,
+    SERVICES_LEARNT,
+    SOURCES_SAMPLED,
+    SynDefence,
+    Watch,
+)
 from apps.firewall.syn.syn_policy import SynRules
-from apps.messages import Decision, Exhibit
+from apps.messages import Confirmation, Decision, Exhibit
 from tests.apps.firewall.syn.test_recent_syns import batch
 
 WEB = TcpService("10.0.0.1", 80)
@@ -102,6 +108,44 @@ def test_guard_ends_an_hour_after_the_last_flood():
     (lifted,) = made.due(NOW + 5400 * SECOND)
     assert lifted.action == "unprotect"
     assert made.guarded == []
+
+
+def said_of(decision: Decision, state: str) -> Confirmation:
+    return Confirmation.from_value(
+        {"id": decision.id, "switch": "s1", "state": state, "action": "protect", "event_time": NOW}
+    )
+
+
+def test_guard_that_the_switch_refused_is_set_again_while_the_flood_goes_on():
+    """Not at once, since the switch may refuse it again: it would come and go with each look."""
+    made = defence()
+    (decision,) = flood(made, 600, 1)
+    made.confirm(said_of(decision, "failed"), NOW, stands=False)
+    assert made.guarded == []
+    assert flood(made, 600, 1, NOW + SECOND) == []
+    (again,) = flood(made, 600, 1, NOW + REFUSED_S * SECOND)
+    assert again.id != decision.id
+    assert made.guarded == [WEB]
+
+
+def test_guard_that_one_of_two_switches_has_stays():
+    """Whichever of them answers first; and it ends when its time is over."""
+    for answers in (("failed", "installed"), ("installed", "failed")):
+        made = defence()
+        (decision,) = flood(made, 600, 1)
+        for number, state in enumerate(answers):
+            made.confirm(said_of(decision, state), NOW, stands="installed" in answers[: number + 1])
+        assert made.guarded == [WEB]
+        assert [each.id for each in made.due(decision.expires)] == [decision.id]
+
+
+def test_guard_ends_on_every_switch_that_was_told_of_it():
+    """The archive has a copy for each switch that connected since."""
+    made, restarted = defence(), defence()
+    decisions = [*flood(made, 600, 1), *made.arm("s1", NOW), *made.arm("s2", NOW)]
+    restarted.restore(decisions)
+    (ended,) = restarted.due(decisions[0].expires)
+    assert (ended.action, ended.id, ended.switch) == ("unprotect", decisions[0].id, "*")
 
 
 def test_guarded_service_is_not_guarded_again():
