@@ -23,24 +23,23 @@ from apps.sonata_adapter.controller_updates import (
 from apps.sonata_adapter.errors import SonataError
 from apps.sonata_adapter.host.engine import DEFAULT_LATENESS_US, DEFAULT_LIMIT, HostEngine, WindowEngine
 from apps.sonata_adapter.host.gates import with_passed
-from apps.sonata_adapter.host.handshake import Handshakes
-from apps.sonata_adapter.host.merge import Merger, patience
+from apps.sonata_adapter.host.merge import patience
 from apps.sonata_adapter.keys import HANDSHAKE, QueryRequest, request_of
 from apps.sonata_adapter.planner.cell_moves import better_places
 from apps.sonata_adapter.planner.cell_needs import CellWords
 from apps.sonata_adapter.planner.moves import Moves, surely_us
 from apps.sonata_adapter.planner.placement import SwitchLimits
-from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, copies_saved, plan
+from apps.sonata_adapter.planner.plan import QueryPlan, QueryPlans, copies_saved, plan, renewed
 from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.planner.refinement import Crossings, Refinement, coarsest
 from apps.sonata_adapter.query.catalogue import Template
 from apps.sonata_adapter.query.dataflow import WindowTable, compile_query
 from apps.sonata_adapter.results import Captured, Output, QueryResult
 from apps.sonata_adapter.switch.cell_read import CellRead
-from apps.sonata_adapter.switch.clock import Clock
 from apps.sonata_adapter.switch.differences import Differences
 from apps.sonata_adapter.switch.register_reads import RegisterReads
 from apps.sonata_adapter.switch.reports import CountReportReader
+from apps.sonata_adapter.switch_state import Counts, Lane, SwitchState
 from due import RecordBatch
 from due.errors import DueError
 
@@ -58,47 +57,6 @@ WEIGH_S: Final = 2.0
 """Seconds between two looks at where queries had better run."""
 MOST_KEYS: Final = 1_024
 """Most keys that are served at a time."""
-_Counts = CountReportReader | RegisterReads | Differences | Crossings
-
-
-class _Lane:
-    """Host operators and their input stream; queries on frame bytes have a lane of their own."""
-
-    def __init__(self, host: WindowEngine) -> None:
-        self.host = host
-        self.merger = Merger()
-        self.names: set[str] = set()
-        """The streams from which its packets come."""
-        self.opens = ""
-        """Of a query with a gate in the switch: the stream of packets that have passed it."""
-        self.brought: dict[str, int] = {}
-        """Packets by stream."""
-
-
-class _SwitchState:
-    """The state kept for one switch."""
-
-    def __init__(self, name: str, engine: Callable[[], WindowEngine], base_us: int) -> None:
-        self.name = name
-        self.headers = _Lane(engine())
-        self.frames = _Lane(engine())
-        self.gated: dict[str, _Lane] = {}
-        """By query, of those with a gate in the switch: what the switch says of packets holds for one query only."""
-        self.handshakes = Handshakes()
-        self.reports: dict[str, _Counts] = {}
-        self.base_us = base_us
-        for lane in self.lanes:
-            lane.host.base_us = base_us
-        self.clock = Clock()
-
-    @property
-    def asking(self) -> list[RegisterReads | Differences]:
-        """The counts for which cells of the switch are read."""
-        return [each for each in self.reports.values() if isinstance(each, (RegisterReads, Differences))]
-
-    @property
-    def lanes(self) -> tuple[_Lane, ...]:
-        return self.headers, self.frames, *self.gated.values()
 
 
 class Control:
@@ -118,7 +76,7 @@ class Control:
         self._engine = partial(engine, limit=keys_limit, lateness_us=lateness_us)
         # what comes through a gate is little
         self._gate_engine = partial(HostEngine, limit=keys_limit, lateness_us=lateness_us)
-        self._switches: dict[str, _SwitchState] = {}
+        self._switches: dict[str, SwitchState] = {}
         self._refinement = Refinement()
         self._moves = Moves()
         self._rates = MeasuredRates()
@@ -272,7 +230,7 @@ class Control:
             if name in lane.names:
                 lane.brought[name] = lane.brought.get(name, 0) + len(batch)
                 mine = with_passed(batch, passed=name == lane.opens) if lane.opens else batch
-                written += self._processed(state, lane, lane.merger.put(name, mine, now), now)
+                written += self._addressed(state, lane.run(lane.merger.put(name, mine, now), now))
         return written
 
     def busy(self, switch: str, now: float) -> None:
@@ -352,7 +310,7 @@ class Control:
             for counts in state.asking:
                 written += self._addressed(state, counts.expire(state.clock, now))
             for lane in state.lanes:
-                written += self._processed(state, lane, lane.merger.release(now), now)
+                written += self._addressed(state, lane.run(lane.merger.release(now), now))
                 heard_us = state.clock.heard_us
                 if heard_us is not None and lane.merger.is_quiet(now):
                     written += self._addressed(state, lane.host.advance(heard_us))
@@ -362,6 +320,22 @@ class Control:
         """Note that a switch's capture time has reached `now_us`, even without packets."""
         self._switch_state(switch).clock.hear(now_us)
 
+    def set_back(self, switch: str, now_us: int) -> list[Written]:
+        """A switch's clock was set back to `now_us`: what is open is reported, and all of the switch begins anew."""
+        state = self._switch_state(switch)
+        step_us = min(0, now_us - (state.clock.heard_us or now_us))
+        written = self._addressed(state, state.set_back(now_us))
+        self._moves.set_back(switch, step_us)
+        self._refinement.set_back(switch, id(state), step_us)
+        return written
+
+    def renew(self) -> ControllerUpdates:
+        """Changes for a switch whose clock was set back: what waits there for windows' ends would wait for far ones."""
+        before = self.plan
+        self._generation = 1 + self._generation % 255
+        self.plan = renewed(before, self._generation)
+        return ControllerUpdates(updates=updates(before, self.plan))
+
     def finish(self) -> list[Written]:
         """No more packets will come."""
         written: list[Written] = []
@@ -369,7 +343,7 @@ class Control:
             for counts in state.asking:
                 written += self._addressed(state, counts.flush())
             for lane in state.lanes:
-                written += self._processed(state, lane, lane.merger.flush(), None)
+                written += self._addressed(state, lane.run(lane.merger.flush(), None))
                 written += self._addressed(state, lane.host.finish())
         return written
 
@@ -481,10 +455,10 @@ class Control:
                 outputs.setdefault(request.identity, set()).add(request.output)
         return requests, outputs, refused
 
-    def _switch_state(self, name: str, base_us: int = 0) -> _SwitchState:
+    def _switch_state(self, name: str, base_us: int = 0) -> SwitchState:
         state = self._switches.get(name)
         if state is None:
-            state = self._switches[name] = _SwitchState(name, self._engine, base_us)
+            state = self._switches[name] = SwitchState(name, self._engine, base_us)
             self._refit(state, {})
         return state
 
@@ -516,7 +490,7 @@ class Control:
             offer=offered(before, self.plan),
         )
 
-    def _refit(self, state: _SwitchState, old: Mapping[str, QueryRequest]) -> None:
+    def _refit(self, state: SwitchState, old: Mapping[str, QueryRequest]) -> None:
         """Adapt a switch's operators to the plan."""
         self._refit_gates(state)
         for lane in (state.headers, state.frames):
@@ -535,14 +509,14 @@ class Control:
             asked = [self._requests[one.identity] for one in mine]
             windows = [request.query.window_us for request in asked if request.kind == "query"]
             lane.merger.hurry(patience(min(windows, default=None)))
-        reports: dict[str, _Counts] = {}
+        reports: dict[str, Counts] = {}
         for one in self.plan.queries:
             if one.in_switch and one.gate is None:
                 held = state.reports.get(one.identity)
                 reports[one.identity] = held or self._new_reports(one, state)
         state.reports = reports
 
-    def _refit_gates(self, state: _SwitchState) -> None:
+    def _refit_gates(self, state: SwitchState) -> None:
         gates = {one.identity: one.gate for one in self.plan.queries if one.gate is not None}
         for identity in state.gated.keys() - gates.keys():
             state.gated.pop(identity).host.close()
@@ -550,7 +524,7 @@ class Control:
             lane = state.gated.get(identity)
             query = self._requests[identity].query
             if lane is None:
-                lane = state.gated[identity] = _Lane(self._gate_engine())
+                lane = state.gated[identity] = Lane(self._gate_engine())
                 lane.host.base_us = state.base_us
                 lane.host.add(query)
             lane.opens = stream(gate.opens)
@@ -558,7 +532,7 @@ class Control:
             lane.merger.expect(lane.names)
             lane.merger.hurry(patience(query.window_us))
 
-    def _new_reports(self, one: QueryPlan, state: _SwitchState) -> _Counts:
+    def _new_reports(self, one: QueryPlan, state: SwitchState) -> Counts:
         request = self._requests[one.identity]
         if request.coarse:
             return Crossings(request, base_us=state.base_us)
@@ -568,19 +542,7 @@ class Control:
             kind = Differences if one.entries[0].role == "difference" else RegisterReads
         return kind(query, one, base_us=state.base_us, since_us=state.clock.heard_us)
 
-    def _processed(
-        self, state: _SwitchState, lane: _Lane, batch: RecordBatch | None, now: float | None
-    ) -> list[Written]:
-        """Run packets through the operators; a window closes when all streams have passed its end."""
-        horizon = None if now is None else lane.merger.horizon_us(now)
-        outputs: list[QueryResult | Captured] = []
-        if batch is not None:
-            outputs += lane.host.process(batch, horizon_us=0 if horizon is None else horizon)
-        if horizon is not None:
-            outputs += lane.host.advance(horizon)
-        return self._addressed(state, outputs)
-
-    def _addressed(self, state: _SwitchState, outputs: Sequence[QueryResult | Captured]) -> list[Written]:
+    def _addressed(self, state: SwitchState, outputs: Sequence[QueryResult | Captured]) -> list[Written]:
         written: list[Written] = []
         for output in outputs:
             keys = self._outputs.get(output.query, ())

@@ -153,6 +153,8 @@ class SonataAdapterService:
         self._intake = Intake(_LOG)
         self._times: dict[str, SteadyTime] = {}
         """Clocks of the switches, us."""
+        self._set_back = 0
+        """Steps back of these clocks."""
         self._observed: dict[Source, Any] = {}
         self._cells: Any = None
         self._counters: Any = None
@@ -222,6 +224,7 @@ class SonataAdapterService:
                 "results": self._written,
                 "switches": sorted(self._switches),
                 "times_doubted": sum(each.doubted for each in self._times.values()),
+                "clocks_set_back": self._set_back,
                 "evidence": self._evidence.written,
                 "evidence_queries": self._evidence.health(),
                 "auto_thresholds": self._auto.health(),
@@ -237,6 +240,21 @@ class SonataAdapterService:
             text = f"switch {switch}: {MOST_SWITCHES} are known already"
             self._intake.refuse("switch", MessageError("size", text), item.key)
         return clock
+
+    def _hears(self, clock: SteadyTime, switch: str, at_us: int) -> bool:
+        """Whether a time that a switch tells is accepted."""
+        before_us = clock.now
+        accepted = clock.hear(at_us)
+        if accepted and before_us is not None and at_us < before_us - _STEP_US:
+            self._begin_anew(switch, before_us, at_us)
+        return accepted
+
+    def _begin_anew(self, switch: str, before_us: int, now_us: int) -> None:
+        """The clock of a switch was set back."""
+        self._set_back += 1
+        _LOG.warning("switch %s: its clock was set back by %d s", switch, (before_us - now_us) // 1_000_000)
+        self._write(self._control.set_back(switch, now_us))
+        self._apply(self._control.renew(), only=switch)
 
     def _templates(self) -> dict[str, Template]:
         try:
@@ -307,7 +325,7 @@ class SonataAdapterService:
             self._sweep()
             if fresh or again:
                 self._apply(self._control.everything(), only=name)
-            if state.event_time and clock.hear(state.event_time // 1000):
+            if state.event_time and self._hears(clock, name, state.event_time // 1000):
                 self._control.advance(name, state.event_time // 1000)
 
     def _sweep(self) -> None:
@@ -415,22 +433,31 @@ class SonataAdapterService:
             if kind == "counts":
                 self._counted(clock, switch, name, batch)
                 return
+            before_us = clock.now
             rows = clock.believed(batch["time_us"])
             batch = batch if rows is None else batch.take(rows)
-            if kind == "digests":
-                self._write(self._control.digests(switch, name, batch))
-                self._refine()
-            else:
-                self._write(self._control.packets(switch, name, batch, time.monotonic()))
-                self._control.busy(switch, time.monotonic())
+            if before_us is not None and clock.now is not None and clock.now < before_us:
+                ahead = batch["time_us"] > clock.now + _STEP_US
+                self._take(kind, switch, name, batch.take(ahead))
+                batch = batch.take(~ahead)
+                self._begin_anew(switch, before_us, int(batch["time_us"].min()))
+            self._take(kind, switch, name, batch)
             self._read_cells()
             self._hear()
+
+    def _take(self, kind: str, switch: str, name: str, batch: RecordBatch) -> None:
+        if kind == "digests":
+            self._write(self._control.digests(switch, name, batch))
+            self._refine()
+        else:
+            self._write(self._control.packets(switch, name, batch, time.monotonic()))
+            self._control.busy(switch, time.monotonic())
 
     def _counted(self, clock: SteadyTime, switch: str, name: str, batch: RecordBatch) -> None:
         """Differences over their threshold; at the end they carry the far time of our own last questions."""
         if not self._ending and len(batch):
             newest_us = int(batch["time_us"].max())
-            if clock.hear(newest_us):
+            if self._hears(clock, switch, newest_us):
                 self._control.advance(switch, newest_us)
         self._write(self._control.counts(switch, name, batch, time.monotonic()))
         self._read_cells()
@@ -463,7 +490,9 @@ class SonataAdapterService:
         switch = item.key.rpartition(".")[2]
         with self._lock:
             clock = self._clock(item, switch)
-            if clock is not None and item.event_time and clock.hear(item.event_time // 1000):
+            if clock is None or not item.event_time:
+                return
+            if self._hears(clock, switch, item.event_time // 1000):
                 self._control.measured(switch, counters, item.event_time // 1000)
 
     def _ask(self, questions: dict[str, list[CellRead]]) -> None:

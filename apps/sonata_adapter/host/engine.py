@@ -73,7 +73,7 @@ class _Running:
         self.least = least_packets(self.outcome)
         self.kinds = query.fields
         self.since_us = since_us
-        """Capture time when it came into force; None: before the first packet."""
+        """Capture time when it came into force, or the clock was set back; None: before the first packet."""
 
     def nodes(self) -> list[Node]:
         return sources(self.outcome) if isinstance(self.outcome, WindowTable) else [self.outcome.node]
@@ -208,6 +208,7 @@ class WindowEngine(Protocol):
         self, batch: RecordBatch, *, horizon_us: int | None = None
     ) -> list[QueryResult | Captured]: ...
     def advance(self, now_us: int) -> list[QueryResult | Captured]: ...
+    def set_back(self, now_us: int) -> list[QueryResult | Captured]: ...
     def finish(self) -> list[QueryResult | Captured]: ...
     def close(self) -> None: ...
 
@@ -299,6 +300,19 @@ class HostEngine:
             if self.base_us + (key[1] + 1) * key[0] + min(self._lateness_us, key[0] // 4) <= self.watermark_us
         ]
         return self._close(over)
+
+    def set_back(self, now_us: int) -> list[QueryResult | Captured]:
+        """The switch's clock was set back to `now_us`: close all windows, whose time it was not, and begin anew.
+
+        The first windows are partial: their packets before `now_us` had another time.
+        """
+        found = self.finish()
+        self._closed.clear()
+        self._flows.clear()
+        self.watermark_us = now_us
+        for running in self._queries.values():
+            running.since_us = now_us
+        return found
 
     def finish(self) -> list[QueryResult | Captured]:
         """No more packets will come: close all windows."""

@@ -122,6 +122,14 @@ class Merger:
         """Whether nothing waits, and nothing has arrived for so long that nothing is expected."""
         return not self._waiting and now - self._heard >= self._wait_s
 
+    def set_back(self) -> RecordBatch | None:
+        """The clock was set back: release all waiting packets, and forget how far the streams have come."""
+        released = self.flush()
+        self._newest_us = None
+        for stream in self._streams.values():
+            stream.time_us = None
+        return released
+
     def flush(self) -> RecordBatch | None:
         """Release all waiting packets."""
         return self._up_to(None) if self._waiting else None

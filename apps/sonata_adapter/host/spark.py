@@ -137,6 +137,20 @@ class SparkEngine:
             stream.pass_time(now_us)
         return self._direct.advance(now_us) + self._results()
 
+    def set_back(self, now_us: int) -> list[QueryResult | Captured]:
+        """The switch's clock was set back to `now_us`: close all windows, whose time it was not, and begin anew.
+
+        Spark's time never goes back, so its streams are started again; that takes seconds.
+        """
+        found = self.finish()
+        self._direct.set_back(now_us)
+        self.watermark_us = now_us
+        self._queries = {name: (query, now_us) for name, (query, _) in self._queries.items()}
+        for length in list(self._streams):
+            self._streams.pop(length).stop()
+            self._stream(length)
+        return found
+
     def finish(self) -> list[QueryResult | Captured]:
         """No more packets will come: close all windows and wait for their results."""
         for stream in self._streams.values():

@@ -112,6 +112,13 @@ class Moves:
             return True
         return (count == self._new(self.owner(count))) == (window_us >= move.from_us.get(switch, 0))
 
+    def set_back(self, switch: str, step_us: int) -> None:
+        """The clock of a switch was set back by `step_us`, at most 0: what begins at a time begins as much earlier."""
+        for move in self._moves.values():
+            if switch in move.from_us:
+                from_us = move.from_us[switch] + step_us
+                move.from_us[switch] = -(-from_us // move.window_us) * move.window_us
+
     def _new(self, identity: str) -> str:
         return identity if identity in self._other else identity + _OTHER
 

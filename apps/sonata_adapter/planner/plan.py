@@ -238,6 +238,12 @@ def _marked(plans: Mapping[str, QueryPlan], generation: int) -> dict[str, QueryP
     }
 
 
+def renewed(plans: QueryPlans, generation: int) -> QueryPlans:
+    """The same plans, with another generation of differences: the switch forgets which keys wait for a window's end."""
+    marked = _marked({one.identity: one for one in plans.queries}, generation)
+    return msgspec.structs.replace(plans, queries=tuple(marked.values()))
+
+
 def _timed(plans: Mapping[str, QueryPlan], limits: SwitchLimits) -> dict[str, QueryPlan]:
     """The plans, with the switch's clock as slow as the windows of all that it serves allow.
 

@@ -63,6 +63,11 @@ class Crossings:
             self._last = {prefix: last for prefix, last in self._last.items() if last >= oldest}
         return set(self._last)
 
+    def set_back(self, now_us: int) -> list[QueryResult]:  # noqa: ARG002 - as other reports
+        """The switch's clock was set back: no prefix is taken to have crossed."""
+        self._last.clear()
+        return []
+
     def _window(self, time_us: int) -> int:
         return (time_us - self._base_us) // self._window_us
 
@@ -169,6 +174,13 @@ class Refinement:
         while len(windows) > _KEPT:
             del windows[min(windows)]
         return first
+
+    def set_back(self, name: str, switch: int, step_us: int) -> None:
+        """The clock of a switch (`switch`: its number of `is_first`) was set back by `step_us`, at most 0."""
+        self._seen = {place: seen for place, seen in self._seen.items() if place[0] != switch}
+        for each in self._resting:
+            if name in each.until_us:
+                each.until_us[name] += step_us
 
     def _of(self, request: QueryRequest) -> list[QueryRequest]:
         """Counts for one request."""

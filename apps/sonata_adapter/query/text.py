@@ -286,6 +286,8 @@ class _Reader:
     def number(self, low: int = 0, high: int = _MOST_NUMBER) -> int:
         """The whole number that comes next, within these bounds."""
         text = self.token.text
+        if self.token.kind != "number":
+            self.fail(f"expected a whole number, found {text}")
         digits, base = (text[2:], 16) if text.startswith("0x") else (text, 10)
         if base == 10 and len(digits) > 1 and digits[0] == "0":
             self.fail(f"{text[:20]} begins with 0; write {digits.lstrip('0')[:20] or '0'}")

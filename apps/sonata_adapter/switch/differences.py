@@ -200,6 +200,12 @@ class Differences:
         self._questions.clear()
         return found
 
+    def set_back(self, now_us: int) -> list[QueryResult]:
+        """The switch's clock was set back to `now_us`: report the remaining results, and begin anew."""
+        found = self.flush()
+        self._ends.since_us = now_us
+        return found
+
     def _window(self, number: int) -> DifferenceWindow:
         return self._windows.setdefault(number, DifferenceWindow())
 

@@ -217,6 +217,13 @@ class RegisterReads:
             self._forget(number)
         return found
 
+    def set_back(self, now_us: int) -> list[QueryResult]:
+        """The switch's clock was set back to `now_us`: report the remaining results, and begin anew."""
+        found = self.flush()
+        self._closed = None
+        self._ends.since_us = now_us
+        return found
+
     def _forget(self, number: int) -> None:
         del self._windows[number]
         self._closed = max(number, self._closed if self._closed is not None else number)

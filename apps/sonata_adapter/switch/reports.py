@@ -67,6 +67,14 @@ class CountReportReader:
             outputs += self._crossed(batch.take(crossed))
         return outputs
 
+    def set_back(self, now_us: int) -> list[QueryResult]:
+        """The switch's clock was set back to `now_us`: begin anew; all results were reported at once."""
+        self._host = None
+        self._seen.clear()
+        self._overflows.clear()
+        self._since_us = now_us
+        return []
+
     def _crossed(self, batch: RecordBatch) -> Iterator[QueryResult]:
         packets = PacketColumns(batch)
         columns: list[tuple[str, Kind, Column | None]] = []

@@ -9,13 +9,14 @@ from apps.sonata_adapter.results import QueryResult
 class WindowEnds:
     """Where the windows of a query lie, by number, and results of them.
 
-    `base_us`: the switch's clock zero.  `since_us`: when the query came into force, if frames were seen before.
+    `base_us`: the switch's clock zero.  `since_us`: when the query came into force, if frames were seen before, or
+    the clock was set back.
     """
 
     def __init__(self, query: Query, base_us: int, since_us: int | None) -> None:
         self._query = query
         self._base_us = base_us
-        self._since_us = since_us
+        self.since_us = since_us
         self.length_us = query.window_us
 
     def end_us(self, number: int) -> int:
@@ -36,6 +37,6 @@ class WindowEnds:
             at_us=self.end_us(number),
             fields=fields,
             exact=not error,
-            partial=self._since_us is not None and self._since_us > start,
+            partial=self.since_us is not None and self.since_us > start,
             error=error,
         )

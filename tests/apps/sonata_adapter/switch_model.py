@@ -24,6 +24,7 @@ ZERO = 1 << 31
 class Ring:
     """Keys of a difference that wait for the end of their windows: (slot, epoch)."""
 
+    generation: int = 0
     newest: int = -1
     waits: list[tuple[Any, int]] = field(default_factory=list)
 
@@ -219,20 +220,23 @@ class SwitchModel:
             source_port & p["source_port_mask"],
         )
         epoch = now * p["reciprocal"] >> 64
-        ring = self.rings.setdefault(p["count_of"], Ring())
+        ring = self.rings.get(p["count_of"], Ring())
+        if ring.generation != p["generation"]:
+            ring = self.rings[p["count_of"]] = Ring(p["generation"])
         ring.newest = max(ring.newest, epoch)
         slot = self._slot(key, epoch, p)
         held = cells.get(slot, (-1, None, ZERO, False))
         mine = held[:2] == (epoch, key)
-        if not mine and (held[0] == epoch or held[3]):
+        marked = held[3] == p["generation"]
+        if not mine and (held[0] == epoch or marked):
             return False
         step = length if p["by_bytes"] else 1
         count = (held[2] if mine else ZERO) + (-step if p["subtracts"] else step)
-        waits = mine and held[3]
+        waits = mine and marked
         if count >= p["threshold"] and not waits:
             ring.waits.append((slot, epoch))
             waits = True
-        cells[slot] = (epoch, key, count, waits)
+        cells[slot] = (epoch, key, count, p["generation"] if waits else 0)
         return True
 
 

@@ -15,6 +15,7 @@ from tests.apps.sonata_adapter.query.test_catalogue import expect, same
 from tests.apps.sonata_adapter.switch_model import SwitchModel, counts_of
 
 PREFIX = "network.traffic_query.sonata"
+DAY_US = 86_400_000_000
 
 
 def play(keys, frames, *, shrink=0, size=512, limits=None, base_us=0):
@@ -24,8 +25,13 @@ def play(keys, frames, *, shrink=0, size=512, limits=None, base_us=0):
     changes = control.want(keys)
     assert not changes.refused
     switch.change(changes)
-    written, tuples = [], 0
+    written, tuples, before = [], 0, 0
     for now, batch in enumerate(batches(frames, size)):
+        first = int(batch["time_us"][0])
+        if first < before - DAY_US // 2:
+            written += control.set_back("s1", first)
+            switch.change(control.renew())
+        before = first
         for (kind, name), sent in switch.process(batch).items():
             tuples += len(sent)
             if kind == "digests":
@@ -91,6 +97,18 @@ def test_split_equals_naive(name, everything):
     assert key.startswith(f"{PREFIX}.{name}:")
     same(rows(results), expect(name, everything))
     assert tuples < len(everything)
+
+
+@pytest.mark.parametrize("name", ["new_tcp", "syn_flood", "slowloris", "dns_tunnel", "arp_scan"])
+def test_a_clock_that_is_set_back_costs_no_window(name, everything):
+    """It was a day ahead: all kinds of counts, in the switch and on the host, begin anew with the right time."""
+    ahead = [frame._replace(time_us=frame.time_us + DAY_US) for frame in everything[: 4 * 512]]
+    found, _ = play([f"{PREFIX}.{name}"], ahead + everything)
+    (results,) = found.values()
+    same(
+        rows(one for one in results if one.window_us < everything[0].time_us + DAY_US // 2),
+        expect(name, everything),
+    )
 
 
 def test_all_together_equal_naive(everything):

@@ -1,11 +1,14 @@
 """The adapter refuses what is no message, counts it, and goes on with what is one."""
 
+from itertools import count
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given
 from hypothesis import settings as examples
 
 from apps.packets import PACKET_COLUMNS
+from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.service import CELLS, INTERESTS, SWITCHES, TRAININGS, Settings, SonataAdapterService
 from due import Assignment, Item, RecordBatch
 from sdnator.testing.controller_run import frame
@@ -134,6 +137,49 @@ def test_one_time_far_ahead_closes_no_window():
     health = service.health()
     assert health["times_doubted"] >= 2
     assert health["late"] == 0
+
+
+def test_a_clock_that_was_ahead_and_is_set_right_costs_few_packets():
+    """Those that do not agree on the new time yet; everything after them has whole windows again."""
+    engine = Hands()
+    settings = Settings(queries="/nowhere", limits=SwitchLimits(stages=0))
+    service = SonataAdapterService(engine, settings)  # type: ignore[arg-type]
+    service.start()
+    engine.hand(SWITCHES, *STATE)
+    key = f"{PREFIX}.new_tcp:threshold=40,window=3s"
+    engine.callback((Assignment(key),))
+    ((pattern, stream),) = places(engine, "packets")
+    begin, day, arrival = NOW // 1000, 86_400_000_000, count()
+    begin -= begin % 3_000_000
+    syns = {"tcp_flags": np.full(ROWS, 2), "tcp_sport": ONES, "tcp_dport": ONES, "ip_proto": np.full(ROWS, 6)}
+    syns |= {"ip_version": np.full(ROWS, 4), "eth_type": np.full(ROWS, 0x800)}
+
+    def send(first_us):
+        times = first_us + np.arange(ROWS)
+        numbers = np.array([next(arrival) for _ in times], dtype="u8")
+        engine.hand(pattern, stream, packets(**syns, time_us=times, arrival=numbers))
+
+    for ahead in (0, day, 0):
+        for n in range(90):
+            send(begin + ahead + n * 100_000)
+    health = service.health()
+    found = [value["window_start"] // 1000 for name, value in engine.written if name.startswith(PREFIX)]
+    right = [begin, begin + 3_000_000, begin + 6_000_000]
+    assert found == [*right, *(each + day for each in right), *right]
+    assert (health["clocks_set_back"], health["times_doubted"], health["late"]) == (1, 4 + 19, 0)
+
+
+def test_a_clock_that_was_set_back_has_the_switch_count_differences_anew():
+    """What waits in it for the end of a window would wait for a far one: entries of another generation forget it."""
+    engine, service = started()
+    reports = GENUINE["digests"]
+    ((pattern, key), *_) = places(engine, "digests")
+    for ahead in (0, 86_400_000_000, 0, 0, 0, 0):
+        engine.hand(pattern, key, RecordBatch({**reports, "time_us": TIMES + ahead}))
+    command = [value for name, value in engine.written if name.startswith("network.p4_command.")][-1]
+    assert service.health()["clocks_set_back"] == 1
+    assert {update["kind"] for update in command["updates"]} == {"delete", "insert"}
+    assert {"generation" in update["params"] for update in command["updates"] if update["params"]} == {True}
 
 
 def test_switches_are_bounded_and_archives_are_checked():

@@ -15,7 +15,21 @@ from apps.sonata_adapter.query.templates import QueryFolder
 from apps.sonata_adapter.query.text import MOST_TEXT, parse_queries
 from due.errors import DueError
 
-TEXTS = [CATALOGUE[name].query().text() for name in CATALOGUE]
+OWN = """\
+query q(window=3s, most=7, gate=0x3):
+    gate dst = ip.dst: count() >= gate where udp.sport == 53 and ip.src in 10.0.0.0/8
+    filter len(dns.name) >= 50 and not (payload contains "zorro" or ip.src == 2001:db8::1)
+    map dst = ip.dst, size = -length + 0x10 * 2
+    distinct
+    reduce by dst: n = sum(size)
+    join left on dst with:
+        filter tcp.flags == SYN
+        map dst = ip.dst
+        reduce by dst: m = count()
+    filter n - m >= most
+"""
+TEXTS = [*(CATALOGUE[name].query().text() for name in CATALOGUE), OWN, OWN.replace(">= gate", ">= 3")]
+ONE_OF_EACH = ["foo", "7", "0x", "0x7", "1s", "1.2.3.4", "1.2.3.4/99", "::", '"a"', "(", ""]
 TOKENS = sorted({token for text in TEXTS for token in re.findall(r"\s+|[\w.]+|\W", text)})
 EXTREMES = ["03", "0x", "9" * 30, "9" * 5000, "not ", "(" * 60, "-" * 60, '"\\q"', '"\\N{DIGIT ONE}"', "\t", "\r", "\u2028",
             "1.2.3.4/99", "::/0", "window", "join anti on dst with:", "\n" + " " * 30, "a.b", "٣", "\x00"]  # fmt: skip
@@ -48,6 +62,18 @@ def test_mutated_queries_are_queries_or_one_error(text):
         compile_query(template.query())
         key = f"network.traffic_query.sonata.{template.name}"
         assert request_of(key, {template.name: template}) is not None
+
+
+@pytest.mark.parametrize("token", ONE_OF_EACH)
+@pytest.mark.parametrize("text", TEXTS[-2:])
+def test_any_token_in_the_place_of_another_is_a_query_or_one_error(text, token):
+    """In each place of a text that has all constructs."""
+    assert parse_queries(text)
+    parts = re.findall(r'\s+|"[^"]*"|[0-9][\w.:/]*|[\w.]+|\W', text)
+    for place, part in enumerate(parts):
+        if not part.isspace():
+            with contextlib.suppress(QueryTextError):
+                parse_queries("".join([*parts[:place], token, *parts[place + 1 :]]))
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,20 @@ def test_a_query_that_comes_within_a_window_says_so():
     assert [r.partial for r in found] == [True, False]
 
 
+def test_a_clock_that_is_set_back_begins_anew():
+    """What is open of the wrong time is reported; right windows stay open, the first of them says that it is partial."""
+    engine = HostEngine()
+    engine.add(final())
+    run(engine, syns([100]))
+    (whole,) = run(engine, syns([86_400_100]))
+    (wrong,) = engine.set_back(BASE_US + 2_500_000)
+    assert [(r.window_us - BASE_US) // 1_000_000 for r in (whole, wrong)] == [0, 86_400]
+    found = run(engine, syns(range(2500, 6500, 100)), 1)
+    assert [(r.window_us - BASE_US) // 1_000_000 for r in found] == [2, 3, 4, 5]
+    assert [r.partial for r in found] == [True, False, False, False]
+    assert engine.late == 0
+
+
 def test_removing_a_query_forgets_it():
     """No result comes any more, and no state stays."""
     engine = HostEngine()

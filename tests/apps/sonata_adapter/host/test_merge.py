@@ -48,6 +48,18 @@ def test_one_stream_is_not_held():
     assert numbers(merger.put("a", batch([1, 2]), 5.0)) == [1, 2]
 
 
+def test_a_clock_that_is_set_back_is_followed():
+    """What waits is released; after that, time has come as far as the streams say from then on."""
+    merger = Merger()
+    merger.expect({"a", "b"})
+    assert not numbers(merger.put("a", batch([5000]), 5.0))
+    assert numbers(merger.set_back()) == [5000]
+    assert merger.horizon_us(5.2) is None
+    later = RecordBatch({**batch([5001]), "time_us": np.array([7])})
+    merger.put("a", later, 5.3)
+    assert merger.horizon_us(5.5) == 7
+
+
 def test_silence_lets_go():
     """When nothing comes any more, nothing is waited for."""
     merger = Merger()

@@ -12,6 +12,7 @@ from apps.sonata_adapter.host.columns import PacketColumns
 from apps.sonata_adapter.host.engine import HostEngine
 from apps.sonata_adapter.host.shards import parts_of, shard_rows, union
 from apps.sonata_adapter.host.spark import (
+    SparkEngine,
     SparkMissing,
     require_spark,
     run_window,
@@ -183,6 +184,26 @@ def test_spark_fed_by_reliable_streams(tmp_path, frames):
         wait_for(lambda: len(found.items) >= len(truth))
         assert truth
         assert sorted(map(text_of_item, found.items)) == truth
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("spark")
+def test_spark_goes_on_when_a_clock_is_set_back(frames):
+    """A day ahead, then set right: the same results as the host's operators, of the wrong time and of the right one."""
+    ahead = [frame._replace(time_us=frame.time_us + 86_400_000_000) for frame in frames]
+    query = request_of(f"{QUERY_PREFIX}.ddos:window=2s", CATALOGUE).query
+    found = []
+    for engine in (HostEngine(), SparkEngine()):
+        engine.add(query)
+        outputs = [each for batch in batches(ahead, 512) for each in engine.process(batch)]
+        outputs += engine.set_back(frames[0].time_us)
+        outputs += [each for batch in batches(frames, 512) for each in engine.process(batch)]
+        outputs += engine.finish()
+        engine.close()
+        found.append(sorted(text_of_value(each.query, each.to_value()) for each in outputs))
+    host, spark = found
+    assert host
+    assert spark == host
 
 
 def arrived(service, count):

@@ -5,6 +5,8 @@ from itertools import count
 import pytest
 
 from apps.sonata_adapter.control import Control
+from apps.sonata_adapter.keys import request_of
+from apps.sonata_adapter.planner.moves import Moves
 from apps.sonata_adapter.planner.placement import SwitchLimits
 from apps.sonata_adapter.planner.rates import MeasuredRates
 from apps.sonata_adapter.query.catalogue import CATALOGUE
@@ -112,6 +114,20 @@ def test_little_traffic_moves_nothing():
     run = Played([SSH, SPREAD], stages=2)
     run.play(guessing(per_s=30)[:-5])
     assert run.control.health()["moved"] == 0
+
+
+def test_a_move_ends_though_the_clock_is_set_back():
+    """The new count begins as much earlier, with a whole window."""
+    request = request_of(OPENED, CATALOGUE)
+    moves = Moves()
+    moves.counts({request.identity: request})
+    moves.begin(request, "host", {"s1": 86_400_000_000})
+    moves.set_back("s1", -86_399_000_000)
+    old, new = moves.counts({request.identity: request})
+    assert [moves.accepts(count, "s1", 0) for count in (old, new)] == [True, False]
+    assert [moves.accepts(count, "s1", 3_000_000) for count in (old, new)] == [False, True]
+    assert not moves.end({"s1": 8_999_999})
+    assert moves.end({"s1": 9_000_000})
 
 
 @pytest.mark.parametrize(

@@ -44,16 +44,25 @@ def attack(name, host, counts):
     return frames
 
 
-def play(name, refine, frames, *, limits=None, shrink=0):
-    """Results of a refined query with threshold 5, and the most entries and copies at the end of a window."""
+def play(name, refine, frames, *, limits=None, shrink=0, ahead_us=0):
+    """Results of a refined query with threshold 5, and the most entries and copies at the end of a window.
+
+    With `ahead_us` all frames come before as well, of a clock that is so far ahead and then set right.
+    """
     control, switch = Control(CATALOGUE, limits=limits), SwitchModel(shrink=shrink)
     control.switch("s1", 0)
     switch.change(control.want([f"{PREFIX}.{name}:window=1s,threshold=5,refine={refine}"]))
     frames = sorted(frames)
     written, held, first = [], [], 0
-    for half in range(2 * (1 + (frames[-1].time_us - BASE_US) // WINDOW_US)):
-        begin = BASE_US + half * WINDOW_US // 2
-        part = [each for each in frames if begin <= each.time_us < begin + WINDOW_US // 2]
+    halves = range(2 * (1 + (frames[-1].time_us - BASE_US) // WINDOW_US))
+    for half, wrong_us in (
+        (half, wrong_us) for wrong_us in sorted({ahead_us, 0}, reverse=True) for half in halves
+    ):
+        if ahead_us and not half + wrong_us:
+            written += control.set_back("s1", BASE_US)
+        begin = BASE_US + half * WINDOW_US // 2 + wrong_us
+        moved = (each._replace(time_us=each.time_us + wrong_us) for each in frames)
+        part = [each for each in moved if begin <= each.time_us < begin + WINDOW_US // 2]
         for (kind, which), sent in switch.process(batch_of(part, first)).items() if part else ():
             if kind == "digests":
                 written += control.digests("s1", which, sent)
@@ -90,6 +99,18 @@ def test_attack_that_lasts_is_found(name, host):
     assert found <= whole
     assert {each for each in whole if each[0] >= 2} <= found
     assert all(result.exact for result in results)
+
+
+def test_a_clock_that_is_set_back_leaves_no_finer_counts_behind():
+    """What crossed in the wrong time is forgotten; the right windows have their results once, as if nothing had been."""
+    day = 86_400 * WINDOW_US
+    frames = attack("ddos", "203.0.113.9", [1] * 10) + attack("ddos", "198.51.100.1", [0, 8, 8, 8, 8])
+    undisturbed, held = play("ddos", "8/16", frames)
+    results, held_after = play("ddos", "8/16", frames, ahead_us=day)
+    right = [each for each in results if each.window_us < BASE_US + day // 2]
+    assert keys(rows(undisturbed)) == keys(rows(right))
+    assert len(keys(rows(right))) == len(right)
+    assert held_after[-1] == held[-1]
 
 
 def test_levels_cost_no_window_where_there_is_time_left():

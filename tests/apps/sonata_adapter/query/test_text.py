@@ -109,6 +109,12 @@ def test_any_text_is_a_query_or_an_error_with_a_place(text):
             "out of bounds",
         ),
         (
+            "query q:\n  gate dst = ip.dst: count() >= foo where udp.sport == 53\n  distinct",
+            2,
+            33,
+            "expected a whole number, found foo",
+        ),
+        (
             "query q:\n  gate dst = ip.dst: count() >= 3 where udp.sport\n  distinct",
             2,
             3,
