@@ -1,4 +1,7 @@
-"""What operators' programs were answered: `done` of nothing that a restart would forget, and again if they ask again."""
+"""What operators' programs were answered: `done` of nothing that a restart would forget, and again if they ask again.
+
+I/O: waits for the archive, and asks it again later.
+"""
 
 import time
 from collections import OrderedDict
