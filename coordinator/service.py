@@ -10,6 +10,7 @@ Run it with `python -m coordinator.service`; like any app it registers, with its
 """
 
 import logging
+import os
 import sys
 import threading
 import time
@@ -51,6 +52,8 @@ EVENTS = "due.event.coordinator"
 _CLAIM = "due.leader.coordinator"
 """The name that version 0.1 gave it: during an upgrade, Coordinators of both versions hear each other."""
 _HEALTH_BYTES = 256 << 10
+TOKEN = "DUE_COORDINATOR_TOKEN"  # noqa: S105 - a variable's name
+_SHORTEST_TOKEN = 16
 
 log = logging.getLogger("coordinator")
 
@@ -67,7 +70,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     http_port: int = 0
     """0 takes a free port; `health` and the log name it."""
     token: str = ""
-    """What requests bring as `Authorization: Bearer …`, those of /metrics excepted; empty: everybody may read."""
+    """What requests bring as `Authorization: Bearer …`, those of /metrics excepted; empty: $DUE_COORDINATOR_TOKEN, and
+    without that everybody may read."""
     metrics_token: str = ""
     """What requests of /metrics bring so; empty: everybody may read them."""
     readers_file: str = ""
@@ -222,6 +226,16 @@ class CoordinatorService:
                 **self._counts,
             }
 
+    def _token(self) -> str:
+        token = self._settings.token or os.environ.get(TOKEN, "")
+        if token and len(token) < _SHORTEST_TOKEN:
+            raise InvalidOption(
+                f"the token of the HTTP API is too short: give {_SHORTEST_TOKEN} characters or more"
+            )
+        if not token:
+            log.warning("everybody on this machine may read all data over the HTTP API: set $%s", TOKEN)
+        return token
+
     def _serve(self) -> None:
         northbound = Northbound(
             engine=self._engine,
@@ -236,7 +250,7 @@ class CoordinatorService:
                 northbound,
                 self._settings.http_host,
                 self._settings.http_port,
-                token=self._settings.token,
+                token=self._token(),
                 metrics_token=self._settings.metrics_token,
                 readers=ArchiveReaders(
                     Path(self._settings.readers_file) if self._settings.readers_file else None

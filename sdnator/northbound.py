@@ -48,6 +48,12 @@ def ask(url: str, path: str) -> Any:
         ) from None
 
 
+def with_token(url: str, token: str) -> str:
+    """A URL of the API that brings a token, unless it has one; with an empty token as it is."""
+    scheme, _, place = url.partition("://")
+    return f"{scheme}://viewer:{token}@{place}" if token and "@" not in place else url
+
+
 def without_user(url: str) -> str:
     """A URL without user and password, for people."""
     scheme, _, rest = url.partition("://")
@@ -78,7 +84,7 @@ def open_existing(url: str) -> "ArchiveDriver":
 
 
 def latest(
-    find: "Callable[[Mapping[str, Any]], list[Item]]",
+    find: "Callable[..., list[Item]]",
     query: Mapping[str, Any],
     start: int,
     end: int,
@@ -86,12 +92,13 @@ def latest(
 ) -> "tuple[list[Item], bool]":
     """The newest items, oldest first, and whether there are older ones; times in ns, `end` not included.
 
-    Looks at the last minute first, then farther back until there are enough: the archive may be large.
+    Looks at the last minute first, then farther back until there are enough, and asks for no more than that: the
+    archive may be large.  `find` is called as `ArchiveDriver.find`.
     """
     items: list[Item] = []
     for window in (*_WINDOWS_NS, end - start):
         left = max(start, end - window)
-        items = find({"$and": [query, {"timestamp": {"$gte": left, "$lt": end}}]})
+        items = find({"$and": [query, {"timestamp": {"$gte": left, "$lt": end}}]}, limit=limit + 1)
         if len(items) > limit or left == start:
             break
     return items[-limit:], len(items) > limit

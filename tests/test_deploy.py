@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+import coordinator.service
 from coordinator import metrics as coordinator_metrics
 from coordinator.registry import Registry
 from dataplane.__main__ import options as switch_options
@@ -124,6 +125,14 @@ def test_compose_keeps_everything_on_loopback():
         assert "127.0.0.1" in " ".join(services[name]["command"]), name
     assert services["grafana"]["environment"]["GF_SERVER_HTTP_ADDR"] == "127.0.0.1"
     assert settings("coordinator").http_host == "127.0.0.1"
+
+
+def test_the_coordinators_api_wants_a_token_everywhere():
+    """And the dashboard has it; on loopback every user of the machine could read frames otherwise."""
+    for name in ("coordinator", "dashboard"):
+        assert coordinator.service.TOKEN in compose()["services"][name]["environment"], name
+        unit = (DEPLOY / "systemd" / f"sdnator-{name}.service").read_text(encoding="utf-8")
+        assert "EnvironmentFile=/etc/sdnator/coordinator.env" in unit, name
 
 
 def test_every_variable_of_compose_has_an_example():

@@ -11,11 +11,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qs
+from weakref import WeakValueDictionary
 
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
-from sdnator.dashboard.sign_in import Sessions
+from sdnator.dashboard.sign_in import Sessions, WaitingRoom, origin_of
 from sdnator.rights.audited_deed import REFUSED
 from sdnator.rights.sign_in_link import PATH as LINK
 from sdnator.rights.users import OWNER
@@ -24,8 +25,6 @@ SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"
 KEY = "signed_in"
 """Of the cookie: the key of the browser's session."""
 _MOST_BYTES = 4096
-_MOST_WAITING = 32
-"""Sign-ins that wait at once; the token and the link are not among them."""
 _POLICY = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; form-action 'self'; frame-ancestors 'none'",
     "Cache-Control": "no-store",
@@ -72,7 +71,9 @@ class AccessControl:
         self._sessions = sessions
         self._noted = noted
         self._hashing = asyncio.Lock()
-        self._waiting = 0
+        self._waiting = WaitingRoom()
+        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        """By name, while attempts at it wait."""
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """ASGI."""
@@ -113,25 +114,33 @@ class AccessControl:
             return PlainTextResponse("refused: more than a name and a password\n", 413)
         name, password = given
         source = request.client.host if request.client is not None else ""
-        await asyncio.sleep(self._sessions.delay_s(source, name, time.monotonic()))
-        if name and self._waiting >= _MOST_WAITING:
+        judged = await self._judged(name, password, source)
+        if judged is None:
             return _form("too many people are signing in just now: try again, or use the token", 503)
-        self._waiting += 1
-        try:
-            if name:
-                # one at a time: each takes 32 MiB
-                async with self._hashing:
-                    key, wrong = await asyncio.to_thread(
-                        self._sessions.sign_in, name, password, source, time.monotonic()
-                    )
-            else:
-                key, wrong = self._sessions.sign_in(name, password, source, time.monotonic())
-        finally:
-            self._waiting -= 1
+        key, wrong = judged
         if wrong:
             self._noted(name or OWNER, REFUSED, source)
             return _form(wrong, 401)
         return self._begin(request, key, "signed in", source)
+
+    async def _judged(self, name: str, password: str, source: str) -> tuple[str, str] | None:
+        """The session's key, or why there is none; None: there was no place to wait."""
+        with self._waiting.place(origin_of(source)) as free:
+            if not name:
+                # the token, which is long, lets the owner in whoever else waits; who has a wrong one waits
+                key, wrong = self._sessions.sign_in(name, password, source, time.monotonic())
+                if wrong and free:
+                    await asyncio.sleep(self._sessions.delay_s(source, name, time.monotonic()))
+                return key, wrong
+            if not free:
+                return None
+            # one after the other, whether or not there is such a user: otherwise many at once would wait side by side
+            async with self._turns.setdefault(name, asyncio.Lock()):
+                await asyncio.sleep(self._sessions.delay_s(source, name, time.monotonic()))
+                async with self._hashing:  # one at a time: each takes 32 MiB
+                    return await asyncio.to_thread(
+                        self._sessions.sign_in, name, password, source, time.monotonic()
+                    )
 
     def _by_link(self, request: Request) -> Response:
         source = request.client.host if request.client is not None else ""

@@ -83,13 +83,13 @@ def serve(
     service: "PageBackend", listener: socket.socket, started: Callable[[Callable[[], None]], None]
 ) -> None:
     """Run until stopped; `started` gets the function that stops it."""
-    import uvicorn
     from fastapi import FastAPI
     from nicegui import ui
     from starlette.middleware.sessions import SessionMiddleware
 
     from sdnator.dashboard.access_control import AccessControl
     from sdnator.dashboard.page import build
+    from sdnator.dashboard.web_server import web_server
 
     app = FastAPI(openapi_url=None)
     app.add_middleware(AccessControl, sessions=service.sessions, noted=service.note)
@@ -113,9 +113,7 @@ def serve(
         reconnect_timeout=_RECONNECT_SECONDS,
         show_welcome_message=False,
     )
-    guarded: Any = Guard(app, service.settings.names)
-    config = uvicorn.Config(guarded, log_level="warning", access_log=False, lifespan="on")
-    server = uvicorn.Server(config)
+    server = web_server(Guard(app, service.settings.names))
 
     def stop() -> None:
         server.should_exit = True

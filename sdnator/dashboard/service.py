@@ -10,7 +10,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -22,8 +22,9 @@ from apps.messages import Alert, Answer, Confirmation, Decision, Instruction, se
 from apps.sonata_adapter.plan_answer import plan_key
 from apps.talkers import TALKERS, TopTalkers
 from due import NO_WAIT, Capability, Engine, Interest, Item
+from due.drivers.query_time import time_limit
 from due.errors import DueError, InvalidOption
-from sdnator.dashboard.board import Board
+from sdnator.dashboard.board import ALERTS_KEPT, Board
 from sdnator.dashboard.settings import Settings
 from sdnator.dashboard.sign_in import Sessions, WeakToken, token_from
 from sdnator.errors import BadInput, SdnatorError
@@ -36,12 +37,13 @@ INSTRUCTION = "network.instruction.dashboard.firewall"
 AUDIT = "network.audit.dashboard.page"
 DECISIONS = ("network.block.firewall.*", "network.protect.firewall.*", "network.meter.firewall.*")
 CONFIRMATIONS = f"{CONFIRMED}.*.*"
+_ALERT = "network.anomaly.kitsune.alert"
 _STATE = "network.switch.p4runtime_ctrl"
 _TALKERS = f"{TALKERS}.kitsune.*"
 
 INTERESTS = (
     Interest("network.anomaly.kitsune.score"),
-    Interest("network.anomaly.kitsune.alert"),
+    Interest(_ALERT),
     *(Interest(key) for key in DECISIONS),
     Interest(CONFIRMATIONS),
     Interest(INCIDENTS),
@@ -61,9 +63,13 @@ _REFUSALS = 30
 _NAME_CHARACTERS = 64
 _WAITING = 64
 _EXPLAINED = 16
-_REPORTS = 5_000
-"""Archived reports of incidents that are read at the start, the newest."""
+_DECISIONS, _CONFIRMATIONS, _REPORTS = 2_000, 5_000, 5_000
+"""Archived items that are read at the start, the newest: of each key of decisions, of what enforcers said of those in
+force, and of incidents."""
+_QUERY_SECONDS = 10.0
+"""For a search, and for reading all of the history at the start."""
 _DAY_NS = 86_400 * 10**9
+_COORDINATOR_TOKEN = "DUE_COORDINATOR_TOKEN"  # noqa: S105 - a variable's name
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +153,7 @@ class DashboardService:
         board = self.board
         handlers: dict[str, Callable[[Item], None]] = {
             "network.anomaly.kitsune.score": lambda item: board.score(item.value, time.time()),
-            "network.anomaly.kitsune.alert": lambda item: board.alert(Alert.from_value(item.value)),
+            _ALERT: lambda item: board.alert(Alert.from_value(item.value)),
             **dict.fromkeys(DECISIONS, lambda item: board.decide([Decision.from_value(item.value)])),
             CONFIRMATIONS: lambda item: board.confirm(Confirmation.from_value(item.value), sender_of(item)),
             INCIDENTS: lambda item: board.incident(Incident.from_value(item.value)),
@@ -173,26 +179,39 @@ class DashboardService:
 
     def _take_up_history(self) -> None:
         """Decisions in force, what enforcers said of them, and the last alerts and incidents, from the archive."""
+        board, since = self.board, {"$gte": time.time_ns() - _DAY_NS}
         try:
-            items = [item for key in DECISIONS for item in self._engine.get(key)]
+            with time_limit(_QUERY_SECONDS):
+                self._take_up(
+                    DECISIONS, lambda item: board.decide([Decision.from_value(item.value)]), _DECISIONS
+                )
+                if standing := [decision.id for decision in board.standing()]:
+                    self._take_up(
+                        [{"dataKey": CONFIRMATIONS, "value.id": {"$in": standing}}],
+                        lambda item: board.confirm(Confirmation.from_value(item.value), sender_of(item)),
+                        _CONFIRMATIONS,
+                    )
+                self._take_up(
+                    [{"dataKey": _ALERT, "timestamp": since}],
+                    lambda item: board.alert(Alert.from_value(item.value)),
+                    ALERTS_KEPT,
+                )
+                self._take_up(
+                    [{"dataKey": INCIDENTS, "timestamp": since}],
+                    lambda item: board.incident(Incident.from_value(item.value)),
+                    _REPORTS,
+                )
         except DueError as error:
-            log.warning("Data Archives do not answer, showing no history: %s", error)
-            return
-        ordered = sorted(items, key=lambda item: (item.timestamp, item.sequence))
-        for item in ordered:
-            self._tolerant(lambda one: self.board.decide([Decision.from_value(one.value)]))(item)
-        standing = [decision.id for decision in self.board.standing()]
-        said = self._engine.get({"dataKey": CONFIRMATIONS, "value.id": {"$in": standing}}) if standing else []
-        for item in sorted(said, key=lambda item: (item.timestamp, item.sequence)):
-            self._tolerant(
-                lambda one: self.board.confirm(Confirmation.from_value(one.value), sender_of(one))
-            )(item)
-        since = time.time_ns() - _DAY_NS
-        query = {"dataKey": "network.anomaly.kitsune.alert", "timestamp": {"$gte": since}}
-        for item in self._engine.get(query)[-200:]:
-            self._tolerant(lambda one: self.board.alert(Alert.from_value(one.value)))(item)
-        for item in self._engine.get({"dataKey": INCIDENTS, "timestamp": {"$gte": since}})[-_REPORTS:]:
-            self._tolerant(lambda one: self.board.incident(Incident.from_value(one.value)))(item)
+            log.warning("Data Archives do not answer, not all history is shown: %s", error)
+
+    def _take_up(
+        self, queries: Iterable[str | Mapping[str, Any]], handler: Callable[[Item], None], limit: int
+    ) -> None:
+        """Handle the newest archived items of each query, the oldest of all of them first."""
+        items = [item for query in queries for item in self._engine.get(query, limit=limit)]
+        handle = self._tolerant(handler)
+        for item in sorted(items, key=lambda one: (one.timestamp, one.sequence)):
+            handle(item)
 
     def _take_up_switches(self) -> None:
         """What switches said before anybody knew of our interest: then it went to the archive alone."""
@@ -248,7 +267,8 @@ class DashboardService:
         """The latest items of the archive, and whether there are older ones; times in ns.  Raises DueError."""
         from sdnator.northbound import latest
 
-        return latest(self._engine.get, {"dataKey": key}, start, end, limit)
+        with time_limit(_QUERY_SECONDS):
+            return latest(self._engine.get, {"dataKey": key}, start, end, limit)
 
     def explain(self, key: str, told: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
         """Hear what the Sonata adapter does for a key, in the engine's thread, until what is returned is called."""
@@ -266,12 +286,13 @@ class DashboardService:
         return end
 
     def _poll(self) -> None:
-        from sdnator.northbound import ask
+        from sdnator.northbound import ask, with_token, without_user
 
         while not self._stopping.wait(_POLL_SECONDS if self.board.versions["apps"] else 0.2):
             self.board.supervised(_health_of_parts(self.settings.run_file))
             try:
-                url = Path(self.settings.coordinator_file).read_text(encoding="utf-8").strip()
+                told = Path(self.settings.coordinator_file).read_text(encoding="utf-8").strip()
+                url = with_token(told, os.environ.get(_COORDINATOR_TOKEN, ""))
                 apps, instances, flow = (ask(url, path) for path in ("/apps", "/instances", "/flow"))
             except (OSError, ValueError, SdnatorError) as error:
                 self.board.uncoordinated(str(error))
@@ -279,7 +300,9 @@ class DashboardService:
             try:
                 self.board.coordinated(apps, instances, flow, time.monotonic())
             except (ValueError, TypeError, LookupError, AttributeError) as error:
-                self.board.uncoordinated(f"{url} does not answer as a Coordinator does: {error!r}")
+                self.board.uncoordinated(
+                    f"{without_user(url)} does not answer as a Coordinator does: {error!r}"
+                )
             self._take_up_switches()
 
     def _serve(self) -> None:

@@ -45,7 +45,7 @@ class Settings(DashboardOptions, frozen=True, kw_only=True, forbid_unknown_field
     """Options, and addresses that `sdnator up` fills in."""
 
     coordinator_file: str = ""
-    """File that holds the URL of the Coordinator's HTTP API."""
+    """File that holds the URL of the Coordinator's HTTP API; if it names no token, $DUE_COORDINATOR_TOKEN is sent."""
     switches: tuple[SwitchPlace, ...] = ()
     state: str = ""
     """Folder with the users of the page and the link of `sdnator up`; empty: the owner's token alone signs in."""

@@ -73,7 +73,7 @@ class Site:
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
         assert ready["ready"] is True
-        assert ready["http"] == address.read_text()
+        assert address.read_text().endswith(ready["http"].removeprefix("http://"))
         return process, httpx.Client(base_url=ready["http"], trust_env=False, timeout=WATCHDOG_S)
 
     def options(self) -> dict[str, Any]:
@@ -219,6 +219,14 @@ def test_settings_are_checked() -> None:
         Settings(selection="alphabetical")
     with pytest.raises(ValueError, match="http_port"):
         Settings(http_port=70000)
+
+
+def test_a_token_of_the_environment_is_asked_for(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DUE_COORDINATOR_TOKEN", "a-token-of-the-operator")
+    _, client = site.coordinator("one")
+    assert client.get("/apps").status_code == 401
+    given = {"Authorization": "Bearer a-token-of-the-operator"}
+    assert client.get("/apps", headers=given).status_code == 200
 
 
 def test_who_came_before_the_coordinator_was_active_is_in_its_history_too(site: Site) -> None:

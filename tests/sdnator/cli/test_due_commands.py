@@ -79,14 +79,16 @@ def test_times_as_people_write_them():
     limit=st.integers(1, 40),
 )
 def test_the_latest_are_those_of_looking_at_all(times, start, length, limit):
-    """Looking farther and farther back finds what one look at everything finds."""
+    """Looking farther and farther back finds what one look at everything finds, and reads one item more at most."""
     end = start + length
     items = [make_item(number, when) for number, when in enumerate(sorted(times), 1)]
 
-    def find(query):
+    def find(query, *, limit):
+        assert limit <= most
         bounds = query["$and"][1]["timestamp"]
-        return [item for item in items if bounds["$gte"] <= item.timestamp < bounds["$lt"]]
+        return [item for item in items if bounds["$gte"] <= item.timestamp < bounds["$lt"]][-limit:]
 
+    most = limit + 1
     inside = [item for item in items if start <= item.timestamp < end]
     assert latest(find, {}, start, end, limit) == (inside[-limit:], len(inside) > limit)
 

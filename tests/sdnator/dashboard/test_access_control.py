@@ -6,7 +6,6 @@ import threading
 
 import httpx
 import pytest
-import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.sessions import SessionMiddleware
@@ -18,6 +17,7 @@ from websockets.sync.client import connect
 from sdnator.dashboard.access_control import AccessControl
 from sdnator.dashboard.server import Guard
 from sdnator.dashboard.sign_in import Sessions
+from sdnator.dashboard.web_server import web_server
 from sdnator.rights.sign_in_link import FILE, new_link
 from sdnator.rights.users import Users
 from sdnator.testing.waiting import wait_for
@@ -52,7 +52,7 @@ class Door:
                 ),
             ],
         )
-        self.server = uvicorn.Server(uvicorn.Config(Guard(app, ()), log_level="warning"))
+        self.server = web_server(Guard(app, ()))
         run = self.server.serve(sockets=[listener])
         self.thread = threading.Thread(target=lambda: asyncio.run(run))
         self.thread.start()
@@ -179,3 +179,80 @@ def test_forms_that_are_none(door, browser, body):
     kind = {"origin": door.url, "content-type": "application/x-www-form-urlencoded"}
     assert browser.post("/sign-in", content=body, headers=kind).status_code in (401, 413)
     assert not looks(browser)
+
+
+class Slow(Sessions):
+    """Others than vera have to wait for hours; remembers the order of what was asked."""
+
+    asked: list[str]
+
+    def delay_s(self, _source, name, _now):
+        self.asked.append("delay")
+        return 0.0 if name == "vera" else 9_999.0
+
+    def sign_in(self, name, password, source, now):
+        self.asked.append("judge")
+        return super().sign_in(name, password, source, now)
+
+
+@pytest.fixture
+def slow(door):
+    made = Slow(TOKEN, Users(door.state))
+    made.asked = []
+    return made
+
+
+async def status_of(access, name, password, source):
+    """Of the answer to a form from an address."""
+    sent = []
+
+    async def receive():
+        return {"type": "http.request", "body": f"name={name}&password={password}".encode()}
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", b"localhost"), (b"origin", b"http://localhost")]
+    scope = {"type": "http", "method": "POST", "path": "/sign-in", "query_string": b"", "headers": headers}
+    await access(scope | {"client": (source, 1), "session": {}}, receive, send)
+    return sent[0]["status"]
+
+
+def test_attempts_at_one_name_wait_one_after_the_other(slow):
+    """Side by side, as many as one likes would be judged after the delay of one."""
+    access = AccessControl(None, slow, lambda *_: None)
+
+    async def guess():
+        return await asyncio.gather(*(status_of(access, "vera", f"guess{n}", "192.0.2.1") for n in range(9)))
+
+    statuses = asyncio.run(guess())
+    assert slow.asked == ["delay", "judge"] * 4
+    assert sorted(statuses) == [401] * 4 + [503] * 5
+
+
+def test_who_guesses_at_many_names_takes_the_places_of_one_address(slow):
+    """Whichever addresses of its own a machine uses; from another one, and with the token, one signs in."""
+    access = AccessControl(None, slow, lambda *_: None)
+
+    async def flood():
+        guesses = [asyncio.create_task(status_of(access, f"n{n}", "x", f"127.0.{n}.1")) for n in range(40)]
+        assert set(await asyncio.gather(*guesses[4:])) == {503}
+        found = [
+            await status_of(access, *given)
+            for given in (
+                ("vera", PASSWORD, "127.0.0.1"),
+                ("vera", PASSWORD, "192.0.2.1"),
+                ("", TOKEN, "127.0.0.1"),
+            )
+        ]
+        for guess in guesses:
+            guess.cancel()
+        return found
+
+    assert asyncio.run(flood()) == [503, 200, 200]
+
+
+def test_nobody_gives_an_address_that_is_not_theirs(door, browser):
+    """Every local user could; the audit trail and what slows guessing go by it."""
+    sign_in(door, browser, "", "not the token, but long", **{"x-forwarded-for": "192.0.2.1"})
+    assert door.noted == [("owner", "refused to sign in", "127.0.0.1")]

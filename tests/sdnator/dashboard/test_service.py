@@ -9,6 +9,7 @@ import pytest
 
 from apps.messages import Confirmation, Decision, Target
 from due import Item
+from due.errors import ArchiveUnavailable
 from sdnator.dashboard import service
 from sdnator.dashboard.service import CAPABILITIES, INTERESTS, DashboardService, listening
 from sdnator.dashboard.settings import Settings
@@ -34,7 +35,7 @@ def test_it_makes_nothing_but_instructions():
 class Archive:
     """An engine that has one unreadable item under every key, and nothing else."""
 
-    def get(self, query):
+    def get(self, query, **_):
         key = query if isinstance(query, str) else query["dataKey"]
         return [Item(key, {"id": [[]]}, 1, 1, "anybody", "i", 1)]
 
@@ -61,12 +62,49 @@ def test_a_page_that_starts_later_knows_where_a_block_is_in_force():
     }
 
     class Kept:
-        def get(self, query):
+        def get(self, query, **_):
             return archived.get(query if isinstance(query, str) else query["dataKey"], [])
 
     dashboard = DashboardService(cast("Any", Kept()), Settings())
     dashboard._take_up_history()
     assert dict(dashboard.board.answers) == {"d1 nftables gateway": "installed"}
+
+
+class Recorded:
+    """An engine with one block in its archive, which remembers how much was asked for and fails from some question on."""
+
+    def __init__(self, fails_at=99):
+        self.limits = []
+        self._fails_at = fails_at
+
+    def get(self, query, *, limit=None):
+        self.limits.append(limit)
+        if len(self.limits) > self._fails_at:
+            raise ArchiveUnavailable("away")
+        target = Target(kind="ip", address="192.0.2.1")
+        block = Decision(
+            id="d1", action="block", switch="*", target=target, reason="r", event_time=1, expires=0
+        )  # fmt: skip
+        return (
+            [Item(query, block.to_value(), 1, 1, "firewall", "i", 1)] if query == service.DECISIONS[0] else []
+        )
+
+
+def test_no_start_and_no_search_reads_a_whole_archive():
+    """Which may be large: a viewer's search could load a day of packets."""
+    engine = Recorded()
+    dashboard = DashboardService(cast("Any", engine), Settings())
+    dashboard._take_up_history()
+    dashboard.find("network.**", 0, 10**18, 200)
+    assert len(engine.limits) == len(service.DECISIONS) + 3 + 4
+    assert all(limit is not None and limit <= 5_000 for limit in engine.limits)
+
+
+@pytest.mark.parametrize("fails_at", range(len(service.DECISIONS) + 3))
+def test_an_archive_that_goes_away_at_any_question_does_not_keep_the_pages_from_starting(fails_at):
+    engine = Recorded(fails_at)
+    DashboardService(cast("Any", engine), Settings())._take_up_history()
+    assert len(engine.limits) == fails_at + 1
 
 
 @pytest.mark.parametrize(
@@ -98,3 +136,33 @@ def test_a_coordinator_that_answers_nonsense_ends_no_thread(tmp_path, said):
             dashboard._stopping.set()
             poll.join()
             server.shutdown()
+
+
+def test_the_token_of_the_environment_is_sent_to_the_coordinator(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUE_COORDINATOR_TOKEN", "a-token-of-the-operator")
+    heard = []
+
+    class Listening(BaseHTTPRequestHandler):
+        def do_GET(self):
+            heard.append(self.headers["Authorization"])
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b"{}")
+
+        def log_message(self, *_):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Listening) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        place = tmp_path / "coordinator"
+        place.write_text(f"http://127.0.0.1:{server.server_port}\n")
+        dashboard = DashboardService(cast("Any", Archive()), Settings(coordinator_file=str(place)))
+        poll = Thread(target=dashboard._poll, daemon=True)
+        poll.start()
+        try:
+            wait_for(lambda: heard)
+        finally:
+            dashboard._stopping.set()
+            poll.join()
+            server.shutdown()
+    assert heard[0] == "Bearer a-token-of-the-operator"

@@ -84,6 +84,19 @@ def test_a_damaged_file_lets_nobody_in_but_the_owner(users):
     assert sessions.may_act(by_token(sessions), 0.0)
 
 
+def test_a_damaged_file_that_is_repaired_lets_users_in_again(users, caplog):
+    """Without a restart, and those who had signed in need not do so again; the log says once what is wrong."""
+    sessions = Sessions(TOKEN, Users(users.path.parent))
+    key = sessions.sign_in("otto", PASSWORD, HERE, 0.0)[0]
+    good = users.path.read_bytes()
+    users.path.write_text("{")
+    assert not any(sessions.may_look(key, 0.0) for _ in range(3))
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+    users.path.write_bytes(good)
+    assert sessions.may_look(key, 0.0)
+    assert not sessions.sign_in("vera", PASSWORD, HERE, 0.0)[1]
+
+
 def test_a_link_signs_one_browser_in(tmp_path):
     sessions = Sessions(TOKEN, None, tmp_path / FILE)
     secret = new_link(tmp_path, "http://127.0.0.1:1/").partition("/link/")[2]
@@ -129,6 +142,37 @@ def test_guessing_becomes_slow_for_the_address_it_comes_from():
     delays = [throttle.delay_s(HERE, 0.0) for _ in range(8)]
     assert delays == [0, 0, 0.5, 1, 2, 4, 4, 4]
     assert throttle.delay_s(HERE, 61.0) == 0
+
+
+def test_no_number_of_other_names_makes_guessing_at_one_fast_again(users):
+    """Nor do they fill memory; who has the name waits no longer, and no shorter, than for one that nobody has."""
+    sessions = Sessions(TOKEN, users)
+    for name in ("otto", "nobody"):
+        for number in range(5):
+            sessions.delay_s(f"192.0.2.{number}", name, 0.0)
+    for number in range(10_000):
+        sessions.delay_s(f"192.0.2.{number % 256}", f"n{number}", 1.0)
+    assert [sessions.delay_s("198.51.100.1", name, 2.0) for name in ("otto", "nobody")] == [4, 4]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("127.0.0.1", "127.9.8.7", True),
+        ("127.0.0.1", "::1", True),
+        ("192.0.2.1", "::ffff:192.0.2.1", True),
+        ("2001:db8::1", "2001:db8::ffff:2", True),
+        ("2001:db8::1", "2001:db8:0:1::1", False),
+        ("fe80::1%eth0", "fe80::2", True),
+        ("192.0.2.1", "192.0.2.2", False),
+        ("", "192.0.2.2", False),
+    ],
+)
+def test_addresses_that_one_guesser_has_count_as_one(one, other, same):
+    sessions = Sessions(TOKEN)
+    delays = [sessions.delay_s(one, "", 0.0) for _ in range(3)]
+    assert delays == [0, 0, 0.5]
+    assert sessions.delay_s(other, "", 0.0) == (1 if same else 0)
 
 
 def test_addresses_that_are_remembered_are_bounded():
