@@ -1,16 +1,18 @@
 """Files with secrets, readable by their owner only from the start."""
 
+import fcntl
 import json
 import os
 import secrets
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 
 def write_private(path: Path, text: str) -> None:
-    """Replace a file atomically, with mode 0600.  Raises OSError.
+    """Replace a file atomically, with mode 0600 and the owner that `give_to_owner` says.  Raises OSError.
 
     A file that holds the text already is left alone, so that a part can be restarted on a full disk.
     """
@@ -22,7 +24,52 @@ def write_private(path: Path, text: str) -> None:
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
         file.write(text)
+        give_to_owner(file.fileno(), path.parent)
     new.replace(path)
+
+
+def give_to_owner(descriptor: int, folder: Path) -> None:
+    """Give a file that root has just made in another user's folder to that user.
+
+    Otherwise a service could no longer read what root's commands change for it.
+    """
+    if os.geteuid() == 0:
+        owner = folder.stat()
+        with suppress(PermissionError):  # root without CAP_CHOWN, as in a container
+            os.fchown(descriptor, owner.st_uid, owner.st_gid)
+
+
+def private_folder(path: Path) -> None:
+    """Make a folder of mode 0700 where there is none, and those above it; each has the owner of the one above.
+
+    Raises OSError.
+    """
+    if path.is_dir():
+        return
+    private_folder(path.parent)
+    path.mkdir(mode=0o700, exist_ok=True)
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        give_to_owner(descriptor, path.parent)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock in a file of the same folder, for which others wait.  Raises OSError."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        # no link: root would open what the folder's owner chose
+        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+    else:
+        give_to_owner(descriptor, path.parent)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _holds(path: Path, text: str) -> bool:

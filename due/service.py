@@ -4,7 +4,8 @@
                                    [--metrics HOST:PORT] [--log-format console|json] [--heartbeat-fd N]
 
 The app prints one JSON line on standard output when it is ready, with "metrics": "HOST:PORT" if requested,
-and with the fields that its `ready()` adds. Logs go to standard error. SIGTERM or SIGINT calls `stop()`, flushes, sends
+and with the fields that its `ready()` adds. Logs go to standard error, and so does what the app prints after
+that line, since nobody may be reading a pipe any more. SIGTERM or SIGINT calls `stop()`, flushes, sends
 an offline heartbeat and exits with 0. The process ends when its parent ends (on Linux: the thread that
 started it).
 
@@ -25,6 +26,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast, get_args, runtime_checkable
 
@@ -292,6 +294,9 @@ class _Run:
         # modules and what was restored stay: scanning them again and again took a twentieth of all CPU of a replay
         gc.freeze()
         print(json.dumps(self._ready()), flush=True)
+        with suppress(OSError):  # without a standard error
+            # our starter reads no further: what the app prints would fill the pipe, and then block it for ever
+            os.dup2(2, 1)
         try:
             self._go_round(stopped, liveness)
         except EngineFailed as error:

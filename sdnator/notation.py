@@ -17,6 +17,9 @@ _UNITS_NS = {
     "d": 86_400 * 10**9,
 }
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)(ms|s|min|m|h|d)")
+_MOST_DAYS = 36_500
+_YEARS = range(1900, 2201)
+"""Times in ns within and near them fit the archives' 64 bits."""
 
 
 def typed_key(text: str) -> str:
@@ -43,7 +46,10 @@ def duration_ns(text: str, option: str) -> int:
     found = _DURATION.fullmatch(text.strip())
     if found is None:
         raise BadInput(f"{option} {text}: give a time such as 30s, 10m, 1h or 7d")
-    return round(float(found[1]) * _UNITS_NS[found[2]])
+    length = float(found[1]) * _UNITS_NS[found[2]]
+    if length > _MOST_DAYS * _UNITS_NS["d"]:
+        raise BadInput(f"{option} {text}: give at most {_MOST_DAYS}d")
+    return round(length)
 
 
 def instant_ns(text: str, now: int, option: str) -> int:
@@ -56,6 +62,8 @@ def instant_ns(text: str, now: int, option: str) -> int:
         raise BadInput(
             f"{option} {text}: give a time ago such as 1h, or one such as 2024-05-01T12:00"
         ) from None
+    if when.year not in _YEARS:
+        raise BadInput(f"{option} {text}: give a year from {_YEARS[0]} to {_YEARS[-1]}")
     return int(when.timestamp()) * 10**9 + when.microsecond * 1_000
 
 

@@ -5,6 +5,7 @@
 The archive is copied as a consistent snapshot, also while a pipeline writes to it.
 """
 
+import errno
 import io
 import json
 import os
@@ -13,14 +14,15 @@ import sqlite3
 import tarfile
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 import typer
 
+from due.private_files import give_to_owner, private_folder
 from sdnator import __version__
 from sdnator.config import config_file
 from sdnator.errors import BadInput, PipelineError
@@ -32,6 +34,9 @@ _KEPT = "kept/kitsune.npz"
 """The model of the state folder."""
 _MANIFEST, _ARCHIVE, _CONFIG, _MODELS = "manifest.json", "archive.db", "sdnator.toml", "models"
 _PRIVATE = 0o600
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_WITH_IT = ("", "-wal", "-shm")
+"""Endings of the files of a SQLite database; a database without its -wal lacks what was written last."""
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 
@@ -103,7 +108,7 @@ def _copied(archive: Path, to: Path) -> Path:
     """A consistent snapshot: SQLite's own backup, since a plain copy of a file in use may be inconsistent."""
     try:
         with (
-            closing(sqlite3.connect(f"file:{archive}?mode=ro", uri=True)) as source,
+            closing(sqlite3.connect(f"file:{quote(str(archive))}?mode=ro", uri=True)) as source,
             closing(sqlite3.connect(to)) as copy,
         ):
             source.backup(copy)
@@ -145,8 +150,9 @@ def restore(
 
     The archive goes into the data folder, the configuration into the configuration folder, models
     beside the archive, and the kept model into the state folder. Existing files are kept, with
-    `.before-restore` appended to their names. An archive of an older version is migrated; one of a
-    newer version is refused. No pipeline may be running.
+    `.before-restore` appended to their names, and a number from the second time on. If anything fails,
+    all files stay as they were. An archive of an older version is migrated; one of a newer version is
+    refused. No pipeline may be running.
     Exit codes: 0 restored, 1 a pipeline runs or something cannot be written, 2 the file cannot be used.
 
     Example: sdnator restore sdnator-backup.tar.gz
@@ -160,18 +166,14 @@ def restore(
         if _ARCHIVE in files:
             _check_archive(files[_ARCHIVE])
         places = {name: _place(name, data) for name in files}
-        kept = [_put_back(files[name], place) for name, place in places.items()]
+        kept = _put_back({place: files[name] for name, place in places.items()})
     shown = {str(name): str(place) for name, place in places.items()}
     if as_json:
-        print(
-            json.dumps(
-                {"made": manifest.get("made"), "files": shown, "kept": [str(one) for one in kept if one]}
-            )
-        )
+        print(json.dumps({"made": manifest.get("made"), "files": shown, "kept": [str(one) for one in kept]}))
         return
     for name, place in shown.items():
         print(f"{name} -> {place}")
-    for path in filter(None, kept):
+    for path in kept:
         print(f"existing files kept as: {path}")
 
 
@@ -194,6 +196,11 @@ def _unpacked(file: Path, folder: Path) -> tuple[dict[str, Any], dict[str, Path]
     except FileNotFoundError:
         raise BadInput(f"{file}: no such file; check the path of the backup") from None
     except OSError as error:
+        if error.errno in _FULL:
+            raise PipelineError(
+                f"{folder.parent}: no room to unpack {file} ({error.strerror}); free space there, "
+                "or set TMPDIR to a folder with more"
+            ) from None
         raise BadInput(
             f"{file}: cannot be read ({error.strerror or error}); give a backup written by `sdnator backup`"
         ) from None
@@ -232,7 +239,7 @@ def _check_archive(path: Path) -> None:
     from due.errors import DueError
 
     try:
-        with closing(open_archive(f"sqlite://{path}")) as driver:
+        with closing(open_archive(f"sqlite://{quote(str(path))}")) as driver:
             driver.find({"dataKey": "sdnator.restore"})
     except DueError as error:
         raise BadInput(f"the archive in the backup cannot be used: {error}") from None
@@ -244,19 +251,51 @@ def _place(name: str, data: Path) -> Path:
     return running.model_file(running.state_folder()) if name == _KEPT else data / name
 
 
-def _put_back(source: Path, place: Path) -> Path | None:
-    """Returns where what was there before is now."""
-    kept: Path | None = None
+def _put_back(files: Mapping[Path, Path]) -> list[Path]:
+    """Copy each value to its key, all or none; returns where what was there before is now."""
+    place = Path()
+    kept: list[Path] = []
+    staged: dict[Path, Path] = {}
     try:
-        place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if place.exists():
-            kept = place.with_name(place.name + ".before-restore")
-            place.replace(kept)
-            for ending in ("-wal", "-shm"):  # they belong to the archive that was there
-                with suppress(FileNotFoundError):
-                    place.with_name(place.name + ending).replace(kept.with_name(kept.name + ending))
-        shutil.copyfile(source, place)
-        place.chmod(_PRIVATE)
+        with ExitStack() as undo:
+            for place, source in files.items():
+                staged[place] = _staged(source, place, undo)
+            for place, new in staged.items():
+                kept += _set_aside(place, undo)
+                _rename(new, place, undo)
+            undo.pop_all()
     except OSError as error:
         raise PipelineError(f"{place}: {error.strerror}; check free space and permissions") from None
     return kept
+
+
+def _staged(source: Path, place: Path, undo: ExitStack) -> Path:
+    """A copy beside the place, on the disk."""
+    private_folder(place.parent)
+    new = place.with_name(place.name + ".new")
+    new.unlink(missing_ok=True)
+    undo.callback(new.unlink, missing_ok=True)
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE)
+    with os.fdopen(descriptor, "wb") as out, source.open("rb") as content:
+        shutil.copyfileobj(content, out)
+        give_to_owner(out.fileno(), place.parent)
+        out.flush()
+        os.fsync(out.fileno())
+    return new
+
+
+def _set_aside(place: Path, undo: ExitStack) -> list[Path]:
+    """Move what is at the place, with what belongs to it, to a name that nothing has."""
+    found = [ending for ending in _WITH_IT if os.path.lexists(f"{place}{ending}")]
+    number, kept = 1, f"{place}.before-restore"
+    while any(os.path.lexists(kept + ending) for ending in _WITH_IT):
+        number += 1
+        kept = f"{place}.before-restore-{number}"
+    for ending in found:
+        _rename(Path(f"{place}{ending}"), Path(kept + ending), undo)
+    return [Path(kept + ending) for ending in found[:1]]
+
+
+def _rename(path: Path, to: Path, undo: ExitStack) -> None:
+    path.rename(to)
+    undo.callback(to.rename, path)

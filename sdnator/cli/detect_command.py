@@ -2,6 +2,7 @@
 
 import json
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
@@ -102,7 +103,10 @@ def detect_command(
         def show(packets: int, alerts: int) -> None:
             bar.update(task, description=f"{counted(packets, 'packet')}, {counted(alerts, 'alert')}")
 
-        source = _live(interface) if interface else None
+        def tell(line: str) -> None:
+            console.print(f"note: {line}", markup=False, highlight=False, soft_wrap=True)
+
+        source = _live(interface, tell) if interface else None
         summary = detect(options, show, source)
     if as_json:
         print(json.dumps(summary))
@@ -110,8 +114,8 @@ def detect_command(
         _show(summary, out)
 
 
-def _live(interface: str) -> Any:
-    """Listen until Ctrl-C, which ends the run with results."""
+def _live(interface: str, tell: Callable[[str], None]) -> Any:
+    """Listen until Ctrl-C or SIGTERM, which end the run with results."""
     from sdnator.capture.live_capture import LiveSource
 
     stopped: list[int] = []
@@ -119,8 +123,9 @@ def _live(interface: str) -> Any:
     def stop(number: int, _frame: FrameType | None) -> None:
         stopped.append(number)
 
-    signal.signal(signal.SIGINT, stop)
-    return LiveSource(interface, lambda: bool(stopped))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return LiveSource(interface, lambda: bool(stopped), tell)
 
 
 def _show(summary: dict[str, Any], out: Path) -> None:

@@ -12,6 +12,7 @@ import typer
 
 from sdnator.cli.plain_table import plain_table
 from sdnator.errors import PipelineError
+from sdnator.supervisor.child import how_ended
 
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _STOP_SECONDS = 10.0
@@ -113,7 +114,7 @@ def _run(command: Sequence[str], ports: Sequence[str], *, as_json: bool) -> int:
 
 def _ended(code: int) -> int:
     if code < 0:
-        raise PipelineError(f"the switch was killed by {signal.Signals(-code).name}")
+        raise PipelineError(f"the switch {how_ended(code)}")
     return code
 
 

@@ -27,6 +27,7 @@ def note(deed: str, *, instruction: str = "", archive: str = "") -> None:
     """
     from due import DueError, Item
     from due.backends import open_archive
+    from sdnator.errors import SdnatorError
     from sdnator.up.running import archive_url
 
     now = time.time_ns()
@@ -35,7 +36,7 @@ def note(deed: str, *, instruction: str = "", archive: str = "") -> None:
     try:
         with closing(open_archive(archive_url(archive))) as driver:
             driver.insert([item])
-    except DueError as error:
+    except (DueError, SdnatorError) as error:
         print(f"this is missing from the audit trail: {error}", file=sys.stderr)
 
 

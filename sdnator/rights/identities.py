@@ -8,7 +8,6 @@
 User names carry the installation's number, so that several installations can share a server.
 """
 
-import fcntl
 import hashlib
 import json
 import re
@@ -23,7 +22,7 @@ import msgspec
 from due.drivers.redis_rights import Rights, acl_rules
 from due.drivers.redis_wire import as_user
 from due.keys import Key
-from due.private_files import write_private
+from due.private_files import locked, private_folder, write_private
 from sdnator.errors import BadInput
 from sdnator.rights.granting import OPERATOR, operator
 
@@ -55,6 +54,9 @@ class Identities:
 
     Args:
         folder: the state folder.
+
+    Raises:
+        BadInput: the file is there, but cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -63,21 +65,26 @@ class Identities:
         self.reread()
 
     def reread(self) -> None:
-        """Take up what others have written."""
+        """Take up what others have written.  Raises BadInput for a file that cannot be read."""
         try:
             self._book = msgspec.json.decode(self.path.read_bytes(), type=_Book)
         except FileNotFoundError:
             return
-        except (OSError, msgspec.MsgspecError, ValueError, RecursionError):
+        except OSError as error:
+            # it may be whole: new identities would lock out everybody who was enrolled
+            raise BadInput(
+                f"{self.path}: cannot be read ({error.strerror}); "
+                "use sudo, or give the file to the user who runs the pipeline (chown)"
+            ) from None
+        except (msgspec.MsgspecError, ValueError, RecursionError):
             return  # every identity that is needed is made again
 
     @contextmanager
     def changing(self) -> Iterator[None]:
         """Reread, change, write; nobody else changes the file meanwhile.  Raises BadInput for the folder."""
         try:
-            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with self.path.with_suffix(".lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
+            private_folder(self.path.parent)
+            with locked(self.path.with_suffix(".lock")):
                 self.reread()
                 yield
                 write_private(self.path, msgspec.json.format(msgspec.json.encode(self._book)).decode() + "\n")

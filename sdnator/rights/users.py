@@ -3,7 +3,6 @@
 sdnator user add ──► users.json ──► the dashboard reads it at every sign-in
 """
 
-import fcntl
 import hashlib
 import hmac
 import re
@@ -16,7 +15,7 @@ from typing import Literal
 
 import msgspec
 
-from due.private_files import write_private
+from due.private_files import locked, private_folder, write_private
 from sdnator.errors import BadInput
 
 FILE = "users.json"
@@ -114,9 +113,8 @@ class Users:
     @contextmanager
     def _changing(self) -> Iterator[None]:
         try:
-            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with self.path.with_suffix(".lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
+            private_folder(self.path.parent)
+            with locked(self.path.with_suffix(".lock")):
                 self.reread()
                 self._users = dict(self._users)
                 yield

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from typing import ClassVar
 
-from sdnator.errors import SdnatorError
+from sdnator.errors import BadInput, SdnatorError
 from sdnator.rights.identities import Identities
 
 _LOOK_SECONDS = 1.0
@@ -88,9 +88,14 @@ class WatchingKeeper(ABC):
             return self._changed
 
     def _run(self) -> None:
+        told = ""
         while not self._ended.wait(_LOOK_SECONDS):
             try:
                 self.look()
+            except BadInput as error:  # the file of identities; the users stay as they are
+                if str(error) != told:
+                    told = str(error)
+                    log.warning("changes of rights are not taken up: %s", told)
             except self._away as error:
                 log.debug("rights cannot be looked after now: %s", error)
                 self.close()

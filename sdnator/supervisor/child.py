@@ -21,6 +21,7 @@ SECRET_VARIABLES = (
     "DUE_UPDATES",
     "DUE_ARCHIVE",
     "DUE_CREDENTIAL",
+    "DUE_COORDINATOR_TOKEN",
     "SDNATOR_UP_UPDATES",
     "SDNATOR_UP_ARCHIVE",
     "SDNATOR_DASHBOARD_TOKEN",
@@ -187,8 +188,7 @@ class Child:
         code = self._process.poll()
         if code is None:
             return None
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return f"{self.name} {how}{self._log_tail()}"
+        return f"{self.name} {how_ended(code)}{self._log_tail()}"
 
     def _log_tail(self) -> str:
         return last_words(self.log)
@@ -222,6 +222,16 @@ class Child:
             if getattr(self, name) >= 0:
                 os.close(getattr(self, name))
                 setattr(self, name, -1)
+
+
+def how_ended(code: int) -> str:
+    """An exit code, negative for a signal, as the predicate of a sentence."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was killed by {signal.Signals(-code).name}"
+    except ValueError:  # most real-time signals have no name
+        return f"was killed by signal {-code}"
 
 
 def last_words(log: Path) -> str:

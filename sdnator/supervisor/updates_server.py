@@ -12,7 +12,7 @@ from typing import Any
 from due.drivers.embedded_redis import EmbeddedServer
 from due.errors import UpdatesUnavailable
 from sdnator.errors import PipelineError
-from sdnator.supervisor.child import last_words, suspended
+from sdnator.supervisor.child import how_ended, last_words, suspended
 
 _PING, _PONG = b"PING\r\n", b"+PONG"
 _PING_SECONDS = 1.0
@@ -96,8 +96,7 @@ class UpdatesProcess:
         code = self._server.exit_code()
         if code is None:
             return None
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return f"updates {how}{last_words(self.log)}"
+        return f"updates {how_ended(code)}{last_words(self.log)}"
 
     def beaten(self) -> bool:
         """Whether it has answered since the last call."""

@@ -147,9 +147,16 @@ def write(folder: Path, running: Running) -> None:
 
 
 def holder(folder: Path) -> int | None:
-    """Process id of the pipeline of this state folder, also while it starts and stops; None where there is none."""
+    """Process id of the pipeline of this state folder, also while it starts and stops; None where there is none.
+
+    Raises PipelineError where another user's pipeline may be running.
+    """
     try:
         descriptor = os.open(folder / "run.lock", os.O_RDONLY)
+    except PermissionError:
+        raise PipelineError(
+            f"{folder} is another user's: use sudo, or run this as the user who started the pipeline"
+        ) from None
     except OSError:
         return None
     try:
@@ -164,7 +171,10 @@ def holder(folder: Path) -> int | None:
 
 
 def find(folder: Path | None = None) -> Running | None:
-    """The running pipeline, None if there is none; raises BadInput for a run file of another version."""
+    """The running pipeline, None if there is none.
+
+    Raises BadInput for a run file of another version, PipelineError for another user's folder.
+    """
     folder = folder or state_folder()
     if holder(folder) is None:
         return None

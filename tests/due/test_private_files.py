@@ -1,6 +1,13 @@
 """Files with secrets are their owner's alone, and one that is right already is left as it is."""
 
-from due.private_files import write_private, write_private_json
+import os
+
+import pytest
+
+from due.private_files import locked, private_folder, write_private, write_private_json
+from tests.requirements import require_root
+
+SOMEBODY = 65_534
 
 
 def test_a_file_that_holds_the_text_is_not_written_again(tmp_path):
@@ -31,3 +38,23 @@ def test_a_link_is_replaced_by_a_file(tmp_path):
     path.symlink_to(elsewhere)
     write_private(path, "word")
     assert not path.is_symlink()
+
+
+def test_what_root_writes_into_another_users_folder_is_that_users(tmp_path):
+    """A service reads what root's commands change for it."""
+    require_root()
+    os.chown(tmp_path, SOMEBODY, SOMEBODY)
+    folder = tmp_path / "state" / "model"
+    private_folder(folder)
+    write_private(folder / "secret", "word")
+    with locked(folder / "file.lock"):
+        made = [folder.parent, folder, folder / "secret", folder / "file.lock"]
+    assert [(path.stat().st_uid, path.stat().st_mode & 0o077) for path in made] == [(SOMEBODY, 0)] * 4
+
+
+def test_a_lock_that_is_a_link_is_not_opened(tmp_path):
+    """Whoever owns the folder does not choose which file root opens."""
+    (tmp_path / "file.lock").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="symbolic links"), locked(tmp_path / "file.lock"):
+        pass
+    assert not (tmp_path / "elsewhere").exists()

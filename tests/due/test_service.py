@@ -54,7 +54,7 @@ def start(tmp_path, server):
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "DUE_DIRECTORY": str(tmp_path)}
         command = [sys.executable, str(program), "--updates", server.url, *arguments]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        started.append(subprocess.Popen(command, env=environment, text=True, **pipes, **options))
+        started.append(subprocess.Popen(command, env=environment, text=True, **(pipes | options)))
         return started[-1]
 
     yield run
@@ -83,6 +83,21 @@ def test_a_service_works_from_ready_to_sigterm(start, tmp_path, make_engine):
     assert process.returncode == 0
     assert stdout == ""
     wait_for(lambda: out == [21, "stopped"])
+
+
+def test_an_app_may_print_though_nobody_reads(start, tmp_path, make_engine):
+    """More than a pipe holds; it goes where the log goes, and the app works on."""
+    (tmp_path / "app.py").write_text(APP.replace("self.ticks += 1", "print('x' * 100_000, flush=True)"))
+    health = []
+    make_engine("outside").observe("due.health.doubler").subscribe(lambda item: health.append(item.value))
+    with (tmp_path / "log").open("w") as log:
+        process = start("--archive", f"sqlite://{tmp_path / 'a.db'}", stderr=log)
+    assert json.loads(process.stdout.readline())["ready"]
+    wait_for(lambda: health)
+    process.send_signal(signal.SIGTERM)
+    stdout, _ = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (0, "")
+    assert "x" * 100_000 in (tmp_path / "log").read_text()
 
 
 def _fetch(address, path, host="localhost", token=""):

@@ -80,6 +80,70 @@ def test_frames_of_others_are_taken_but_none_of_other_interfaces():
     assert said_inside(LISTENERS) == "0 1"
 
 
+OUTAGE = """
+import socket, subprocess, time
+from sdnator.capture.live_capture import LiveSource
+got, told, end = [], [], time.monotonic() + 20
+def send(last):
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as sender:
+        sender.bind(("right", 0))
+        sender.send(bytes(6) + bytes.fromhex("02000000aa") + last + bytes(60))
+def enough():
+    send(b"\\1")
+    return bool(got) or time.monotonic() > end
+source = LiveSource("left", enough, told.append)
+send(b"\\2")
+subprocess.run(COMMAND, shell=True, check=True)
+for batch in source:
+    got += [sender for sender in batch["eth_src"] if sender == 0x02000000AA01]
+print(told, bool(got))
+"""
+UP = "ip link set left up && ip link set right up"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        f"ip link set left down && {UP}",
+        f"ip link delete left && ip link add left type veth peer name right && {UP}",
+    ],
+    ids=["down", "replaced"],
+)
+def test_an_interface_that_was_away_is_listened_to_again(command):
+    """A cable that is pulled, or an adapter that is plugged in anew, does not end a run of hours."""
+    told = said_inside(OUTAGE.replace("COMMAND", repr(command)))
+    assert told == "['left is down: waiting until it is back'] True"
+
+
+TERMINATED = """
+import json, socket, subprocess, sys, time
+from pathlib import Path
+def queued():
+    rows = [line.split() for line in Path("/proc/net/packet").read_text().splitlines()[1:]]
+    return [int(row[6]) for row in rows if row[3] == "0003"]
+lengths = ["--fm-grace", "20", "--ad-grace", "80"]
+command = [sys.executable, "-m", "sdnator.cli.main", "detect", "--interface", "left", "--out", OUT, *lengths, "--json"]
+detect = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+while not queued() and detect.poll() is None:
+    time.sleep(0.02)
+with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as sender:
+    sender.bind(("right", 0))
+    for number in range(300):
+        sender.send(bytes(6) + bytes.fromhex("0200000000%02x" % (number % 4)) + bytes(60))
+while any(queued()):
+    time.sleep(0.02)
+detect.terminate()
+told = json.loads(detect.communicate(timeout=50)[0])
+print(detect.returncode, told["scored"] >= 150)
+"""
+
+
+def test_sigterm_ends_a_run_with_results(tmp_path):
+    """As Ctrl-C does: a service manager sends it, and hours of scores are not thrown away."""
+    assert said_inside(TERMINATED.replace("OUT", repr(str(tmp_path / "scores")))) == "0 True"
+    assert (tmp_path / "scores" / "scores.csv").exists()
+
+
 def test_an_interface_that_is_not_there_is_named():
     if os.geteuid() != 0:
         with pytest.raises(BadInput, match="needs root"):

@@ -2,9 +2,12 @@
 
 import io
 import json
+import resource
 import sqlite3
 import tarfile
 import time
+from contextlib import closing
+from urllib.parse import quote
 
 import pytest
 from typer.testing import CliRunner
@@ -158,3 +161,75 @@ def test_damaged_files_are_named(home):
         run("restore", home / "b.tar.gz")
     with pytest.raises(BadInput, match=r"none\.tar\.gz"):
         run("restore", home / "none.tar.gz")
+
+
+def test_restoring_twice_keeps_what_was_there_at_first(home):
+    """The operator's own archive, which the first time has set aside."""
+    fill(home, 1)
+    run("backup", home / "b.tar.gz")
+    fill(home, 2)
+    for _ in range(2):
+        run("restore", home / "b.tar.gz")
+    assert values(home) == [1]
+    kept = home / "data" / "sdnator" / "archive.db.before-restore"
+    with closing(open_archive(f"sqlite://{kept}")) as driver:
+        assert [item.value for item in driver.find({"dataKey": "a.b.c.d"})] == [1, 2]
+    assert kept.with_name("archive.db.before-restore-2").exists()
+
+
+def test_a_restore_that_fails_changes_nothing(home):
+    """One file of two cannot be written: the other stays as it was, too, and nothing is left behind."""
+    fill(home, 1)
+    config = home / "config" / "sdnator" / "sdnator.toml"
+    config.parent.mkdir(parents=True)
+    config.write_text("")
+    run("backup", home / "b.tar.gz")
+    fill(home, 2)
+    before = sorted(path.name for path in (home / "data" / "sdnator").iterdir())
+    config.unlink()
+    config.parent.rmdir()
+    config.parent.write_text("in the way")
+    with pytest.raises(PipelineError, match=r"sdnator\.toml"):
+        run("restore", home / "b.tar.gz")
+    assert sorted(path.name for path in (home / "data" / "sdnator").iterdir()) == before
+    assert values(home) == [1, 2]
+
+
+def test_what_belongs_to_the_old_archive_is_set_aside_even_without_it(home):
+    """A -wal that stays would be taken for the new archive's."""
+    fill(home, 1)
+    run("backup", home / "b.tar.gz")
+    archive = home / "data" / "sdnator" / "archive.db"
+    archive.unlink()
+    archive.with_name("archive.db-wal").write_bytes(b"old")
+    run("restore", home / "b.tar.gz")
+    assert archive.with_name("archive.db.before-restore-wal").read_bytes() == b"old"
+    assert values(home) == [1]
+
+
+def test_no_room_to_unpack_is_told_as_such(home):
+    """A limit on the size of files stands for a full disk."""
+    fill(home, 1)
+    run("backup", home / "b.tar.gz")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(PipelineError, match=r"no room to unpack .* TMPDIR"):
+            run("restore", home / "b.tar.gz")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", ["a#b", "a?b", "a%20b"])
+def test_an_archive_in_a_folder_with_a_strange_name_is_backed_up(home, monkeypatch, name):
+    """What has a meaning in a URL has none in a path."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(home / name))
+    archive = home / name / "sdnator" / "archive.db"
+    with closing(open_archive(f"sqlite://{quote(str(archive))}")) as driver:
+        now = time.time_ns()
+        driver.insert([Item("a.b.c.d", 1, now, now, "app", "instance", 1)])
+    run("backup", home / "b.tar.gz")
+    archive.unlink()
+    run("restore", home / "b.tar.gz")
+    with closing(open_archive(f"sqlite://{quote(str(archive))}")) as driver:
+        assert [item.value for item in driver.find({"dataKey": "a.b.c.d"})] == [1]

@@ -14,7 +14,7 @@ from due import DB_ONLY, PRODUCER, Capability, Engine, Options
 from due.drivers.embedded_redis import EmbeddedServer
 from sdnator.cli.main import app as program
 from sdnator.errors import BadInput, PipelineError
-from sdnator.rights.audit_trail import unix_user
+from sdnator.rights.audit_trail import note, unix_user
 from sdnator.rights.sign_in_link import FILE, used_up
 from sdnator.rights.users import Users
 from sdnator.up import running
@@ -50,6 +50,14 @@ def test_somebody_comes_changes_the_password_and_goes(state):
     assert Users(state).verified("ada", PASSWORD) is None
     run("user", "remove", "ada")
     assert set(Users(state).all) == {"bob"}
+
+
+def test_what_is_done_is_done_though_the_trail_cannot_be_kept(state, capsys):
+    """The running pipeline, which says where the archive is, is another version's."""
+    with running.claimed(state):
+        (state / "run.json").write_text("[]")
+        note("added user ada")
+    assert "missing from the audit trail" in capsys.readouterr().err
 
 
 def test_what_is_done_on_the_command_line_is_kept_with_the_name_of_the_unix_user(monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 
 import pytest
 
@@ -47,6 +48,14 @@ def test_death_is_told_with_the_last_words(program):
     """An operator sees which part died, how, and why."""
     child = program("import sys\nprint('no such interface veth9', file=sys.stderr)\nsys.exit(3)")
     with pytest.raises(PipelineError, match=r"(?s)program ended with exit code 3.*veth9"):
+        child.wait_ready()
+    child.stop()
+
+
+def test_death_by_a_signal_without_a_name_is_told(program):
+    """Python knows two of the real-time signals by name; the others are numbers."""
+    child = program("import os, signal\nos.kill(os.getpid(), signal.SIGRTMIN + 6)")
+    with pytest.raises(PipelineError, match=f"program was killed by signal {signal.SIGRTMIN + 6}"):
         child.wait_ready()
     child.stop()
 

@@ -67,6 +67,20 @@ def test_a_killed_one_deceives_nobody(tmp_path):
         assert running.find(tmp_path) is None, "what the killed one wrote is gone"
 
 
+def test_another_users_pipeline_is_not_taken_for_none(tmp_path):
+    """Such as that of `sudo sdnator up`, which runs although its lock cannot be opened."""
+    with running.claimed(tmp_path):
+        (tmp_path / "run.lock").chmod(0)
+        before = os.geteuid()
+        if before == 0:
+            os.seteuid(65_534)
+        try:
+            with pytest.raises(PipelineError, match="sudo"):
+                running.find(tmp_path)
+        finally:
+            os.seteuid(before)
+
+
 def test_run_file_is_its_owners(tmp_path):
     """It holds URLs, and these may hold passwords."""
     with running.claimed(tmp_path / "state"):
