@@ -25,7 +25,6 @@ from typing import Any, overload
 from urllib.parse import urlsplit
 
 import msgspec
-import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
@@ -40,6 +39,7 @@ from coordinator.metrics import render
 from coordinator.openapi import document
 from coordinator.readers import ArchiveReader, ArchiveReaders
 from coordinator.registry import Registry
+from coordinator.web_server import web_server
 from due import DueError, Engine, Item
 from due.drivers.query_time import time_limit
 from due.errors import BackendError, InvalidQuery, Timeout
@@ -56,7 +56,6 @@ _QUERIES = 2
 _QUERY_S = 10.0
 _WAIT_S = 5.0
 _MAX_OBSERVERS = 64
-_MAX_CONNECTIONS = 256
 _MAX_MESSAGE_BYTES = 4096
 """Clients of /observe send nothing."""
 _QUEUE_ITEMS = 1000
@@ -109,15 +108,11 @@ class Api:
         self.unauthorized = 0
         """Requests without the token, or for what their app may not read, so far."""
         self._told = LogLimit(log)
-        config = uvicorn.Config(
+        self._server = web_server(
             application(northbound, host, token, metrics_token, self._refused, readers),
-            log_level="warning",
             lifespan="off",
-            access_log=False,
-            limit_concurrency=_MAX_CONNECTIONS,
-            ws_max_size=_MAX_MESSAGE_BYTES,
+            message_bytes=_MAX_MESSAGE_BYTES,
         )
-        self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._run, name="coordinator-api", daemon=True)
 
     def start(self) -> None:

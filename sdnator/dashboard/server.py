@@ -87,9 +87,9 @@ def serve(
     from nicegui import ui
     from starlette.middleware.sessions import SessionMiddleware
 
+    from coordinator.web_server import web_server
     from sdnator.dashboard.access_control import AccessControl
     from sdnator.dashboard.page import build
-    from sdnator.dashboard.web_server import web_server
 
     app = FastAPI(openapi_url=None)
     app.add_middleware(AccessControl, sessions=service.sessions, noted=service.note)

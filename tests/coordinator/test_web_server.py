@@ -11,7 +11,7 @@ from starlette.responses import PlainTextResponse
 from starlette.routing import Route, WebSocketRoute
 from websockets.sync.client import connect
 
-from sdnator.dashboard import web_server
+from coordinator import web_server
 from sdnator.testing.waiting import wait_for
 
 

@@ -1,11 +1,11 @@
-"""The web server around the pages: nobody can keep all connections, neither with silence nor with half a request, nor by
-reading nothing."""
+"""The web server of the HTTP API and of the dashboard: nobody can keep all connections, neither with silence nor with half
+a request, nor by reading nothing."""
 
 import asyncio
 import os
 import resource
 import socket
-from typing import Any, Final, cast
+from typing import Any, Final, Literal, cast
 
 import h11
 import uvicorn
@@ -23,11 +23,15 @@ _UNREAD_MS: Final = 30_000
 """After this time the kernel gives up a client that reads nothing, also when the connection is closed already."""
 
 
-def web_server(app: Any) -> uvicorn.Server:
+def web_server(
+    app: Any, *, lifespan: Literal["on", "off"] = "on", message_bytes: int = 16 << 20
+) -> uvicorn.Server:
     """A server that is about to be run with a socket that listens.
 
     Args:
         app: ASGI.
+        lifespan: whether the app is told when the server starts and stops.
+        message_bytes: most bytes of a message of a WebSocket.
     """
     return uvicorn.Server(
         uvicorn.Config(
@@ -35,7 +39,8 @@ def web_server(app: Any) -> uvicorn.Server:
             http=BrowserConnection,
             log_level="warning",
             access_log=False,
-            lifespan="on",
+            lifespan=lifespan,
+            ws_max_size=message_bytes,
             backlog=_ACCEPTED_AT_ONCE,
             # every local user could give any address; who runs a proxy says so
             proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
