@@ -54,6 +54,7 @@ class Archiver:
         self._closing = False
         self._condition = threading.Condition()
         self._backoff = Backoff(0.1, 5.0)
+        self._spool_backoff = Backoff(0.1, 5.0)
         self._away = False
         self._adopt_at = 0.0
         self._counts = {"archived": 0, "spooled": 0, "lost": 0, "refused": 0, "held_back": 0}
@@ -78,7 +79,7 @@ class Archiver:
                 self._condition.notify_all()
 
     def flush(self, timeout: float | None = None) -> None:
-        """Return when all that was put is archived, or spooled because the archive is away.
+        """Return when all that was put is archived; or spooled or lost, which `statistics` counts.
 
         Raises `Timeout`.
         """
@@ -214,7 +215,10 @@ class Archiver:
         return True
 
     def _can_drain(self) -> bool:
-        return self._spool is not None and len(self._spool) > 0 and self._backoff.due(time.monotonic())
+        now = time.monotonic()
+        if self._spool is None or not (self._backoff.due(now) and self._spool_backoff.due(now)):
+            return False
+        return len(self._spool) > 0
 
     def _drain_spool(self) -> None:
         if self._spool is None:
@@ -228,8 +232,9 @@ class Archiver:
         frames = self._spool.take(_SPOOL_FRAMES)
         if frames and self._insert(frames):
             self._spool.done(len(frames))
+            self._spool_backoff.succeeded()
 
     def _spool_failed(self, error: DueError) -> None:
-        """A broken disk must not end the thread; frames in the spool stay there."""
-        delay = self._backoff.failed(time.monotonic())
+        """A broken disk must neither end the thread nor slow down the archive; frames in the spool stay there."""
+        delay = self._spool_backoff.failed(time.monotonic())
         log.error("%s; retrying in %.1f s", error, delay)

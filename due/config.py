@@ -53,7 +53,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     handshake_timeout: float = 1.0
     """How long declared keys are buffered while no Coordinator answers, seconds."""
     handshake_bytes: int = 16 << 20
-    """Bytes buffered meanwhile; beyond that `write` waits."""
+    """Bytes buffered meanwhile; beyond that `write` waits. While Data Updates are away it does so for reliable keys only:
+    of others it refuses, with False, what is to be archived, and drops and counts the rest."""
     heartbeat: float = 0.5
     """Seconds between heartbeats."""
     pause_limit: float = 0.0

@@ -207,8 +207,9 @@ class Engine:
             event_time: when the described event happened, ns since the epoch; None takes the time of writing.
 
         Returns:
-            False if nobody wants the item or this instance is not the active one. The item is then archived
-            only if the capability says `archive="always"`.
+            False if nobody wants the item or this instance is not the active one, or if that is not known and
+            there is no room to hold the item. Of these, unwanted items are archived if the capability says
+            `archive="always"`.
 
         Raises:
             InvalidKey: the key breaks the grammar or has wildcards.

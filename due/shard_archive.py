@@ -3,8 +3,11 @@
     save ──► <key>.<path>: state, place ──► archive ──► load: the one with the highest grant, of those the newest
 
 An instance that was replaced while it was suspended may still write a state. Its grant is lower, so it is not found.
+A state in this host's spool is found by nobody on another host: it does not count as saved.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from due.engine import Engine
@@ -28,6 +31,8 @@ class ArchivedStates:
     def __init__(self, engine: Engine, key: str) -> None:
         self._engine = engine
         self._key = key
+        self._behind = False
+        """It is not known that what was written last is in the archive."""
 
     def load(self, path: str) -> tuple[Any, Place] | None:
         """The state that was saved last, and its place.
@@ -52,7 +57,7 @@ class ArchivedStates:
         return newest.value["state"], newest.value["place"]
 
     def save(self, path: str, state: Any, place: Place) -> None:
-        """Archive a state; on return it is durable.
+        """Archive a state; on return it is in the archive.
 
         Args:
             path: as `ShardState.save` gets it.
@@ -60,9 +65,49 @@ class ArchivedStates:
             place: as `ShardState.save` gets it.
 
         Raises:
-            BackendError: the archive did not answer, or this instance may not write now.
+            BackendError: the archive did not take it, or this instance may not write now.
             UnsupportedValue: the state is not of a DUE type.
         """
-        if not self._engine.write(f"{self._key}.{path}", {"state": state, "place": place}, [DB_ONLY]):
-            raise ArchiveUnavailable(f"the state of {path} was not written: this instance may not write now")
+        with self.archived(path):
+            if not self._engine.write(f"{self._key}.{path}", {"state": state, "place": place}, [DB_ONLY]):
+                raise ArchiveUnavailable(
+                    f"the state of {path} was not written: this instance may not write now"
+                )
+
+    @contextmanager
+    def archived(self, path: str, timeout: float = _SAVE_SECONDS) -> Iterator[None]:
+        """What is written in the body of `with` is in the archive at its end.
+
+        While the archive is away the body is entered once; then not before it has taken what waits in the spool.
+
+        Args:
+            path: named in errors.
+            timeout: seconds for the archive to take it.
+
+        Raises:
+            BackendError: the archive did not take it, or not all of it for certain.
+        """
+        self._catch_up(path)
+        before = self._not_archived()
+        self._behind = True
+        yield
+        self._engine.flush(timeout)
+        if self._not_archived() != before:
+            raise ArchiveUnavailable(f"the archive did not take the state of {path}")
+        self._behind = False
+
+    def _catch_up(self, path: str) -> None:
+        if not self._behind:
+            return
+        archive = self._engine.health().get("archive", {})
+        if archive.get("away") and archive["backlog"]:
+            raise ArchiveUnavailable(
+                f"the state of {path} is not written: what was written before still waits"
+            )
         self._engine.flush(_SAVE_SECONDS)
+
+    def _not_archived(self) -> int:
+        """Items of this engine, also under other keys, that went elsewhere; their number is the same if none did."""
+        health = self._engine.health()
+        archive = health.get("archive", {})
+        return int(health["refused"]) + sum(archive.get(name, 0) for name in ("spooled", "lost", "refused"))

@@ -39,7 +39,7 @@ class WriteAdmission:
         self.not_kept = 0
         """Refused items that were to be archived: more than a word that is repeated anyway."""
         self.lost = 0
-        """Best-effort items for which there was no room while Data Updates could not be reached."""
+        """Items only to be published, for which there was no room while Data Updates could not be reached."""
         self.counts = {"unwanted": 0, "refused": 0, "held_for_permission": 0, "replaced": 0}
 
     def changed(self) -> None:
@@ -113,10 +113,17 @@ class WriteAdmission:
         return True
 
     def _hold(self, writer: KeyWriter, item: Waiting) -> bool:
-        """Hold an item until the assignments are known; wait if too much is held already."""
+        """Hold an item until the assignments are known; wait if too much is held already.
+
+        Data Updates may be away for long, and the caller may be the dispatcher: items of best-effort keys do not wait then.
+        """
         self.counts["held_for_permission"] += 1
         while self._held_bytes > self._hold_bytes:
             if not (writer.reliable or self._heartbeats.connected):
+                if item[1] & ARCHIVE:  # whether this instance may archive it is not known
+                    self.counts["refused"] += 1
+                    self.not_kept += 1
+                    return False
                 self.lost += 1
                 return True
             with self._changed:

@@ -1,6 +1,6 @@
 """Checkpoints in Data Archives: in parts that fit into frames, found by what is saved last.  I/O.
 
-    save ──► parts (bytes, at one event time) ──► place, event time, length and sum of the whole ──► flush
+    save ──► parts (bytes, at one event time) ──► archived ──► place, event time, length and sum of the whole
     load ──► the newest of the highest grant ──► its parts ──► whole and undamaged, or not there
 
 The parts of one checkpoint are those of one instance at one event time, so that another instance, which was suspended
@@ -47,11 +47,11 @@ class CheckpointStore:
         self._engine = engine
         self._parts = f"{key}_part"
         self._saved = ArchivedStates(engine, key)
-        self._behind = False
-        """The archive did not take the last one: what was written waits in the spool."""
 
     def save(self, path: str, data: bytes, place: Place) -> None:
-        """Archive a checkpoint; on return it is durable.
+        """Archive a checkpoint; on return it is in the archive.
+
+        While the archive is away no more is spooled than the parts of one checkpoint.
 
         Args:
             path: as `ShardState.save` gets it.
@@ -59,7 +59,7 @@ class CheckpointStore:
             place: as `ShardState.save` gets it.
 
         Raises:
-            BackendError: the archive did not answer, or this instance may not write now.
+            BackendError: the archive did not take it, or this instance may not write now.
             CheckpointError: it is too long.
         """
         parts = [data[at : at + PART_BYTES] for at in range(0, len(data), PART_BYTES)]
@@ -67,15 +67,14 @@ class CheckpointStore:
             raise CheckpointError(
                 f"a checkpoint of {len(data):,} bytes, at most {MOST_PARTS * PART_BYTES:,} are kept; lower max_streams and max_links"
             )
-        self._catch_up()
         now = time.time_ns()
-        self._behind = True
-        for number, part in enumerate(parts):
-            value = {"number": number, "data": part}
-            if not self._engine.write(f"{self._parts}.{path}", value, [DB_ONLY], event_time=now):
-                raise ArchiveUnavailable(
-                    f"the checkpoint of {path} was not written: this instance may not write now"
-                )
+        with self._saved.archived(path, _FLUSH_S):
+            for number, part in enumerate(parts):
+                value = {"number": number, "data": part}
+                if not self._engine.write(f"{self._parts}.{path}", value, [DB_ONLY], event_time=now):
+                    raise ArchiveUnavailable(
+                        f"the checkpoint of {path} was not written: this instance may not write now"
+                    )
         whole = _Whole(
             instance=self._engine.instance_id,
             time=now,
@@ -84,7 +83,6 @@ class CheckpointStore:
             sum=zlib.crc32(data),
         )
         self._saved.save(path, msgspec.to_builtins(whole), place)
-        self._behind = False
 
     def load(self, path: str) -> tuple[bytes | CheckpointError, Place] | None:
         """The checkpoint that was saved last.
@@ -106,12 +104,6 @@ class CheckpointStore:
             return self._whole(path, value), place
         except CheckpointError as error:
             return error, place
-
-    def _catch_up(self) -> None:
-        """While the archive is away nothing more is spooled than one checkpoint."""
-        if self._behind:
-            self._engine.flush(_FLUSH_S)
-            self._behind = False
 
     def _whole(self, path: str, value: Any) -> bytes:
         try:

@@ -27,7 +27,8 @@ class DiskSpool:
     """A spool in `folder`/`name`.db, of at most about `limit` bytes; raises BackendError if it cannot be opened.
 
     Survives kill -9 of its process.  A damaged
-    file is set aside under another name (the last three are kept) and an empty one takes its place.
+    file is set aside under another name (the last three are kept) and an empty one takes its place; where none can
+    be created, as on a full disk, the next `put` or `take` tries again.
     """
 
     def __init__(self, folder: Path, limit: int, name: str = "spool") -> None:
@@ -40,16 +41,24 @@ class DiskSpool:
         self.set_aside = 0
         """Damaged files so far."""
         self._dropped = 0
+        self._missing = True
+        """There is no file: not yet, or a damaged one could not be replaced."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            try:
-                self._file = self._opened()
-            except sqlite3.DatabaseError as error:
-                if not _is_damage(error):
-                    raise
-                self._set_aside(error)
+            self._open()
         except (OSError, sqlite3.Error) as error:
             raise BackendError(f"spool {self.path} cannot be opened: {error}; name another folder") from error
+
+    def _open(self) -> None:
+        """Open the file, unless it is; raises `sqlite3.Error` or `OSError`."""
+        if not self._missing:
+            return
+        try:
+            self._file = self._opened()
+        except sqlite3.DatabaseError as error:
+            if not _is_damage(error):
+                raise
+            self._set_aside(error)
 
     def _opened(self) -> sqlite3.Connection:
         file = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
@@ -64,6 +73,7 @@ class DiskSpool:
             file.close()
             raise
         self._count, self._bytes = int(count), int(size)
+        self._missing = False
         return file
 
     def _set_aside(self, error: sqlite3.Error) -> None:
@@ -85,23 +95,38 @@ class DiskSpool:
             lost or "the",
             aside,
         )
-        self._file = self._opened()
         self.set_aside += 1
+        self._file = self._opened()
 
-    def _failed(self, error: sqlite3.Error) -> bool:
+    def _failed(self, error: OSError | sqlite3.Error) -> bool:
         """Handle an error; True if a damaged file was replaced by an empty one."""
-        if not _is_damage(error):
+        if isinstance(error, OSError) or not _is_damage(error):
             return False
+        self._file.close()
+        self._missing = True
         try:
-            self._file.close()
             self._set_aside(error)
         except (OSError, sqlite3.Error) as again:
             log.error("spool %s: %s", self.path, again)  # noqa: TRY400 - no trace needed
+            self._count = self._bytes = 0
             return False
         return True
 
     def put(self, frames: Sequence[PackedFrame]) -> int:
         """Append frames; returns how many items did not fit and are lost.  See `Spool.put`."""
+        try:
+            self._open()
+            rows = self._fitting(frames)
+            self._append(rows)
+        except (OSError, sqlite3.Error) as error:
+            if self._failed(error):
+                return self.put(frames)
+            raise BackendError(
+                f"spool {self.path} cannot be written: {error}; make room on its disk"
+            ) from error
+        return sum(frame.count for frame in frames[len(rows) :])
+
+    def _fitting(self, frames: Sequence[PackedFrame]) -> list[tuple[int, bytes]]:
         rows, space = [], self._limit - self._bytes
         for frame in frames:
             data = self._encode(frame)
@@ -110,21 +135,14 @@ class DiskSpool:
                 break
             space -= size
             rows.append((size, data))
-        try:
-            self._append(rows)
-        except sqlite3.Error as error:
-            if self._failed(error):
-                return self.put(frames)
-            raise BackendError(
-                f"spool {self.path} cannot be written: {error}; make room on its disk"
-            ) from error
-        return sum(frame.count for frame in frames[len(rows) :])
+        return rows
 
     def take(self, frames: int) -> list[PackedFrame]:
         """Up to `frames` of the oldest frames, which stay until `done`; damaged records are dropped."""
         try:
+            self._open()
             rows = self._rows("SELECT id, data FROM frames ORDER BY id LIMIT ?", frames)
-        except sqlite3.Error as error:
+        except (OSError, sqlite3.Error) as error:
             if self._failed(error):
                 return []
             raise BackendError(f"spool {self.path}: {error}") from error
@@ -170,6 +188,8 @@ class DiskSpool:
         self._bytes += sum(size for size, _ in rows)
 
     def _remove(self, which: str, number: int) -> None:
+        if self._missing:
+            return
         try:
             removed = self._rows(f"DELETE FROM frames WHERE {which} RETURNING size", number)  # noqa: S608 our own text
         except sqlite3.Error as error:

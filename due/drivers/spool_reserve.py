@@ -92,7 +92,10 @@ class SpoolReserve:
         del self._records[:frames]
         if not self._records:
             self._end = 0
-            os.pwrite(self._file, _END, 0)
+            try:
+                os.pwrite(self._file, _END, 0)
+            except OSError as error:  # they are archived: the next start delivers them once more
+                log.error("spool reserve %s: %s", self.path, error)  # noqa: TRY400 - no trace needed
 
     def __len__(self) -> int:
         return len(self._records)

@@ -215,6 +215,24 @@ def test_on_a_full_disk_writers_do_not_wait_for_ever(shelf, tmp_path):
     archiver.close()
 
 
+def test_a_broken_spool_does_not_slow_down_the_archive(shelf, tmp_path, monkeypatch):
+    """What is put goes to the archive as if there were no spool."""
+
+    def failing(frames):
+        raise BackendError("disk")
+
+    spool = Bare(tmp_path, 1 << 20)
+    spool.put([_frame(0)])
+    monkeypatch.setattr(spool, "take", failing)
+    archiver = Archiver(shelf, spool)
+    for first in range(10, 210, 10):
+        archiver.put(_frame(first))
+        archiver.flush(60)
+    counts = archiver.statistics()
+    assert (counts["archived"], counts["spooled"], counts["away"]) == (200, 0, 0)
+    archiver.close()
+
+
 def test_a_broken_spool_does_not_end_the_archiver(shelf, tmp_path, monkeypatch):
     spool = Bare(tmp_path, 1 << 20)
     spool.put([_frame(0)])

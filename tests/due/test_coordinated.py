@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from benchmarks.chaos_links import UnixLink
-from due import NO_WAIT, PUB_ONLY, Capability, Interest
+from due import DB_ONLY, NO_WAIT, PUB_ONLY, Capability, Interest
 from due.drivers import redis_wire
 from due.errors import Superseded
 from due.membership import ASSIGNMENT, Assignments, Registration
@@ -169,6 +169,18 @@ def test_an_instance_without_data_updates_keeps_its_items_until_it_is_told_that_
     assert not cut_off.health()["asking"]
     assert cut_off.connected
     cut_off.flush()
+
+
+def test_what_is_to_be_archived_and_cannot_be_held_without_data_updates_is_refused(cut_off, link):
+    """The writer hears it; it need not wait, which would stop its app for as long as Data Updates are away."""
+    value = bytes(1 << 20)
+    assert [cut_off.write("t.beside.x", value, [DB_ONLY]) for _ in range(20)] == [True] * 17 + [False] * 3
+    assert cut_off.write("t.beside.x", value, [PUB_ONLY])
+    assert cut_off.health()["refused"] == 3
+    link.mend()
+    wait_for(lambda: not cut_off.health()["asking"])
+    cut_off.flush()
+    assert len(cut_off.get("t.beside.x")) == 17
 
 
 def test_an_instance_that_was_replaced_while_it_was_cut_off_writes_nothing_and_flush_says_so(

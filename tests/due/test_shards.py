@@ -1,5 +1,7 @@
 """States of shards: of several the one that counts is found, and what is no place is none."""
 
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from due import DB_ONLY, Capability
-from due.errors import InvalidOption
+from due.errors import ArchiveUnavailable, InvalidOption
 from due.shard_archive import ArchivedStates
 from due.shards import Place, grant_of
 from tests.due.conftest import wait_for
@@ -58,6 +60,29 @@ def test_the_state_of_the_last_grant_is_loaded_even_if_an_older_one_was_written_
     engine.write("t.state.keeper.a.b", "of somebody else", [DB_ONLY])
     assert states.load("a.b") == ("successor", _place(2))
     assert states.load("a.c") is None
+
+
+@pytest.mark.parametrize("spool_bytes", [1 << 20, 1])
+def test_a_state_is_saved_when_the_archive_has_it(make_engine, tmp_path: Path, spool_bytes: int) -> None:
+    """A successor on another host finds none in this one's spool; and attempts to save it do not fill that."""
+    folder = tmp_path / "archive"
+    folder.write_text("no folder")
+    engine = make_engine("spooler", archive=f"sqlite://{folder / 'a.db'}", spool_bytes=spool_bytes)
+    states = ArchivedStates(engine, "t.state.spooler")
+    for number in range(3):
+        with pytest.raises(ArchiveUnavailable):
+            states.save("a.b", number, _place(number))
+    assert engine.health()["archive"]["spooled"] == (spool_bytes > 1)
+    folder.unlink()
+
+    def saved() -> bool:
+        with suppress(ArchiveUnavailable):
+            states.save("a.b", "last", _place(3))
+            return True
+        return False
+
+    wait_for(saved)
+    assert states.load("a.b") == ("last", _place(3))
 
 
 def test_state_is_kept_by_sharded_apps_only_and_from_the_beginning(make_engine) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 from contextlib import suppress
@@ -133,6 +134,34 @@ def test_it_behaves_like_a_list(
             spool.close()
             spool = DiskSpool(folder, 1 << 20)
         assert len(spool) == len(model)
+    spool.close()
+
+
+def test_a_damaged_file_that_cannot_be_replaced_at_once_is_replaced_later(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """On a full disk; meanwhile nothing is in the spool."""
+    spool = DiskSpool(tmp_path, 1 << 20)
+    spool.put([frame(n) for n in range(200)])
+    for statement in ("wal_checkpoint(TRUNCATE)", "cache_size = 0", "shrink_memory"):
+        spool._file.execute(f"PRAGMA {statement}")
+    with spool.path.open("r+b") as file:
+        file.seek(4096)
+        file.write(b"\xaa" * (spool.path.stat().st_size - 4096))
+
+    def full(*_: object, **__: object) -> None:
+        raise sqlite3.OperationalError("unable to open database file")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(sqlite3, "connect", full)
+        for n in range(2):
+            with pytest.raises(BackendError):
+                spool.put([frame(n)])
+            assert len(spool) == 0
+        spool.done(1)
+    assert spool.put([frame(1)]) == 0
+    assert spool.take(9) == [frame(1)]
+    assert (len(spool), spool.damaged) == (1, 1)
     spool.close()
 
 

@@ -125,6 +125,21 @@ def test_a_reserve_keeps_whole_frames_only_and_all_of_them(tmp_path: Path) -> No
         each.close()
 
 
+def test_a_reserve_that_cannot_be_emptied_on_disk_is_delivered_again_after_a_restart(tmp_path: Path) -> None:
+    """A broken disk ends no thread, and no frame is lost."""
+    reserve = SpoolReserve(tmp_path / "r", 4096)
+    reserve.put([frame(1)])
+    unwritable = os.open(tmp_path / "r", os.O_RDONLY)
+    os.dup2(unwritable, reserve._file)
+    os.close(unwritable)
+    reserve.done(1)
+    assert not len(reserve)
+    reserve.close()
+    again = SpoolReserve(tmp_path / "r", 4096)
+    assert again.take(9) == [frame(1)]
+    again.close()
+
+
 @pytest.mark.parametrize("content", [b"", b"\xff" * 4096, b"\1\0\0\0" * 1024, os.urandom(4096)])
 def test_a_damaged_reserve_is_an_empty_one(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "r").write_bytes(content)
