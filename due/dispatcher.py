@@ -185,11 +185,12 @@ class Dispatcher:
                 observations = self._routes.find(frame.key, frame.app_id, delivery.path)
             new = bool(observations) and self.tracker.admit(frame, reliable=bool(delivery.token))
         except NewerVersion as error:
-            self._count("newer_version", delivery, error)
+            # whole: this app can read it once it is upgraded, too
+            self._refuse("newer_version", delivery, delivery.payload, error)
         except DecodeError as error:
-            self._refuse("undecodable", delivery, error)
+            self._refuse("undecodable", delivery, delivery.payload[:_REFUSED_BYTES], error)
         except RefusedFrame as error:
-            self._refuse(error.cause, delivery, error)
+            self._refuse(error.cause, delivery, delivery.payload[:_REFUSED_BYTES], error)
         else:
             if new:
                 self._deliver(delivery, frame, observations)
@@ -240,20 +241,16 @@ class Dispatcher:
         self._errors.error("a callback failed on %s (sequence %d)", item.key, item.sequence, error=error)
         if self._reliable is not None:
             self._counts["set_aside"] += 1
-            self.receiver.set_aside(self._reliable, _alone(item), f"{type(error).__name__}: {error}")
+            reason = f"{type(error).__name__}: {error}"[:_REASON]
+            self.receiver.set_aside(self._reliable, _alone(item), reason)
 
-    def _refuse(self, cause: str, delivery: Delivery, error: DueError) -> None:
+    def _refuse(self, cause: str, delivery: Delivery, kept: bytes, error: DueError) -> None:
         """Count the refusal; a frame from a stream is set aside, so that it is not read again."""
-        self._count(cause, delivery, error)
-        if delivery.token:
-            self.receiver.set_aside(
-                delivery, delivery.payload[:_REFUSED_BYTES], f"{cause}: {error}"[:_REASON]
-            )
-
-    def _count(self, cause: str, delivery: Delivery, error: DueError) -> None:
         self._counts[cause] += 1
         if self._counts[cause] == 1:
             log.error("refused a frame under %s: %s; further ones are only counted", delivery.path, error)
+        if delivery.token:
+            self.receiver.set_aside(delivery, kept, f"{cause}: {error}"[:_REASON])
 
 
 def _alone(item: Item) -> bytes:

@@ -33,7 +33,12 @@ _ENGINE: dict[str, _Family] = {
         ("written", "written_items", "counter", "Items written"),
         ("unpublished", "unpublished_items", "counter", "Best-effort items lost without a connection"),
         ("unwanted", "unwanted_items", "counter", "Items not published because nobody wants them"),
-        ("refused", "refused_items", "counter", "Items refused because another instance is active"),
+        (
+            "refused",
+            "refused_items",
+            "counter",
+            "Items refused: another instance is active, or there was no room to hold them until that is known",
+        ),
         ("held_for_permission", "held_items", "counter", "Items held until the handshake ended"),
         ("replaced", "replaced_items", "counter", "Items replaced by newer ones under pacing"),
         ("key_writers", "key_writers", "gauge", "Keys that are being written"),
@@ -56,6 +61,18 @@ _ENGINE: dict[str, _Family] = {
         ("receiving.refuted", "refuted_frames", "counter", "Numbers that later frames showed to be false"),
         ("receiving.callback_errors", "callback_errors", "counter", "Exceptions raised by callbacks"),
         ("receiving.set_aside", "set_aside_items", "counter", "Items set aside: callbacks kept failing"),
+        (
+            "receiving.set_aside_waiting",
+            "set_aside_waiting",
+            "gauge",
+            "Set-aside payloads that wait for Data Updates",
+        ),
+        (
+            "receiving.set_aside_lost",
+            "set_aside_lost",
+            "counter",
+            "Payloads that could be neither handled nor set aside",
+        ),
         (
             "receiving.dropped_slow",
             "dropped_slow_frames",

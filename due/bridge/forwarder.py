@@ -6,7 +6,8 @@
 
 A reliable frame is acknowledged once the other site's server has it, so it survives the death of the bridge; a full
 window there, or a cut link, stops the receiving, and with it the producers of this site.  Best-effort frames that
-find no connection are lost and counted.
+find no connection are lost and counted.  A frame that the other site refuses is set aside at this one: it would be
+refused again.
 """
 
 import logging
@@ -17,7 +18,7 @@ from typing import Final
 
 from due.bridge.bridged_keys import BridgedKeys
 from due.drivers.base import Delivery, Publisher, Receiver
-from due.errors import DueError, Timeout, UpdatesUnavailable
+from due.errors import BackendError, DueError, Timeout, UpdatesUnavailable
 from due.logs import LogLimit
 from due.threads import Failed, LoudThread
 
@@ -95,7 +96,7 @@ class FrameForwarder:
             self._source.activate(active)
 
     def health(self) -> dict[str, int]:
-        """Counters: frames and bytes that crossed, best-effort frames lost, frames that were not to cross."""
+        """Counters: frames and bytes that crossed, best-effort frames lost, frames that might not cross or were refused."""
         return {**self._counts, "patterns": len(self.keys.patterns), "unsettled": len(self._unsettled)}
 
     def close(self) -> None:
@@ -138,18 +139,32 @@ class FrameForwarder:
             if delivery.token:
                 self._source.acknowledge(delivery)  # withdrawn a moment ago
             return
-        if not delivery.token:
-            try:
+        try:
+            if delivery.token:
+                self._target.append(path, payload)
+            else:
                 self._target.publish(path, payload)
-            except UpdatesUnavailable:
-                self._counts["lost"] += 1
-                return
-        else:
-            self._target.append(path, payload)
+        except UpdatesUnavailable:
+            if delivery.token:
+                raise
+            self._counts["lost"] += 1
+            return
+        except BackendError as error:
+            self._refuse(delivery, error)
+            return
+        if delivery.token:
             self._unsettled.append(delivery)
             self._unsettled_bytes += len(payload)
         self._counts["frames"] += 1
         self._counts["bytes"] += len(payload)
+
+    def _refuse(self, delivery: Delivery, error: BackendError) -> None:
+        """The other site will never take this frame; those behind it must not wait for it."""
+        self._counts["refused"] += 1
+        self._errors.error("%s: a frame of %s is refused there: %s", self._name, delivery.path, error)
+        if delivery.token:
+            self._source.set_aside(delivery, delivery.payload, f"{self._name}: {error}")
+            self._source.acknowledge(delivery)
 
     def _is_batch(self) -> bool:
         return self._unsettled_bytes >= _BATCH_BYTES or len(self._unsettled) >= _BATCH_FRAMES

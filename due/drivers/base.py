@@ -263,7 +263,11 @@ class Receiver(Protocol):
         ...
 
     def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
-        """Set aside a payload on which callbacks keep failing."""
+        """Set aside a payload on which callbacks keep failing, or that cannot be read.
+
+        While the server is away, up to 16 MiB of them wait in this process (`set_aside_waiting`) until a later `receive`,
+        or `close`; what does not fit is lost and counted (`set_aside_lost`).
+        """
         ...
 
     def aside(self) -> list[tuple[bytes, str]]:

@@ -16,7 +16,7 @@ from confluent_kafka import Consumer, KafkaError, KafkaException, Message, Produ
 from due.drivers.base import NO_RIGHT
 from due.drivers.kafka_control import ControlLog, topic_record
 from due.drivers.kafka_names import MOST_BYTES, KafkaAddress, is_denied, parse_kafka_url, topic_prefix
-from due.drivers.kafka_progress import Partition, PathWindow, SentRecord
+from due.drivers.kafka_progress import AwaitedGroups, Partition, PathWindow, SentRecord
 from due.drivers.kafka_receiver import KafkaReceiver
 from due.errors import BackendError, DueError, Timeout, UpdatesUnavailable
 
@@ -96,7 +96,7 @@ class GroupPositions:
         self._consumers: dict[str, Consumer] = {}
 
     def of(self, group: str, partitions: list[Partition]) -> Mapping[Partition, int]:
-        """Committed offsets; a partition without one is missing.
+        """Committed offsets; a partition without one is missing, one that cannot be told now is at -1.
 
         Raises:
             UpdatesUnavailable: the group's broker does not answer now.
@@ -111,7 +111,9 @@ class GroupPositions:
         except KafkaException as error:
             raise UpdatesUnavailable(f"positions of {group}: {error.args[0]}") from None
         return {
-            (one.topic, one.partition): one.offset for one in found if one.error is None and one.offset >= 0
+            (one.topic, one.partition): one.offset if one.error is None else -1
+            for one in found
+            if one.error is not None or one.offset >= 0
         }
 
     def keep_only(self, groups: set[str]) -> None:
@@ -144,6 +146,7 @@ class KafkaPublisher:
         self._topics: dict[str, list[int]] = {}
         """Topics that are announced, and the partitions of reliable ones."""
         self._positions = GroupPositions(address)
+        self._awaited = AwaitedGroups(self._group_timeout)
         self._closed = False
         self.answered = 0
         """See `Publisher.answered`."""
@@ -447,9 +450,13 @@ class KafkaPublisher:
                 for number in self._topics[topic]
             ]
             positions[group] = self._positions.of(group, wanted)
+        awaited = {
+            topic: self._awaited.of(topic, {group: positions[group] for group in readers[topic]}, now)
+            for topic in topics
+        }
         with self._lock:
             for window in windows:
-                window.release(positions[group] for group in readers[window.topic])
+                window.release(awaited[window.topic])
             self._room.notify_all()
 
     def _tidy(self) -> None:

@@ -70,6 +70,8 @@ class ReaderRecord(msgspec.Struct, frozen=True, array_like=True):
     """Changes with each renewal."""
     holds: tuple[tuple[str, int], ...] = ()
     """Partitions that it reads, or has read and still works on."""
+    denied: tuple[str, ...] = ()
+    """Topics that its patterns hold, and that it may not read."""
 
 
 class TopicRecord(msgspec.Struct, frozen=True, array_like=True):
@@ -180,6 +182,7 @@ class ControlLog:
             found = set()
             for (group, _), seen in self._readers.items():
                 wants = any(may_hold(prefix, pattern) for pattern in seen.record.patterns)
+                wants = wants and topic not in seen.record.denied
                 if wants and now - seen.changed_at <= timeout:
                     found.add(group)
             return sorted(found)

@@ -18,6 +18,7 @@ import msgspec
 from confluent_kafka import KafkaError, KafkaException
 from msgspec import structs
 
+from due.codec import MAX_PAYLOAD
 from due.errors import BackendError, InvalidOption, UpdatesUnavailable
 from due.keys import ANY, ANY_NUMBER
 from due.logs import without_passwords
@@ -33,8 +34,8 @@ _TEXTS = ("mechanism", "ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
 _MECHANISMS = ("SCRAM-SHA-512", "SCRAM-SHA-256", "PLAIN")
 SCHEMES = ("kafka", "kafkas")
 """The second: over TLS."""
-MOST_BYTES = 64 << 20
-"""Largest payload, by the settings of our topics."""
+MOST_BYTES = MAX_PAYLOAD + (64 << 10)
+"""Largest record, by the settings of our topics: a frame, its key, and what Kafka adds."""
 TOO_EARLY = (
     KafkaError.NOT_LEADER_FOR_PARTITION,
     KafkaError.LEADER_NOT_AVAILABLE,

@@ -128,3 +128,42 @@ class PathWindow:
             if any(group.get((self.topic, place[0]), -1) <= place[1] for group in groups):
                 return
             self.kept_bytes -= self.kept.popleft().size
+
+
+class AwaitedGroups:
+    """For which of a topic's groups a producer waits.
+
+    A group that has no position yet is waited for while it may be about to begin, and no longer: one without the right to
+    read the topic never gets a position.  It misses nothing either way, because only age deletes records.
+
+    Args:
+        patience: s, how long a group without a position is waited for.
+    """
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._since: dict[str, dict[str, float]] = {}
+        """By topic: when a group was first seen without a position."""
+
+    def of(
+        self, topic: str, groups: Mapping[str, Mapping[Partition, int]], now: float
+    ) -> list[Mapping[Partition, int]]:
+        """The positions of those that are waited for.
+
+        Args:
+            topic: its name.
+            groups: that want to read it, with their positions in this and other topics.
+            now: s, monotonic.
+        """
+        before = self._since.get(topic, {})
+        without = {
+            group: before.get(group, now)
+            for group, positions in groups.items()
+            if not any(place[0] == topic for place in positions)
+        }
+        self._since[topic] = without
+        return [
+            positions
+            for group, positions in groups.items()
+            if now - without.get(group, now) <= self._patience
+        ]

@@ -23,10 +23,11 @@ from confluent_kafka import (
 )
 
 from due.drivers.base import NO_RIGHT, Delivery, app_of
+from due.drivers.kafka_aside import KafkaAside
 from due.drivers.kafka_control import ControlLog, ReaderRecord, reader_key, reader_record
 from due.drivers.kafka_names import MOST_BYTES, TOO_EARLY, KafkaAddress, is_denied
 from due.drivers.kafka_progress import Partition, PartitionProgress
-from due.errors import BackendError, DueError, InvalidOption, Timeout, UpdatesUnavailable
+from due.errors import BackendError, InvalidOption, Timeout, UpdatesUnavailable
 from due.keys import Key
 
 log = logging.getLogger("due.updates")
@@ -66,6 +67,7 @@ class KafkaReceiver:
         self._address, self._control, self._producer = address, control, producer
         self._group, self._member, self._shared = group, consumer, shared
         self._app = app_of(group)
+        self._aside = KafkaAside(address, control, producer, group)
         self._lock = threading.RLock()
         self._patterns: dict[str, int] = {}
         self._followed: dict[str, str] = {}
@@ -88,8 +90,7 @@ class KafkaReceiver:
         self._beat = 0
         self._said: ReaderRecord | None = None
         self._look_at = self._commit_at = 0.0
-        self._counts = {"dropped_slow": 0, "reconnects": 0, "claimed": 0, "set_aside": 0, "misplaced": 0}
-        self._counts["paths_denied"] = 0
+        self._counts = {"dropped_slow": 0, "reconnects": 0, "claimed": 0, "misplaced": 0, "paths_denied": 0}
         self._consumer = Consumer(
             address.client(
                 **{
@@ -220,18 +221,7 @@ class KafkaReceiver:
 
     def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
         """See `Receiver.set_aside`."""
-        topic = self._address.aside(self._app)
-        try:
-            self._control.make_topic(topic)
-            self._producer.produce(
-                topic, payload, delivery.path.encode(), headers={"reason": reason.encode()[:4096]}
-            )
-            self._producer.flush(_CALL_SECONDS)
-        except (DueError, KafkaException, BufferError) as error:
-            log.warning("a payload of %s could not be set aside: %s", delivery.path, error)
-            return
-        with self._lock:
-            self._counts["set_aside"] += 1
+        self._aside.put(delivery, payload, reason)
 
     def aside(self) -> list[tuple[bytes, str]]:
         """See `Receiver.aside`."""
@@ -273,10 +263,12 @@ class KafkaReceiver:
     def statistics(self) -> dict[str, int]:
         """See `Receiver.statistics`."""
         with self._lock:
-            return {**self._counts, "held_paths": 0, "refused_control": self._control.refused}
+            counts = {**self._counts, **self._aside.counts()}
+            return {**counts, "held_paths": 0, "refused_control": self._control.refused}
 
     def close(self) -> None:
         """See `Receiver.close`."""
+        self._aside.close()  # before what it was set aside from is acknowledged
         with self._lock:
             if self._closed:
                 return
@@ -294,8 +286,16 @@ class KafkaReceiver:
     def _tell(self) -> None:
         """Write this reader's record."""
         holds = tuple(sorted({*self._progress, *self._leaving, *self._claiming}))
+        denied = tuple(sorted(filter(self._address.is_reliable, self._denied)))
         record = ReaderRecord(
-            self._group, self._member, tuple(self._followed), self._active, self._since, self._beat, holds
+            self._group,
+            self._member,
+            tuple(self._followed),
+            self._active,
+            self._since,
+            self._beat,
+            holds,
+            denied,
         )
         if record == self._said or not (self._followed or self._said):
             return
@@ -312,6 +312,7 @@ class KafkaReceiver:
 
     def _care(self) -> None:
         now = time.monotonic()
+        self._aside.care(now)
         if now >= self._commit_at:
             with self._lock:
                 self._commit()
@@ -434,8 +435,16 @@ class KafkaReceiver:
         if again:
             self._give_up([place for place in self._progress if place[0] == topic])
         if wanted:
-            self._consumer.commit(offsets=wanted, asynchronous=False)
+            self._set_positions(wanted)
         self._joined.add(topic)
+
+    def _set_positions(self, positions: list[TopicPartition]) -> None:
+        try:
+            self._consumer.commit(offsets=positions, asynchronous=False)
+        except KafkaException as error:
+            if is_denied(error):  # a topic that this app may write, and not read
+                raise BackendError(str(error.args[0])) from None
+            raise
 
     def _offset(self, topic: str, number: int, start: str) -> int:
         if not start:

@@ -176,6 +176,7 @@ class MemoryReceiver:
         self._backlog: deque[Delivery] = deque()
         self._backlog_bytes = 0
         self._counts = {"dropped_slow": 0, "reconnects": 0, "claimed": 0, "set_aside": 0}
+        self._counts |= {"set_aside_waiting": 0, "set_aside_lost": 0}
         self._active = True
         self._take_over = False
         self._share: frozenset[str] | None = None

@@ -196,6 +196,7 @@ class RedisReceiver:
     def close(self) -> None:
         """See `Receiver.close`."""
         self._closed = True
+        self._reader.aside.close()  # before what it was set aside from is acknowledged
         self._reader.close()
         with self._lock:
             if self._bus is not None:
@@ -280,6 +281,7 @@ class RedisReceiver:
 
     def _care(self) -> None:
         """Reconnect lost connections, and look for streams announced meanwhile."""
+        self._reader.aside.care()
         self._leave_old_primary()
         if self._bus is None and self._channels and not self._closed:
             with self._lock:
@@ -326,7 +328,7 @@ class RedisReceiver:
             timeout = min(timeout, LOOK_SECONDS)
         if self._unlisted:
             timeout = min(timeout, _LIST_SECONDS)
-        timeout = min(timeout, self._reader.patience())
+        timeout = min(timeout, self._reader.patience(), self._reader.aside.patience())
         stream = self._reader.fileno()
         if stream >= 0:
             poll.register(stream, select.POLLIN)

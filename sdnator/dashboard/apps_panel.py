@@ -20,7 +20,16 @@ _COLUMNS = [
         ("health", "health", "left"),
     )
 ]
-_FAULTS = ("lost", "gaps", "dropped_slow", "callback_errors", "set_aside", "undecodable", "away")
+_FAULTS = (
+    "lost",
+    "gaps",
+    "dropped_slow",
+    "callback_errors",
+    "set_aside",
+    "set_aside_lost",
+    "undecodable",
+    "away",
+)
 
 
 class AppsPanel:

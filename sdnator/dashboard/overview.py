@@ -13,7 +13,7 @@ from sdnator.model_words import headline
 from sdnator.plurals import counted
 
 Level = Literal["well", "notice", "trouble"]
-_LOST: Final = ("lost", "dropped_slow", "set_aside")
+_LOST: Final = ("lost", "dropped_slow", "set_aside", "set_aside_lost")
 _ACTION_STATES: Final = {"decided": "decided", "in_force": "in force", "over": "over", "failed": "FAILED"}
 _TALKED_S: Final = 10.0
 """A list that is older says nothing of now: the switch is silent, or nobody counts."""

@@ -47,6 +47,7 @@ REFUSED = {
     "misplaced": lambda _key: encode_frame(_frame("h.elsewhere")),
     "foreign": lambda key: encode_frame(_frame(key)),
     "out_of_range": None,
+    "newer_version": lambda _key: b"DUE\x02" + bytes(5000),
 }
 
 
@@ -69,7 +70,11 @@ def test_what_is_refused_in_a_stream_is_set_aside_once_and_the_rest_arrives(pair
     assert bus.xlen(aside_name("con")) == before + 2
     wait_for(lambda: bus.xpending(f"due:work:con:{key}", "con")["pending"] == 0)
     assert caplog.text.count("refused a frame") == 1
-    assert bus.xrevrange(aside_name("con"), count=1)[0][1][b"reason"].startswith(cause.encode())
+    latest = bus.xrevrange(aside_name("con"), count=1)[0][1]
+    assert latest[b"reason"].startswith(cause.encode())
+    assert latest[b"f"] == (payload if cause == "newer_version" else payload[:4096]), (
+        "an upgraded app can read it"
+    )
     assert all(
         reason.startswith(("misplaced", "foreign", "out_of_range")) for _, reason in consumer.set_aside()
     )

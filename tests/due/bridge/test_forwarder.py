@@ -9,7 +9,7 @@ from due.backends import open_updates
 from due.bridge.bridged_keys import BridgedKeys
 from due.bridge.forwarder import FrameForwarder
 from due.config import Options
-from due.errors import Timeout
+from due.errors import BackendError, Timeout
 from tests.due.conftest import wait_for
 
 COUNT = 500
@@ -175,4 +175,54 @@ def test_on_a_long_way_a_short_lull_is_no_reason_to_wait_for_arrivals(sites):
     assert 0.2 <= forwarder._linger <= 1.0
     forwarder.close()
     writer.close()
+    assert not died
+
+
+class Refusing:
+    """A publisher whose server takes no long payloads."""
+
+    def __init__(self, inner) -> None:
+        self._inner = inner
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def append(self, path, payload):
+        self._check(path, payload)
+        self._inner.append(path, payload)
+
+    def publish(self, path, *payloads):
+        self._check(path, *payloads)
+        self._inner.publish(path, *payloads)
+
+    def _check(self, path, *payloads):
+        if any(len(payload) > 10 for payload in payloads):
+            raise BackendError(f"{path}: Broker: Message size too large")
+
+
+def test_a_frame_that_the_other_site_refuses_is_set_aside_and_the_others_cross(sites):
+    """It would come again after each restart of the bridge, and nothing behind it would ever cross."""
+    near, far = sites
+    source, target = near.receiver("bridge", "b1"), Refusing(far.publisher("bridge"))
+    died: list[BaseException] = []
+    forwarder = FrameForwarder("near to far", BridgedKeys(["a.**"]), source, target, died.append)
+    forwarder.start()
+    forwarder.activate(True)
+    forwarder.want(["a.b.*"])
+    reader, writer = far.receiver("app", "app1"), near.publisher("maker")
+    reader.follow("a.b.*")
+    reader.subscribe("a.b.*")
+    writer.publish("a.b.quick", bytes(11))
+    for payload in (b"1", bytes(11), b"2"):
+        writer.append("a.b.c", payload)
+    assert [d.payload for d in received(reader, 2)] == [b"1", b"2"]
+    wait_for(lambda: forwarder.health()["unsettled"] == 0)
+    assert (forwarder.health()["refused"], forwarder.health()["frames"]) == (2, 2)
+    assert source.aside() == [(bytes(11), "near to far: a.b.c: Broker: Message size too large")]
+    forwarder.close()
+    again = near.receiver("bridge", "b2")
+    again.follow("a.b.*")
+    assert again.receive(0.0) == [], "everything was acknowledged"
+    for half in (again, reader, writer):
+        half.close()
     assert not died

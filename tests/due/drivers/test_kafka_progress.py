@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from due.drivers.kafka_progress import PartitionProgress, PathWindow
+from due.drivers.kafka_progress import AwaitedGroups, PartitionProgress, PathWindow
 
 
 @given(wanted=st.lists(st.booleans(), max_size=40), order=st.randoms(use_true_random=False))
@@ -63,3 +63,34 @@ def test_a_window_keeps_what_the_slowest_group_has_not_committed() -> None:
     window.release([])
     assert window.kept_bytes == 0
     assert window.has_room(5000), "an empty window takes any payload"
+
+
+def test_a_group_that_never_gets_a_position_is_not_waited_for_for_ever() -> None:
+    """One without the right to read a topic would hold back its producers as long as it runs."""
+    place = ("due.r.r.x.y", 0)
+    window, awaited = PathWindow("r.x.y", place[0], 1000), AwaitedGroups(30.0)
+
+    def release(now: float) -> int:
+        groups = {"reads": {place: 1}, "denied": {("due.r.r.x.z", 0): 7}}
+        window.release(awaited.of(place[0], groups, now))
+        return len(window.kept)
+
+    for offset in range(2):
+        window.add(100).place = (0, offset)
+    assert release(100.0) == 2, "it may be about to begin"
+    assert release(130.0) == 2
+    assert release(131.0) == 1, "the other one is still waited for"
+    window.add(100).place = (0, 2)
+    assert release(1000.0) == 2, "and the first one is not waited for again"
+
+
+def test_a_group_that_begins_late_is_waited_for_from_then_on() -> None:
+    """As slow as it may be, and also where its position cannot be told for a while."""
+    place = ("due.r.r.x.y", 0)
+    awaited = AwaitedGroups(30.0)
+    assert awaited.of(place[0], {"slow": {}}, 100.0) == [{}]
+    assert awaited.of(place[0], {"slow": {}}, 200.0) == []
+    for now, offset in ((201.0, 0), (900.0, -1), (1800.0, 0)):
+        assert awaited.of(place[0], {"slow": {place: offset}}, now) == [{place: offset}]
+    assert awaited.of(place[0], {}, 2000.0) == []
+    assert awaited.of(place[0], {"slow": {}}, 3000.0) == [{}], "a new reader of that name"

@@ -3,7 +3,9 @@
 import importlib.util
 from itertools import pairwise
 
-from due.drivers.kafka_names import parse_kafka_url
+from due.codec import MAX_PAYLOAD
+from due.drivers.kafka_names import MOST_BYTES, parse_kafka_url
+from due.keys import MAX_BYTES
 from tests.requirements import missing
 
 if importlib.util.find_spec("confluent_kafka") is None:
@@ -66,3 +68,13 @@ def test_the_first_record_of_a_partition_is_alone_on_its_way(kafka_server):
         assert events[first - 1] is None
         assert sum(event is None for event in events[:first]) == len([at for at in stored if at <= first])
     assert (None, None) in pairwise(events), "the others do not wait for each other"
+
+
+def test_the_largest_frame_fits_into_a_record():
+    """With the longest key, and with the reason for which it may be set aside; no broker is needed for that."""
+    from confluent_kafka import Producer
+
+    producer = Producer({"bootstrap.servers": "127.0.0.1:1", "message.max.bytes": MOST_BYTES, "log_level": 0})
+    producer.produce("t", bytes(MAX_PAYLOAD), bytes(MAX_BYTES), headers={"reason": bytes(4096)})
+    producer.purge()
+    producer.flush(0)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from due import PUB_ONLY, Capability
+from due.drivers.base import Delivery
 from due.drivers.embedded_redis import EmbeddedServer
 from due.drivers.redis import RedisUpdates
 from due.drivers.redis_streams import work_name
@@ -102,6 +103,35 @@ def test_what_a_server_loses_without_a_restart_is_sent_again(tmp_path, monkeypat
         publisher.close()
         receiver.close()
         commands.close()
+
+
+@pytest.mark.parametrize("ends", [False, True], ids=["goes-on", "ends"])
+def test_what_is_set_aside_during_an_outage_is_stored_afterwards(tmp_path, ends):
+    """It is acknowledged: nobody would ever see it again."""
+    with EmbeddedServer(tmp_path / "u", durable=True) as server:
+        updates = RedisUpdates(server.url)
+        publisher, receiver = updates.publisher("producer"), updates.receiver("group", "one")
+        receiver.follow("r.outage")
+        for number in range(3):
+            publisher.append("r.outage", b"%d" % number)
+        publisher.settle(10)
+        found: list[Delivery] = []
+        wait_for(lambda: found.extend(receiver.receive(0.05)) or len(found) == 3)
+        server.kill()
+        for delivery in found:
+            receiver.set_aside(delivery, delivery.payload, "what it needs is away")
+            receiver.acknowledge(delivery)
+        counts = receiver.statistics()
+        assert (counts["set_aside"], counts["set_aside_waiting"], counts["set_aside_lost"]) == (0, 3, 0)
+        server.start()
+        if not ends:
+            wait_for(lambda: (receiver.receive(0.05), receiver.statistics()["set_aside"] == 3)[1])
+        receiver.close()
+        assert receiver.statistics()["set_aside_waiting"] == 0
+        other = updates.receiver("group", "two")
+        assert other.aside() == [(b"%d" % number, "what it needs is away") for number in range(3)]
+        for half in (other, publisher):
+            half.close()
 
 
 def test_foreign_and_newer_payloads_are_counted_and_skipped(make_engine, server, caplog):

@@ -75,9 +75,23 @@ def test_what_is_set_aside_is_bounded_in_bytes(server):
         assert commands.memory_usage(aside_name("bounded"), samples=0) <= _MOST_BYTES
     assert aside.all()[-1][0].startswith(b"029"), "the latest stay"
     aside.put("a.b", bytes(5 << 20), "failed")
-    assert aside.counts == {"set_aside": 31, "set_aside_cut": 1, "set_aside_failed": 0}
+    assert aside.counts == {
+        "set_aside": 31,
+        "set_aside_cut": 1,
+        "set_aside_waiting": 0,
+        "set_aside_lost": 0,
+    }
     assert all(len(payload) < 5 << 20 for payload, _ in aside.all()), "what was cut cannot be read"
     assert commands.ttl(aside_name("bounded")) > 0
+    commands.close()
+
+
+def test_a_reason_that_is_no_text_is_kept_as_far_as_it_is(server):
+    """An error may quote a file's name, which is any bytes; nothing may end the thread of the callbacks."""
+    commands = client(server.url)
+    aside = Aside(commands, "quoting")
+    aside.put("a.b", b"1", "OSError: \udcff.txt")
+    assert aside.all() == [(b"1", "OSError: ?.txt")]
     commands.close()
 
 
