@@ -92,6 +92,7 @@ class P4RuntimeCtrlService:
         self._agents = {each.name: self._agent(each, pipeline) for each in settings.switches}
         classifier = Classifier(ProgramInfo(pipeline.p4info))
         self._offers = Offers(lambda request: classifier.entries((request,)))
+        self._last_port = classifier.last_port
         self._demand = threading.Lock()
         self._asked: dict[str, Demand] = {}
         self._by_digest = {each.name: settings.by_digest(each) for each in settings.switches}
@@ -228,10 +229,10 @@ class P4RuntimeCtrlService:
             **self._intake.health(),
         }
 
-    def _on_decision(self, _: Item, decision: Decision) -> None:
+    def _on_decision(self, item: Item, decision: Decision) -> None:
         for agent in self._agents.values():
             if is_for(decision, agent.name):
-                agent.decide(decision)
+                agent.decide(decision, item.timestamp)
 
     def _on_command(self, item: Item, told: tuple[TableCommand, str, tuple[Offer, ...]]) -> None:
         """A frame that meets a request meets the entries behind it."""
@@ -240,7 +241,7 @@ class P4RuntimeCtrlService:
         if agent is None:
             return
         self._take_offers(item, app, [offer for offer in offers if not offer.active])
-        agent.command(command)
+        agent.command(command, item.timestamp)
         self._take_offers(item, app, [offer for offer in offers if offer.active])
 
     def _take_offers(self, item: Item, app: str, offers: Sequence[Offer]) -> None:
@@ -316,7 +317,13 @@ class P4RuntimeCtrlService:
             for name, agent in self._agents.items():
                 everything = key_of("packets", name, ALL)
                 wanted = (*keys, everything) if self._engine.wanted(everything) else keys
-                demand = demand_for(name, wanted, self._offers, by_digest=self._by_digest[name])
+                demand = demand_for(
+                    name,
+                    wanted,
+                    self._offers,
+                    by_digest=self._by_digest[name],
+                    last_port=self._last_port,
+                )
                 if demand != self._asked.get(name):
                     self._asked[name] = demand
                     agent.want(demand)

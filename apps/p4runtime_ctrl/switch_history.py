@@ -7,7 +7,7 @@ from typing import Final
 from apps.messages import Decision, Intake, TableCommand, read_latest
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
 from apps.p4runtime_ctrl.state.heard_decisions import HeardDecisions
-from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for
+from apps.p4runtime_ctrl.state.history import DECISIONS, LONGEST_S, commands_of, decisions_for, in_order
 from due import Engine, Item
 
 _RESTORED: Final = 100_000
@@ -32,27 +32,27 @@ class SwitchHistory:
         self._mine = mine
         self._intake = intake
         self._decisions = HeardDecisions()
-        self._commands: deque[TableCommand] = deque(maxlen=_COMMANDS)
+        self._commands: deque[tuple[int, TableCommand]] = deque(maxlen=_COMMANDS)
 
-    def heard(self, decision: Decision) -> None:
-        """Note a decision that was heard live."""
-        self._decisions.hear(decision)
+    def heard(self, decision: Decision, at: int) -> None:
+        """Note a decision that was heard live, and when it was written."""
+        self._decisions.hear(decision, at)
 
-    def heard_command(self, command: TableCommand) -> None:
-        """Note a command that was heard live, where the archive may be behind it."""
-        self._commands.append(command)
+    def heard_command(self, command: TableCommand, at: int) -> None:
+        """Note a command that was heard live, where the archive may be behind it, and when it was written."""
+        self._commands.append((at, command))
 
-    def read(self) -> tuple[list[Decision], list[TableCommand]]:
+    def read(self) -> list[Decision | TableCommand]:
         """Decisions and commands that may be in force, oldest first; none if the settings say so."""
         if not self._settings.restore:
-            return [], []
+            return []
         since = self._settings.restore_since
         recently = max(since, time.time_ns() - LONGEST_S * 1_000_000_000)
         items = [item for key in DECISIONS for item in self._archived(key, recently)]
         decisions = decisions_for(self._mine.name, items, list(self._decisions), since, self._intake)
         archived = self._archived(f"network.p4_command.*.{self._mine.name}", since)
         commands = commands_of(archived, since, self._intake)
-        return [] if self._mine.mirror else decisions, [*commands, *self._commands]
+        return in_order([] if self._mine.mirror else decisions, [*commands, *self._commands])
 
     def _archived(self, key: str, since: int) -> list[Item]:
         return read_latest(self._engine, {"dataKey": key}, since, _RESTORED)

@@ -55,8 +55,6 @@ _UNCONFIRMED_S: Final = 15.0
 """What the primary controller of a switch has not confirmed after once or twice this time, it confirms no more."""
 
 Connect = Callable[[Listener], Connection]
-
-
 _Job = Callable[[], None]
 
 
@@ -81,25 +79,23 @@ class SwitchWorker:
         self._mine = mine
         self._settings = settings
         self._program = program
-        times = CaptureTimes.load(Path(mine.capture_times)) if mine.capture_times else None
         self._outbound = PacketPublisher(
             mine.name,
             self._program,
             mine.base_us,
             self._publish,
             by_digest=settings.by_digest(mine),
-            times=times,
+            times=CaptureTimes.load(Path(mine.capture_times)) if mine.capture_times else None,
         )
         self._progress = self._outbound.progress
         self._packet_outs = PacketOuts(self._program, mine.base_us)
         self._sent = {"cells_asked": 0, "frames_sent": 0, "packet_outs_refused": 0}
         self._program_name = Path(settings.program).name
-        forward = {int(port): egress for port, egress in mine.forward.items()}
         self._switch = DesiredSwitch(
             mine.name,
             self._program,
             self._now,
-            forward=forward,
+            forward={int(port): egress for port, egress in mine.forward.items()},
             fail=mine.fail,
             guard=settings.guard,
             learn=mine.learn,
@@ -136,6 +132,7 @@ class SwitchWorker:
         lossless = mine.clock == "packets" and mine.target == "embedded"
         self._settle_s = _SETTLE_LOSSLESS_S if lossless else _SETTLE_S
         self._secret_at = float("-inf")
+        self._left_out: list[str] = []
         self._stated = (0, 0, 0.0)
         self._change = "starting"
         self._brought_up_ms = 0.0
@@ -178,17 +175,17 @@ class SwitchWorker:
         self._worker.join(timeout=self._settings.timeout_s * 2)
         self._connection.close()
 
-    def decide(self, decision: Decision) -> None:
-        """Queue a decision; a switch that sees copies only carries none out: a counter would claim a stop."""
+    def decide(self, decision: Decision, at: int) -> None:
+        """Queue a decision, and when it was written; a mirror carries none out: its counter would claim a stop."""
         if self._mine.mirror:
             return
-        self._history.heard(decision)
+        self._history.heard(decision, at)
         self._urgent.append(decision)
         self._put(self._decide)
 
-    def command(self, command: TableCommand) -> None:
+    def command(self, command: TableCommand, at: int) -> None:
         if self._duty.divided:
-            self._history.heard_command(command)
+            self._history.heard_command(command, at)
         self._put(partial(self._command, command))
 
     def want(self, demand: Demand) -> None:
@@ -444,12 +441,15 @@ class SwitchWorker:
 
     def _want(self, demand: Demand) -> None:
         """Unwanted keys are no longer published; new keys are, before they are requested of the switch."""
-        self._outbound.route(demand)
+        fit, left_out = self._switch.fitting(demand.requests)
+        news = [f"no telemetry {name}: {why}" for name, why in left_out.items() if name not in self._left_out]
+        self._left_out = list(left_out)
+        self._outbound.route(demand.only(fit))
         self._telemetry_counters.wanted = demand.counters
-        for text in self._switch.want(demand.requests, self._session):
+        for text in [*news, *self._switch.want(fit, self._session)]:
             _LOG.error("%s: %s", self.name, text)
-        names = ", ".join(each.name for each in demand.requests if each not in FALLBACK) or "nothing"
-        self._say(f"telemetry: {names}")
+        names = ", ".join(each.name for each in fit if each not in FALLBACK) or "nothing"
+        self._say(f"telemetry: {names}" + (f"; left out: {', '.join(left_out)}" if left_out else ""))
 
     def _expire(self, entries: Iterable[Any]) -> None:
         if self._session is not None:
@@ -553,6 +553,7 @@ class SwitchWorker:
             "mirror": self._mine.mirror,
             "fail": self._mine.fail,
             "telemetry": [each.name for each in self._switch.requests or () if each not in FALLBACK],
+            "left_out": self._left_out,
             "packet_in": self._progress.received,
             "digests": self._progress.reported,
             "fell_back": self._outbound.fell_back,
@@ -581,16 +582,17 @@ class SwitchWorker:
     def _restore(self) -> None:
         """Restore the desired state from Data Archives and from items received since."""
         try:
-            decisions, commands = self._history.read()
+            history = self._history.read()
         except BackendError as error:
             if not (self._was_backup and self._duty.divided):
                 raise
             # every decision was heard here, too
             _LOG.warning("%s: taken over without the archive, which cannot be read: %s", self.name, error)
             return
-        for decision in decisions:
-            self._ends.add(decision)
-        for problem in self._switch.restore(decisions, commands):
+        for each in history:
+            if isinstance(each, Decision):
+                self._ends.add(each)
+        for problem in self._switch.restore(history):
             _LOG.warning("%s: not restored: %s", self.name, one_line(problem))
 
 

@@ -3,6 +3,8 @@
 The switch numbers the frames that it copies or reports, in one sequence.  They arrive in two ordered
 streams, packet-ins and digests.  A number is lost when all expected streams have passed it, or when the
 silent one is far behind.
+
+The switch's numbers have 32 bits and skip 0, which says that a frame has none; here they go on behind them.
 """
 
 from itertools import pairwise
@@ -14,8 +16,11 @@ from numpy.typing import NDArray
 from apps.packets import SteadyTime
 
 Source = Literal["packet", "digest"]
-_WRAP: Final = 1 << 32
-_HALF: Final = _WRAP // 2
+WRAP: Final = 1 << 32
+"""The switch's numbers are modulo this."""
+_HALF: Final = WRAP // 2
+_NEAR: Final = 1 << 24
+"""A lower number is taken for one behind the wrap if it is less than this ahead, else for that of a switch that restarted."""
 _STEP_US: Final = 3_600_000_000
 _HORIZON: Final = 1 << 16
 """A stream that is this many numbers behind the other is not waited for."""
@@ -59,8 +64,8 @@ class LossTracker:
 
     @property
     def sequence(self) -> int:
-        """The highest number that has arrived; 0: none yet."""
-        return self._highest or 0
+        """The highest number that has arrived, as the switch wrote it; 0: none yet."""
+        return (self._highest or 0) % WRAP
 
     def rest(self) -> None:
         """Another controller receives the packets from now on: what is missing here from then on is no loss."""
@@ -79,7 +84,10 @@ class LossTracker:
 
     def _join(self) -> None:
         if self._before is not None and self._first is not None:
-            self.unaccounted += max(0, self._first - self._before - 1)
+            missed = self._first - self._before - 1
+            if missed < 0:  # behind the wrap, or the switch has restarted
+                missed = missed % WRAP if missed % WRAP < _NEAR else 0
+            self.unaccounted += missed
             self._before = None
 
     def expect_first(self) -> None:
@@ -127,21 +135,21 @@ class LossTracker:
 
     def _arrive(self, arrival: int) -> None:
         """The newest of both streams: a copy may come after digests of later frames."""
-        if not self._arrived or (arrival - self.arrival) % _WRAP < _HALF:
+        if not self._arrived or (arrival - self.arrival) % WRAP < _HALF:
             self.arrival, self._arrived = arrival, True
 
     def _count(self, source: Source, numbers: NDArray[np.int64]) -> None:
         # after a break in both streams a lower first number means that the switch restarted
-        first = self._highest if self._highest and not self._passed else int(numbers[0]) - 1
+        near = unwrapped(int(numbers[0]), self._highest or 0) - 1
+        first = self._highest if self._highest and not self._passed else near
         before = self._passed.get(source, first)
-        previous = np.concatenate(([before], numbers[:-1]))
-        backwards = np.flatnonzero((numbers - previous) % _WRAP >= _HALF)
+        steps, restarts = steps_ahead(numbers, before)
         start = 0
-        for begin in backwards:
-            self._pass(source, numbers[start:begin])
+        for begin in np.flatnonzero(restarts).tolist():
+            self._pass(source, before + np.cumsum(steps[start:begin]))
             self._begin_anew()
-            start = int(begin)
-        self._pass(source, numbers[start:])
+            start, before, steps[begin] = begin, 0, numbers[begin]
+        self._pass(source, before + np.cumsum(steps[start:]))
 
     def _begin_anew(self) -> None:
         """A switch that counts from 1 again: the numbers before the first to arrive are lost, too."""
@@ -191,7 +199,30 @@ class LossTracker:
         waiting = []
         for first, end in self._gaps:
             over = end if everything else min(end, passed + 1)
-            self._lost += max(0, over - first)
+            self._lost += max(0, _numbers(first, over))
             if max(first, over) < end:
                 waiting.append((max(first, over), end))
         self._gaps = waiting
+
+
+def steps_ahead(numbers: NDArray[np.int64], before: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """How far each of a stream's numbers is ahead of the one before it, and where the switch has restarted.
+
+    Args:
+        numbers: as the switch wrote them.
+        before: the last number of the stream, which may have gone on behind the wrap.
+    """
+    steps = np.diff(numbers, prepend=before) % WRAP
+    lower = np.diff(numbers, prepend=before % WRAP) < 0
+    return steps, (steps >= _HALF) | lower & (steps >= _NEAR)
+
+
+def unwrapped(number: int, highest: int) -> int:
+    """The first number of a stream, in the round of the other stream if it is near that one's highest."""
+    ahead = (number - highest + _HALF) % WRAP - _HALF
+    return highest + ahead if abs(ahead) < _NEAR and highest + ahead > 0 else number
+
+
+def _numbers(first: int, end: int) -> int:
+    """How many numbers the switch gives from the first one up to the end."""
+    return end - first - ((end - 1) // WRAP - (first - 1) // WRAP)

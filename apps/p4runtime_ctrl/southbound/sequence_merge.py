@@ -7,7 +7,8 @@ packet-in, or as both.  A copy has all fields; a digest has them if the switch's
     packet-ins  · · · 4 · 6         (6 is not covered by the parser)
     records     1 2 3 4 5 6 7
 
-A missing number is waited for until it arrives, until both streams have passed it, or until `flush`.
+A missing number is waited for until it arrives, until both streams have passed it, or until `flush`.  The switch's
+numbers have 32 bits and skip 0; between arrival and record they go on behind them.
 """
 
 from dataclasses import dataclass
@@ -17,13 +18,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.p4runtime_ctrl.southbound.loss_tracker import Source
+from apps.p4runtime_ctrl.southbound.loss_tracker import WRAP, Source, steps_ahead, unwrapped
 from apps.p4runtime_ctrl.southbound.rows import has_bit
 from due import RecordBatch
 
 _LONGEST: Final = 1 << 16
 """Most rows that wait."""
-_WRAP: Final = 1 << 32
+_ALL: Final = 1 << 62
+"""No number is higher."""
 
 _Columns = dict[str, NDArray[Any]]
 
@@ -42,6 +44,10 @@ class PacketRows:
     @property
     def sequence(self) -> NDArray[np.int64]:
         return self.columns["sequence"].astype(np.int64)
+
+    def numbered(self, numbers: NDArray[np.int64]) -> "PacketRows":
+        """The same rows with other numbers."""
+        return PacketRows(self.columns | {"sequence": numbers.astype(np.uint64)}, self.queries, self.whole)
 
     def only(self, rows: NDArray[Any] | slice) -> "PacketRows":
         columns = {name: column[rows] for name, column in self.columns.items()}
@@ -126,7 +132,7 @@ class SequenceMerger:
     def flush(self) -> list[PacketRows]:
         """Return all waiting rows and give up missing numbers."""
         before, self._follows = 0 if self._follows else self._told, False
-        told = self._tell(_WRAP)
+        told = self._tell(_ALL)
         if told:
             first = before + 1 if before else int(told[0].sequence[0])
             self.skipped += self._told + 1 - first - sum(map(len, told))
@@ -134,29 +140,35 @@ class SequenceMerger:
 
     def _take(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
         if self._is_next(rows):
-            self._told = self._passed[stream] = self._told + len(rows)
+            self._told = self._passed[stream] = _next(self._told) - 1 + len(rows)
             self.copies += len(rows) if stream == "packet" else 0
             return [rows]
         rows = rows.where(rows.sequence != 0)
         if not len(rows):
             return []
-        back = np.flatnonzero(np.diff(rows.sequence, prepend=self._passed[stream]) <= 0)
+        numbers = rows.sequence
+        before = self._passed[stream] or unwrapped(int(numbers[0]), self._told) - 1
+        steps, restarts = steps_ahead(numbers, before)
+        back = np.flatnonzero(restarts | (steps == 0))
         if not len(back):
-            return self._follow(stream, rows)
+            return self._follow(stream, _placed(rows, before + np.cumsum(steps)))
         told: list[PacketRows] = []
         for begin, end in pairwise(sorted({0, *back.tolist(), len(rows)})):
             if begin in back:  # the switch counts from 1 again
                 told += self.flush()
                 self._passed = dict.fromkeys(self._passed, 0)
-                self._told = 0
-            told += self._follow(stream, rows.only(slice(begin, end)))
+                self._told = before = 0
+                steps[begin] = numbers[begin]
+            part = slice(begin, end)
+            told += self._follow(stream, _placed(rows.only(part), before + np.cumsum(steps[part])))
         return told
 
     def _is_next(self, rows: PacketRows) -> bool:
         """The usual case: nothing waits, nothing is missing."""
         if len(self) or not len(rows) or not rows.whole.all():
             return False
-        return bool((rows.sequence == np.arange(self._told + 1, self._told + 1 + len(rows))).all())
+        first = _next(self._told) % WRAP
+        return bool((rows.sequence == np.arange(first, first + len(rows))).all())
 
     def _follow(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
         self._passed[stream] = int(rows.sequence[-1])
@@ -167,7 +179,7 @@ class SequenceMerger:
 
     def _decided(self) -> int:
         """The highest number up to which each number has arrived or is given up."""
-        both = max(self._told, min(self._passed.values()))
+        both = _next(max(self._told, min(self._passed.values()))) - 1
         there = [rows.sequence[rows.whole] for rows in self._held.values() if rows is not None and len(rows)]
         later = [numbers[numbers > both] for numbers in there]
         # each of them is in order already: merging them is faster than np.unique, which hashes
@@ -187,7 +199,10 @@ class SequenceMerger:
         self._told = max(self._told, min(end, max(self._passed.values())))
         chosen = {stream: rows for stream, rows in chosen.items() if len(rows)}
         self.copies += len(chosen.get("packet", ()))
-        return [self._merged(**chosen)] if len(chosen) > 1 else list(chosen.values())
+        found = [self._merged(**chosen)] if len(chosen) > 1 else list(chosen.values())
+        if self._told < WRAP:
+            return found
+        return [rows.numbered(rows.sequence % WRAP) for rows in found]
 
     def _merged(self, packet: PacketRows, digest: PacketRows) -> PacketRows:
         known, numbers = packet.sequence, digest.sequence
@@ -197,6 +212,16 @@ class SequenceMerger:
         place = np.minimum(np.searchsorted(known, numbers), len(known) - 1)
         rows = _joined(packet, digest.where(known[place] != numbers))
         return rows.only(np.argsort(rows.sequence, kind="stable"))
+
+
+def _next(number: int) -> int:
+    """The number after one: none is 0 modulo 2^32."""
+    return number + 1 + ((number + 1) % WRAP == 0)
+
+
+def _placed(rows: PacketRows, numbers: NDArray[np.int64]) -> PacketRows:
+    """The rows with numbers that go on behind the wrap."""
+    return rows if int(numbers[-1]) < WRAP else rows.numbered(numbers)
 
 
 def _joined(first: PacketRows, second: PacketRows) -> PacketRows:

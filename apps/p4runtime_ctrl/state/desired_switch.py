@@ -142,6 +142,8 @@ class DesiredSwitch:
         self._unconfirmed: dict[bytes, EntryUpdate] = {}
         self._aged: dict[bytes, EntryUpdate] = {}
         """Of those the ones that were there when `age_unconfirmed` was called last."""
+        self._refused: dict[bytes, EntryUpdate] = {}
+        """Updates that the switch refused in part, and may still have the rest of: their slots are not free yet."""
         self._telemetry = EntrySet()
         self._secrets = (0, (0,) * len(SECRET_WORDS))
 
@@ -150,22 +152,37 @@ class DesiredSwitch:
         """Whether any service is protected."""
         return self._entry_updates.guards
 
-    def restore(self, decisions: Iterable[Decision], commands: Iterable[TableCommand]) -> list[str]:
-        """Build the desired state from history, oldest first; returns errors for what did not fit the program."""
+    def restore(self, history: Iterable[Decision | TableCommand]) -> list[str]:
+        """Build the desired state from history, oldest first; returns errors for what did not fit the program.
+
+        Of a command's updates those are left out that the switch must have refused.
+        """
         problems: list[str] = []
-        for decision in decisions:
-            if decision.dry_run:
+        for each in history:
+            if isinstance(each, TableCommand):
+                problems += self._restore_command(each)
+                continue
+            if each.dry_run:
                 continue
             try:
-                self._remember(self._entry_updates.of_decision(decision))
+                self._remember(self._entry_updates.of_decision(each))
             except (EntryError, P4InfoError) as error:
-                problems.append(f"decision {decision.id}: {error}")
-        for command in commands:
-            updates, refused = self._entry_updates.of_command(command)
-            problems += [f"command {command.id}: {reason}" for _, reason in refused]
-            for update in [] if refused else updates:
-                self._remember(update)
+                problems.append(f"decision {each.id}: {error}")
         return problems
+
+    def _restore_command(self, command: TableCommand) -> list[str]:
+        updates, refused = self._entry_updates.of_command(command)
+        for update in [] if refused else updates:
+            if self._was_taken(update.main):
+                self._remember(update)
+        return [f"command {command.id}: {reason}" for _, reason in refused]
+
+    def _was_taken(self, change: Change) -> bool:
+        """Whether a switch with the entries of now takes the change: it inserts no entry twice, and modifies none that is missing."""
+        held = self._desired.get(change.entry)
+        if change.kind == INSERT:
+            return held is None or held.idle_timeout_ns > 0  # that one may have expired meanwhile
+        return held is not None or is_standing(change.entry)
 
     def bring_up(self, transport: Transport) -> BringUp:
         """Read, compare, write the difference in one batch."""
@@ -191,7 +208,8 @@ class DesiredSwitch:
         for change, outcome in zip(changes, transport.write(changes) if changes else [], strict=True):
             self._note(report, change, outcome)
         self._telemetry = telemetry if self.requests is None else self._classifier.entries(self.requests)
-        report.confirmations = self._confirm_pending(report)
+        self._free_slots(report)
+        report.confirmations = self._confirm_pending(report, transport)
         return report
 
     def decide(self, decisions: Sequence[Decision], transport: Transport | None) -> list[Confirmation]:
@@ -216,6 +234,16 @@ class DesiredSwitch:
         if refused:
             return [self._confirmation(owner, "failed", cause=reason) for owner, reason in refused]
         return self._carry_out(updates, transport)
+
+    def fitting(self, requests: Sequence[TelemetryRequest]) -> tuple[list[TelemetryRequest], dict[str, str]]:
+        """The telemetry requests that can be held together; those in force take precedence.
+
+        Returns:
+            Those that can be held, in their order; name to reason of the others.
+        """
+        in_force = self.requests or ()
+        fit, left_out = self._classifier.fitting(sorted(requests, key=lambda each: each not in in_force))
+        return [each for each in requests if each in fit], left_out
 
     def want(self, requests: Sequence[TelemetryRequest], transport: Transport | None) -> list[str]:
         """Change the telemetry requests; returns what the switch refused.
@@ -372,7 +400,7 @@ class DesiredSwitch:
         else:
             report.removed += 1
 
-    def _confirm_pending(self, report: BringUp) -> list[Confirmation]:
+    def _confirm_pending(self, report: BringUp, transport: Transport) -> list[Confirmation]:
         """Confirm postponed updates as done or failed."""
         pending, self._unconfirmed = self._unconfirmed, {}
         answers = []
@@ -381,7 +409,7 @@ class DesiredSwitch:
             cause = report.failed.get(key)
             state: State = "failed" if cause else done
             if cause and update.main.kind != DELETE:
-                self._give_up(update)
+                self._give_up(update, transport)
             text = cause or "done when the switch was connected again"
             answers.append(self._confirmation(update.owner, state, update.main.entry, cause=text))
         return answers
@@ -423,7 +451,8 @@ class DesiredSwitch:
             outcomes = iter(transport.write([change for update in updates for change in update.changes]))
         except SwitchError as error:
             return [self._postpone(update, str(error)) for update in updates]
-        return [self._conclude(update, [next(outcomes) for _ in update.changes]) for update in updates]
+        each = [(update, [next(outcomes) for _ in update.changes]) for update in updates]
+        return [self._conclude(update, said, transport) for update, said in each]
 
     def _postpone(self, update: EntryUpdate, cause: str) -> Confirmation:
         """Kept as desired; written and confirmed when the switch is connected again."""
@@ -432,12 +461,16 @@ class DesiredSwitch:
         text = f"{cause}; it is kept, and written when the switch is connected again"
         return self._confirmation(update.owner, "pending", update.main.entry, cause=text)
 
-    def _conclude(self, update: EntryUpdate, outcomes: list[UpdateOutcome]) -> Confirmation:
+    def _conclude(
+        self, update: EntryUpdate, outcomes: list[UpdateOutcome], transport: Transport
+    ) -> Confirmation:
         main = update.main
         results = list(zip(update.changes, outcomes, strict=True))
         bad = [(change, outcome) for change, outcome in results if not _achieved(change, outcome)]
         if bad:
-            self._entry_updates.give_up(update)
+            taken = [change for change, outcome in results if _achieved(change, outcome)]
+            new = [change for change in taken if change.entry not in self._desired]
+            self._take_back(update, new, transport)
             return self._confirmation(update.owner, "failed", bad[0][0].entry, cause=bad[0][1].message)
         said = next(outcome for change, outcome in results if change is main)
         if main.kind == DELETE:
@@ -450,11 +483,33 @@ class DesiredSwitch:
         self._remember(update)
         return self._confirmation(update.owner, "installed", main.entry)
 
-    def _give_up(self, update: EntryUpdate) -> None:
+    def _give_up(self, update: EntryUpdate, transport: Transport) -> None:
         """What the switch has refused is not tried at each connection: nobody holds it to be in force."""
-        self._entry_updates.give_up(update)
-        for change in update.changes:
+        changes = self._entry_updates.own_changes(update)
+        for change in changes:
             self._forget(change.entry)
+        self._take_back(update, changes if len(changes) > 1 else [], transport)
+
+    def _take_back(self, update: EntryUpdate, taken: Sequence[Change], transport: Transport) -> None:
+        """Delete what the switch has taken of a refused update; until that is gone nobody else gets its slot."""
+        changes = [deletion(change.entry) for change in reversed(taken) if change.kind == INSERT]
+        try:
+            outcomes = transport.write(changes) if changes else []
+        except SwitchError:
+            outcomes = []
+        if len(outcomes) < len(changes) or not all(map(_achieved, changes, outcomes)):
+            self._refused[entry_key(update.main.entry)] = update
+        elif update.main.entry not in self._desired:  # otherwise it was in force before
+            self._entry_updates.give_up(update)
+
+    def _free_slots(self, report: BringUp) -> None:
+        """Reconciliation has removed what was left of refused updates, unless the switch refused that, too."""
+        refused, self._refused = self._refused, {}
+        for key, update in refused.items():
+            if update.keys & report.failed.keys():
+                self._refused[key] = update
+            elif update.main.entry not in self._desired:
+                self._entry_updates.give_up(update)
 
     def _kept(self, update: EntryUpdate, said: str) -> str:
         """The existing entry stays; returns the text for the confirmation."""

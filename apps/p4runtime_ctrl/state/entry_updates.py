@@ -82,8 +82,7 @@ class EntryUpdates:
         if decision.action == "protect":
             changes = guard.protection(self._program, service, self._slot(service), self._settings)
         else:
-            others = [each for each in self._slots if each[0] == service[0] and each != service]
-            changes = guard.release(self._program, service, last_of_host=not others)
+            changes = guard.release(self._program, service, last_of_host=not self._others(service))
             self._slots.pop(service, None)
         return EntryUpdate(owner, tuple(changes), service)
 
@@ -98,6 +97,13 @@ class EntryUpdates:
             except EntryError as error:
                 refused.append((owner, str(error)))
         return updates, refused
+
+    def own_changes(self, update: EntryUpdate) -> list[Change]:
+        """The changes of an update that no other one needs."""
+        if update.service is None or not self._others(update.service):
+            return list(update.changes)
+        host = entry_key(guard.host_entry(self._program, update.service[0]))
+        return [change for change in update.changes if entry_key(change.entry) != host]
 
     def give_up(self, update: EntryUpdate) -> None:
         """The switch refused the update: free its slot."""
@@ -121,6 +127,10 @@ class EntryUpdates:
         else:
             raise EntryError(f"no rate limit of {limit.words} towards {target.address} is in force")
         return EntryUpdate(owner, tuple(changes), limit=key)
+
+    def _others(self, service: Service) -> bool:
+        """Whether another service of its host is protected."""
+        return any(each[0] == service[0] and each != service for each in self._slots)
 
     def _slot(self, service: Service) -> int:
         if service not in self._slots:

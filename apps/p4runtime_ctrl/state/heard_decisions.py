@@ -8,6 +8,7 @@ A lift is needed as long as the archive may have what it lifts, and not the lift
 
 from collections import OrderedDict
 from collections.abc import Iterator
+from operator import itemgetter
 from typing import Final
 
 from apps.messages import Decision
@@ -22,48 +23,45 @@ _SECOND: Final = 1_000_000_000
 
 _Name = tuple[str, str]
 """Id and switch: a guard is told to each switch that comes, under the same id."""
+_Heard = tuple[int, int, Decision]
+"""Place in the order of hearing, and when it was written."""
 
 
 class HeardDecisions:
     """The last word about each decision, without what led to it."""
 
     def __init__(self) -> None:
-        self._standing: OrderedDict[_Name, tuple[int, Decision]] = OrderedDict()
-        """And the place in the order of hearing, as of the lifts."""
-        self._lifts: OrderedDict[_Name, tuple[int, Decision]] = OrderedDict()
+        self._standing: OrderedDict[_Name, _Heard] = OrderedDict()
+        self._lifts: OrderedDict[_Name, _Heard] = OrderedDict()
         self._heard = 0
 
     def __len__(self) -> int:
         return len(self._standing) + len(self._lifts)
 
-    def __iter__(self) -> Iterator[Decision]:
-        """In the order of hearing."""
-        return (
-            decision for _, decision in sorted([*self._standing.values(), *self._lifts.values()], key=_place)
-        )
+    def __iter__(self) -> Iterator[tuple[int, Decision]]:
+        """When each was written, and the decision, in the order of hearing."""
+        heard = sorted([*self._standing.values(), *self._lifts.values()], key=itemgetter(0))
+        return ((at, decision) for _, at, decision in heard)
 
-    def hear(self, decision: Decision) -> None:
+    def hear(self, decision: Decision, at: int = 0) -> None:
         """Take a decision.
 
         Args:
             decision: as it was heard.
+            at: when it was written, wall time, ns.
         """
         self._heard += 1
         name = decision.id, decision.switch
         self._standing.pop(name, None)
         self._lifts.pop(name, None)
         kept = self._standing if decision.action in STANDING else self._lifts
-        kept[name] = self._heard, as_remembered(decision)
+        kept[name] = self._heard, at, as_remembered(decision)
         while len(kept) > MOST:
             kept.popitem(last=False)
         while self._lifts and _time(self._lifts) < decision.event_time - LIFTS_HELD_S * _SECOND:
             self._lifts.popitem(last=False)
 
 
-def _place(held: tuple[int, Decision]) -> int:
-    return held[0]
-
-
-def _time(lifts: OrderedDict[_Name, tuple[int, Decision]]) -> int:
-    _, oldest = next(iter(lifts.values()))
+def _time(lifts: OrderedDict[_Name, _Heard]) -> int:
+    *_, oldest = next(iter(lifts.values()))
     return oldest.event_time

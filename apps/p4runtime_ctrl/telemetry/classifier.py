@@ -10,6 +10,7 @@ order, so that no packet meets half a request.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 import msgspec
@@ -76,15 +77,40 @@ class Classifier:
         self._closures = {table.id: Closure(limit=table.size, where=table.name) for table in self._tables}
         self.table_ids = frozenset(table.id for table in (*self._tables, self._active))
 
+    @property
+    def last_port(self) -> int:
+        """The highest ingress port that a condition can name; -1 if the program matches none."""
+        fields = (field for table in self._tables for field in table.fields)
+        return max(((1 << field.width) - 1 for field in fields if field.name == "ingress_port"), default=-1)
+
+    def fitting(self, requests: Sequence[TelemetryRequest]) -> tuple[list[TelemetryRequest], dict[str, str]]:
+        """The requests that the tables can hold together, earlier ones first; and why each of the others is left out.
+
+        Returns:
+            Those that fit, in their order; name to reason of the others.
+        """
+        with suppress(EntryError, TelemetryError):
+            self._check(requests)
+            return list(requests), {}
+        fit: list[TelemetryRequest] = []
+        left_out: dict[str, str] = {}
+        for request in requests:
+            try:
+                self._check([*fit, request])
+            except (EntryError, TelemetryError) as error:
+                left_out[request.name] = str(error)
+            else:
+                fit.append(request)
+        return fit, left_out
+
     def entries(self, requests: Sequence[TelemetryRequest]) -> EntrySet:
         """All entries and default actions that the requests need.
 
         Raises `TelemetryError` where two requests share a bit or a table is too small, `EntryError`
         for a condition that the classifier cannot express.
         """
-        _check_bits(requests)
+        conditions = self._check(requests)
         requests = [request for request in requests if not request.by_stage]
-        conditions = [self._assign(request) for request in requests]
         found = EntrySet([self._active_entry(requests)])
         for table in self._tables:
             regions = [given.get(table.id) for given in conditions]
@@ -122,6 +148,14 @@ class Classifier:
         action = self._active.default_actions[0]
         update = TableUpdate(kind="modify", table=self._active.name, action=action.name, params=maps)
         return self._program.entry(update)
+
+    def _check(self, requests: Sequence[TelemetryRequest]) -> list[dict[int, MatchRegion]]:
+        """Conditions by table, of each request that has some here; raises as `entries` does."""
+        _check_bits(requests)
+        conditions = [self._assign(request) for request in requests if not request.by_stage]
+        for table in self._tables:
+            self._closures[table.id].of(given[table.id] for given in conditions if table.id in given)
+        return conditions
 
     def _assign(self, request: TelemetryRequest) -> dict[int, MatchRegion]:
         """Conditions of a request by table; one that fits several tables goes to the first."""

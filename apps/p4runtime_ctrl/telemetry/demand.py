@@ -15,7 +15,7 @@ A key with a wildcard in its last segment follows `all` only: the others hold th
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -32,6 +32,8 @@ KINDS: Final[tuple[Kind, ...]] = ("packets", "frames", "digests", "counts")
 COUNTERS: Final = "telemetry_counters"
 APP: Final = "p4runtime_ctrl"
 ALL: Final = "all"
+_LAST_PORT: Final = 511
+"""Of v1model, whose ports have 9 bits."""
 _PORT_BITS: Final = 47
 """Bits 208-254 are for ports, 200-207 for frames that digests do not cover; queries of other apps use 0-199."""
 QUERY_BITS: Final = 200
@@ -138,19 +140,33 @@ class Demand:
     def to(self, kind: Kind) -> dict[str, int]:
         return self.routes.get(kind, {})
 
+    def only(self, requests: Iterable[TelemetryRequest]) -> "Demand":
+        """What is left of it if only these of its requests are carried out."""
+        kept = tuple(requests)
+        bits = {request.bit for request in kept}
+        routes = {
+            kind: {which: bit for which, bit in to.items() if bit in bits} for kind, to in self.routes.items()
+        }
+        return replace(self, requests=kept, routes=routes)
+
 
 def demand_for(
-    switch: str, wanted: Iterable[str], offers: Mapping[str, Offer], *, by_digest: bool = False
+    switch: str,
+    wanted: Iterable[str],
+    offers: Mapping[str, Offer],
+    *,
+    by_digest: bool = False,
+    last_port: int = _LAST_PORT,
 ) -> Demand:
     """The demand on one switch from the wanted keys.
 
     `by_digest`: record batches are made from digests, and frames are copied only for who wants frames,
-    or if the digest is incomplete.
+    or if the digest is incomplete.  `last_port`: a key of a higher port gets no packets.
     """
     keys = [Key.parse(text) for text in wanted]
     data = [key for key in keys if key.segments[1:2] != (COUNTERS,)]
     named = sorted({key.segments[-1] for key in data} - {"*", "**", ALL})
-    ports = [name for name in named if name.isdecimal()][:_PORT_BITS]
+    ports = [name for name in named if name.isdecimal() and int(name) <= last_port][:_PORT_BITS]
     known = {ALL: TelemetryRequest(name="packets", bit=EVERY_PACKET)}
     for bit, port in enumerate(sorted(ports, key=int), start=EVERY_PACKET - len(ports)):
         known[port] = TelemetryRequest(name=f"port{port}", bit=bit, conditions={"ingress_port": int(port)})

@@ -31,10 +31,10 @@ def test_decisions_that_follow_each_other_are_counted_together(monkeypatch):
     one.start(active=True)
     one.became_primary(switch)
     wait_for(one.settled.is_set)
-    one.decide(decision(1))
+    one.decide(decision(1), 1)
     wait_for(lambda: set(engine.counted()) == {"d1"}, 60)
     for number in range(2, 6):
-        one.decide(decision(number, address=f"10.0.0.{number}"))
+        one.decide(decision(number, address=f"10.0.0.{number}"), number)
     wait_for(lambda: ("d5", "installed") in engine.confirmed(), 60)
     assert switch.readings == 1
     monkeypatch.setattr(counter_reads, "_CALM_S", 0.0)

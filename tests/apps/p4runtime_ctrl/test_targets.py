@@ -257,7 +257,7 @@ def test_a_rate_limit_of_the_archive_is_written_by_a_controller_that_is_started_
     attached.connection.close()
     again = make()
     faster = structs.replace(LIMIT, rate=400, spared=LIMIT.spared[:1])
-    assert not again.restore([decision(3, "meter", LIMITED, faster)], ())
+    assert not again.restore([decision(3, "meter", LIMITED, faster)])
     report = attach(again, rank=2).until_up()
     assert not report.failed
     assert (report.modified, report.removed) == (2, 1)

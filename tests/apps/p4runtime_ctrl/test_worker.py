@@ -3,6 +3,8 @@
 import threading
 
 from apps.p4runtime_ctrl.settings import Settings, SwitchSettings
+from apps.p4runtime_ctrl.telemetry.classifier import TelemetryRequest
+from apps.p4runtime_ctrl.telemetry.demand import Demand
 from apps.p4runtime_ctrl.worker import SwitchWorker
 from sdnator.testing.product_program import program
 from sdnator.testing.waiting import wait_for
@@ -70,9 +72,9 @@ def test_a_decision_does_not_wait_for_counters():
     agent = SwitchWorker(engine, settings, MINE, program(), Connected)
     agent.start(active=True)
     agent.became_primary(switch)
-    agent.decide(decision(1))
+    agent.decide(decision(1), 1)
     assert switch.asked.wait(60)
-    agent.decide(decision(2, address="10.0.0.2"))
+    agent.decide(decision(2, address="10.0.0.2"), 2)
     wait_for(lambda: ("d2", "installed") in engine.confirmed(), 60)
     assert not engine.counted()
     switch.let.set()
@@ -89,7 +91,7 @@ def test_a_switch_that_sees_copies_only_carries_no_decision_out():
     agent.start(active=True)
     try:
         agent.became_primary(Held())  # type: ignore[arg-type]
-        agent.decide(decision(1))
+        agent.decide(decision(1), 1)
         agent.say_again()
         wait_for(lambda: [value for key, value in engine.items if ".switch." in key and value["primary"]])
         assert agent.health()["mirror"] is True
@@ -112,5 +114,26 @@ def test_time_of_a_silent_live_switch_goes_on():
 
     try:
         wait_for(ticked, 60)
+    finally:
+        agent.stop()
+
+
+def test_what_the_switch_cannot_hold_is_named_and_takes_nothing_from_others(caplog):
+    engine = Written()
+    settings = Settings(switches=(MINE,), program="", p4info="", restore=False)
+    agent = SwitchWorker(engine, settings, MINE, program(), Connected)
+    agent.start(active=True)
+    everything = TelemetryRequest(name="packets", bit=255)
+    impossible = TelemetryRequest(name="far", bit=3, conditions={"ingress_port": 600})
+    routes = {"packets": {"all": 255, "far": 3}}
+    try:
+        agent.became_primary(Held())
+        agent.want(Demand((everything, impossible), routes))
+        wait_for(lambda: agent.health()["telemetry"] == ["packets"], 60)
+        wait_for(lambda: "left out: far" in agent.health()["change"], 60)
+        assert agent.health()["left_out"] == ["far"]
+        assert "far: ingress.telemetry_link ingress_port: 600 does not fit" in caplog.text
+        agent.want(Demand((everything,)))
+        wait_for(lambda: agent.health()["left_out"] == [], 60)
     finally:
         agent.stop()

@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 
 from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker
 
+WRAP = 1 << 32
+
 
 def note(progress, numbers, source="packets"):
     sequence = np.array(numbers, dtype=np.uint64)
@@ -24,6 +26,10 @@ def note(progress, numbers, source="packets"):
         (False, [[900, 901, 1, 2]], 0, 1),
         (False, [[900, 901], [4]], 3, 1),
         (False, [[9], [3, 1], [2]], 2, 2),
+        (False, [[WRAP - 2, WRAP - 1, 1, 2], [5000], [2_000_000]], 4_997 + 1_994_999, 0),
+        (False, [[WRAP - 2], [WRAP - 1], [3]], 2, 0),
+        (False, [[WRAP - 3], [2]], 3, 0),
+        (False, [[3_000_000_000], [1, 2], [4]], 1, 1),
     ],
 )  # fmt: skip
 def test_one_stream(fresh, batches, lost, restarts):
@@ -133,8 +139,27 @@ def test_what_another_controller_received_meanwhile_is_no_loss():
     assert (progress.lost, progress.unaccounted, progress.restarts) == (2, 0, 0)
 
 
-def test_a_switch_that_counts_from_one_again_behind_another_controller_has_nothing_unaccounted():
+@pytest.mark.parametrize("before", [5_000, 3_000_000_000])
+def test_a_switch_that_counts_from_one_again_behind_another_controller_has_nothing_unaccounted(before):
     progress = LossTracker()
-    progress.follow(5_000)
+    progress.follow(before)
     note(progress, [1, 2])
     assert (progress.lost, progress.unaccounted) == (0, 0)
+
+
+def test_two_streams_wrap_around_one_after_the_other():
+    progress = LossTracker()
+    progress.expected = frozenset(("packet", "digest"))
+    note(progress, [WRAP - 5, WRAP - 4, WRAP - 2], "digests")
+    note(progress, [WRAP - 1, 2, 4], "digests")
+    note(progress, [WRAP - 3, 1])
+    note(progress, [5])
+    note(progress, [6], "digests")
+    assert (progress.lost, progress.restarts, progress.sequence) == (1, 0, 6)
+
+
+def test_behind_another_controller_the_numbers_may_wrap_around():
+    progress = LossTracker()
+    progress.follow(WRAP - 3)
+    note(progress, [2, 3])
+    assert (progress.unaccounted, progress.lost, progress.sequence) == (4, 0, 3)

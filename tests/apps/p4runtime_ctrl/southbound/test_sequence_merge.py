@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from apps.p4runtime_ctrl.southbound.sequence_merge import PacketRows, SequenceMerger
 
 BIT = 255
+WRAP = 1 << 32
 
 
 def rows(numbers, whole=True, mark=0):
@@ -109,3 +110,27 @@ def test_numbers_that_the_controller_before_may_have_told_are_not_called_skipped
     assert not merger.digests(rows([5_014]))
     assert told(merger.flush()) == [5_014]
     assert merger.skipped == 2
+
+
+def test_numbers_that_wrap_around_are_no_restart():
+    """A copy of a frame before the wrap may come after digests of frames behind it."""
+    merger = SequenceMerger()
+    merger.follow(WRAP - 6)
+    assert told(merger.digests(rows([WRAP - 5, WRAP - 4]))) == [WRAP - 5, WRAP - 4]
+    assert told(merger.digests(rows([WRAP - 2, WRAP - 1, 1, 2, 4]))) == []
+    assert merger.waits_for == WRAP - 3
+    found = told(merger.packets(rows([WRAP - 3]))) + told(merger.digests(rows([5])))
+    found += told(merger.packets(rows([3]))) + told(merger.digests(rows([6])))
+    assert found == [WRAP - 3, WRAP - 2, WRAP - 1, 1, 2, 3, 4, 5, 6]
+    assert told(merger.digests(rows([7, 8]))) == [7, 8]
+    assert (len(merger), merger.skipped, merger.copies) == (0, 0, 2)
+    assert told(merger.digests(rows([1, 2]))) == [1, 2]
+
+
+def test_a_stream_without_copies_waits_for_nothing_at_the_wrap():
+    merger = SequenceMerger()
+    merger.follow(WRAP - 3)
+    assert told(merger.digests(rows([WRAP - 2, WRAP - 1]))) == [WRAP - 2, WRAP - 1]
+    assert told(merger.digests(rows([1, 2]))) == [1, 2]
+    assert told(merger.digests(rows([3]))) == [3]
+    assert merger.waits_for == 0

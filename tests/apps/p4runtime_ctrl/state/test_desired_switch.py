@@ -1,6 +1,8 @@
 """A switch is brought to its desired state whatever happened to it, and every decision is confirmed."""
 
-from apps.messages import Decision, TableCommand, TableUpdate, Target
+import pytest
+
+from apps.messages import Decision, RateLimit, TableCommand, TableUpdate, Target
 from apps.p4runtime_ctrl.errors import Unreachable
 from apps.p4runtime_ctrl.state.desired_state import DELETE, INSERT, MODIFY, EntrySet, is_standing
 from apps.p4runtime_ctrl.state.desired_switch import DesiredSwitch, UpdateOutcome
@@ -57,6 +59,8 @@ class Held:
                 return UpdateOutcome(6, "it exists")
             self.entries.put(change.entry)
         elif change.kind == MODIFY:
+            if change.entry not in self.entries:
+                return UpdateOutcome(5, "there is no such entry")
             self.entries.put(change.entry)
         elif change.kind == DELETE and not self.entries.discard(change.entry):
             return UpdateOutcome(5, "there is no such entry")
@@ -143,7 +147,7 @@ def test_dry_runs_leave_no_trace():
     held, switch = Held(), make()
     switch.bring_up(held)
     assert switch.decide([decision(1, dry_run=True)], held) == []
-    assert switch.restore([decision(1, dry_run=True)], []) == []
+    assert switch.restore([decision(1, dry_run=True)]) == []
     assert not switch.blocks
     assert not held.names()
 
@@ -208,7 +212,7 @@ def test_a_restarted_switch_and_a_restarted_controller():
     assert anew.names() == held.names()
     history = [decision(1), decision(2, address="10.0.0.2"), decision(3, "unblock")]
     heir = make(forward={1: 2})
-    assert heir.restore(history, []) == []
+    assert heir.restore(history) == []
     assert str(heir.bring_up(held)) == "nothing to change"
     assert counted(heir, held)[0]["id"] == "d2"
 
@@ -380,3 +384,174 @@ def test_known_sources_are_metered():
     assert said(switch.command(TableCommand(id="c", updates=(update,)), held)) == [("c", "installed")]
     (entry,) = held.entries
     assert entry.meter_config.cir == 20
+
+
+def wire(kind, egress=0, ingress=5):
+    given = {} if kind == "delete" else {"action": "to_port", "params": {"port": egress}}
+    update = TableUpdate(kind=kind, table="forward_port", match={"ingress_port": ingress}, **given)
+    return TableCommand(id=f"{kind}{egress}", updates=(update,))
+
+
+@pytest.mark.parametrize(
+    "commands",
+    [
+        [wire("insert", 6), wire("insert", 7)],
+        [wire("modify", 7)],
+        [wire("insert", 6), wire("modify", 7), wire("insert", 8)],
+        [wire("insert", 6), wire("delete"), wire("modify", 7)],
+        [wire("modify", 6), wire("insert", 7), wire("delete"), wire("insert", 8)],
+    ],
+)
+def test_what_the_switch_had_refused_is_not_carried_out_after_a_restart(commands):
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    for each in commands:
+        switch.command(each, held)
+    heir = make()
+    assert heir.restore(commands) == []
+    assert str(heir.bring_up(held)) == "nothing to change"
+
+
+def test_an_entry_that_may_have_expired_is_inserted_again():
+    """Nothing says when it did: the later insert is the better guess."""
+
+    def known(rate):
+        update = TableUpdate(
+            kind="insert",
+            table="smac",
+            match={"vid": 0, "eth_src": 7},
+            action="known_station",
+            params={"port": rate},
+            idle_timeout_ns=1_000,
+        )
+        return TableCommand(id="c", updates=(update,))
+
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.command(known(1), held)
+    switch.expire(list(held.entries), held)
+    switch.command(known(2), held)
+    heir = make()
+    heir.restore([known(1), known(2)])
+    assert str(heir.bring_up(held)) == "nothing to change"
+
+
+def test_a_block_holds_against_a_command_that_had_deleted_the_one_before_it():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    match = {"is_ipv4": 1, "src": "10.0.0.1"}
+    unblock = TableCommand(id="c", updates=(TableUpdate(kind="delete", table="block_src", match=match),))
+    switch.decide([decision(1)], held)
+    switch.command(unblock, held)
+    switch.decide([decision(2)], held)
+    heir = make()
+    heir.restore([unblock, decision(2)])
+    assert str(heir.bring_up(held)) == "nothing to change"
+    assert heir.blocks == 1
+
+
+def of_ports(count):
+    """With as many VLANs they fill the table of 256 entries: each pair overlaps."""
+    return [TelemetryRequest(name=f"port{n}", bit=n, conditions={"ingress_port": n}) for n in range(count)]
+
+
+def of_vlans(count):
+    return [TelemetryRequest(name=f"vlan{n}", bit=100 + n, conditions={"vid": n}) for n in range(count)]
+
+
+def test_telemetry_in_force_stays_when_more_is_asked_for_than_the_tables_hold():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.want(of_ports(15), held)
+    asked = [*of_vlans(16), *of_ports(15), PACKETS]
+    fit, left_out = switch.fitting(asked)
+    assert fit == [each for each in asked if each.name != "vlan15"]
+    assert list(left_out) == ["vlan15"]
+    assert "has room for 256 conditions" in left_out["vlan15"]
+    assert switch.want(fit, held) == []
+    assert switch.fitting(asked[1:]) == (asked[1:], {})
+
+
+def limit(number, address, action="meter", spared=()):
+    rate = RateLimit(kind="udp", rate=100, spared=spared, spared_rate=50)
+    return decision(number, action, address, limit=rate)
+
+
+SPARED = "ingress.limit_spared[slot=0,is_ipv4=1,src=203.0.113.7]"
+
+
+def limited(address):
+    """What the switch calls the entry of a rate limit."""
+    switch = make()
+    (answer,) = switch.decide([limit(0, address)], None)
+    return answer.handle
+
+
+def test_of_a_rate_limit_that_fails_half_way_nothing_is_left_for_the_next_one():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    held.refuse[limited("10.0.0.1")] = (8, "table is full")
+    assert said(switch.decide([limit(1, "10.0.0.1", spared=("203.0.113.7",))], held)) == [("d1", "failed")]
+    assert not held.names()
+    assert said(switch.decide([limit(2, "10.0.0.2")], held)) == [("d2", "installed")]
+    assert held.names() == {limited("10.0.0.2"), "ingress.limit_over[slot=0]"}
+
+
+def test_a_slot_stays_taken_until_what_was_left_in_it_is_gone():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    held.refuse[limited("10.0.0.1")] = (8, "table is full")
+    take = held.one
+
+    def keeps(change):
+        if change.kind == DELETE and program().describe(change.entry) == SPARED:
+            return UpdateOutcome(2, "not now")
+        return take(change)
+
+    held.one = keeps
+    switch.decide([limit(1, "10.0.0.1", spared=("203.0.113.7",))], held)
+    assert held.names() == {SPARED}
+    switch.decide([limit(2, "10.0.0.2")], held)
+    assert "ingress.limit_over[slot=1]" in held.names()
+    held.one = take
+    assert str(switch.bring_up(held)) == "1 removed"
+    switch.decide([limit(3, "10.0.0.3")], held)
+    assert "ingress.limit_over[slot=0]" in held.names()
+
+
+def test_a_limit_in_force_outlives_the_refusal_of_more_spared_sources():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([limit(1, "10.0.0.1")], held)
+    before = held.names()
+    held.refuse[SPARED] = (8, "table is full")
+    more = switch.decide([limit(2, "10.0.0.1", spared=("203.0.113.8", "203.0.113.7"))], held)
+    assert said(more) == [("d2", "failed")]
+    assert held.names() == before
+    switch.decide([limit(3, "10.0.0.2")], held)
+    assert "ingress.limit_over[slot=1]" in held.names()
+
+
+def test_of_a_rate_limit_that_fails_when_the_switch_is_back_nothing_is_left():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([limit(1, "10.0.0.1", spared=("203.0.113.7",))], None)
+    held.refuse[limited("10.0.0.1")] = (8, "table is full")
+    assert said(switch.bring_up(held).confirmations) == [("d1", "failed")]
+    assert not switch.blocks
+    held.refuse.clear()
+    assert not held.names()
+    assert str(switch.bring_up(held)) == "nothing to change"
+
+
+def test_a_protected_service_keeps_its_host_when_another_one_of_it_is_refused():
+    held, switch = Held(), make()
+    switch.bring_up(held)
+    switch.decide([service(1, "protect", 80)], held)
+    held.refuse["ingress.protect[is_ipv4=1,dst=10.0.0.80,dport=443]"] = (8, "table is full")
+    before = held.names()
+    for transport in (held, None):
+        switch.decide([service(2, "protect", 443)], transport)
+        switch.bring_up(held)
+        assert held.names() == before
+    assert str(switch.bring_up(held)) == "nothing to change"

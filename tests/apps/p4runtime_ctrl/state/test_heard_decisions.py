@@ -23,7 +23,7 @@ def _decision(name, second, *, action="block", switch="*", expires=0):
 
 
 def _words(heard):
-    return [(each.id, each.action, each.expires) for each in heard]
+    return [(each.id, each.action, each.expires) for _, each in heard]
 
 
 def test_the_last_word_about_each_decision_is_kept_in_the_order_of_hearing():
@@ -34,14 +34,14 @@ def test_the_last_word_about_each_decision_is_kept_in_the_order_of_hearing():
     heard.hear(_decision("3", 4))
     heard.hear(_decision("2", 5, action="unblock"))
     assert _words(heard) == [("1", "block", 9), ("3", "block", 0), ("2", "unblock", 0)]
-    assert all(not each.reason for each in heard), "what led to it is not needed"
+    assert all(not each.reason for _, each in heard), "what led to it is not needed"
 
 
 def test_a_guard_that_is_told_to_one_switch_is_kept_for_the_others_too():
     heard = HeardDecisions()
     for switch in ("*", "s2"):
         heard.hear(_decision("1", 1, action="protect", switch=switch))
-    assert {each.switch for each in heard} == {"*", "s2"}
+    assert {each.switch for _, each in heard} == {"*", "s2"}
 
 
 def test_hours_of_blocks_that_end_again_take_no_more_than_one_hour_of_them():
@@ -66,7 +66,7 @@ def test_what_stands_is_kept_however_old_it_is_up_to_a_number():
     for number in range(2, MOST + 2):
         heard.hear(_decision(str(number), 100 * LIFTS_HELD_S))
     assert len(heard) == MOST
-    assert next(iter(heard)).id == "2"
+    assert next(iter(heard))[1].id == "2"
 
 
 def test_a_lift_holds_against_a_block_that_the_archive_has_alone():

@@ -5,7 +5,7 @@ import logging
 from msgspec import structs
 
 from apps.messages import Decision, Exhibit, Ground, Intake, Target
-from apps.p4runtime_ctrl.state.history import as_remembered, commands_of, decisions_for
+from apps.p4runtime_ctrl.state.history import as_remembered, commands_of, decisions_for, in_order
 from due import Item
 
 
@@ -34,9 +34,11 @@ def item(value, timestamp, key="network.block.firewall.ipv4"):
 
 def test_order_identity_and_age():
     archived = [item(decision(n).to_value(), 100 - n) for n in range(5)]
-    recent = [decision(3), decision(9)]
+    recent = [(97, decision(3)), (120, decision(9))]
     found = decisions_for("s1", archived, recent, since=96, intake=intake())
-    assert [each.id for each in found] == ["d3", "d2", "d1", "d0", "d9"]
+    assert [(at, each.id) for at, each in found] == [
+        (97, "d3"), (98, "d2"), (99, "d1"), (100, "d0"), (120, "d9"),
+    ]  # fmt: skip
 
 
 def test_what_led_to_a_decision_is_not_kept_with_it():
@@ -48,21 +50,22 @@ def test_what_led_to_a_decision_is_not_kept_with_it():
     )
     assert as_remembered(heard) == plain
     archived = [item(heard.to_value(), 50), item(decision(4).to_value(), 51)]
-    assert decisions_for("s1", archived, [as_remembered(heard)], 0, intake()) == [plain, decision(4)]
+    found = decisions_for("s1", archived, [(50, as_remembered(heard))], 0, intake())
+    assert found == [(50, plain), (51, decision(4))]
 
 
 def test_what_was_lifted_does_not_come_back():
     """Neither where the archive has no lift yet, nor where a clock that was behind put it first."""
     lift, block = decision(3, action="unblock"), decision(3)
     archived = [item(block.to_value(), 50)]
-    assert decisions_for("s1", archived, [lift], 0, intake()) == [lift]
-    assert decisions_for("s1", [item(lift.to_value(), 7), *archived], [], 0, intake()) == [lift]
+    assert decisions_for("s1", archived, [(60, lift)], 0, intake()) == [(60, lift)]
+    assert decisions_for("s1", [item(lift.to_value(), 7), *archived], [], 0, intake()) == [(7, lift)]
 
 
 def test_other_switches_and_all_switches():
     names = ("s1", "s2", "", "*")
     archived = [item(decision(n, name).to_value(), n + 1) for n, name in enumerate(names)]
-    assert [each.switch for each in decisions_for("s1", archived, [], 0, intake())] == ["s1", "", "*"]
+    assert [each.switch for _, each in decisions_for("s1", archived, [], 0, intake())] == ["s1", "", "*"]
 
 
 def test_what_cannot_be_read_is_left_out(caplog):
@@ -72,5 +75,39 @@ def test_what_cannot_be_read_is_left_out(caplog):
     good = {"id": "c1", "updates": [{"kind": "delete", "table": "t"}]}
     key = "network.p4_command.firewall.s1"
     archived = [item({"no": 1}, 1, key), item(good, 2, key), item(good, 0, key)]
-    assert [command.id for command in commands_of(archived, 1, heard)] == ["c1"]
+    assert [(at, command.id) for at, command in commands_of(archived, 1, heard)] == [(2, "c1")]
     assert heard.health()["refused_by_cause"] == {"fields": 1}
+
+
+def command_item(name, timestamp):
+    value = {"id": name, "updates": [{"kind": "delete", "table": "t"}]}
+    return item(value, timestamp, "network.p4_command.firewall.s1")
+
+
+def test_decisions_and_commands_are_told_in_the_order_in_which_they_were_written():
+    """A command that deleted the entry of a block does not undo a block decided after it."""
+    again = structs.replace(decision(3), id="d9")
+    archived = [
+        item(each.to_value(), at) for each, at in ((decision(3), 10), (again, 2000), (decision(4), 3000))
+    ]
+    decisions = decisions_for("s1", archived, [], 0, intake())
+    commands = commands_of([command_item("c1", 1000), command_item("c2", 2500)], 0, intake())
+    heard_too = commands[-1:]
+    told = in_order(decisions, [*commands, *heard_too])
+    assert [each.id for each in told] == ["c1", "d9", "c2", "d4"]
+
+
+def test_a_decision_that_was_said_again_counts_from_then():
+    archived = [item(decision(3).to_value(), at) for at in (10, 2000)]
+    decisions = decisions_for("s1", archived, [], 0, intake())
+    told = in_order(decisions, commands_of([command_item("c1", 1000)], 0, intake()))
+    assert [each.id for each in told] == ["c1", "d3"]
+
+
+def test_what_stands_comes_behind_the_lifts_of_its_target_whatever_the_clocks():
+    """A firewall whose clock was set back writes a block "before" the lift of the one before it."""
+    block = structs.replace(decision(3), id="d9", event_time=2)
+    archived = [item(decision(3, action="unblock").to_value(), 90), item(block.to_value(), 30)]
+    decisions = decisions_for("s1", archived, [], 0, intake())
+    told = in_order(decisions, commands_of([command_item("c1", 60)], 0, intake()))
+    assert [each.id for each in told] == ["c1", "d3", "d9"]

@@ -179,3 +179,17 @@ def test_what_cannot_be_held_is_refused():
     ]
     with pytest.raises(TelemetryError, match="telemetry_l4 has room for"):
         CLASSIFIER.entries(crossing)
+
+
+def test_what_cannot_be_held_is_left_out_with_its_reason_and_the_rest_fits():
+    good = [TelemetryRequest(name=f"q{bit}", bit=bit, conditions={"dport": bit}) for bit in range(3)]
+    bad = [
+        TelemetryRequest(name="far", bit=7, conditions={"ingress_port": CLASSIFIER.last_port + 1}),
+        TelemetryRequest(name="twice", bit=1),
+        TelemetryRequest(name="odd", bit=8, conditions={"colour": 1}),
+    ]
+    fit, left_out = CLASSIFIER.fitting([*good[:2], *bad, good[2]])
+    assert fit == good
+    assert list(left_out) == ["far", "twice", "odd"]
+    assert "does not fit into 9 bits" in left_out["far"]
+    assert CLASSIFIER.fitting(good) == (good, {})

@@ -65,3 +65,20 @@ def test_offers_are_sent_only_while_observed():
     assert names(demand) == [("report", 8), ("scan", 4)]
     assert demand.to("packets") == {"scan": 4}
     assert demand.to("digests") == demand.to("counts") == {"report": 8}
+
+
+def test_a_port_that_no_switch_has_is_not_requested():
+    wanted = [f"{KEY}.s1.600", f"{KEY}.s1.{'9' * 900}", f"{KEY}.s1.511", f"{KEY}.s1.all"]
+    demand = demand_for("s1", wanted, {})
+    assert names(demand) == [("packets", 255), ("port511", 254)]
+    assert demand.to("packets") == {"all": 255, "511": 254}
+    assert names(demand_for("s1", wanted, {}, last_port=255)) == [("packets", 255)]
+
+
+def test_what_is_left_out_of_a_demand_is_not_published_either():
+    wanted = [f"{KEY}.s1.1", f"{KEY}.s1.all", key_of("frames", "s1", "1"), "network.telemetry_counters.**"]
+    demand = demand_for("s1", wanted, {}, by_digest=True)
+    left = demand.only(request for request in demand.requests if request.name != "port1")
+    assert "port1" not in [name for name, _ in names(left)]
+    assert left.routes == {"packets": {"all": 255}, "frames": {}, "digests": {}, "counts": {}}
+    assert left.counters
