@@ -79,7 +79,7 @@ class InstructionHandler:
 
     def restore(self) -> None:
         """Take up what earlier runs were told, and what they answered."""
-        self._stored.take_up(self._past.answered())
+        self._stored.take_up(self._past.answers())
         self._desk.take_up(history.carried_out(self._past.instructions(), self._stored.carried_out()))
         self._panics.extend(self._past.panics())
 
@@ -114,6 +114,7 @@ class InstructionHandler:
         """A `blocks panic` while Data Updates were unreachable is in the archive only."""
         # the writer's clock may be behind ours, or ours may have been set back
         items = self._archive.look(PANICS, CLOCKS_DIFFER_NS, ARCHIVED_WORD_S)
+        new: list[tuple[Item, Instruction]] = []
         with self._lock:
             for item in items:
                 said = self._intake.read(history.INSTRUCTIONS, Instruction.from_item, item)
@@ -121,7 +122,9 @@ class InstructionHandler:
                     continue
                 self._panics.append(said.id)
                 if said.verb == "panic" and said.id not in self._stored:
-                    self._carry_out(said, item)
+                    new.append((item, said))
+        for item, said in new:
+            self._answer(item, said)  # so that no later start carries it out again
 
     def _answer(self, item: Item, instruction: Instruction) -> None:
         with self._lock:
@@ -147,16 +150,20 @@ class InstructionHandler:
         try:
             return self._decide(instruction, evidence)
         except DueError as error:
+            log.error("%s", one_line(f"instruction {instruction.id} failed: {error}"))  # noqa: TRY400
             return Answer(id=instruction.id, done=False, text=f"failed: {error}")
 
     def _decide(self, instruction: Instruction, evidence: Exhibit) -> Answer:
         decisions, answer = self._desk.carry_out(instruction, evidence, self._now() or evidence.timestamp)
-        for place, decision in enumerate(decisions):
+        failed: DueError | None = None
+        for decision in decisions:
             try:
                 self._publish(decision)
-            except DueError:
-                self._desk.take_back(decisions[place:])
-                raise
+            except DueError as error:
+                self._desk.take_back([decision])
+                failed = failed or error
+        if failed is not None:
+            raise failed
         for lesson in self._lessons.told():
             self._evidence.learnt(lesson)
             self._engine.write(history.lesson_key(lesson), lesson.to_value(), [due.NO_WAIT])

@@ -311,7 +311,7 @@ class FirewallService:
                 if is_prefix(decision.target):
                     self._carry_out_prefix(decision, self._switches)
             over = {each.id for each in restored if self._panicked}
-            over |= {each.id for each in blocks if self._desk.allow.covers_target(each.target)}
+            over |= {each.id for each in blocks if self._desk.spares(each)}
             self._lift(over, "lifted by an operator, or allowed, while history was not known")
 
     def _lift(self, blocks: Iterable[str], reason: str) -> None:
@@ -337,7 +337,8 @@ class FirewallService:
             self._say_notices()
         self._take_up_later()
         self._instructions.answer_earlier()
-        self._instructions.read_archived_words()
+        if self._past.is_taken_up:  # before, it is not known which were carried out, nor what they lift
+            self._instructions.read_archived_words()
         self._announcer.check()
 
     def stop(self) -> None:
@@ -456,9 +457,10 @@ class FirewallService:
             self._enforcers.tell_allowed(self._desk.entries)
 
     def _on_instruction(self, item: Item, instruction: Instruction) -> None:
-        self._instructions.instruct(item, instruction)
         if instruction.verb == "panic" and refused_as_late(instruction, time.time_ns()) is None:
-            self._panicked = self._panicked or not self._past.is_taken_up
+            with self._lock:  # first: carrying it out may wait, and history come meanwhile
+                self._panicked = self._panicked or not self._past.is_taken_up
+        self._instructions.instruct(item, instruction)
 
     def _keep(self, switch: str, updates: Iterable[TableUpdate], name: str = "") -> None:
         """Write entries that outlive the controller."""

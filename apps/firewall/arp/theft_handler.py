@@ -73,13 +73,15 @@ class TheftHandler:
         blocked = any(block.decision.target == target for block in self._lifecycle.blocks.values())
         if news or not (spared or blocked):
             self._own.tell(evidence)
-        if spared:
+        if spared and (
+            news or theft.thief.mac != theft.owner.mac
+        ):  # a host that moves to and fro is told once
             self._announcer.say(
                 OperatorNotice("arp", f"{evidence.text}; not blocked: {spared}", evidence.event_time)
             )
             if news and not evidence.supporting:
                 self._own.spared(evidence, spared)
-        elif not blocked:
+        elif not (spared or blocked):
             exhibits = (evidence_of(item, evidence.text),)
             self._publish(
                 self._lifecycle.open(thief.switch, target, evidence.text, exhibits, evidence.event_time)
@@ -91,8 +93,8 @@ class TheftHandler:
             return 'the setting `arp` is "tell"'
         if evidence.supporting:
             return (
-                "the owner was not on its port in training, the claimant has the owner's MAC, "
-                "or other hosts share its port"
+                "the owner was not on this port in training, the claimant has the owner's MAC, "
+                "or other hosts share the claimant's port"
             )
         if len(self._switches) != 1:
             return f"{len(self._switches)} switches are connected, and records do not say which"

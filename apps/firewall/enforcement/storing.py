@@ -43,7 +43,7 @@ class StoredAnswers:
         """Whether to answer now what earlier runs did not; once, and newer instructions wait until it is done.
 
         Not before this instance works: after a kill the Coordinator still names the dead one for a while, and the
-        decisions of another are refused.  If the archive does not answer meanwhile it is done another time, a little later.
+        decisions of another are refused.  If the archive does not answer, this is done again a little later.
         """
         with self._catching_up:
             now = self._behind and self._engine.active and time.monotonic() >= self._ask_after

@@ -91,7 +91,8 @@ class ArchivedState:
         self.archive = archive
         self._intake = intake
         self._settings = settings
-        self._began = time.time_ns()
+        self._away_since: int | None = None
+        """When the first reading failed, ns: what was written later is this run's."""
         self._reading: threading.Thread | None = None
         self._meanwhile: deque[Decision] = deque(maxlen=_MEANWHILE)
         self.past: PastState | None = None
@@ -109,6 +110,7 @@ class ArchivedState:
         try:
             self.past = self._ask(patience_s)
         except NoAnswer:
+            self._away_since = self._away_since or time.time_ns()
             return False
         return True
 
@@ -163,8 +165,8 @@ class ArchivedState:
             allowing=allowing,
             panics=[each.id for each in panicked],
             decisions=[each for each in made if not each.dry_run],
-            # of those that were written since the start more is known here
-            incidents=[each for at, each in incidents if at < self._began],
+            # more is known here of those that were written since
+            incidents=[each for at, each in incidents if self._away_since is None or at < self._away_since],
             false_alarms=read(LESSONS, "false alarm", FalseAlarm.from_item, most=_LESSONS),
             training=next(iter(read(f"{TRAINING}.*", "training", training_in, most=1)), None),
             handshakes=shakes,
@@ -206,13 +208,20 @@ class ArchivedState:
         """Instructions that change the allow-list, oldest first; those that were carried out have no deadline."""
         return [] if self.past is None else self.past.allowing
 
+    def answers(self) -> list[Answer]:
+        """What earlier runs answered most recently."""
+        return [] if self.past is None else self.past.answers
+
     def panics(self) -> list[str]:
         """Ids of the panics in the archive, which were carried out already."""
         return [] if self.past is None else self.past.panics
 
     def teach(self, known: KnownSources) -> None:
         """Known sources, from the handshakes of the last `known_days`."""
+        later = known.times()
         for source, at in () if self.past is None else self.past.handshakes:  # oldest first
+            known.learn(source, at)
+        for source, at in later:  # seen in this run already: the last to be dropped
             known.learn(source, at)
         log.info("%d known sources in the archive", len(known))
 
@@ -227,10 +236,8 @@ class ArchivedState:
         """What was answered most recently.
 
         Raises:
-            NoAnswer: the archive does not answer, or `past` is not known yet.
+            NoAnswer: the archive does not answer, or `past` is not taken up yet.
         """
-        if self.past is not None:
-            return self.past.answers
         if not self.is_taken_up:
             raise NoAnswer
         return self._read(f"{ANSWERS}.*", "answer", answer_in, most=_ANSWERS)

@@ -42,6 +42,10 @@ class KnownSources:
     def __contains__(self, source: object) -> bool:
         return source in self._seen
 
+    def times(self) -> list[tuple[str, int]]:
+        """Each source and its last handshake, the most recent last."""
+        return list(self._seen.items())
+
     def learn(self, source: str, at: int) -> None:
         """Record a completed handshake of this source."""
         if source not in self._seen:

@@ -19,6 +19,8 @@ from apps.messages import Confirmation, Decision, Exhibit, Sender, Target
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
+SET_BACK = 3_600 * SECOND
+"""A time that far behind an earlier one means that a clock was set back; those of several senders differ by less."""
 NOTICES = 100
 PROBATION_S = 600
 STILL_GOING_RATIO = 3.0
@@ -179,7 +181,7 @@ class BlockLifecycle:
         self.stopped = cap
         name = cap[cap.rfind("(") :]
         # a clock that was ahead may have been set right since
-        if abs(now - self._said.get(name, now - MINUTE)) >= MINUTE:
+        if not -SET_BACK < now - self._said.get(name, now - MINUTE) < MINUTE:
             self._said[name] = now
             text = f"BLOCKING STOPPED, {cap}: {who} stays unblocked, and others after it"
             self.notices.append(OperatorNotice("cap", text, now))
@@ -226,10 +228,10 @@ class BlockLifecycle:
     def _forget_old(self, now: int) -> None:
         """Only decisions of the last minute count towards a cap.
 
-        Those of a clock that was ahead would keep all later ones.  Capture times of several senders differ by a
-        little, so that what is less than a minute ahead counts.
+        Those of a clock that was ahead would keep all later ones.  Capture times of several senders differ, so that
+        what is less than an hour ahead counts.
         """
-        while self._recent and self._recent[-1] >= now + MINUTE:
+        while self._recent and self._recent[-1] >= now + SET_BACK:
             self._recent.pop()
         while self._recent and self._recent[0] <= now - MINUTE:
             self._recent.popleft()

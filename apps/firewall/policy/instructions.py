@@ -148,7 +148,7 @@ class Desk:
             raise ValueError(f"the allow-list has {_MOST_ENTRIES} entries; remove some, or name prefixes")
         self._set_entries((*self.entries, instruction.subject))
         blocks = [block.decision for block in self._lifecycle.blocks.values()]
-        touched = [each for each in blocks if self._spares(each)]
+        touched = [each for each in blocks if self.spares(each)]
         lifted = self._lift(touched, now, f"{instruction.subject} is on the allow-list now")
         blocks_lifted = "1 block" if len(lifted) == 1 else f"{len(lifted)} blocks"
         return lifted, f"{instruction.subject} is allowed; {blocks_lifted} lifted"
@@ -161,7 +161,7 @@ class Desk:
         self._set_entries(tuple(each for each in self.entries if each != instruction.subject))
         return [], f"{instruction.subject} is no longer allowed"
 
-    def _spares(self, decision: Decision) -> bool:
+    def spares(self, decision: Decision) -> bool:
         """Whether the allow-list covers what a block matches, or the address of the host whose MAC it matches."""
         host = decision.host if decision.target.kind == "mac" else ""
         return self.allow.covers_target(decision.target) or (bool(host) and self.allow.covers_address(host))

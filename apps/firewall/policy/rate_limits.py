@@ -21,6 +21,7 @@ from apps.firewall.policy.block_lifecycle import (
     MINUTE,
     NOTICES,
     SECOND,
+    SET_BACK,
     OperatorNotice,
     decision_id,
     drops_per_second,
@@ -183,7 +184,7 @@ class RateLimits:
 
     def _refuse(self, victim: str, now: int) -> None:
         self.refused += 1
-        if self._said is None or abs(now - self._said) >= MINUTE:
+        if self._said is None or not -SET_BACK < now - self._said < MINUTE:
             self._said = now
             text = f"{MOST_LIMITS} rate limits are in force: none is set towards {victim} or any later victim"
             self.notices.append(OperatorNotice("cap", text, now))

@@ -189,6 +189,10 @@ class SequentialTest:
         # a clock that was ahead may have been set back since; evidence that is merely late is no sign of that
         if -PLACE_HELD_S * _SECOND < now - self._swept < _SWEEP_S * _SECOND:
             return
+        if now < self._swept:  # what was noted while the clock was ahead would not fade until then
+            for tally in self._tallies.values():
+                for each in tally.contributions.values():
+                    each.time = min(each.time, now)
         self._swept = now
         bound = self.bound
         for subject in [each for each, tally in self._tallies.items() if tally.faded(now, bound)]:

@@ -40,6 +40,21 @@ def test_an_instruction_that_cannot_be_carried_out_is_answered_and_leaves_no_blo
     assert (desk.blocked, desk.service.health()["blocks"]) == (["192.0.2.66"], 1)
 
 
+def test_of_lifts_that_cannot_all_be_published_the_others_are():
+    """Enforcers would go on with all of them, and nobody would know of them any more."""
+    engine = RefusingEngine("none")
+    desk = Desk(engine=engine)
+    for number, address in enumerate(("192.0.2.66", "2001:db8::66", "192.0.2.67")):
+        said = Instruction(id=f"b{number}", verb="block", subject=address)
+        desk.hand(INSTRUCTION, said.to_value(), pattern=INSTRUCTIONS)
+    engine.refused = "network.block.firewall.ipv6"
+    panic = Instruction(id="p", verb="panic").to_value()
+    desk.hand(INSTRUCTION, panic, pattern=INSTRUCTIONS)
+    lifts = [each for each in desk.written("network.block.firewall.ipv4") if each["action"] == "unblock"]
+    assert [each["target"]["address"] for each in lifts] == ["192.0.2.66", "192.0.2.67"]
+    assert not desk.written(ANSWER)[-1]["done"]
+
+
 def test_an_unanswered_instruction_cannot_end_the_start():
     """Each start would find it again."""
     engine, now = RefusingEngine(ANSWER), time.time_ns()

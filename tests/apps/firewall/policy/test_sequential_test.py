@@ -120,6 +120,15 @@ def test_after_a_clock_was_set_back_sums_and_places_are_forgotten_as_before():
     assert CAMERA not in test._tallies
 
 
+def test_a_sum_that_was_noted_while_the_clock_was_ahead_fades_all_the_same():
+    test = trained()
+    test.hear(evidence(8.0, 100 + 86_400), "kitsune")
+    test.hear(evidence(1.0, 100, source="other"), "kitsune")
+    later = 100 + 2 * int(HALF_LIFE_S)
+    (tally,) = test._tallies.values()
+    assert tally.total(later * SECOND, test.bound) < 8.0 / 3
+
+
 def test_victims_of_forged_senders_have_a_sum_of_their_own():
     test = trained()
     flood = structs.replace(evidence(8.0), sender=None, victims=("10.0.0.1",), service="tcp/80")
