@@ -233,7 +233,7 @@ class CoordinatorService:
                 f"the token of the HTTP API is too short: give {_SHORTEST_TOKEN} characters or more"
             )
         if not token:
-            log.warning("everybody on this machine may read all data over the HTTP API: set $%s", TOKEN)
+            log.warning("everybody who reaches the HTTP API may read all data: set $%s", TOKEN)
         return token
 
     def _serve(self) -> None:

@@ -12,8 +12,8 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 WAIT_SECONDS = 10.0
-"""Within this time after connecting, or after the last answer, a request has come completely; as long may a client not
-read what waits for it."""
+"""Within this time after connecting, or after the last answer, a request has come completely; a client may
+leave an answer unread for as long."""
 MOST_CONNECTIONS = 256
 """Open at once, WebSockets among them, if so many descriptors are allowed."""
 _SHARE = 4

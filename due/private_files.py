@@ -35,7 +35,8 @@ def give_to_owner(descriptor: int, folder: Path) -> None:
     """
     if os.geteuid() == 0:
         owner = folder.stat()
-        with suppress(PermissionError):  # root without CAP_CHOWN, as in a container
+        # root without CAP_CHOWN, or of a user namespace that does not know the owner
+        with suppress(OSError):
             os.fchown(descriptor, owner.st_uid, owner.st_gid)
 
 

@@ -5,7 +5,7 @@
 
 The app prints one JSON line on standard output when it is ready, with "metrics": "HOST:PORT" if requested,
 and with the fields that its `ready()` adds. Logs go to standard error, and so does what the app prints after
-that line, since nobody may be reading a pipe any more. SIGTERM or SIGINT calls `stop()`, flushes, sends
+that line, since nobody need be reading the pipe any more. SIGTERM or SIGINT calls `stop()`, flushes, sends
 an offline heartbeat and exits with 0. The process ends when its parent ends (on Linux: the thread that
 started it).
 

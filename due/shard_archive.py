@@ -78,7 +78,7 @@ class ArchivedStates:
     def archived(self, path: str, timeout: float = _SAVE_SECONDS) -> Iterator[None]:
         """What is written in the body of `with` is in the archive at its end.
 
-        While the archive is away the body is entered once; then not before it has taken what waits in the spool.
+        While the archive is away the body is entered once; then not before it answers again.
 
         Args:
             path: named in errors.
@@ -97,13 +97,13 @@ class ArchivedStates:
         self._behind = False
 
     def _catch_up(self, path: str) -> None:
-        if not self._behind:
-            return
-        archive = self._engine.health().get("archive", {})
-        if archive.get("away") and archive["backlog"]:
-            raise ArchiveUnavailable(
-                f"the state of {path} is not written: what was written before still waits"
-            )
+        if self._behind:
+            archive = self._engine.health().get("archive", {})
+            if archive.get("away") and archive["backlog"]:
+                raise ArchiveUnavailable(
+                    f"the state of {path} is not written: what was written before still waits"
+                )
+        # what was written before may be refused, and is not to be taken for what is written now
         self._engine.flush(_SAVE_SECONDS)
 
     def _not_archived(self) -> int:

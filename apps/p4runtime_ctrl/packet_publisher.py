@@ -17,6 +17,7 @@ from apps.p4runtime_ctrl.southbound.loss_tracker import LossTracker, Source
 from apps.p4runtime_ctrl.southbound.p4info import ProgramInfo
 from apps.p4runtime_ctrl.southbound.packet_in import PacketInBatch, PacketReader
 from apps.p4runtime_ctrl.southbound.sequence_merge import PacketRows, SequenceMerger
+from apps.p4runtime_ctrl.telemetry.coverage import FALLBACK
 from apps.p4runtime_ctrl.telemetry.demand import APP, Demand, Kind, key_of
 from apps.packets import read_frames
 
@@ -55,6 +56,8 @@ class PacketPublisher:
         self.counts_reported = 0
         """Differences that the switch reported when their window was over."""
         self._routes: dict[Kind, list[tuple[str, int]]] = {}
+        self._copied = True
+        """Frames that digests do not cover are copied."""
         self._unison = SequenceMerger()
         self._waited = 0
         self._handovers: deque[int | None] = deque()
@@ -81,6 +84,8 @@ class PacketPublisher:
             kind: [(key_of(kind, self._name, which), bit) for which, bit in routes.items()]
             for kind, routes in demand.routes.items()
         }
+        bits = {request.bit for request in demand.requests}
+        self._copied = all(each.bit in bits for each in FALLBACK)
         expected: set[Source] = set()
         for request in demand.requests:
             expected |= {"packet"} if request.copy else set()
@@ -119,7 +124,9 @@ class PacketPublisher:
     def _write_reports(self, lists: list[Any]) -> None:
         reports = self._digests.read(lists)
         if self._by_digest:
-            rows = PacketRows(reports.columns, reports.queries, reports.covered)
+            # where frames that digests do not cover are not copied, there is nothing to wait for
+            whole = reports.covered if self._copied else np.ones_like(reports.covered)
+            rows = PacketRows(reports.columns, reports.queries, whole)
             self._write_records(self._unison.digests(rows))
         for key, bit in self._routes.get("digests", ()):
             batch = reports.counted(bit)

@@ -96,7 +96,7 @@ class FrameForwarder:
             self._source.activate(active)
 
     def health(self) -> dict[str, int]:
-        """Counters: frames and bytes that crossed, best-effort frames lost, frames that might not cross or were refused."""
+        """Counters: frames and bytes that crossed, best-effort frames lost, frames that may not cross, or were refused."""
         return {**self._counts, "patterns": len(self.keys.patterns), "unsettled": len(self._unsettled)}
 
     def close(self) -> None:
@@ -144,12 +144,14 @@ class FrameForwarder:
                 self._target.append(path, payload)
             else:
                 self._target.publish(path, payload)
-        except UpdatesUnavailable:
+        except (UpdatesUnavailable, Timeout):
             if delivery.token:
                 raise
             self._counts["lost"] += 1
             return
         except BackendError as error:
+            if delivery.token and _may_pass(error):
+                raise  # the frame comes again
             self._refuse(delivery, error)
             return
         if delivery.token:
@@ -201,3 +203,8 @@ class FrameForwarder:
                 self._target.poll()
             except DueError as error:
                 self._errors.error("%s: upkeep failed", self._name, error=error)
+
+
+def _may_pass(error: BackendError) -> bool:
+    """Whether Kafka says so of a topic that it cannot make while a broker is away."""
+    return "eplication factor" in str(error)

@@ -1,4 +1,4 @@
-"""Payloads that a server, which is away, cannot take aside now: kept within bounds, and given to it later.
+"""Payloads that cannot be set aside while the server is away: kept within bounds, and stored later.
 
 set_aside ──► store ──► the server
                 │ away          ▲
@@ -60,11 +60,11 @@ class AsideQueue:
             if not self._waiting and self._done(one, now):
                 return
             if len(self._waiting) >= _MOST_ENTRIES or self._bytes + len(one.payload) > _MOST_BYTES:
-                self._lose(one, "too many payloads wait for the server")
+                self._lose(one, "there is no room for it while the server is away")
                 return
             if not self._waiting:
                 log.warning(
-                    "payloads cannot be set aside now, they wait here for the server: %s", self._reason
+                    "payloads cannot be set aside now; they wait here for the server: %s", self._reason
                 )
             self._waiting.append(one)
             self._bytes += len(one.payload)

@@ -265,8 +265,8 @@ class Receiver(Protocol):
     def set_aside(self, delivery: Delivery, payload: bytes, reason: str) -> None:
         """Set aside a payload on which callbacks keep failing, or that cannot be read.
 
-        While the server is away, up to 16 MiB of them wait in this process (`set_aside_waiting`) until a later `receive`,
-        or `close`; what does not fit is lost and counted (`set_aside_lost`).
+        While the server is away, up to 16 MiB of them wait in this process, and on Kafka also what its client has taken
+        already (`set_aside_waiting`), until a later `receive`, or `close`; what does not fit is lost and counted (`set_aside_lost`).
         """
         ...
 

@@ -24,6 +24,13 @@ class GroupPlaces:
         """Work lists that could not be made: start, and since when; their streams are not read before that."""
         self._group = group
 
+    def register(self, paths: list[str]) -> None:
+        """See `WorkLists.register`; said again by the housekeeping where it fails."""
+        try:
+            self.lists.register(paths)
+        except (redis.RedisError, OSError) as error:
+            log.debug("readers could not be told: %s", error)
+
     def make(self, path: str, start: str, *, reset: bool = False, since: float | None = None) -> None:
         """Make the group's list of a stream; where that fails now, it is left in `unmade`.
 

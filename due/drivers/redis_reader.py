@@ -54,6 +54,7 @@ _LOOK_SECONDS = 1.0
 _HOLD_SECONDS = 0.2
 _MOST_PATHS = 4096
 """Most streams that one member reads, because any program may announce paths."""
+_TOO_MANY = "%s reads at most %d reliable paths: %s and others are left out; observe a narrower key"
 _STREAM = stream_name("")
 _Expected = tuple[str, str, str]
 """Kind of an answer, path, id."""
@@ -75,8 +76,7 @@ class StreamReader:
         self._expected: deque[_Expected] = deque()
         self._at: dict[str, str] = {}
         """Up to where the ids of a stream are on the work list, as far as is known here."""
-        self._found = ReadRound()
-        self._read_ahead = ReadAhead()
+        self._found, self._read_ahead = ReadRound(), ReadAhead()
         self._size = AnswerSize(fixed=shared)  # whoever takes more at once leaves less to the others
         self._woken = "0-0"
         self._listless = self._ask_lists = False
@@ -85,22 +85,22 @@ class StreamReader:
         self._catch_up: set[str] = set()
         self._requested: tuple[str, ...] = ()
         self._held: set[str] = set()
+        self._making: set[str] = set()
+        """Paths that are being added: their lists are not there yet, and not gone."""
         self._leases = MemberLeases(commands, group, consumer)
         self._share = StreamShare()
         self._places = GroupPlaces(commands, group)
         self._dead = DeadMembers(commands, group, consumer)
         self._upkeep = Upkeep(commands, group, consumer)
         self.aside = Aside(commands, app_of(group))
-        self._look_at = 0.0
-        self._alone = False
+        self._look_at, self._alone = 0.0, False
         self._quiet = False
         """Whether the server can suppress the reply to an XACK."""
         self._claimed: deque[Delivery] = deque()
         self._backoff = backoff_for(url)
         self._life = b""
         self._active = True
-        self._take_over = False
-        self._stale = False
+        self._take_over = self._stale = False
         self._denied: set[str] = set()
         """Paths without a right to read them."""
         self._counts = {"claimed": 0, "vanished": 0, "paths_refused": 0, "paths_denied": 0}
@@ -116,9 +116,13 @@ class StreamReader:
             self._paths[path] = start
             self._upkeep.added(path)
             self._held.add(path)
+            self._making.add(path)
             self._look_at = 0.0
             self._stale = True
-        self._make_list(path, start, reset=reset)
+        try:
+            self._make_list(path, start, reset=reset)
+        finally:
+            self._making.discard(path)
         self.renew()
         self._register([path])
         self._interrupt()
@@ -251,6 +255,9 @@ class StreamReader:
         with self._lock:
             paths, self._paths = list(self._paths), {}
         self._leases.give_up(paths)
+        self._hang_up()
+
+    def _hang_up(self) -> None:
         if self._wire is not None:
             self._wire.close()
             self._wire = None
@@ -261,9 +268,8 @@ class StreamReader:
 
     def _refuse(self, path: str) -> None:
         self._counts["paths_refused"] += 1
-        told = "%s reads at most %d reliable paths: %s and others are left out; observe a narrower key"
         if self._counts["paths_refused"] == 1:
-            log.error(told, self._group, _MOST_PATHS, path)
+            log.error(_TOO_MANY, self._group, _MOST_PATHS, path)
 
     def _deny(self, path: str, error: Exception) -> None:
         """A right is missing: this path is left out, and the others are read on."""
@@ -286,10 +292,7 @@ class StreamReader:
         self._at.pop(path, None)
 
     def _register(self, paths: Sequence[str]) -> None:
-        try:
-            self._places.lists.register([path for path in paths if path in self._paths])
-        except (redis.RedisError, OSError) as error:
-            log.debug("readers could not be told: %s", error)
+        self._places.register([path for path in paths if path in self._paths])
 
     def _interrupt(self) -> None:
         """Make the server answer the blocked request now, so that a new one goes out."""
@@ -310,8 +313,7 @@ class StreamReader:
         self._backoff.succeeded()
         self._wire = wire
         self._expected.clear()
-        self._read_ahead = ReadAhead()
-        self._found = ReadRound()
+        self._read_ahead, self._found = ReadAhead(), ReadRound()
         self._at.clear()
         self._acks.lost()
         self._share.answered()
@@ -332,9 +334,7 @@ class StreamReader:
         self._register(paths)
 
     def _lose(self, error: Exception) -> None:
-        if self._wire is not None:
-            self._wire.close()
-            self._wire = None
+        self._hang_up()
         delay = self._backoff.failed(time.monotonic())
         log.warning("streams at %s: %s; retrying in %.2f s", self._place, error, delay)
 
@@ -539,7 +539,7 @@ class StreamReader:
 
     def _begin_again(self) -> None:
         """A work list is gone because the server restarted empty: begin at the stream's beginning."""
-        paths = self.offered()
+        paths = [path for path in self.offered() if path not in self._making]
         for path in paths:
             self._make_list(path, "0")
         with self._lock:
@@ -575,7 +575,7 @@ class StreamReader:
             except (redis.RedisError, OSError) as error:
                 log.debug("members of %s could not be checked: %s", path, error)
                 self._alone = False
-                gone = gone or (list_gone(error) and path not in self._places.unmade)
+                gone = gone or (list_gone(error) and path not in self._making | self._places.unmade.keys())
                 continue
             if not waits or self._shared:
                 with self._lock:

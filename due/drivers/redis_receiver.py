@@ -281,7 +281,6 @@ class RedisReceiver:
 
     def _care(self) -> None:
         """Reconnect lost connections, and look for streams announced meanwhile."""
-        self._reader.aside.care()
         self._leave_old_primary()
         if self._bus is None and self._channels and not self._closed:
             with self._lock:
@@ -290,6 +289,7 @@ class RedisReceiver:
                 log.warning("resubscribed at %s", self._place)
         if self._unlisted and time.monotonic() >= self._list_at:
             self._list_streams()
+        self._reader.aside.care()
         self._reader.care()
 
     def _list_streams(self) -> None:

@@ -84,6 +84,7 @@ class DiskSpool:
         with suppress(FileNotFoundError):
             self.path.with_suffix(".db-wal").rename(f"{aside}-wal")
         self.path.rename(aside)
+        self._count = self._bytes = 0  # not before: a spool that is empty is deleted
         former = sorted(self.path.parent.glob(f"{self.path.stem}.damaged-*[0-9]"))
         for path in former[:-_DAMAGED_KEPT]:
             path.unlink(missing_ok=True)
@@ -108,7 +109,6 @@ class DiskSpool:
             self._set_aside(error)
         except (OSError, sqlite3.Error) as again:
             log.error("spool %s: %s", self.path, again)  # noqa: TRY400 - no trace needed
-            self._count = self._bytes = 0
             return False
         return True
 

@@ -32,6 +32,7 @@ _SECRETS = (
     "coordinator.url",
 )
 _SECONDS = 5.0
+_NOT_READ = "repair the file's owner and mode"
 _UNIX = "unix:"
 _ELSEWHERE = ("redis://", "redis+sentinel://", "mongodb://", "kafka://")
 
@@ -170,9 +171,13 @@ def _hosts(url: str) -> list[str]:
 
 def check_commanding(state: Path) -> Check:
     """Who outside the pipeline may command."""
+    try:
+        identities = Identities(state).all
+    except BadInput as error:
+        return Check("commanding apps", "exposed", str(error), _NOT_READ)
     named = sorted(
         f"{name} ({key})"
-        for name, one in Identities(state).all.items()
+        for name, one in identities.items()
         if one.enrolled and name != OPERATOR
         for key in one.rights.publish
         if is_dangerous(key, name)
@@ -184,9 +189,13 @@ def check_commanding(state: Path) -> Check:
 
 def check_readers(state: Path) -> Check:
     """Which apps outside the pipeline may read from the archive what others wrote."""
+    try:
+        identities = Identities(state).all
+    except BadInput as error:
+        return Check("reading apps", "exposed", str(error), _NOT_READ)
     named = sorted(
         f"{name} ({', '.join(one.rights.read)})"
-        for name, one in Identities(state).all.items()
+        for name, one in identities.items()
         if one.enrolled and one.rights.read
     )
     said = ", ".join(named) or "no enrolled app may read from the archive what others wrote"

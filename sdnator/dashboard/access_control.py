@@ -127,7 +127,7 @@ class AccessControl:
         """The session's key, or why there is none; None: there was no place to wait."""
         with self._waiting.place(origin_of(source)) as free:
             if not name:
-                # the token, which is long, lets the owner in whoever else waits; who has a wrong one waits
+                # the token, which is long, lets the owner in whoever else waits; whoever has a wrong one waits
                 key, wrong = self._sessions.sign_in(name, password, source, time.monotonic())
                 if wrong and free:
                     await asyncio.sleep(self._sessions.delay_s(source, name, time.monotonic()))

@@ -92,6 +92,7 @@ class WatchingKeeper(ABC):
         while not self._ended.wait(_LOOK_SECONDS):
             try:
                 self.look()
+                told = ""
             except BadInput as error:  # the file of identities; the users stay as they are
                 if str(error) != told:
                     told = str(error)

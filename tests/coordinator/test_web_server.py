@@ -26,7 +26,7 @@ class Served:
         routes = [
             Route("/", lambda _: PlainTextResponse("the page")),
             Route("/slow", self._slow),
-            Route("/large", lambda _: PlainTextResponse(b"x" * (16 << 20))),
+            Route("/large", self._large),
             WebSocketRoute("/echo", self._echo),
         ]
         self.server = web_server.web_server(Starlette(routes=routes))
@@ -34,6 +34,10 @@ class Served:
         self.thread = threading.Thread(target=lambda: asyncio.run(run))
         self.thread.start()
         wait_for(lambda: self.server.started)
+
+    def _large(self, _):
+        self.asked.set()
+        return PlainTextResponse(b"x" * (16 << 20))
 
     def _slow(self, _):
         self.asked.set()
@@ -83,7 +87,7 @@ POST = b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nname"
     ids=["nothing", "half", "whole", "one-and-a-half"],
 )
 def test_a_connection_without_a_request_is_closed(served, monkeypatch, sent, said):
-    monkeypatch.setattr(web_server, "WAIT_SECONDS", 0.2)
+    monkeypatch.setattr(web_server, "WAIT_SECONDS", 1.0)
     assert closed(served.connected(sent)).endswith(said)
 
 
@@ -93,18 +97,18 @@ def test_a_request_whose_body_does_not_come_is_closed(served, monkeypatch):
 
 
 def test_a_client_that_reads_nothing_is_closed(served, monkeypatch):
-    monkeypatch.setattr(web_server, "WAIT_SECONDS", 0.2)
+    monkeypatch.setattr(web_server, "WAIT_SECONDS", 1.0)
     connections = served.server.server_state.connections
     with served.connected(GET.replace(b"/ ", b"/large ") + b"\r\n"):
-        wait_for(lambda: connections)
+        assert served.asked.wait(60)
         wait_for(lambda: not connections)
 
 
 def test_pages_that_are_open_and_answers_that_take_long_stay(served, monkeypatch):
-    monkeypatch.setattr(web_server, "WAIT_SECONDS", 0.2)
-    with connect(served.url.replace("http", "ws") + "/echo") as page, served.connected() as slow:
-        slow.sendall(GET.replace(b"/ ", b"/slow ") + b"Connection: close\r\n\r\n")
-        served.asked.wait(60)
+    monkeypatch.setattr(web_server, "WAIT_SECONDS", 2.0)
+    slow_page = GET.replace(b"/ ", b"/slow ") + b"Connection: close\r\n\r\n"
+    with connect(served.url.replace("http", "ws") + "/echo") as page, served.connected(slow_page) as slow:
+        assert served.asked.wait(60)
         assert closed(served.connected()) == b"", "this one came later, and its time is over"
         page.send("still here")
         assert page.recv() == "still here"

@@ -6,6 +6,7 @@ import threading
 from contextlib import ExitStack
 
 from due.status_server import StatusServer
+from tests.due.conftest import wait_for
 
 
 def test_connections_that_ask_nothing_take_nobody_s_place():
@@ -20,5 +21,5 @@ def test_connections_that_ask_nothing_take_nobody_s_place():
         asking.request("GET", "/metrics")
         assert asking.getresponse().status == 200
         asking.close()
-        assert threading.active_count() < threads + 30
+        wait_for(lambda: threading.active_count() < threads + 30)
     server.close()

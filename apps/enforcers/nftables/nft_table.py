@@ -129,7 +129,11 @@ class NftTable:
             self._make(new)
             return
         gone = [each for each in lifted if each in listing.elements and each not in new]
-        left = dict.fromkeys(listing.elements.keys() - set(gone), 0)
+        lifted_here = set(gone)
+        # a range, which only somebody else adds, is no network: it stays, too, until history is known
+        left = {
+            each: 0 for each in listing.elements if each not in lifted_here and not each[1].startswith("{")
+        }
         every = {**left, **new}
         gone += [each for each in left if outermost(each, every) != each]
         changed = {

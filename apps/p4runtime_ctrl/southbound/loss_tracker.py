@@ -20,7 +20,7 @@ WRAP: Final = 1 << 32
 """The switch's numbers are modulo this."""
 _HALF: Final = WRAP // 2
 _NEAR: Final = 1 << 24
-"""A lower number is taken for one behind the wrap if it is less than this ahead, else for that of a switch that restarted."""
+"""A lower number is behind the wrap if it is less than this ahead; otherwise the switch has restarted."""
 _STEP_US: Final = 3_600_000_000
 _HORIZON: Final = 1 << 16
 """A stream that is this many numbers behind the other is not waited for."""
@@ -142,7 +142,8 @@ class LossTracker:
         # after a break in both streams a lower first number means that the switch restarted
         near = unwrapped(int(numbers[0]), self._highest or 0) - 1
         first = self._highest if self._highest and not self._passed else near
-        before = self._passed.get(source, first)
+        # a stream that was silent for long goes on where the other one is
+        before = max(self._passed.get(source, first), near)
         steps, restarts = steps_ahead(numbers, before)
         start = 0
         for begin in np.flatnonzero(restarts).tolist():
@@ -199,7 +200,7 @@ class LossTracker:
         waiting = []
         for first, end in self._gaps:
             over = end if everything else min(end, passed + 1)
-            self._lost += max(0, _numbers(first, over))
+            self._lost += max(0, numbers_between(first, over))
             if max(first, over) < end:
                 waiting.append((max(first, over), end))
         self._gaps = waiting
@@ -212,7 +213,7 @@ def steps_ahead(numbers: NDArray[np.int64], before: int) -> tuple[NDArray[np.int
         numbers: as the switch wrote them.
         before: the last number of the stream, which may have gone on behind the wrap.
     """
-    steps = np.diff(numbers, prepend=before) % WRAP
+    steps = np.diff(numbers, prepend=before) & (WRAP - 1)  # as % WRAP, without a division for each
     lower = np.diff(numbers, prepend=before % WRAP) < 0
     return steps, (steps >= _HALF) | lower & (steps >= _NEAR)
 
@@ -223,6 +224,6 @@ def unwrapped(number: int, highest: int) -> int:
     return highest + ahead if abs(ahead) < _NEAR and highest + ahead > 0 else number
 
 
-def _numbers(first: int, end: int) -> int:
+def numbers_between(first: int, end: int) -> int:
     """How many numbers the switch gives from the first one up to the end."""
     return end - first - ((end - 1) // WRAP - (first - 1) // WRAP)

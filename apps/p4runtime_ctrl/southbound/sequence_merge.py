@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.p4runtime_ctrl.southbound.loss_tracker import WRAP, Source, steps_ahead, unwrapped
+from apps.p4runtime_ctrl.southbound.loss_tracker import WRAP, Source, numbers_between, steps_ahead, unwrapped
 from apps.p4runtime_ctrl.southbound.rows import has_bit
 from due import RecordBatch
 
@@ -134,8 +134,8 @@ class SequenceMerger:
         before, self._follows = 0 if self._follows else self._told, False
         told = self._tell(_ALL)
         if told:
-            first = before + 1 if before else int(told[0].sequence[0])
-            self.skipped += self._told + 1 - first - sum(map(len, told))
+            first = before + 1 if before else unwrapped(int(told[0].sequence[0]), self._told)
+            self.skipped += numbers_between(first, self._told + 1) - sum(map(len, told))
         return told
 
     def _take(self, stream: Source, rows: PacketRows) -> list[PacketRows]:
@@ -147,7 +147,8 @@ class SequenceMerger:
         if not len(rows):
             return []
         numbers = rows.sequence
-        before = self._passed[stream] or unwrapped(int(numbers[0]), self._told) - 1
+        # a stream that was silent for long goes on where the other one is
+        before = max(self._passed[stream], unwrapped(int(numbers[0]), self._told) - 1)
         steps, restarts = steps_ahead(numbers, before)
         back = np.flatnonzero(restarts | (steps == 0))
         if not len(back):
@@ -202,7 +203,7 @@ class SequenceMerger:
         found = [self._merged(**chosen)] if len(chosen) > 1 else list(chosen.values())
         if self._told < WRAP:
             return found
-        return [rows.numbered(rows.sequence % WRAP) for rows in found]
+        return [rows.numbered(rows.sequence & (WRAP - 1)) for rows in found]
 
     def _merged(self, packet: PacketRows, digest: PacketRows) -> PacketRows:
         known, numbers = packet.sequence, digest.sequence

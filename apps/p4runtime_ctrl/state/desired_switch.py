@@ -138,6 +138,7 @@ class DesiredSwitch:
             self._desired.put(entry)
         if self.mac_learning is not None:
             self._desired.put(self.mac_learning.flood())
+        self._configured = tuple(self._desired)
         self._owners: dict[bytes, Owner] = {}
         self._unconfirmed: dict[bytes, EntryUpdate] = {}
         self._aged: dict[bytes, EntryUpdate] = {}
@@ -155,34 +156,37 @@ class DesiredSwitch:
     def restore(self, history: Iterable[Decision | TableCommand]) -> list[str]:
         """Build the desired state from history, oldest first; returns errors for what did not fit the program.
 
-        Of a command's updates those are left out that the switch must have refused.
+        Of a command's updates those are left out that the switch must have refused.  That goes by what the history
+        has put there before: at a takeover the desired state already holds its end.
         """
         problems: list[str] = []
+        there = EntrySet(self._configured)
         for each in history:
             if isinstance(each, TableCommand):
-                problems += self._restore_command(each)
+                problems += self._restore_command(each, there)
                 continue
             if each.dry_run:
                 continue
             try:
-                self._remember(self._entry_updates.of_decision(each))
+                self._replay(self._entry_updates.of_decision(each), there)
             except (EntryError, P4InfoError) as error:
                 problems.append(f"decision {each.id}: {error}")
         return problems
 
-    def _restore_command(self, command: TableCommand) -> list[str]:
+    def _restore_command(self, command: TableCommand, there: EntrySet) -> list[str]:
         updates, refused = self._entry_updates.of_command(command)
         for update in [] if refused else updates:
-            if self._was_taken(update.main):
-                self._remember(update)
+            if _was_taken(update.main, there):
+                self._replay(update, there)
         return [f"command {command.id}: {reason}" for _, reason in refused]
 
-    def _was_taken(self, change: Change) -> bool:
-        """Whether a switch with the entries of now takes the change: it inserts no entry twice, and modifies none that is missing."""
-        held = self._desired.get(change.entry)
-        if change.kind == INSERT:
-            return held is None or held.idle_timeout_ns > 0  # that one may have expired meanwhile
-        return held is not None or is_standing(change.entry)
+    def _replay(self, update: EntryUpdate, there: EntrySet) -> None:
+        self._remember(update)
+        for change in update.changes:
+            if change.kind == DELETE:
+                there.discard(change.entry)
+            else:
+                there.put(change.entry)
 
     def bring_up(self, transport: Transport) -> BringUp:
         """Read, compare, write the difference in one batch."""
@@ -241,8 +245,10 @@ class DesiredSwitch:
         Returns:
             Those that can be held, in their order; name to reason of the others.
         """
-        in_force = self.requests or ()
-        fit, left_out = self._classifier.fitting(sorted(requests, key=lambda each: each not in in_force))
+        in_force = {(each.name, each.bit): each.conditions for each in self.requests or ()}
+        fit, left_out = self._classifier.fitting(
+            sorted(requests, key=lambda each: in_force.get((each.name, each.bit)) != each.conditions)
+        )
         return [each for each in requests if each in fit], left_out
 
     def want(self, requests: Sequence[TelemetryRequest], transport: Transport | None) -> list[str]:
@@ -548,3 +554,11 @@ def _achieved(change: Change, outcome: UpdateOutcome) -> bool:
     """Whether the switch now has the state that the change asks for, even if it had it before."""
     also = {INSERT: _EXISTS, DELETE: _NOT_FOUND}.get(change.kind)
     return outcome.code in (_OK, also)
+
+
+def _was_taken(change: Change, there: EntrySet) -> bool:
+    """Whether a switch with these entries takes the change: it inserts none twice, and modifies none that is missing."""
+    held = there.get(change.entry)
+    if change.kind == INSERT:
+        return held is None or held.idle_timeout_ns > 0  # that one may have expired meanwhile
+    return change.kind == DELETE or held is not None or is_standing(change.entry)

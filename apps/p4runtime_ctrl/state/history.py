@@ -10,7 +10,7 @@ from typing import Final
 
 from msgspec import structs
 
-from apps.messages import Decision, Intake, TableCommand, Target
+from apps.messages import Decision, FloodKind, Intake, TableCommand, Target
 from apps.standing_decisions import STANDING, in_force
 from due import Item
 
@@ -80,14 +80,16 @@ def in_order(
         decisions: as `decisions_for` returns them.
         commands: those of the archive, and those heard live, which may be the same.
     """
-    lifted: dict[Target, int] = {}
+    lifted: dict[tuple[Target, FloodKind | None, int | None], int] = {}
     told: list[tuple[int, Decision | TableCommand]] = []
     for at, decision in decisions:
-        last = max(at, lifted.get(decision.target, 0))
+        limit = decision.limit
+        about = (decision.target, limit.kind if limit else None, limit.port if limit else None)
+        last = max(at, lifted.get(about, 0))
         if decision.action in STANDING:
             told.append((last, decision))
         else:
-            lifted[decision.target] = last
+            lifted[about] = last
             told.append((at, decision))
     once = {(at, command.id): command for at, command in commands}
     told += [(at, command) for (at, _), command in once.items()]

@@ -94,13 +94,17 @@ class Classifier:
             return list(requests), {}
         fit: list[TelemetryRequest] = []
         left_out: dict[str, str] = {}
+        given: list[dict[int, MatchRegion]] = []
         for request in requests:
             try:
-                self._check([*fit, request])
+                _check_bits([*fit, request])
+                more = given if request.by_stage else [*given, self._assign(request)]
+                self._hold(more)
             except (EntryError, TelemetryError) as error:
                 left_out[request.name] = str(error)
             else:
                 fit.append(request)
+                given = more
         return fit, left_out
 
     def entries(self, requests: Sequence[TelemetryRequest]) -> EntrySet:
@@ -153,9 +157,13 @@ class Classifier:
         """Conditions by table, of each request that has some here; raises as `entries` does."""
         _check_bits(requests)
         conditions = [self._assign(request) for request in requests if not request.by_stage]
+        self._hold(conditions)
+        return conditions
+
+    def _hold(self, conditions: Sequence[Mapping[int, MatchRegion]]) -> None:
+        """Raises `TelemetryError` where a table is too small for them."""
         for table in self._tables:
             self._closures[table.id].of(given[table.id] for given in conditions if table.id in given)
-        return conditions
 
     def _assign(self, request: TelemetryRequest) -> dict[int, MatchRegion]:
         """Conditions of a request by table; one that fits several tables goes to the first."""

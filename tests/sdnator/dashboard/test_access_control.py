@@ -14,10 +14,10 @@ from starlette.routing import Route, WebSocketRoute
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from coordinator.web_server import web_server
 from sdnator.dashboard.access_control import AccessControl
 from sdnator.dashboard.server import Guard
 from sdnator.dashboard.sign_in import Sessions
-from sdnator.dashboard.web_server import web_server
 from sdnator.rights.sign_in_link import FILE, new_link
 from sdnator.rights.users import Users
 from sdnator.testing.waiting import wait_for

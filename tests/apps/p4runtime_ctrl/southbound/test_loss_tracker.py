@@ -163,3 +163,16 @@ def test_behind_another_controller_the_numbers_may_wrap_around():
     progress.follow(WRAP - 3)
     note(progress, [2, 3])
     assert (progress.unaccounted, progress.lost, progress.sequence) == (4, 0, 3)
+
+
+def test_a_stream_that_was_silent_for_long_goes_on_where_the_other_one_is():
+    progress = LossTracker()
+    progress.expected = frozenset(("packet", "digest"))
+    note(progress, [1])
+    note(progress, [1], "digests")
+    for number in range(1 << 23, 3 << 30, 1 << 23):
+        note(progress, [number], "digests")
+    lost = progress.lost
+    note(progress, [(3 << 30) - (1 << 23) + 1])
+    assert progress.restarts == 0
+    assert progress.lost - lost < 1 << 16, "of the last gap, what the silent stream was still waited for"

@@ -134,3 +134,12 @@ def test_a_stream_without_copies_waits_for_nothing_at_the_wrap():
     assert told(merger.digests(rows([1, 2]))) == [1, 2]
     assert told(merger.digests(rows([3]))) == [3]
     assert merger.waits_for == 0
+
+
+def test_copies_that_begin_again_after_a_whole_round_are_not_dropped():
+    merger = SequenceMerger()
+    merger.follow(WRAP - 3)
+    merger._passed["packet"] = 10
+    merger.digests(rows([WRAP - 2, WRAP - 1]))
+    merger.digests(rows(range(1, 21)))
+    assert told(merger.packets(rows([21]))) == [21]

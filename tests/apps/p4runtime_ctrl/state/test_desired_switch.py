@@ -412,6 +412,16 @@ def test_what_the_switch_had_refused_is_not_carried_out_after_a_restart(commands
     assert str(heir.bring_up(held)) == "nothing to change"
 
 
+def test_what_is_replayed_at_a_takeover_does_not_go_by_how_it_ended():
+    history = [wire("modify", 7), wire("insert", 6)]
+    held, heir = Held(), make()
+    heir.bring_up(held)
+    for each in history:
+        heir.command(each, held)
+    assert heir.restore(history) == []
+    assert str(heir.bring_up(held)) == "nothing to change"
+
+
 def test_an_entry_that_may_have_expired_is_inserted_again():
     """Nothing says when it did: the later insert is the better guess."""
 
