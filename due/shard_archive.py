@@ -110,4 +110,5 @@ class ArchivedStates:
         """Items of this engine, also under other keys, that went elsewhere; their number is the same if none did."""
         health = self._engine.health()
         archive = health.get("archive", {})
-        return int(health["refused"]) + sum(archive.get(name, 0) for name in ("spooled", "lost", "refused"))
+        elsewhere = (int(archive.get(name, 0)) for name in ("spooled", "lost", "refused"))
+        return int(health["refused"]) + sum(elsewhere)
