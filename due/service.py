@@ -37,6 +37,7 @@ from due.config import Options
 from due.drivers.embedded_redis import die_with_parent
 from due.engine import Engine
 from due.errors import DueError, EngineFailed, InvalidOption
+from due.heap import HeapTrim
 from due.liveness import HeartbeatPipe, Liveness
 from due.messages import CONSUMER, PRODUCER, PUB_ONLY, Capability, Instances, Interest
 from due.status_server import StatusServer, metrics_token
@@ -308,11 +309,13 @@ class _Run:
 
     def _go_round(self, stopped: Sequence[int], liveness: Liveness) -> None:
         health_at = 0.0
+        heap = HeapTrim(time.monotonic())
         while not stopped:
             # a signal wakes nobody here: it is noted, and seen a tick later at the most
             time.sleep(TICK_SECONDS)
             self._app.tick()
             now = time.monotonic()
+            heap.tick(now)
             if now >= health_at:
                 health_at = now + _HEALTH_SECONDS
                 self._engine.write(f"{HEALTH}.{self._app_id}", self._report(), [PUB_ONLY])
