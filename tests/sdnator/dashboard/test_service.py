@@ -1,6 +1,7 @@
 """The dashboard listens where it is told to, or beside it."""
 
 import socket
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
 from typing import Any, cast
@@ -107,14 +108,14 @@ def test_an_archive_that_goes_away_at_any_question_does_not_keep_the_pages_from_
     assert len(engine.limits) == fails_at + 1
 
 
-@pytest.mark.parametrize(
-    "said", [b"[5]", b'{"a": 1}', b"[" * 5000, b"5"], ids=["list", "map", "deep", "number"]
-)
-def test_a_coordinator_that_answers_nonsense_ends_no_thread(tmp_path, said):
-    """Else the pages would show the last state for ever."""
+@contextmanager
+def polling(tmp_path, said):
+    """A dashboard whose Coordinator answers this: the board, the thread that asks, and the tokens that came."""
+    tokens = []
 
-    class Nonsense(BaseHTTPRequestHandler):
+    class Answering(BaseHTTPRequestHandler):
         def do_GET(self):
+            tokens.append(self.headers["Authorization"])
             self.send_response(200)
             self.end_headers()
             self.wfile.write(said)
@@ -122,37 +123,7 @@ def test_a_coordinator_that_answers_nonsense_ends_no_thread(tmp_path, said):
         def log_message(self, *_):
             pass
 
-    with HTTPServer(("127.0.0.1", 0), Nonsense) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        place = tmp_path / "coordinator"
-        place.write_text(f"http://127.0.0.1:{server.server_port}")
-        dashboard = DashboardService(cast("Any", Archive()), Settings(coordinator_file=str(place)))
-        poll = Thread(target=dashboard._poll, daemon=True)
-        poll.start()
-        try:
-            wait_for(lambda: dashboard.board.coordinator or not poll.is_alive())
-            assert poll.is_alive()
-        finally:
-            dashboard._stopping.set()
-            poll.join()
-            server.shutdown()
-
-
-def test_the_token_of_the_environment_is_sent_to_the_coordinator(tmp_path, monkeypatch):
-    monkeypatch.setenv("DUE_COORDINATOR_TOKEN", "a-token-of-the-operator")
-    heard = []
-
-    class Listening(BaseHTTPRequestHandler):
-        def do_GET(self):
-            heard.append(self.headers["Authorization"])
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(b"{}")
-
-        def log_message(self, *_):
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Listening) as server:
+    with HTTPServer(("127.0.0.1", 0), Answering) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         place = tmp_path / "coordinator"
         place.write_text(f"http://127.0.0.1:{server.server_port}\n")
@@ -160,9 +131,25 @@ def test_the_token_of_the_environment_is_sent_to_the_coordinator(tmp_path, monke
         poll = Thread(target=dashboard._poll, daemon=True)
         poll.start()
         try:
-            wait_for(lambda: heard)
+            yield dashboard.board, poll, tokens
         finally:
             dashboard._stopping.set()
             poll.join()
             server.shutdown()
-    assert heard[0] == "Bearer a-token-of-the-operator"
+
+
+@pytest.mark.parametrize(
+    "said", [b"[5]", b'{"a": 1}', b"[" * 5000, b"5"], ids=["list", "map", "deep", "number"]
+)
+def test_a_coordinator_that_answers_nonsense_ends_no_thread(tmp_path, said):
+    """Else the pages would show the last state for ever."""
+    with polling(tmp_path, said) as (board, poll, _):
+        wait_for(lambda: board.coordinator or not poll.is_alive())
+        assert poll.is_alive()
+
+
+def test_the_token_of_the_environment_is_sent_to_the_coordinator(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUE_COORDINATOR_TOKEN", "a-token-of-the-operator")
+    with polling(tmp_path, b"{}") as (_, _, tokens):
+        wait_for(lambda: tokens)
+    assert tokens[0] == "Bearer a-token-of-the-operator"
