@@ -13,7 +13,7 @@ VENV := .venv
 # optional parts of pyproject.toml to install: `make EXTRAS=dev,spark test` tests the Spark engine too
 EXTRAS ?= dev
 # how many workers share the tests (tests/conftest.py says how); 0: one after the other
-WORKERS ?= 2
+WORKERS ?= 3
 PYTEST := -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 BIN := $(VENV)/bin
 comma := ,
