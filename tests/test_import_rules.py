@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 OURS = {"due", "coordinator", "apps", "dataplane", "sdnator", "p4rt", "sdnator_due", "tests", "benchmarks"}
 CONTRACT = {
-    "apps", "apps.enforcement", "apps.evidence", "apps.incidents", "apps.intake", "apps.messages", "apps.packets",
+    "apps", "apps.archive_question", "apps.enforcement", "apps.evidence", "apps.incidents", "apps.intake", "apps.messages", "apps.packets",
     "apps.standing_decisions", "apps.talkers",
 }  # fmt: skip
 APPS = ("p4runtime_ctrl", "kitsune", "sonata_adapter", "firewall", "enforcers")

@@ -3,19 +3,18 @@
 import logging
 import re
 import socket
-import threading
 import time
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, Final
 
 import due
+from apps.archive_question import ArchiveQuestion
 from apps.enforcement import ALLOWED, CONFIRMED, ENFORCED, EnforcementReport
 from apps.enforcers.arrivals import DECISIONS, allowed_in, decision_in, last_of_each
 from apps.enforcers.enforcement_worker import EnforcementWorker, Spoken
 from apps.enforcers.enforcer import Enforcer
-from apps.messages import LONGEST_BLOCK_S, Confirmation, Decision, Intake, one_line, read_latest
-from due import Capability, DueError, Engine, Interest, Item
+from apps.messages import LONGEST_BLOCK_S, Confirmation, Decision, Intake, one_line
+from due import Capability, Engine, Interest, Item
 
 ENFORCER_WANTS: Final = (*(Interest(key) for key in DECISIONS), Interest(ALLOWED))
 """What every enforcer wants."""
@@ -49,28 +48,6 @@ def place_name(given: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "_", given or socket.gethostname()) or "host"
 
 
-class _Question(threading.Thread):
-    """Asks the archive; a thread, because an archive that is away may take half a minute to say so."""
-
-    def __init__(
-        self, engine: Engine, queries: Sequence[tuple[dict[str, Any], int, int]], asked_at: int
-    ) -> None:
-        super().__init__(name="archive query", daemon=True)
-        self._engine = engine
-        self._queries = queries
-        self.asked_at = asked_at
-        self.found: list[list[Item]] | None = None
-        """By query; None: no answer."""
-        self.problem = "no answer"
-        self.start()
-
-    def run(self) -> None:
-        try:
-            self.found = [read_latest(self._engine, *each) for each in self._queries]
-        except DueError as error:
-            self.problem = str(error)
-
-
 class EnforcerApp:
     """Between DUE and an `EnforcementWorker`.
 
@@ -88,7 +65,7 @@ class EnforcerApp:
         self._place = place
         self._intake = Intake(log)
         self._desk = EnforcementWorker(enforcer, (app, place), self._confirm, self._report, **options)
-        self._question: _Question | None = None
+        self._question: ArchiveQuestion | None = None
         self._ask_at = 0.0
         self._pause = _LOOK_EVERY_S
         self._restored = False
@@ -144,7 +121,7 @@ class EnforcerApp:
         elif time.monotonic() >= self._ask_at:
             self._ask()
 
-    def _ask(self) -> _Question:
+    def _ask(self) -> ArchiveQuestion:
         now = time.time_ns()
         if self._restored:
             back = _LATE_NS if self._looks % _FAR_LOOK else _CLOCKS_DIFFER_NS
@@ -153,7 +130,7 @@ class EnforcerApp:
         else:
             queries = [({"dataKey": key}, now - _LONGEST_NS, _RESTORED) for key in DECISIONS]
             queries.append(({"dataKey": ALLOWED}, 0, 1))
-        self._question = _Question(self._engine, queries, now)
+        self._question = ArchiveQuestion(self._engine, now, queries)
         return self._question
 
     def _hear_archive(self) -> None:

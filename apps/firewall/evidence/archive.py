@@ -1,14 +1,12 @@
 """Queries to Data Archives with a time limit, so that no decision waits for an unreachable archive.  I/O."""
 
 import logging
-import threading
 import time
 from collections.abc import Mapping
 from typing import Any, Final
 
-from apps.messages import read_latest
+from apps.archive_question import ArchiveQuestion
 from due import Engine, Item
-from due.errors import DueError
 
 ASK_AGAIN_S: Final = 10.0
 """Pause after a query without an answer, in seconds."""
@@ -26,31 +24,14 @@ OFFENCES_READ: Final = 1_000
 """Most archived blocks read per address, the newest."""
 
 
-class _Question(threading.Thread):
-    def __init__(self, engine: Engine, query: Mapping[str, Any], since: int, most: int) -> None:
-        super().__init__(name="archive query", daemon=True)
-        self._engine = engine
-        self._asked = (query, since, most)
-        self.asked_at = time.time_ns()
-        self.items: list[Item] | None = None
-        self.problem = "no answer in time"
-        self.start()
-
-    def run(self) -> None:
-        try:
-            self.items = read_latest(self._engine, *self._asked)
-        except DueError as error:
-            self.problem = str(error)
-
-
 class Archive:
     """Queries with a time limit of `patience_s`; while the archive is unreachable they return None."""
 
     def __init__(self, engine: Engine, patience_s: float) -> None:
         self._engine = engine
         self._patience_s = patience_s
-        self._asked: _Question | None = None
-        self._looking: _Question | None = None
+        self._asked: ArchiveQuestion | None = None
+        self._looking: ArchiveQuestion | None = None
         self._look_after = time.monotonic()
         self._looked_to = time.time_ns()
         """Wall time of the last look that was answered; before the first, of the start."""
@@ -82,9 +63,9 @@ class Archive:
         if self.away:
             self.unanswered += 1
             return None
-        question = self._asked = _Question(self._engine, asked, since, most)
+        question = self._asked = ArchiveQuestion(self._engine, time.time_ns(), [(asked, since, most)])
         question.join(self._patience_s if patience_s is None else patience_s)
-        found = question.items
+        found = None if question.found is None else question.found[0]
         if found is None:
             self.unanswered += 1
             self._quiet_until = time.monotonic() + ASK_AGAIN_S
@@ -109,13 +90,14 @@ class Archive:
             if self._looking.is_alive():
                 return []
             looked, self._looking = self._looking, None
-            if looked.items is None:
+            if looked.found is None:
                 return []
             self._looked_to = looked.asked_at
-            return looked.items
+            return looked.found[0]
         if time.monotonic() >= self._look_after:
             self._look_after = time.monotonic() + every_s
             # this machine's clock may have been ahead at that time
-            since = min(self._looked_to, time.time_ns()) - back_ns
-            self._looking = _Question(self._engine, query, since, MOST)
+            now = time.time_ns()
+            since = min(self._looked_to, now) - back_ns
+            self._looking = ArchiveQuestion(self._engine, now, [(query, since, MOST)])
         return []
