@@ -50,6 +50,14 @@ def flow(**given):
     return RecordBatch({name: np.array([values[name]], dtype=kind) for name, kind in FLOW_COLUMNS.items()})
 
 
+def syns(count, begin_us=BASE_US):
+    """Connections of many hosts to one."""
+    return [
+        TimedFrame(begin_us + place, 60, tcp(f"10.7.0.{place}", "192.0.2.9", 5000, 80, SYN))
+        for place in range(count)
+    ]
+
+
 def groups(**given):
     """Flags and number of the packets that a flow stands for."""
     found = packet_groups(flow(**given))
@@ -193,10 +201,7 @@ def test_attack_is_found_in_flows(name):
 
 
 def test_a_threshold_is_told_at_once_and_a_difference_when_its_window_is_over():
-    frames = [
-        TimedFrame(BASE_US + place, 60, tcp(f"10.7.0.{place}", "192.0.2.9", 5000, 80, SYN))
-        for place in range(60)
-    ]
+    frames = syns(60)
     tried = windows("new_tcp", "syn_flood")
     flows = flows_of(frames, export_us=BASE_US + 10_000_000)
     at_once = tried.take("lab", flows, 100.0)
@@ -210,10 +215,7 @@ def test_a_threshold_is_told_at_once_and_a_difference_when_its_window_is_over():
 
 def test_exporters_are_counted_apart():
     """Two routers on one path tell the same packets twice."""
-    frames = [
-        TimedFrame(BASE_US + place, 60, tcp(f"10.7.0.{place}", "192.0.2.9", 5000, 80, SYN))
-        for place in range(30)
-    ]
+    frames = syns(30)
     tried = windows("new_tcp:threshold=40")
     flows = flows_of(frames)
     assert [*tried.take("a", flows, 0.0), *tried.take("b", flows, 0.0), *tried.finish()] == []
@@ -221,15 +223,27 @@ def test_exporters_are_counted_apart():
 
 def test_records_of_a_wrong_clock_stop_nothing():
     """One export from the year 2100 does not close the windows of all others."""
-    frames = [
-        TimedFrame(BASE_US + place, 60, tcp(f"10.7.0.{place}", "192.0.2.9", 5000, 80, SYN))
-        for place in range(60)
-    ]
+    frames = syns(60)
     tried = windows("new_tcp")
     tried.take("lab", flows_of(frames[:20]), 0.0)
     assert tried.take("lab", flows_of(frames[20:30], export_us=4_102_444_800_000_000), 0.0) == []
     assert tried.take("lab", flows_of(frames[20:]), 0.0) != []
     assert tried.health()["times_doubted"] >= 1
+
+
+def test_a_clock_that_was_ahead_is_followed_when_it_is_set_right():
+    """The exporter sends twenty times by then, so that nobody sets it back with one record."""
+    tried = windows("new_tcp")
+    ahead_us = BASE_US + 7_200_000_000
+    assert tried.take("lab", flows_of(syns(60, ahead_us)), 0.0) != []
+    for second in range(20):
+        begin_us = BASE_US + second * 1_000_000
+        tried.take("lab", flows_of(syns(1, begin_us), export_us=begin_us), 0.0)
+    connections = syns(60, BASE_US + 60_000_000)
+    assert tried.take("lab", flows_of(connections[:30]), 0.0) == []
+    assert tried.take("lab", flows_of(connections[30:]), 0.0) != []
+    health = tried.health()
+    assert (health["late"], health["clocks_set_back"]) == (0, 1)
 
 
 def test_packets_of_long_ago_count_in_the_oldest_open_window():
@@ -275,10 +289,7 @@ def test_the_number_of_queries_is_limited():
 
 def test_the_app_answers_queries_of_its_settings():
     """Flows in under the collector's key, results out and archived."""
-    frames = [
-        TimedFrame(BASE_US + place, 60, tcp(f"10.7.0.{place}", "192.0.2.9", 5000, 80, SYN))
-        for place in range(60)
-    ]
+    frames = syns(60)
     with AppRun(flow_queries, queries=["new_tcp:threshold=50"]) as app:
         app.feed("network.flows.flow_records.lab", flows_of(frames))
         (item,) = app.wait_for(f"{RESULTS}.new_tcp")

@@ -79,6 +79,8 @@ class QueryWindows:
         """Packets beyond `most_packets`: counts of packets are too small by these."""
         self.not_kept = 0
         """Items of exporters beyond MOST_EXPORTERS."""
+        self.clocks_set_back = 0
+        """Times that an exporter's clock was set back: all its windows were closed."""
 
     def want(self, keys: Iterable[str], templates: Mapping[str, Template]) -> dict[str, str]:
         """Replace the set of wanted keys.
@@ -117,6 +119,7 @@ class QueryWindows:
         state = self._state_of(exporter)
         if state is None or not self._queries or not len(flows):
             return []
+        before_us = state.clock.now
         # one vote for each time of export, since hundreds of records share it
         exports = np.unique(flows["time_us"])
         believed = state.clock.believed(exports)
@@ -129,7 +132,12 @@ class QueryWindows:
         packets = single_packets(groups, self._most_packets)
         self.left_out += max(0, int(groups["packets"].sum(dtype=np.float64)) - len(packets))
         horizon_us = state.clock.now - self._delay_us
-        return list(self._addressed(exporter, state.engine.process(packets, horizon_us=horizon_us)))
+        outputs: list[QueryResult | Captured] = []
+        if before_us is not None and state.clock.now < before_us - _STEP_US:
+            self.clocks_set_back += 1
+            outputs += state.engine.set_back(horizon_us)
+        outputs += state.engine.process(packets, horizon_us=horizon_us)
+        return list(self._addressed(exporter, outputs))
 
     def advance(self, now_s: float) -> list[FlowResult]:
         """Results of windows that are over although no records come any more."""
@@ -158,6 +166,7 @@ class QueryWindows:
             "packets": sum(state.engine.packets for state in states),
             "late": sum(state.engine.late for state in states),
             "times_doubted": sum(state.clock.doubted for state in states),
+            "clocks_set_back": self.clocks_set_back,
             "left_out": self.left_out,
             "not_kept": self.not_kept,
         }
