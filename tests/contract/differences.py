@@ -40,12 +40,18 @@ DIFFERENCES = {
     "constant-table": Difference(
         "an insert into a constant table is UNKNOWN", "PERMISSION_DENIED", _SPECIFIED
     ),
+    "is-const": Difference("the flag is ignored in a Write", "INVALID_ARGUMENT", _SPECIFIED),
+    "delete-with-age": Difference(
+        "a DELETE with `time_since_last_hit` set is INVALID_ARGUMENT",
+        "only the key counts",
+        f"{_SPECIFIED}; an entry can be deleted as it was read",
+    ),
     "read-by-priority": Difference(
         "the priority of a read without match is ignored", "it selects", _SPECIFIED
     ),
     "atomicity": Difference(
-        "CONTINUE_ON_ERROR only",
-        "also ROLLBACK_ON_ERROR and DATAPLANE_ATOMIC",
+        "CONTINUE_ON_ERROR only; all others are UNIMPLEMENTED",
+        "also ROLLBACK_ON_ERROR and DATAPLANE_ATOMIC; others are INVALID_ARGUMENT",
         "nobody wants half a batch",
     ),
     "cell-index": Difference(
