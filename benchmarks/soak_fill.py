@@ -4,7 +4,7 @@
 
 Half of them ask twice, and nothing answers the second request: contacts in vain are kept, too.  Some of them connect
 to the next one by TCP in the end: the firewall, its controller and the switch keep sources with a finished handshake, and
-their services.  At the end some hosts speak with ten others each: what such a hub says is logged for the peers that have
+their services.  Others only ask for a login, of which Kitsune keeps the latest.  At the end some hosts speak with ten others each: what such a hub says is logged for the peers that have
 not heard it yet, and without them the number of these logs would grow for hours.  Hosts with even numbers are on the
 side of the office.  A table at its cap forgets the oldest to take the newest: memory that grows from then on is a leak.
 """
@@ -16,6 +16,7 @@ from typing import Any, Final
 from apps.firewall.settings import Settings
 from apps.firewall.syn.syn_defence import SERVICES_LEARNT
 from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS, STREAMS_PER_LOG
+from apps.kitsune.behaviour.behaviour import KEPT
 from apps.kitsune.behaviour.contacts import MOST_CONTACTS
 
 PAIRS: Final = round(2.1 * MOST_CONTACTS)
@@ -26,12 +27,14 @@ UNANSWERED: Final = round(1.05 * MOST_CONTACTS)
 """Of their requests."""
 HANDSHAKES: Final = round(1.05 * max(Settings().known_limit, SERVICES_LEARNT))
 """Connections: each brings a known source and a service.  To a host goes one, so that nothing looks like a flood."""
+LOGINS: Final = round(1.05 * KEPT)
+"""SYNs to login services.  In the office traffic they take an hour and more until Kitsune forgets them."""
 HUBS: Final = round(1.2 * MAX_STREAMS / STREAMS_PER_LOG)
 """Each has a log in two tables."""
 PEERS: Final = 10
 ROUNDS: Final = 26
 """A log keeps 256 packets."""
-FRAMES: Final = 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES + HUBS * PEERS * (ROUNDS + 1)
+FRAMES: Final = 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES + LOGINS + HUBS * PEERS * (ROUNDS + 1)
 TRAINED: Final = 70_000
 """Frames of the office before: 55,000 of training, the rest is scored."""
 CAPS: Final = {
@@ -47,7 +50,7 @@ _ADDRESSES: Final = 100 << 24 | 64 << 16
 """100.64.0.0/10 (RFC 6598), where nobody in the office traffic is."""
 _MACS: Final = 0x02_66_00_000000
 _PORT, _SILENT_PORT, _UDP, _LIFE = 20_000, 20_001, 17, 64
-_TCP, _HTTPS, _WINDOW = 6, 443, 65_535
+_TCP, _HTTPS, _SSH, _WINDOW = 6, 443, 22, 65_535
 _SYN, _ACK = 0x02, 0x10
 _CLIENTS, _SERVERS = 1_000, 5_000
 """Sequence numbers with which both ends begin."""
@@ -59,7 +62,11 @@ _PSEUDO = struct.Struct("!IIHH")
 
 
 def fill_frames(
-    pairs: int = PAIRS, unanswered: int = UNANSWERED, handshakes: int = HANDSHAKES, hubs: int = HUBS
+    pairs: int = PAIRS,
+    unanswered: int = UNANSWERED,
+    handshakes: int = HANDSHAKES,
+    logins: int = LOGINS,
+    hubs: int = HUBS,
 ) -> Iterator[tuple[int, bytes]]:
     """Frames, and the end that each is sent into: 0 that of the office, 1 that of the Internet.
 
@@ -67,6 +74,7 @@ def fill_frames(
         pairs: of neighbours in the chain.
         unanswered: requests without an answer, by the first hosts.
         handshakes: connections, by the first hosts, after all requests.
+        logins: requests for a login without an answer, by the first hosts.
         hubs: hosts behind the chain that speak with ten others each, all at the same time.
     """
     for first in range(0, pairs, _TOGETHER):
@@ -85,7 +93,9 @@ def fill_frames(
             yield (number + 1) % 2, _segment(number + 1, number, _SYN | _ACK, _SERVERS, _CLIENTS + 1)
         for number in clients:
             yield number % 2, _segment(number, number + 1, _ACK, _CLIENTS + 1, _SERVERS + 1)
-    yield from _hub_frames(max(pairs, handshakes) + 1, hubs)
+    for number in range(logins):
+        yield number % 2, _segment(number, number + 1, _SYN, _CLIENTS, 0, _SSH)
+    yield from _hub_frames(max(pairs, handshakes, logins) + 1, hubs)
 
 
 def _hub_frames(first: int, hubs: int) -> Iterator[tuple[int, bytes]]:
@@ -112,9 +122,11 @@ def _frame(sender: int, receiver: int, port: int = _PORT) -> bytes:
     return _packet(sender, receiver, _UDP, datagram)
 
 
-def _segment(sender: int, receiver: int, flags: int, sequence: int, acknowledged: int) -> bytes:
+def _segment(
+    sender: int, receiver: int, flags: int, sequence: int, acknowledged: int, service: int = _HTTPS
+) -> bytes:
     """A TCP segment of a connection to the host with the higher number."""
-    ports = (_PORT, _HTTPS) if sender < receiver else (_HTTPS, _PORT)
+    ports = (_PORT, service) if sender < receiver else (service, _PORT)
     fields = *ports, sequence, acknowledged, _SEGMENT.size // 4 << 4, flags, _WINDOW
     pseudo = _PSEUDO.pack(_ADDRESSES + sender, _ADDRESSES + receiver, _TCP, _SEGMENT.size)
     checksum = _checksum(pseudo + _SEGMENT.pack(*fields, 0, 0))

@@ -5,15 +5,16 @@ import numpy as np
 from apps.firewall.settings import Settings
 from apps.firewall.syn.syn_defence import SERVICES_LEARNT
 from apps.kitsune.afterimage import MAX_LINKS, MAX_STREAMS, STREAMS_PER_LOG, AfterImage
+from apps.kitsune.behaviour.behaviour import KEPT
 from apps.kitsune.behaviour.contacts import MOST_CONTACTS
 from apps.kitsune.senders import MOST_CONVERSATIONS, MOST_SENDERS
 from apps.packets import read_frames
 from apps.sonata_adapter.host.handshake import Handshakes
-from benchmarks.soak_fill import FRAMES, HANDSHAKES, HUBS, PAIRS, UNANSWERED, fill_frames, fullness
+from benchmarks.soak_fill import FRAMES, HANDSHAKES, HUBS, LOGINS, PAIRS, UNANSWERED, fill_frames, fullness
 
 
-def packets(pairs, unanswered=0, handshakes=0, hubs=0):
-    sides, frames = zip(*fill_frames(pairs, unanswered, handshakes, hubs), strict=True)
+def packets(pairs, unanswered=0, handshakes=0, logins=0, hubs=0):
+    sides, frames = zip(*fill_frames(pairs, unanswered, handshakes, logins, hubs), strict=True)
     numbers = np.arange(len(frames))
     return read_frames(
         frames,
@@ -51,9 +52,18 @@ def test_connections_make_known_sources_and_services_and_no_flood():
     assert {each.port for each in found} == {443}
 
 
+def test_logins_are_asked_for_once_in_each_place():
+    columns = packets(0, logins=100)
+    assert ((columns["ip_src_lo"] - columns["ip_src_lo"].min()) % 2 + 1).tolist() == columns["port"].tolist()
+    assert len(set(zip(columns["ip_src_lo"].tolist(), columns["ip_dst_lo"].tolist(), strict=True))) == 100
+    assert set(columns["tcp_dport"].tolist()) == {22}
+    assert set(columns["tcp_flags"].tolist()) == {2}
+    assert KEPT < LOGINS < PAIRS
+
+
 def test_as_many_frames_are_sent_as_there_are():
-    assert len(list(fill_frames(130, 70, 100, 3))) == 2 * 130 + 70 + 3 * 100 + 3 * 270
-    assert FRAMES == 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES + 270 * HUBS
+    assert len(list(fill_frames(130, 70, 100, 50, 3))) == 2 * 130 + 70 + 3 * 100 + 50 + 3 * 270
+    assert FRAMES == 2 * PAIRS + UNANSWERED + 3 * HANDSHAKES + LOGINS + 270 * HUBS
 
 
 def test_there_are_connections_enough_for_known_sources_and_services():
@@ -62,14 +72,14 @@ def test_there_are_connections_enough_for_known_sources_and_services():
 
 
 def test_headers_are_valid():
-    for _, frame in fill_frames(3, 1, 2, 1):
+    for _, frame in fill_frames(3, 1, 2, 2, 1):
         words = np.frombuffer(frame[14:34], ">u2").astype(int).sum()
         assert words % 0xFFFF == 0
         assert int.from_bytes(frame[16:18], "big") == len(frame) - 14
 
 
 def test_segments_have_their_checksum():
-    for _, frame in fill_frames(0, 0, 2, 0):
+    for _, frame in fill_frames(0, 0, 2, 2, 0):
         words = np.frombuffer(frame[26:], ">u2").astype(int).sum() + 6 + len(frame) - 34
         assert words % 0xFFFF == 0
 
