@@ -74,7 +74,8 @@ def fill_frames(
         pairs: of neighbours in the chain.
         unanswered: requests without an answer, by the first hosts.
         handshakes: connections, by the first hosts, after all requests.
-        logins: requests for a login without an answer, by the first hosts.
+        logins: requests for a login without an answer, by the last hosts of the chain: who asked in vain twice would be
+            blocked.
         hubs: hosts behind the chain that speak with ten others each, all at the same time.
     """
     for first in range(0, pairs, _TOGETHER):
@@ -93,7 +94,7 @@ def fill_frames(
             yield (number + 1) % 2, _segment(number + 1, number, _SYN | _ACK, _SERVERS, _CLIENTS + 1)
         for number in clients:
             yield number % 2, _segment(number, number + 1, _ACK, _CLIENTS + 1, _SERVERS + 1)
-    for number in range(logins):
+    for number in range(max(pairs - logins, 0), max(pairs, logins)):
         yield number % 2, _segment(number, number + 1, _SYN, _CLIENTS, 0, _SSH)
     yield from _hub_frames(max(pairs, handshakes, logins) + 1, hubs)
 
