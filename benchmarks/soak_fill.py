@@ -4,9 +4,10 @@
 
 Half of them ask twice, and nothing answers the second request: contacts in vain are kept, too.  Some of them connect
 to the next one by TCP in the end: the firewall, its controller and the switch keep sources with a finished handshake, and
-their services.  Others only ask for a login, of which Kitsune keeps the latest.  At the end some hosts speak with ten others each: what such a hub says is logged for the peers that have
-not heard it yet, and without them the number of these logs would grow for hours.  Hosts with even numbers are on the
-side of the office.  A table at its cap forgets the oldest to take the newest: memory that grows from then on is a leak.
+their services.  Others ask for a login, and Kitsune keeps that.  At the end some hosts speak with ten others each: what
+such a hub says is logged for the peers that have not heard it yet, and without them the number of these logs would grow
+for hours.  Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest, or all, to take
+the newest: memory that grows from then on is a leak.
 """
 
 import struct
