@@ -4,7 +4,7 @@
 
 Half of them ask twice, and nothing answers the second request: contacts in vain are kept, too.  Some of them connect
 to the next one by TCP in the end: the firewall, its controller and the switch keep sources with a finished handshake, and
-their services.  Others ask for a login, and Kitsune keeps that.  At the end some hosts speak with ten others each: what
+their services.  Others have asked for a login before, and Kitsune keeps that.  At the end some hosts speak with ten others each: what
 such a hub says is logged for the peers that have not heard it yet, and without them the number of these logs would grow
 for hours.  Hosts with even numbers are on the side of the office.  A table at its cap forgets the oldest, or all, to take
 the newest: memory that grows from then on is a leak.
@@ -79,6 +79,9 @@ def fill_frames(
             blocked.
         hubs: hosts behind the chain that speak with ten others each, all at the same time.
     """
+    # first, since they would push links out of the tables that the others fill
+    for number in range(max(pairs - logins, 0), max(pairs, logins)):
+        yield number % 2, _segment(number, number + 1, _SYN, _CLIENTS, 0, _SSH)
     for first in range(0, pairs, _TOGETHER):
         askers = range(first, min(first + _TOGETHER, pairs))
         for number in askers:
@@ -95,8 +98,6 @@ def fill_frames(
             yield (number + 1) % 2, _segment(number + 1, number, _SYN | _ACK, _SERVERS, _CLIENTS + 1)
         for number in clients:
             yield number % 2, _segment(number, number + 1, _ACK, _CLIENTS + 1, _SERVERS + 1)
-    for number in range(max(pairs - logins, 0), max(pairs, logins)):
-        yield number % 2, _segment(number, number + 1, _SYN, _CLIENTS, 0, _SSH)
     yield from _hub_frames(max(pairs, handshakes, logins) + 1, hubs)
 
 
