@@ -79,7 +79,7 @@ def fill_frames(
             blocked.
         hubs: hosts behind the chain that speak with ten others each, all at the same time.
     """
-    # first, since they would push links out of the tables that the others fill
+    # first: later they would push links out of the tables that the others fill
     for number in range(max(pairs - logins, 0), max(pairs, logins)):
         yield number % 2, _segment(number, number + 1, _SYN, _CLIENTS, 0, _SSH)
     for first in range(0, pairs, _TOGETHER):
