@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from due.drivers.base import ArchiveDriver
 from due.drivers.lasting import Lasting
@@ -54,6 +55,9 @@ class Retention:
         while not self._stop.wait(self._every_s):
             if self._allowed():
                 self._prune(archive)
+            else:
+                with suppress(DueError):
+                    archive.tend()
         archive.close()
 
     def _prune(self, archive: ArchiveDriver) -> None:

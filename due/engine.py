@@ -446,6 +446,17 @@ class Engine:
         """
         return self._require().health()
 
+    def tend(self) -> None:
+        """Let go of files that were replaced; `Service` calls it every second.
+
+        An archive of SQLite whose file is moved or replaced keeps its space as long as a process has it open.  Every
+        call that reads or writes the archive notices; a program without `Service` that may do neither for long
+        calls this.
+        """
+        session = self._session
+        if session is not None:
+            session.tend()
+
     def close(self) -> None:
         """Send what is still queued, sign off from the Coordinator and disconnect.  Safe to call twice."""
         session = self._session

@@ -318,6 +318,7 @@ class _Run:
             heap.tick(now)
             if now >= health_at:
                 health_at = now + _HEALTH_SECONDS
+                self._engine.tend()
                 self._engine.write(f"{HEALTH}.{self._app_id}", self._report(), [PUB_ONLY])
                 if liveness.beat() and self._heartbeat is not None:
                     self._heartbeat.beat()

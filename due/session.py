@@ -5,7 +5,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -239,6 +239,12 @@ class Session:
     def archive(self) -> ArchiveDriver:
         """Data Archives."""
         return self._archive
+
+    def tend(self) -> None:
+        """See `Engine.tend`."""
+        # an archive that is away is told of where it is needed
+        with suppress(BackendError):
+            self._archive.tend()
 
     def opened(self, observation: Observation) -> None:
         """An observation got its first subscriber."""

@@ -76,6 +76,13 @@ class ArchiveDriver(Protocol):
         """
         ...
 
+    def tend(self) -> None:
+        """Release what is of no more use; called every second, also while nothing is read or written.
+
+        Raises `BackendError`.
+        """
+        ...
+
     def close(self) -> None:
         """Release connections and files; further calls raise `BackendError`."""
         ...

@@ -127,6 +127,9 @@ class MemoryArchive:
                 deleted += self._store.drop(_oldest(self._store.rows, max_bytes, lasts))
             return deleted
 
+    def tend(self) -> None:
+        """Nothing is held that others could need."""
+
     def close(self) -> None:
         """Further calls raise BackendError; what is stored stays for others of the same name."""
         self._closed = True

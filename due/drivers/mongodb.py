@@ -128,6 +128,9 @@ class MongoArchive:
             self._retention.forget_keys()
             return deleted
 
+    def tend(self) -> None:
+        """Nothing to do: the client looks after its connections."""
+
     def close(self) -> None:
         """Close connections; further calls raise BackendError."""
         self._closed = True

@@ -102,6 +102,10 @@ class MongoAppsArchive:
         limits = {} if max_bytes is None else _limits(parts, max_bytes, lasting)
         return sum(_pruned(part, before, lasting, limits.get(part)) for part in parts)
 
+    def tend(self) -> None:
+        """See `ArchiveDriver.tend`."""
+        self._own.tend()
+
     def close(self) -> None:
         """See `ArchiveDriver.close`."""
         self._own.close()

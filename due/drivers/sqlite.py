@@ -8,7 +8,7 @@ key and time, then `query.matches` decides item by item.  URL: `sqlite:///folder
 import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from heapq import merge
 from itertools import groupby
 from operator import attrgetter, itemgetter
@@ -22,7 +22,8 @@ from due.drivers.latest_items import by_age, latest_items
 from due.drivers.query import ArchiveQuery, parse
 from due.drivers.query_time import in_time, time_left
 from due.drivers.query_tree import INT64, Condition
-from due.drivers.sqlite_file import DamagedCell, SqliteFile, whole_number
+from due.drivers.sqlite_file import ArchiveDiskFull, DamagedCell, SqliteFile, whole_number
+from due.drivers.sqlite_reserve import PruningReserve
 from due.errors import DecodeError, InvalidKey, InvalidOption, Timeout
 from due.messages import Item, PackedFrame
 
@@ -83,6 +84,7 @@ class SqliteArchive:
         if options or synchronous not in _SYNCHRONOUS:
             raise InvalidOption(f"archive URL {url!r}: the only option is synchronous=normal or =full")
         self._file = SqliteFile(path, synchronous)
+        self._reserve = PruningReserve(path)
         self._url = url
         self._damaged_rows = 0
 
@@ -132,7 +134,20 @@ class SqliteArchive:
     def prune(
         self, *, before: int | None = None, max_bytes: int | None = None, lasting: Lasting = NOTHING
     ) -> int:
-        """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`."""
+        """Delete rows that are wholly older than `before`, then the oldest down to `max_bytes`.
+
+        Where the disk is full, what was kept in reserve for this is used.
+        """
+        try:
+            with suppress(ArchiveDiskFull):
+                return self._pruned(before, max_bytes, lasting)
+            if self._reserve.give_up():
+                self._file.checkpoint()
+            return self._pruned(before, max_bytes, lasting)
+        finally:
+            self._reserve.allocate()
+
+    def _pruned(self, before: int | None, max_bytes: int | None, lasting: Lasting) -> int:
         deleted = 0
         if before is not None or lasting.before is not None:
             deleted += self._in_steps(lambda connection: self._prune_older(connection, before, lasting))
@@ -182,6 +197,10 @@ class SqliteArchive:
             if not count:
                 return deleted
             deleted += count
+
+    def tend(self) -> None:
+        """See `ArchiveDriver.tend`."""
+        self._file.tend()
 
     def close(self) -> None:
         """Close the file; further calls raise BackendError."""
@@ -348,13 +367,15 @@ def _delete_older(connection: sqlite3.Connection, keys: Sequence[int], before: i
 def _delete_oldest(connection: sqlite3.Connection, keys: Sequence[int], excess: int) -> int:
     """Delete the oldest rows that hold so many bytes together, or the most of a step."""
     deleted, ids = 0, list[tuple[int]]()
-    by_time = merge(*(connection.execute(_OLDEST, (key,)) for key in keys), key=itemgetter(0))
-    for _, number, count, size in by_time:
-        if excess <= 0 or len(ids) >= _PRUNE_ROWS:
-            break
-        ids.append((number,))
-        deleted += count
-        excess -= size + _ROW_OVERHEAD
+    with ExitStack() as stack:
+        # closed also when deleting fails: a cursor that is read later would keep the WAL from being written again
+        each = [stack.enter_context(closing(connection.execute(_OLDEST, (key,)))) for key in keys]
+        for _, number, count, size in merge(*each, key=itemgetter(0)):
+            if excess <= 0 or len(ids) >= _PRUNE_ROWS:
+                break
+            ids.append((number,))
+            deleted += count
+            excess -= size + _ROW_OVERHEAD
     connection.executemany(_DELETE, ids)
     return deleted
 

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Final
 
 from due.drivers.query import ArchiveQuery
 from due.drivers.query_tree import Condition
@@ -21,6 +22,12 @@ from due.messages import Item
 
 _VERSION = 1
 _DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_FULL = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN)
+"""What SQLite says where the disk takes no more, of the archive or of the files beside it."""
+_WAL_PAGES = 4000
+WAL_BYTES: Final = 64 << 20
+"""What the WAL keeps at the most; 4,000 pages are 31 MiB, and a transaction may come on top."""
+_SHRINK_PAGES = 1000
 _BUSY_S = 5.0
 _AGAIN_S = 0.01
 _LOOKUPS = 256
@@ -52,6 +59,10 @@ COMMIT;
 
 class DamagedCell(Exception):
     """A cell holds what no archive writes there, and the file's own checks let it pass."""
+
+
+class ArchiveDiskFull(ArchiveUnavailable):
+    """The archive's disk took no more, or cannot be used."""
 
 
 # a connection inherited by fork is neither used nor closed: its locks belong to the parent
@@ -177,10 +188,15 @@ class SqliteFile:
         self._closed = False
         self._written: sqlite3.Connection | None = None
         """The connection whose transaction runs now; its thread closes it if it was released meanwhile."""
+        self._born()
+
+    def _born(self) -> None:
+        self._pid = os.getpid()
+        self._lock = threading.RLock()
+        """Guards which connections there are, not what is done with them."""
         self._reset()
 
     def _reset(self) -> None:
-        self._pid = os.getpid()
         self._file: tuple[int, int] | None = None
         self._writer: sqlite3.Connection | None = None
         self._idle: deque[sqlite3.Connection] = deque()
@@ -188,23 +204,37 @@ class SqliteFile:
         self.sources = Dictionary("sources", "source_id", "app", "instance")
         self.spans: dict[int, tuple[int, int]] = {}
 
-    def _enter(self) -> None:
-        if self._closed:
-            raise BackendError(f"archive {self._path} is closed")
+    @contextmanager
+    def _entered(self) -> Iterator[None]:
+        """Hold the lock; what connections there are belong to the file that has the archive's name now."""
         if self._pid != os.getpid():
             _inherited.extend(self._idle)
             if self._writer is not None:
                 _inherited.append(self._writer)
-            self._reset()
-        if self._file is not None and self._file != self._named():
-            # moved away or replaced: what is written into the old file would be in no archive
-            self._let_go()
+            self._born()
+        with self._lock:
+            if self._closed:
+                raise BackendError(f"archive {self._path} is closed")
+            if self._file is not None and self._file != self._named():
+                # moved away or replaced: what is written into the old file would be in no archive
+                self._let_go()
+            yield
 
-    def _check_place(self) -> None:
+    def tend(self) -> None:
+        """See `ArchiveDriver.tend`."""
+        with self._errors(), self._entered():
+            pass
+
+    def _check_place(self, written: sqlite3.Connection) -> None:
         """Raises `ArchiveUnavailable` if the file was moved while it was written; what is repeated is known by its numbers."""
-        if self._file is not None and self._file != self._named():
-            self._let_go()
-            raise ArchiveUnavailable(f"archive {self._path} was moved away or replaced while it was written")
+        with self._lock:
+            if self._file is not None and self._file != self._named():
+                self._let_go()
+            # it may have been let go by another thread
+            if self._writer is not written and not self._closed:
+                raise ArchiveUnavailable(
+                    f"archive {self._path} was moved away or replaced while it was written"
+                )
 
     def _named(self) -> tuple[int, int] | None:
         """Which file has the archive's name now."""
@@ -240,43 +270,51 @@ class SqliteFile:
         if version < _VERSION:
             _make_tables(connection)
         connection.execute(f"PRAGMA synchronous = {self._synchronous}")
-        connection.execute("PRAGMA wal_autocheckpoint = 4000")
+        connection.execute(f"PRAGMA wal_autocheckpoint = {_WAL_PAGES}")
+        connection.execute(f"PRAGMA journal_size_limit = {WAL_BYTES}")
 
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """One transaction: committed at the end, rolled back on any error."""
-        with self._errors():
-            self._enter()
-            if self._writer is None:
-                self._writer = self._connect()
-            connection = self._written = self._writer
+        with self._errors(), self._writer_in_use() as connection:
             try:
                 connection.execute("BEGIN IMMEDIATE")
                 self.keys.forget()
                 self.sources.forget()
                 yield connection
                 connection.execute("COMMIT")
-                self._check_place()
+                self._check_place(connection)
             except BaseException:
                 self.spans.clear()
                 if connection.in_transaction:
                     connection.execute("ROLLBACK")
                 raise
-            finally:
-                if self._written is connection:
-                    self._written = None
-                if self._writer is not connection:
-                    connection.close()
+
+    @contextmanager
+    def _writer_in_use(self) -> Iterator[sqlite3.Connection]:
+        with self._entered():
+            connection = self._written = self._writer
+        try:
+            if connection is None:
+                connection = self._connect()
+                with self._lock:
+                    self._writer = self._written = connection
+            yield connection
+        finally:
+            with self._lock:
+                self._written = None
+                released = connection is not self._writer
+            if connection is not None and released:
+                connection.close()
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
         """One snapshot of the file: no row appears whose key or source was not known before."""
         with self._errors():
-            self._enter()
-            idle = self._idle
-            try:
-                connection = idle.pop()
-            except IndexError:
+            with self._entered():
+                idle = self._idle
+                connection = idle.pop() if idle else None
+            if connection is None:
                 connection = self._connect()
             try:
                 connection.execute("BEGIN")
@@ -284,16 +322,20 @@ class SqliteFile:
             finally:
                 if connection.in_transaction:
                     connection.execute("ROLLBACK")
-                if self._closed or idle is not self._idle:
+                with self._lock:
+                    released = idle is not self._idle
+                    if not released:
+                        idle.append(connection)
+                if released:
                     connection.close()
-                else:
-                    idle.append(connection)
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.OperationalError as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in _FULL:
+                raise ArchiveDiskFull(f"archive {self._path}: {error}") from error
             raise ArchiveUnavailable(f"archive {self._path}: {error}") from error
         except sqlite3.Error as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
@@ -321,28 +363,40 @@ class SqliteFile:
 
         Left to the garbage collector they would keep the old file's space taken.
         """
+        with self._lock:
+            self._disconnect()
+            self._reset()
+
+    def _disconnect(self) -> None:
         for connection in self._idle:
             connection.close()
         if self._writer is not None and self._writer is not self._written:
             self._writer.close()
-        self._reset()
+        self._idle, self._writer = deque(), None
+
+    def checkpoint(self) -> None:
+        """Bring what is in the WAL into the file, so that the WAL's own space can be written again."""
+        with self._errors(), self._writer_in_use() as connection:
+            connection.execute("PRAGMA wal_checkpoint(RESTART)").fetchall()
 
     def shrink(self) -> None:
-        """Return free pages to the file system."""
-        with self._errors():
-            self._enter()
-            if self._writer is not None:
+        """Return free pages to the file system, some at a time: each page that moves takes room in the WAL first."""
+        with self._errors(), self._writer_in_use() as connection:
+            free = connection.execute("PRAGMA freelist_count").fetchone()[0]
+            for _ in range(0, free, _SHRINK_PAGES):
                 # not `execute`: it would free a single page only
-                self._writer.executescript("PRAGMA incremental_vacuum; PRAGMA wal_checkpoint(PASSIVE);")
+                connection.executescript(
+                    f"PRAGMA incremental_vacuum({_SHRINK_PAGES}); PRAGMA wal_checkpoint(PASSIVE);"
+                )
 
     def close(self) -> None:
-        if self._closed:
+        """Close all connections; what runs closes its own."""
+        if self._pid != os.getpid():
+            self._closed = True
             return
-        self._closed = True
-        if self._pid == os.getpid():
-            for connection in (*self._idle, *((self._writer,) if self._writer else ())):
-                connection.close()
-            self._idle.clear()
+        with self._lock:
+            self._closed = True
+            self._disconnect()
 
 
 def _make_tables(connection: sqlite3.Connection) -> None:

@@ -8,11 +8,14 @@ import sys
 import textwrap
 import time
 import urllib.request
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from due import NO_WAIT
+from due.drivers.sqlite import SqliteArchive
+from due.messages import Item
 from tests.due.conftest import gone, wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -83,6 +86,32 @@ def test_a_service_works_from_ready_to_sigterm(start, tmp_path, make_engine):
     assert process.returncode == 0
     assert stdout == ""
     wait_for(lambda: out == [21, "stopped"])
+
+
+def test_an_archive_that_was_replaced_is_let_go_though_the_app_has_nothing_to_ask(
+    start, tmp_path, make_engine
+):
+    """Its space would be taken until the app's next read."""
+    app = APP.replace("i.value * self.settings.factor", "len(self.engine.get('a.b')), [PUB_ONLY]")
+    app = app.replace("Capability, Interest", "PUB_ONLY, Capability, Interest")
+    (tmp_path / "app.py").write_text(app)
+    with closing(SqliteArchive(f"sqlite://{tmp_path}/a.db")) as archive:
+        archive.insert([Item("a.b", 1, 1, 1, "app", "i", 1)])
+    out, engine = [], make_engine("outside")
+    engine.observe("svc.out").subscribe(lambda item: out.append(item.value))
+    process = start("--archive", f"sqlite://{tmp_path}/a.db")
+    assert process.stdout.readline()
+    engine.write("svc.in", 7)
+    wait_for(lambda: out == [1])
+
+    def held():
+        links = [each.readlink() for each in Path(f"/proc/{process.pid}/fd").iterdir() if each.is_symlink()]
+        return [str(each) for each in links if str(each).startswith(str(tmp_path / "old"))]
+
+    for end in ("", "-wal", "-shm"):
+        (tmp_path / f"a.db{end}").rename(tmp_path / f"old{end}")
+    assert held()
+    wait_for(lambda: not held())
 
 
 def test_an_app_may_print_though_nobody_reads(start, tmp_path, make_engine):

@@ -228,6 +228,13 @@ def test_times_are_datetimes_or_nanoseconds(archive: ArchiveDriver) -> None:
         assert [i.sequence for i in archive.find({"timestamp": now})] == [2]
 
 
+def test_tending_costs_no_item(archive: ArchiveDriver) -> None:
+    archive.tend()
+    archive.insert([Item("a", 1, T0, T0, "app", "i", 1)])
+    archive.tend()
+    assert [item.value for item in archive.find({})] == [1]
+
+
 def test_retention_by_age(archive: ArchiveDriver) -> None:
     archive.insert([item(n=n) for n in range(1, 11)])
     archive.insert_frames([pack([item("f", n=n) for n in range(1, 4)])])

@@ -1,10 +1,8 @@
 """Frames that a full disk does not take: kept in space allocated before, over kill -9, and archived later."""
 
 import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,7 @@ from due.drivers.spool_slots import SlottedSpool
 from due.drivers.sqlite import SqliteArchive
 from due.messages import Item, PackedFrame
 from tests.due.conftest import wait_for
-from tests.requirements import missing
+from tests.due.drivers.conftest import Disk, fill
 
 ROOT = Path(__file__).parents[3]
 PRODUCER = """
@@ -35,44 +33,22 @@ for line in sys.stdin:
 """
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 8 MiB."""
-    if os.geteuid() != 0 or shutil.which("mount") is None:
-        missing("mounting a small disk needs root")
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)], check=True)
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
-
-
-def fill(folder: Path) -> Path:
-    """A file that leaves no byte."""
-    path = folder / "filler"
-    with path.open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(bytes(4096))
-        except OSError:
-            return path
-
-
 def frame(n: int, size: int = 10) -> PackedFrame:
     return pack([Item("a", b"x" * size, n, n, "app", "i", n)])
 
 
-def test_what_is_flushed_on_a_full_disk_is_archived_when_there_is_room(small_disk: Path, server) -> None:
+def test_what_is_flushed_on_a_full_disk_is_archived_when_there_is_room(small_disk: Disk, server) -> None:
     """The disk holds archive and spool; the process is killed while it is full, and another reads what it kept."""
-    archive = f"sqlite://{small_disk / 'archive.db'}"
-    command = [sys.executable, "-c", PRODUCER, server.url, str(small_disk), archive]
+    disk = small_disk(8)
+    archive = f"sqlite://{disk / 'archive.db'}"
+    command = [sys.executable, "-c", PRODUCER, server.url, str(disk), archive]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "cwd": ROOT}
     with subprocess.Popen(command, **pipes) as producer:  # type: ignore[call-overload]
         assert producer.stdout.readline() == "ready\n"
         producer.stdin.write("0\n")
         producer.stdin.flush()
         assert producer.stdout.readline() == "kept 0\n"
-        filler = fill(small_disk)
+        filler = fill(disk)
         for number in range(1, 51):
             producer.stdin.write(f"{number}\n")
             producer.stdin.flush()

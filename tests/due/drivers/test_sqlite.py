@@ -7,6 +7,9 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -257,8 +260,9 @@ def test_a_file_that_is_moved_away_is_written_no_more(tmp_path: Path, *, instead
     old.close()
 
 
-def test_a_file_that_was_replaced_takes_no_space(tmp_path: Path) -> None:
-    """Nobody waits for the garbage collector, which may come late or never."""
+@pytest.mark.parametrize("idle", [False, True])
+def test_a_file_that_was_replaced_takes_no_space(tmp_path: Path, idle: bool) -> None:
+    """Nobody waits for the garbage collector, which may come late or never; nor for a call that needs the archive."""
     archive = opened(tmp_path)
     gc.disable()
     try:
@@ -269,7 +273,10 @@ def test_a_file_that_was_replaced_takes_no_space(tmp_path: Path) -> None:
             for end in ("-wal", "-shm"):
                 (tmp_path / f"archive.db{end}").unlink(missing_ok=True)
             (tmp_path / "copy.db").replace(tmp_path / "archive.db")
-            archive.insert(items(1, start=start + 20))
+            if idle:
+                archive.tend()
+            else:
+                archive.insert(items(1, start=start + 20))
             held = [str(each.readlink()) for each in Path("/proc/self/fd").iterdir() if each.is_symlink()]
             assert [each for each in held if str(tmp_path) in each and "deleted" in each] == []
     finally:
@@ -277,13 +284,51 @@ def test_a_file_that_was_replaced_takes_no_space(tmp_path: Path) -> None:
     archive.close()
 
 
-def test_a_file_that_is_moved_away_while_it_is_written_has_not_taken_it(tmp_path: Path) -> None:
-    """The writer is told, and writes again."""
+def test_what_runs_is_not_taken_from_under_it(tmp_path: Path) -> None:
+    """A file that is replaced is let go while others read and write it; they end as if it was not."""
+    archive, stop, found = opened(tmp_path), threading.Event(), list[int]()
+    failed: list[Exception] = []
+
+    def again(call: Callable[[], object]) -> None:
+        while not stop.is_set():
+            try:
+                call()
+            except ArchiveUnavailable:  # moved while it was opened
+                continue
+            except Exception as error:  # noqa: BLE001 - told by the test's thread
+                failed.append(error)
+                return
+
+    threads = [
+        threading.Thread(target=again, args=(call,))
+        for call in (archive.tend, lambda: found.append(len(archive.find({}))), lambda: archive.find({}))
+    ]
+    for each in threads:
+        each.start()
+    for start in range(1, 200):
+        with suppress(ArchiveUnavailable):
+            archive.insert(items(1, start=start))
+        if start % 5 == 0:
+            for end in ("-wal", "-shm", ""):
+                (tmp_path / f"archive.db{end}").unlink(missing_ok=True)
+    stop.set()
+    for each in threads:
+        each.join()
+    archive.close()
+    assert found
+    assert failed == []
+
+
+@pytest.mark.parametrize("tended", [False, True])
+def test_a_file_that_is_moved_away_while_it_is_written_has_not_taken_it(tmp_path: Path, tended: bool) -> None:
+    """The writer is told, and writes again; also if it was another thread that noticed."""
     file = sqlite_file.SqliteFile(tmp_path / "archive.db", "NORMAL")
     with file.writing():
         pass
     with pytest.raises(ArchiveUnavailable, match="moved away"), file.writing():
         (tmp_path / "archive.db").rename(tmp_path / "old.db")
+        if tended:
+            file.tend()
     with file.writing():
         pass
     file.close()
