@@ -298,7 +298,9 @@ class SqliteFile:
             if connection is None:
                 connection = self._connect()
                 with self._lock:
-                    self._writer = self._written = connection
+                    self._written = connection
+                    # of a file that was closed meanwhile nobody would close it
+                    self._writer = None if self._closed else connection
             yield connection
         finally:
             with self._lock:
