@@ -453,8 +453,7 @@ class Engine:
         call that reads or writes the archive notices; a program without `Service` that may do neither for long
         calls this.
         """
-        session = self._session
-        if session is not None:
+        if (session := self._session) is not None:
             session.tend()
 
     def close(self) -> None:
@@ -564,19 +563,8 @@ def _readable(payload: bytes) -> list[Item]:
 
 
 def _reborn(old: Registration) -> Registration:
-    return Registration(
-        app_id=old.app_id,
-        instance_id=uuid4().hex[:16],
-        instances=old.instances,
-        revision=1,
-        capabilities=old.capabilities,
-        interests=old.interests,
-        producer=old.producer,
-        consumer=old.consumer,
-        heartbeat=old.heartbeat,
-        started=time.time_ns(),
-        host=old.host,
-        pid=os.getpid(),
+    return msgspec.structs.replace(
+        old, instance_id=uuid4().hex[:16], revision=1, started=time.time_ns(), pid=os.getpid()
     )
 
 

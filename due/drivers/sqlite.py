@@ -8,7 +8,7 @@ key and time, then `query.matches` decides item by item.  URL: `sqlite:///folder
 import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from heapq import merge
 from itertools import groupby
 from operator import attrgetter, itemgetter
@@ -139,10 +139,12 @@ class SqliteArchive:
         Where the disk is full, what was kept in reserve for this is used.
         """
         try:
-            with suppress(ArchiveDiskFull):
+            try:
                 return self._pruned(before, max_bytes, lasting)
-            if self._reserve.give_up():
-                self._file.checkpoint()
+            except ArchiveDiskFull:
+                if not self._reserve.give_up():
+                    raise
+            self._file.checkpoint()
             return self._pruned(before, max_bytes, lasting)
         finally:
             self._reserve.allocate()
