@@ -118,8 +118,8 @@ def check(record: RunRecord) -> list[Violation]:
         *_instructions(record),
         *_switch(record),
         *_verdicts(record),
-        *_actives(record.words, LONGEST_OVERLAP_S),
-        *_actives(record.reports, LONGEST_TURN_S),
+        *_actives("standby pair", record.words, LONGEST_OVERLAP_S),
+        *_actives("controllers", record.reports, LONGEST_TURN_S),
         *(Violation("part_away", f"{name} did not run at the end") for name in record.away),
     ]
 
@@ -202,7 +202,7 @@ def _verdicts(record: RunRecord) -> Iterator[Violation]:
             )
 
 
-def _actives(words: Sequence[Word], longest_s: float) -> Iterator[Violation]:
+def _actives(who: str, words: Sequence[Word], longest_s: float) -> Iterator[Violation]:
     turns: list[tuple[str, float, float]] = []
     for word in sorted(words, key=lambda each: each.at):
         if turns and turns[-1][0] == word.speaker:
@@ -210,13 +210,16 @@ def _actives(words: Sequence[Word], longest_s: float) -> Iterator[Violation]:
         else:
             turns.append((word.speaker, word.at, word.at))
     spoiled = float("-inf")
-    for (before, _, ended), (_, began, _), (after, again, _) in zip(
+    for (before, _, ended), (other, began, left), (after, again, _) in zip(
         turns, turns[1:], turns[2:], strict=False
     ):
         if before == after and again - ended < longest_s:
             # one overlap is one violation, however often the two took turns in it
             if began - spoiled > longest_s:
-                yield Violation("two_actives", f"both spoke from {began:.2f} s on")
+                turn = f"{other} from {began:.2f} to {left:.2f} s"
+                yield Violation(
+                    "two_actives", f"{who}: {turn}, amid words of {before} at {ended:.2f} and {again:.2f} s"
+                )
             spoiled = began
 
 

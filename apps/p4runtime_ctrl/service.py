@@ -200,6 +200,10 @@ class P4RuntimeCtrlService:
             self._asked.clear()
             for agent in self._agents.values():
                 agent.stand(active=active)
+        elif active:
+            # a standby may have stepped in while this one was away, with a clock that is ahead
+            for agent in self._agents.values():
+                agent.insist()
 
     def _look_at_switches(self) -> None:
         self._engine.offer_shards(name for name, agent in self._agents.items() if agent.within_reach)

@@ -57,7 +57,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     linger_ms: float = 2.0
     """How long the first packet of a batch waits for others."""
     rank: int = 1
-    """The controller with the highest rank is primary, the others are backups."""
+    """The controller with the highest rank is primary, the others are backups. Pipelines that share a switch need
+    different ranks: of one rank, their controllers take it from each other."""
     copy_session: int = 1
     """Clone session to which the program copies frames."""
     cpu_port: int = 510

@@ -165,9 +165,9 @@ class SwitchWorker:
         return self._connected or time.monotonic() - self._away_since < _AWAY_S
 
     def insist(self) -> None:
-        """The switch was given to this controller: let it be primary."""
-        if self._duty.backup:
-            self._connection.outbid()
+        """This is the controller of the switch: let it be primary."""
+        if self._duty.backup and self._connection.outbid():
+            _LOG.warning("%s: claiming the switch from another controller of no higher rank", self.name)
 
     def stop(self) -> None:
         self._put(self._leave)

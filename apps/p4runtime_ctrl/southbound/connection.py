@@ -2,8 +2,8 @@
 
 A lost stream is opened again, with growing pauses.  The active controller claims to be primary with its rank, a
 standby with the lowest election id.  When the switch reports that there is no primary, a standby waits a
-moment for the active one, then asks to be primary.  With `steps_up` a standby that is primary at once, because the switch
-is new, claims it with its rank, too.
+moment for the active one, then asks to be primary, and stays so until the active one claims the switch above it
+(`outbid`).  With `steps_up` a standby that is primary at once, because the switch is new, claims it with its rank, too.
 """
 
 import threading
@@ -13,6 +13,7 @@ from typing import Any, Final, Protocol
 import grpc
 from google.protobuf.message import DecodeError
 
+from apps.p4runtime_ctrl.southbound.claim_pauses import ClaimPauses
 from apps.p4runtime_ctrl.southbound.digest_rows import ReceivedDigests
 from apps.p4runtime_ctrl.southbound.session import (
     Address,
@@ -88,7 +89,7 @@ class Connection:
         self._opened_ms = 0
         self._highest = 0
         """The highest election id that the switch has seen, as far as it said."""
-        self._outbid_at = 0.0
+        self._claim_pauses = ClaimPauses()
         self._told: tuple[bool, Any] | None = None
         """What the listener knows: primary or not, and the election id of its writes."""
         self._active = active
@@ -128,16 +129,21 @@ class Connection:
             self._active = active
             self._claim(self._usual_id())
 
-    def outbid(self) -> None:
-        """Claim above whoever is primary, unless its rank is higher; once a second at most.
+    def outbid(self) -> bool:
+        """Claim the switch above whoever is primary, unless its rank is higher or the last claim was moments ago.
 
         Clocks of two machines differ, so the time of a stream does not decide between two of one rank.
+
+        Returns:
+            Whether it was claimed.
         """
-        now = time.monotonic()
         of_lower_rank = self._highest >> 64 <= self._address.rank
-        if self._active and self._told == (False, None) and of_lower_rank and now - self._outbid_at > 1:
-            self._outbid_at = now
-            self._claim(min(max(self._highest + 1, self._usual_id()), _HIGHEST_ID))
+        if not (self._active and self._told == (False, None) and of_lower_rank):
+            return False
+        if not self._claim_pauses.due(time.monotonic()):
+            return False
+        self._claim(min(max(self._highest + 1, self._usual_id()), _HIGHEST_ID))
+        return True
 
     def break_off(self) -> None:
         """Close this stream; a new one is opened unless `close` was called."""

@@ -1,12 +1,14 @@
 """Whatever breaks, the switch ends up with exactly the desired rules: none stale, none twice, none missing."""
 
 import threading
+import time
 
 import pytest
 
 from due import Capability
 from sdnator.testing.cable import Cable
 from sdnator.testing.controller_run import PACKETS, Bystander, ControllerRun, Heard, block, end, frame
+from sdnator.testing.p4runtime_client import P4RuntimeClient
 from sdnator.testing.waiting import wait_for
 
 DECISIONS = Capability("network.block.firewall.*", delivery="reliable", archive="always")
@@ -169,6 +171,15 @@ def test_a_standby_controller_takes_over(stage):
     assert verdicts(feed, [1, 2, 3, 4]) == [BLOCKED, BLOCKED, BLOCKED, FREE]
     wait_for(lambda: len(firewall.state()["blocks"]) == 3, why=stage.log)
     feed.close()
+
+
+def test_an_active_controller_takes_its_switch_from_one_whose_clock_is_ahead(stage):
+    """As a standby on another machine, which stepped in while this one was away, and hears of no decision."""
+    an_hour_ahead = 1 << 64 | time.time_ns() // 1_000_000 + 3_600_000
+    with P4RuntimeClient(stage.target.address, election_id=an_hour_ahead) as standby:
+        standby.arbitrate()
+        stage.controller()
+        Firewall(stage).decide(1)
 
 
 @pytest.mark.parametrize(("fail", "without_controller"), [("open", FORWARDED), ("closed", 0)])
