@@ -16,6 +16,7 @@ from typing import Final
 
 from due.drivers.query import ArchiveQuery
 from due.drivers.query_tree import Condition
+from due.drivers.sqlite_place import ArchivePlace, FileId
 from due.errors import ArchiveUnavailable, BackendError, InvalidKey
 from due.keys import Key
 from due.messages import Item
@@ -184,6 +185,7 @@ class SqliteFile:
 
     def __init__(self, path: Path, synchronous: str) -> None:
         self._path = path
+        self._place = ArchivePlace(path)
         self._synchronous = synchronous
         self._closed = False
         self._written: sqlite3.Connection | None = None
@@ -197,7 +199,7 @@ class SqliteFile:
         self._reset()
 
     def _reset(self) -> None:
-        self._file: tuple[int, int] | None = None
+        self._file: FileId | None = None
         self._writer: sqlite3.Connection | None = None
         self._idle: deque[sqlite3.Connection] = deque()
         self.keys = Dictionary("keys", "key_id", "key", check=Key.parse)
@@ -215,7 +217,7 @@ class SqliteFile:
         with self._lock:
             if self._closed:
                 raise BackendError(f"archive {self._path} is closed")
-            if self._file is not None and self._file != self._named():
+            if self._file is not None and self._file != self._place.file():
                 # moved away or replaced: what is written into the old file would be in no archive
                 self._let_go()
             yield
@@ -228,7 +230,7 @@ class SqliteFile:
     def _check_place(self, written: sqlite3.Connection) -> None:
         """Raises `ArchiveUnavailable` if the file was moved while it was written; what is repeated is known by its numbers."""
         with self._lock:
-            if self._file is not None and self._file != self._named():
+            if self._file is not None and self._file != self._place.file():
                 self._let_go()
             # it may have been let go by another thread
             if self._writer is not written and not self._closed:
@@ -236,31 +238,24 @@ class SqliteFile:
                     f"archive {self._path} was moved away or replaced while it was written"
                 )
 
-    def _named(self) -> tuple[int, int] | None:
-        """Which file has the archive's name now."""
-        try:
-            found = self._path.stat()
-        except FileNotFoundError:
-            return None
-        return found.st_dev, found.st_ino
-
     def _connect(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        if (before := self._named()) is None:
-            # SQLite gives the files beside it the same mode, and tells what is wrong where it cannot be made
-            with suppress(OSError):
-                os.close(os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600))
-        connection = sqlite3.connect(
-            self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
-        )
-        # decoded by us, cell by cell: one that is no UTF-8 would fail the whole query
-        connection.text_factory = bytes
-        try:
-            self._prepare(connection)
-        except BaseException:
-            connection.close()
-            raise
-        self._file = self._file or before or self._named()
+        with self._place.opening():
+            if (before := self._place.file()) is None:
+                # SQLite gives the files beside it the same mode, and tells what is wrong where it cannot be made
+                with suppress(OSError):
+                    os.close(os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600))
+            connection = sqlite3.connect(
+                self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
+            )
+            # decoded by us, cell by cell: one that is no UTF-8 would fail the whole query
+            connection.text_factory = bytes
+            try:
+                self._prepare(connection)
+            except BaseException:
+                connection.close()
+                raise
+            self._file = self._file or before or self._place.file()
         return connection
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
