@@ -58,7 +58,7 @@ class ArchivePlace:
     def opening(self) -> Iterator[None]:
         """Open the archive inside: what is left of another file is gone then, and nobody else opens it meanwhile.
 
-        Where the notes cannot be written, such as on a full disk, it is opened without.
+        Where the notes cannot be written or locked, such as on a full disk, it is opened without.
 
         Raises:
             ArchiveUnavailable: another process has been opening it for seconds.
@@ -75,8 +75,9 @@ class ArchivePlace:
                 yield
             finally:
                 self._write(notes)
-                # closing alone would leave the lock to a child that was forked meanwhile
-                fcntl.flock(notes, fcntl.LOCK_UN)
+                with suppress(OSError):
+                    # closing alone would leave the lock to a child that was forked meanwhile
+                    fcntl.flock(notes, fcntl.LOCK_UN)
         finally:
             os.close(notes)
 
@@ -91,6 +92,8 @@ class ArchivePlace:
                         f"archive {self._path} is being opened by another process, which does not end"
                     ) from None
                 time.sleep(_LOOK_S)
+            except OSError:
+                return  # a file system without such locks
             else:
                 return
 
@@ -106,8 +109,8 @@ class ArchivePlace:
                 path.unlink(missing_ok=True)
 
     def _write(self, notes: int) -> None:
-        text = " ".join(f"{number:016x}" for each in self._now() for number in each)
         with suppress(OSError):
+            text = " ".join(f"{number:016x}" for each in self._now() for number in each)
             os.pwrite(notes, text.encode(), 0)
             archive = self._path.stat()
             if os.fstat(notes).st_uid != archive.st_uid:

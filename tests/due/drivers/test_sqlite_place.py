@@ -1,5 +1,6 @@
 """A file that takes the archive's place is not mixed with what was written beside the one before."""
 
+import errno
 import fcntl
 import os
 import shutil
@@ -125,6 +126,19 @@ def test_an_archive_is_opened_where_no_notes_can_be_made(tmp_path: Path) -> None
     assert numbers(archive) == [1, 2, 3, 4, 5]
     archive.close()
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_nor_does_an_archive_need_a_file_system_with_locks_of_this_kind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    archive = opened(tmp_path)
+    archive.insert(items(5))
+    assert numbers(archive) == [1, 2, 3, 4, 5]
+    archive.close()
 
 
 def test_one_that_does_not_end_opening_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
