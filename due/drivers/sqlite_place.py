@@ -22,6 +22,7 @@ from due.errors import ArchiveUnavailable
 
 _WAIT_S: Final = 5.0
 _LOOK_S: Final = 0.01
+"""Between looks at the lock: one that waits inside `flock` cannot be told to give up."""
 _MOST_BYTES: Final = 512
 
 FileId = tuple[int, int]
@@ -63,9 +64,8 @@ class ArchivePlace:
         Raises:
             ArchiveUnavailable: another process has been opening it for seconds.
         """
-        try:
-            notes = os.open(self._notes, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-        except OSError:
+        notes = self._open_notes()
+        if notes is None:
             yield
             return
         try:
@@ -80,6 +80,12 @@ class ArchivePlace:
                     fcntl.flock(notes, fcntl.LOCK_UN)
         finally:
             os.close(notes)
+
+    def _open_notes(self) -> int | None:
+        try:
+            return os.open(self._notes, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        except OSError:
+            return None
 
     def _lock(self, notes: int) -> None:
         give_up = time.monotonic() + _WAIT_S

@@ -13,6 +13,8 @@ class ClaimPauses:
 
     A standby gives way to the first claim.  Two active controllers of one rank, which are a mistake in their settings,
     would take the switch from each other for ever; so each comes to keep it for longer and longer.
+    Not `due.backoff`: the switch says that a claim has succeeded also where it will be lost again in a second, so a claim
+    counts as good only once it has lasted.
     """
 
     def __init__(self) -> None:

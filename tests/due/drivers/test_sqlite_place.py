@@ -29,6 +29,7 @@ archive.insert(items(1, start=3000))
 archive.close()
 """
 
+ROOT = Path(__file__).parents[3]
 T0 = 1_700_000_000_000_000_000
 
 
@@ -85,7 +86,7 @@ def test_nor_is_what_another_process_writes_while_the_file_is_being_replaced(tmp
     for end in ("-wal", "-shm"):
         (tmp_path / f"archive.db{end}").rename(tmp_path / f"old.db{end}")
     with subprocess.Popen(
-        [sys.executable, "-c", LATE, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", LATE, str(tmp_path)], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as late:
         assert late.stdin is not None
         assert late.stdout is not None
